@@ -1,0 +1,8 @@
+"""The one exception for bad input."""
+
+
+class DataError(ValueError):
+    """Bad input, in one sentence: the file, the place in it, what was expected and what to do.
+
+    The `microid` command prints the sentence on stderr and exits with status 2.
+    """

@@ -1,0 +1,28 @@
+"""Strict numerics for every test, and randomness that prints itself."""
+
+import os
+import secrets
+
+import jax
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+mpl.use("Agg")
+
+
+@pytest.fixture
+def seed() -> int:
+    """A fresh seed, printed when the test fails; MICROID_SEED replays it."""
+    value = int(os.environ.get("MICROID_SEED") or secrets.randbelow(2**31))
+    print(f"replay with MICROID_SEED={value}")
+    return value
+
+
+@pytest.fixture
+def rng(seed: int) -> np.random.Generator:
+    """A NumPy generator made from the printed seed."""
+    return np.random.default_rng(seed)
