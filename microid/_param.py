@@ -1,0 +1,252 @@
+"""Parameters that carry their unit, scale and bounds, and the coordinates a solver sees."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+_KEY = "microid.param"
+_Model = TypeVar("_Model")
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """What is known of a parameter before any data: its unit, scale and bounds.
+
+    Attributes
+    ----------
+    unit
+        Unit of the value, such as `"um"`; `"1"` where there is none.
+    scale
+        A typical magnitude in that unit. Solvers see `value / scale`.
+    lower, upper
+        Bounds in that unit, `-inf` and `inf` where there are none.
+    """
+
+    unit: str
+    scale: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """One row of `parameter_table`: where a parameter stands in a model, and its specification."""
+
+    path: str
+    shape: tuple[int, ...]
+    spec: ParameterSpec
+
+
+def _as_inexact(value: Any) -> Any:
+    # A bare asarray keeps Python floats weakly typed, and each new value would retrace.
+    if isinstance(value, eqx.Module):
+        return value
+    keep = getattr(value, "dtype", None)
+    if keep is not None and jnp.issubdtype(keep, jnp.inexact):
+        return jnp.asarray(value)
+    return jnp.asarray(value, dtype=float)
+
+
+def array() -> Any:
+    """Declare an array field that is data, not a parameter: the voltage range, say."""
+    return eqx.field(converter=_as_inexact)
+
+
+def static() -> Any:
+    """Declare a field that is part of a model's structure: the number of levels, say."""
+    return eqx.field(static=True)
+
+
+def param(*, unit: str, scale: float = 1.0, lower: float = -math.inf, upper: float = math.inf) -> Any:
+    """Declare a field that can be fitted, with its unit, scale and bounds beside it.
+
+    Every floating-point array at or below the field is a parameter. Bounds become bijections in
+    `Coordinates`; no solver option is involved.
+
+    Parameters
+    ----------
+    unit, scale, lower, upper
+        See `ParameterSpec`.
+
+    Raises
+    ------
+    ValueError
+        If the scale is not positive or the bounds are not in order.
+    """
+    if not scale > 0:
+        raise ValueError(f"scale must be positive, got {scale}")
+    if not lower < upper:
+        raise ValueError(f"lower must be less than upper, got {lower} and {upper}")
+    spec = ParameterSpec(unit, float(scale), float(lower), float(upper))
+    return eqx.field(converter=_as_inexact, metadata={_KEY: spec})
+
+
+def _spec_of(model: Any, path: tuple[Any, ...]) -> ParameterSpec | None:
+    """Find the specification of the innermost declared field on the way to a leaf."""
+    spec, node = None, model
+    for entry in path:
+        if isinstance(entry, jax.tree_util.GetAttrKey):
+            if isinstance(node, eqx.Module):
+                fields = {f.name: f for f in _fields(node)}
+                spec = fields[entry.name].metadata.get(_KEY, spec) if entry.name in fields else spec
+            node = getattr(node, entry.name)
+        elif isinstance(entry, jax.tree_util.SequenceKey):
+            node = node[entry.idx]
+        elif isinstance(entry, jax.tree_util.DictKey):
+            node = node[entry.key]
+    return spec
+
+
+def _fields(node: eqx.Module) -> tuple[Any, ...]:
+    return tuple(getattr(type(node), "__dataclass_fields__", {}).values())
+
+
+def _walk(model: Any) -> list[tuple[str, Any, ParameterSpec | None]]:
+    """Visit every leaf in JAX's own order: the only walk over parameters there is."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(model)
+    found = []
+    for path, leaf in leaves:
+        fits = eqx.is_inexact_array(leaf)
+        name = jax.tree_util.keystr(path).lstrip(".")
+        found.append((name, leaf, _spec_of(model, path) if fits else None))
+    return found
+
+
+def parameter_table(model: PyTree) -> tuple[ParameterInfo, ...]:
+    """List the parameters of a model in the order of the solver's coordinates.
+
+    Parameters
+    ----------
+    model
+        Any pytree of modules.
+
+    Returns
+    -------
+    tuple of ParameterInfo
+        Path, shape, unit, scale and bounds of every parameter.
+    """
+    return tuple(ParameterInfo(name, leaf.shape, spec) for name, leaf, spec in _walk(model) if spec is not None)
+
+
+def _constrain(spec: ParameterSpec, z: Float[Array, "..."]) -> Float[Array, "..."]:
+    low, high = math.isfinite(spec.lower), math.isfinite(spec.upper)
+    if low and high:
+        return spec.lower + (spec.upper - spec.lower) * jax.nn.sigmoid(z)
+    if low:
+        return spec.lower + spec.scale * jax.nn.softplus(z)
+    if high:
+        return spec.upper - spec.scale * jax.nn.softplus(-z)
+    return spec.scale * z
+
+
+def _softplus_inverse(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    return x + jnp.log(-jnp.expm1(-x))
+
+
+def _unconstrain(spec: ParameterSpec, value: Float[Array, "..."]) -> Float[Array, "..."]:
+    low, high = math.isfinite(spec.lower), math.isfinite(spec.upper)
+    # A value on its bound lies at infinity; a millionth of the scale inside is where solvers can start.
+    margin = 1e-6
+    if low and high:
+        fraction = (value - spec.lower) / (spec.upper - spec.lower)
+        fraction = jnp.clip(fraction, margin, 1 - margin)
+        return jnp.log(fraction) - jnp.log1p(-fraction)
+    if low:
+        return _softplus_inverse(jnp.maximum((value - spec.lower) / spec.scale, margin))
+    if high:
+        return -_softplus_inverse(jnp.maximum((spec.upper - value) / spec.scale, margin))
+    return value / spec.scale
+
+
+class Coordinates(eqx.Module, Generic[_Model]):
+    """The map between a model and one flat vector of scaled, unbounded coordinates.
+
+    Calling it with a vector gives the model. Parameters with bounds go through a softplus (one bound) or a
+    logistic (two), so no vector can leave them; the others are divided by their scale.
+
+    Attributes
+    ----------
+    size
+        Number of coordinates.
+    """
+
+    _rest: PyTree
+    _slots: tuple[tuple[int, tuple[int, ...], ParameterSpec], ...] = eqx.field(static=True)
+    _treedef: Any = eqx.field(static=True)
+
+    def __init__(self, model: _Model, free: Callable[[ParameterInfo], bool] = lambda _: True):
+        """Choose the coordinates of a model.
+
+        Parameters
+        ----------
+        model
+            Any pytree of modules; its values are kept for everything that is not free.
+        free
+            Says of each parameter whether it may move.
+
+        Raises
+        ------
+        ValueError
+            If no parameter is free.
+        """
+        leaves, self._treedef = jax.tree_util.tree_flatten(model)
+        slots = []
+        rest: list[Any] = []
+        for index, (name, leaf, spec) in enumerate(_walk(model)):
+            if spec is not None and free(ParameterInfo(name, leaf.shape, spec)):
+                slots.append((index, leaf.shape, spec))
+                rest.append(None)
+            else:
+                rest.append(leaves[index])
+        if not slots:
+            raise ValueError("no parameter is free: nothing to fit")
+        self._slots, self._rest = tuple(slots), rest
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return sum(math.prod(shape) for _, shape, _ in self._slots)
+
+    def of(self, model: _Model) -> Float[Array, " size"]:
+        """Read the coordinates of a model of the same structure.
+
+        Raises
+        ------
+        ValueError
+            If the model has another structure, or a concrete value lies outside its bounds.
+        """
+        leaves, treedef = jax.tree_util.tree_flatten(model)
+        if treedef != self._treedef:
+            raise ValueError("the model has another structure than the one these coordinates were made for")
+        parts = []
+        for index, _, spec in self._slots:
+            value = leaves[index]
+            if not isinstance(value, jax.core.Tracer):
+                _refuse_outside(spec, np.asarray(value))
+            parts.append(jnp.ravel(_unconstrain(spec, value)))
+        return jnp.concatenate(parts)
+
+    def __call__(self, vector: Float[Array, " size"]) -> _Model:
+        """Build the model that has these coordinates."""
+        leaves = list(self._rest)
+        start = 0
+        for index, shape, spec in self._slots:
+            stop = start + math.prod(shape)
+            leaves[index] = _constrain(spec, vector[start:stop].reshape(shape))
+            start = stop
+        return jax.tree_util.tree_unflatten(self._treedef, leaves)
+
+
+def _refuse_outside(spec: ParameterSpec, value: np.ndarray) -> None:
+    if np.any(value < spec.lower) or np.any(value > spec.upper):
+        worst = float(np.min(value)) if np.any(value < spec.lower) else float(np.max(value))
+        raise ValueError(
+            f"value {worst:g} {spec.unit} lies outside its bounds [{spec.lower:g}, {spec.upper:g}] {spec.unit}"
+        )
