@@ -1,0 +1,54 @@
+"""What data teach: measured records, estimation, reports and the `microid` command."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fits._errors import DataError as DataError
+    from fits._fit import LADDER as LADDER
+    from fits._fit import fit as fit
+    from fits._metrics import Errors as Errors
+    from fits._metrics import errors as errors
+    from fits._metrics import loop_width_pct as loop_width_pct
+    from fits._read_csv import read_csv as read_csv
+    from fits._read_csv import read_runs as read_runs
+    from fits._record import Record as Record
+    from fits._result import FitError as FitError
+    from fits._result import FitResult as FitResult
+    from fits._result import FitStatus as FitStatus
+    from fits._result import LevelTrial as LevelTrial
+    from fits._result import Prediction as Prediction
+    from fits._result import RunReport as RunReport
+    from fits._result import predict as predict
+    from fits._uncertainty import Uncertainty as Uncertainty
+
+# Names are looked up when first used, so that the command's help does not wait for JAX and pandas.
+_HOMES = {
+    "DataError": "_errors",
+    "Errors": "_metrics",
+    "FitError": "_result",
+    "FitResult": "_result",
+    "FitStatus": "_result",
+    "LADDER": "_fit",
+    "LevelTrial": "_result",
+    "Prediction": "_result",
+    "Record": "_record",
+    "RunReport": "_result",
+    "Uncertainty": "_uncertainty",
+    "errors": "_metrics",
+    "fit": "_fit",
+    "loop_width_pct": "_metrics",
+    "predict": "_result",
+    "read_csv": "_read_csv",
+    "read_runs": "_read_csv",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(_HOMES)

@@ -1,0 +1,124 @@
+"""The Preisach operator as a linear regression: one column per weight and slope."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from microid import GridDensity, Preisach, Reversible, Staircase, everett, forest_sum, node_areas, remember
+
+
+class Grid(eqx.Module):
+    """The columns of the regression, in units where the voltage range is 1.
+
+    The first `N (N + 1) / 2` columns are densities of 1 at one node each, packed row by row; the last `N` are slopes
+    of 1 at one level each. In these units the columns of all rigs look alike, so scales and priors need no unit.
+
+    Attributes
+    ----------
+    lower_V, upper_V
+        Range of the levels.
+    levels
+        Their number `N`.
+    """
+
+    lower_V: Float[Array, ""]
+    upper_V: Float[Array, ""]
+    levels: int = eqx.field(static=True)
+
+    @property
+    def weights(self) -> int:
+        """Number of weights."""
+        return self.levels * (self.levels + 1) // 2
+
+    @property
+    def columns(self) -> int:
+        """Number of weights and slopes together, `D`."""
+        return self.weights + self.levels
+
+    @property
+    def range_V(self) -> Float[Array, ""]:
+        """Width of the range."""
+        return self.upper_V - self.lower_V
+
+    def nodes(self, packed: Float[Array, " p"]) -> Float[Array, "N N"]:
+        """Spread packed values over the half-plane, shape `(N, N)`."""
+        zeros = jnp.zeros((self.levels, self.levels), packed.dtype)
+        return zeros.at[np.tril_indices(self.levels)].set(packed)
+
+    def model(self, columns_um: Float[Array, " D"], offset_um: Float[Array, ""]) -> Preisach:
+        """Turn a solution, in um, into a model."""
+        weights, slopes = columns_um[: self.weights], columns_um[self.weights :]
+        packed = weights * node_areas(self.levels)[np.tril_indices(self.levels)]
+        density = GridDensity(packed, self.lower_V, self.upper_V)
+        return Preisach(density, Reversible(slopes / self.range_V, self.lower_V, self.upper_V), offset_um)
+
+
+def columns_of(model: Preisach) -> Float[Array, " D"]:
+    """Read the columns of any family's model, in um: the inverse of `Grid.model` where the family is a grid."""
+    range_V = model.density.upper_V - model.density.lower_V
+    nodes = model.density.nodes_um_per_V2() * range_V**2
+    weights = nodes[np.tril_indices(model.density.levels)]
+    return jnp.concatenate([weights, model.reversible.slope_um_per_V * range_V])
+
+
+def design(grid: Grid, voltage_V: Float[Array, " n"], start: Staircase) -> tuple[Float[Array, "n D"], Staircase]:
+    """Respond with every column alone.
+
+    Parameters
+    ----------
+    grid
+        The columns.
+    voltage_V
+        Shape `(n,)`.
+    start
+        Memory before the first sample.
+
+    Returns
+    -------
+    Array
+        Responses, shape `(n, D)`; dimensionless.
+    Staircase
+        Memory after the last sample.
+    """
+    n = grid.levels
+    memory = remember(voltage_V, start)
+    x = jnp.clip((memory.path_V - grid.lower_V) / grid.range_V, 0, 1) * (n - 1)
+    up, anchor = memory.rising[:, None], memory.anchor
+    reach = _reach(x, n)
+    # A branch adds or takes off the rectangle between its anchor and the present voltage (see microid.Everett).
+    high = jnp.where(up, -reach, reach[anchor])
+    low = jnp.where(up, reach[anchor], reach)
+    rectangle = high[:, :, None] * low[:, None, :]
+    total = forest_sum(rectangle.at[0].set(0), anchor)[memory.lead :]
+    # Nodes under the diagonal triangles are not free: they continue the three corners linearly.
+    ghost = jnp.diagonal(total, 1, axis1=1, axis2=2)
+    i = np.arange(n - 1)
+    total = total.at[:, i, i].add(ghost).at[:, i + 1, i + 1].add(ghost).at[:, i + 1, i].add(-ghost)
+    packed = total.reshape(total.shape[0], n * n)[:, np.ravel_multi_index(np.tril_indices(n), (n, n))]
+
+    x, rising = x[memory.lead :], memory.rising[memory.lead :]
+    cell = jnp.clip(x.astype(jnp.int32), 0, n - 2)
+    s = (x - cell.astype(x.dtype))[:, None]
+    c0, c1, c2, c3 = _branch_table(n)[:, jnp.where(rising, cell, cell + (n - 1))]
+    branch = c0 + s * (c1 + s * (c2 + s * c3))
+    return branch.at[:, : grid.weights].add(packed), memory.end()
+
+
+def _reach(x: Float[Array, " m"], n: int) -> Float[Array, "m N"]:
+    """Integral of each hat function up to `x` levels, in units of the range."""
+    z = jnp.clip(x[:, None] - jnp.arange(n, dtype=x.dtype)[None, :], -1, 1)
+    rise = jnp.where(z < 0, (z + 1) ** 2 / 2, 1 - (1 - z) ** 2 / 2)
+    return rise.at[:, 0].add(-0.5) / (n - 1)
+
+
+def _branch_table(n: int) -> Float[Array, "4 k D"]:
+    """Branch polynomials of every column, taken from the model itself."""
+    grid = Grid(jnp.asarray(0.0), jnp.asarray(1.0), n)
+
+    def branch(column: Float[Array, " D"]) -> Float[Array, "4 k"]:
+        nodes, slopes = grid.nodes(column[: grid.weights]), column[grid.weights :]
+        return everett(nodes, slopes, grid.lower_V, grid.upper_V).branch_um
+
+    return jnp.moveaxis(jax.vmap(branch)(jnp.eye(grid.columns)), 0, -1)

@@ -1,0 +1,85 @@
+"""How smooth and how noisy: found by maximising the probability of the data (the evidence), not set by hand."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+from optimistix import RESULTS
+
+from fits._moments import Moments
+from fits._prior import Hyper, Roughness
+
+# Beyond these the evidence is flat: the prior then says "straight" or nothing at all.
+_LOWEST, _HIGHEST = -25.0, 25.0
+
+
+class Posterior(eqx.Module):
+    """Gaussian belief about the columns, in strokes, before non-negativity.
+
+    Attributes
+    ----------
+    mean
+        Shape `(D,)`.
+    root
+        Lower Cholesky factor of the precision, shape `(D, D)`.
+    effective
+        Number of columns that the data, not the prior, determine.
+    """
+
+    mean: Float[Array, " D"]
+    root: Float[Array, "D D"]
+    effective: Float[Array, ""]
+
+
+def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array, ""]:
+    """Negative logarithm of the evidence (MacKay 1992; Rasmussen & Williams 2006, ch. 2), but for a constant."""
+    moments, rough = args
+    prior = rough.precision(hyper)
+    variance = jnp.exp(hyper.log_variance)
+    root = jnp.linalg.cholesky(moments.gram / variance + prior)
+    half = jax.scipy.linalg.solve_triangular(root, moments.cross_um / variance, lower=True)
+    misfit = moments.energy_um2 / variance - half @ half
+    volume = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
+    prior_volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(prior))))
+    # A fence far out keeps the search from running along a flat valley for ever.
+    values = jnp.stack([hyper.log_density, hyper.log_reversible])
+    fence = jnp.sum(jnp.maximum(values - _HIGHEST, 0) ** 2 + jnp.maximum(_LOWEST - values, 0) ** 2)
+    return (moments.count * hyper.log_variance + misfit + volume - prior_volume) / 2 + fence
+
+
+@eqx.filter_jit
+def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> tuple[Hyper, RESULTS]:
+    """Find the smoothness and the noise under which the data are most probable.
+
+    Parameters
+    ----------
+    moments
+        Of the data, in strokes.
+    rough
+        Curvature of the same columns.
+    start
+        Where the search begins.
+    """
+    solver = optx.BFGS(rtol=1e-3, atol=1e-2)
+    solution = optx.minimise(_negative_log, solver, start, args=(moments, rough), max_steps=128, throw=False)
+    return solution.value, solution.result
+
+
+@eqx.filter_jit
+def posterior(moments: Moments, rough: Roughness, hyper: Hyper) -> Posterior:
+    """Condition the prior on the data."""
+    prior = rough.precision(hyper)
+    variance = jnp.exp(hyper.log_variance)
+    root = jnp.linalg.cholesky(moments.gram / variance + prior)
+    mean = jax.scipy.linalg.cho_solve((root, True), moments.cross_um / variance)
+    held = jax.scipy.linalg.cho_solve((root, True), prior)
+    return Posterior(mean, root, prior.shape[0] - jnp.trace(held))
+
+
+@eqx.filter_jit
+def renew_noise(moments: Moments, hyper: Hyper, belief: Posterior) -> Hyper:
+    """Re-estimate the noise from what is left at the full resolution (MacKay's fixed point)."""
+    left = moments.energy_um2 - 2 * belief.mean @ moments.cross_um + belief.mean @ moments.gram @ belief.mean
+    variance = jnp.maximum(left, 0) / jnp.maximum(moments.count - belief.effective, 1)
+    return Hyper(hyper.log_density, hyper.log_reversible, jnp.log(jnp.maximum(variance, 1e-30)))

@@ -1,0 +1,265 @@
+"""From records to a fitted Preisach operator."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from optimistix import RESULTS
+
+from fits._design import Grid, columns_of
+from fits._errors import DataError
+from fits._grid import GridSolution, cross_validate, solve_grid
+from fits._history import estimate_start
+from fits._metrics import Errors, errors, loop_width_pct
+from fits._moments import Data, gather
+from fits._noise import correlation_samples
+from fits._prior import Hyper
+from fits._record import Record
+from fits._result import FitError, FitResult, FitStatus, LevelTrial, RunReport
+from fits._run import Run, prepare_run, simulate_run
+from fits._shapes import solve_shape
+from fits._uncertainty import Uncertainty, perturbations
+from microid import FAMILIES, Preisach
+
+# Resolutions in steps of the square root of two: intervals double every second one.
+LADDER = (8, 12, 17, 24, 34, 48, 68)
+# Refining goes on while it takes this fraction off the error of predicted blocks.
+_WORTH = 0.005
+# A residual less correlated than this counts as white.
+_WHITE = 1.2
+# Families that are not grids are evaluated on at least this many levels.
+_SHAPE_LEVELS = 34
+# Largest derivative, per coordinate and in squared noise standard deviations, that counts as zero.
+_STATIONARY = 0.1
+
+
+@dataclass(frozen=True)
+class _Trial:
+    data: Data
+    solution: GridSolution
+    correlation: float
+    error: float
+
+
+def fit(
+    records: Sequence[Record],
+    *,
+    family: str = "grid",
+    levels: int | None = None,
+    holdout: float | Sequence[Record] = 0.2,
+    initial: str = "unknown",
+    starts: int = 8,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> FitResult:
+    """Fit a Preisach operator to measured voltage and displacement (Eq. 8-11).
+
+    The weights are found by a smooth, non-negative regression whose smoothness and noise level maximise the
+    evidence; the resolution is raised until blocks of the record are no longer predicted better from the others.
+
+    Parameters
+    ----------
+    records
+        Runs of one rig. Each has its own sensor offset.
+    family
+        Name in `microid.FAMILIES`.
+    levels
+        Number of switching voltages; chosen from the data by default.
+    holdout
+        Fraction at the end of every run that is only predicted, or records that are.
+    initial
+        Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`.
+    starts, seed
+        Number of starts, and their seed, for families whose fit is not convex.
+    progress
+        Told what is being done, a sentence at a time.
+
+    Returns
+    -------
+    FitResult
+        Never the start: a fit that fails raises.
+
+    Raises
+    ------
+    DataError
+        If the records cannot be fitted.
+    FitError
+        If a solver fails.
+    RuntimeError
+        If JAX computes in single precision.
+    """
+    if not jax.config.jax_enable_x64:
+        raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
+    if family not in FAMILIES:
+        raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
+    if levels is not None and not 4 <= levels <= 100:
+        raise DataError(f"{levels} levels were asked for: choose between 4 and 100")
+    fraction = holdout if isinstance(holdout, int | float) else 0.0
+    if not 0 <= fraction <= 0.9:
+        raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
+    aside = () if isinstance(holdout, int | float) else tuple(holdout)
+    if not records:
+        raise DataError("there is no record to fit")
+
+    voltages = [record.voltage_V for record in (*records, *aside)]
+    lower, upper = min(v.min() for v in voltages), max(v.max() for v in voltages)
+    runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]
+    stroke = max(float(np.ptp(run.displacement_um[run.fitted])) for run in runs)
+    if stroke == 0:
+        raise DataError(f"{records[0].source}: the displacement does not move in the samples to be fitted")
+
+    def trial(n: int, hyper: Hyper) -> _Trial:
+        progress(f"{n} levels")
+        return _try(Grid(jnp.asarray(lower), jnp.asarray(upper), n), runs, stroke, hyper)
+
+    tried, trials = _resolve(trial, levels, stroke)
+    remarks = _remarks(runs, tried, trials, levels)
+    if family == "grid":
+        model, uncertainty, data = _from_grid(tried, stroke)
+    else:
+        if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
+            tried = trial(_SHAPE_LEVELS, tried.solution.hyper)
+        key = jax.random.key(seed)
+        solution = solve_shape(
+            family, tried.data, stroke, tried.correlation, tried.solution.hyper, starts, key, progress
+        )
+        _check(solution.result)
+        if not solution.gradient < _STATIONARY:
+            raise FitError(FitStatus.NOT_STATIONARY)
+        if solution.agreeing == 1 and starts > 1:
+            remarks.append(
+                f"only one of {starts} starts reached the best fit, so there may be a better one: raise --starts"
+            )
+        model, data = solution.model, tried.data
+        uncertainty = _uncertainty(data, solution.factor_um, tried, stroke)
+    offsets = _offsets(model, data)
+    first = eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offsets[0]))
+    noise = float(jnp.exp(tried.solution.hyper.log_variance / 2)) * stroke
+
+    progress("comparing with the measurement")
+    reports = [_report(_with_offset(model, o), run, noise) for o, run in zip(offsets, runs, strict=True)]
+    for record in aside:
+        run = prepare_run(record, lower, upper, initial, holdout=1.0)
+        run = replace(run, fitted=np.zeros_like(run.known))
+        off = float(np.mean((run.displacement_um - simulate_run(model, run))[run.known]))
+        reports.append(_report(_with_offset(model, off), run, noise))
+    return FitResult(
+        model=first,
+        uncertainty=uncertainty,
+        status=FitStatus.CONVERGED,
+        remarks=tuple(remarks),
+        noise_um=noise,
+        correlation_samples=tried.correlation,
+        smoothness=float(jnp.exp(tried.solution.hyper.log_density)),
+        trials=tuple(trials),
+        runs=tuple(reports),
+    )
+
+
+def _resolve(
+    trial: Callable[[int, Hyper], _Trial], levels: int | None, stroke: float
+) -> tuple[_Trial, list[LevelTrial]]:
+    """Refine until it no longer pays; the coarser of two equals is kept."""
+    best = trial(levels or LADDER[0], Hyper.start())
+    trials = [LevelTrial(best.data.grid.levels, best.error * stroke)]
+    if levels is not None:
+        return best, trials
+    for n in LADDER[1:]:
+        finer = trial(n, best.solution.hyper)
+        trials.append(LevelTrial(n, finer.error * stroke))
+        if not finer.error < (1 - _WORTH) * best.error:
+            break
+        best = finer
+    return best, trials
+
+
+def _try(grid: Grid, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
+    data = gather(grid, runs)
+    correlation = 1.0
+    solution = solve_grid(data, stroke, correlation, hyper)
+    _check(solution.result)
+    model = grid.model(solution.columns * stroke, jnp.asarray(0.0))
+    # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
+    found = correlation_samples([(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs])
+    if found > _WHITE:
+        correlation = found
+        solution = solve_grid(data, stroke, correlation, hyper)
+        _check(solution.result)
+    error = float(np.sqrt(np.mean(cross_validate(data, stroke, correlation, solution.hyper))))
+    return _Trial(data, solution, correlation, error)
+
+
+def _check(result: RESULTS) -> None:
+    if result == RESULTS.successful:
+        return
+    if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
+        raise FitError(FitStatus.MAX_STEPS)
+    raise FitError(FitStatus.NONFINITE)
+
+
+def _from_grid(tried: _Trial, stroke: float) -> tuple[Preisach, Uncertainty, Data]:
+    belief = tried.solution.belief
+    inverse = jax.scipy.linalg.solve_triangular(belief.root, jnp.eye(belief.root.shape[0]), lower=True)
+    model = tried.data.grid.model(tried.solution.columns * stroke, jnp.asarray(0.0))
+    return model, _uncertainty(tried.data, inverse.T * stroke, tried, stroke), tried.data
+
+
+def _uncertainty(data: Data, factor_um: jax.Array, tried: _Trial, stroke: float) -> Uncertainty:
+    mean = data.means[0]
+    noise = float(jnp.exp(tried.solution.hyper.log_variance / 2)) * stroke
+    return perturbations(data.grid, factor_um, mean.response, noise * (tried.correlation / mean.count) ** 0.5)
+
+
+def _offsets(model: Preisach, data: Data) -> list[float]:
+    columns = columns_of(model)
+    return [mean.displacement_um - float(mean.response @ columns) for mean in data.means]
+
+
+def _with_offset(model: Preisach, offset_um: float) -> Preisach:
+    return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offset_um))
+
+
+def _report(model: Preisach, run: Run, noise_um: float) -> RunReport:
+    start = estimate_start(model, run, noise_um)
+    predicted = simulate_run(model, run)
+    measured = run.displacement_um
+
+    def compare(samples: np.ndarray) -> Errors | None:
+        if not samples.any() or np.ptp(measured[samples]) == 0:
+            return None
+        return errors(measured[samples], predicted[samples])
+
+    voltage = run.record.voltage_V[run.known]
+    return RunReport(
+        source=run.record.source,
+        offset_um=float(model.offset_um),
+        in_sample=compare(run.fitted),
+        held_out=compare(run.held_out),
+        unknown=int(np.sum(~run.known)),
+        start=run.starts[0] if start is None else start,
+        loop_measured_pct=loop_width_pct(voltage, measured[run.known]),
+        loop_model_pct=loop_width_pct(voltage, predicted[run.known]),
+    )
+
+
+def _remarks(runs: list[Run], tried: _Trial, trials: list[LevelTrial], levels: int | None) -> list[str]:
+    remarks = []
+    for run in runs:
+        remarks += list(run.record.warnings)
+        lost = int(np.sum(~run.known))
+        if lost:
+            remarks.append(
+                f"{run.record.source}: the first {lost} samples depend on what the rig went through before; "
+                "they were not used for the weights, and the initial state was estimated from them"
+            )
+    if tried.correlation > _WHITE:
+        remarks.append(
+            f"neighbouring residuals agree over {tried.correlation:.0f} samples: something other than sensor noise "
+            "is left that this model does not describe, and the band covers the model's own uncertainty only"
+        )
+    if levels is None and len(trials) == len(LADDER) and tried.data.grid.levels == LADDER[-1]:
+        remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try --levels 100")
+    return remarks

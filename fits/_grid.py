@@ -1,0 +1,117 @@
+"""Fitting the weights of a grid: a smooth, non-negative regression, convex and therefore without a start."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+from optimistix import RESULTS
+
+from fits._evidence import Posterior, maximise_evidence, posterior, renew_noise
+from fits._moments import Data, Moments
+from fits._nonnegative import NonNegativeNewton
+from fits._prior import Hyper, Roughness, interpolation, roughness
+
+# The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
+_EVIDENCE_LEVELS = 16
+_NOISE_ROUNDS = 2
+_ATOL = 1e-9
+
+
+@dataclass(frozen=True)
+class GridSolution:
+    """Weights and slopes of a grid, in strokes.
+
+    Attributes
+    ----------
+    columns
+        Non-negative solution, shape `(D,)`.
+    belief
+        Gaussian posterior it is the constrained mode of.
+    hyper
+        Smoothness and noise that the data chose.
+    result
+        Status of the least successful solver on the way.
+    """
+
+    columns: Float[Array, " D"]
+    belief: Posterior
+    hyper: Hyper
+    result: RESULTS
+
+
+def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -> GridSolution:
+    """Find the most probable non-negative columns, smoothness and noise.
+
+    Parameters
+    ----------
+    data
+        Moments of the runs.
+    stroke_um
+        Unit of the columns and the noise.
+    correlation
+        Samples that are worth one independent one.
+    start
+        Smoothness and noise to start the search from.
+    """
+    moments = data.total.scaled(1 / correlation, stroke_um)
+    rough = roughness(data.grid.levels)
+    if data.grid.levels > _EVIDENCE_LEVELS:
+        basis = jnp.asarray(interpolation(_EVIDENCE_LEVELS, data.grid.levels))
+        hyper, result = maximise_evidence(moments.project(basis), rough.project(basis), start)
+    else:
+        hyper, result = maximise_evidence(moments, rough, start)
+    belief = posterior(moments, rough, hyper)
+    for _ in range(_NOISE_ROUNDS):
+        hyper = renew_noise(moments, hyper, belief)
+        belief = posterior(moments, rough, hyper)
+    if bool(jnp.all(belief.mean >= 0)):
+        return GridSolution(belief.mean, belief, hyper, result)
+    columns, constrained = _constrained(belief)
+    worst = constrained if constrained != RESULTS.successful else result
+    return GridSolution(columns, belief, hyper, worst)
+
+
+@eqx.filter_jit
+def _constrained(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+    # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
+    precision = belief.root @ belief.root.T
+    scale = jnp.sqrt(jnp.diagonal(precision))
+    quadratic = precision / (scale[:, None] * scale[None, :]), belief.mean * scale
+    start = jnp.maximum(quadratic[1], 0)
+    solver = NonNegativeNewton(atol=_ATOL)
+    solution = optx.minimise(_distance, solver, start, args=quadratic, max_steps=100, throw=False)
+    return solution.value / scale, solution.result
+
+
+def _distance(y: Float[Array, " D"], args: tuple[Float[Array, "D D"], Float[Array, " D"]]) -> Float[Array, ""]:
+    precision, mean = args
+    off = y - mean
+    return off @ (precision @ off) / 2
+
+
+def cross_validate(data: Data, stroke_um: float, correlation: float, hyper: Hyper) -> np.ndarray:
+    """Predict each block of every run from the others, with the smoothness and noise given.
+
+    Returns
+    -------
+    ndarray
+        Mean squared error of each block, up to the block's own constant, in squared strokes, shape `(blocks,)`.
+    """
+    rough = roughness(data.grid.levels)
+    blocks = [b.scaled(1 / correlation, stroke_um) for b in data.blocks if float(b.count) > 0]
+    whole = sum(blocks[1:], start=blocks[0])
+    return np.array([float(_left_out(whole, block, rough, hyper)) for block in blocks])
+
+
+@eqx.filter_jit
+def _left_out(whole: Moments, block: Moments, rough: Roughness, hyper: Hyper) -> Float[Array, ""]:
+    variance = jnp.exp(hyper.log_variance)
+    precision = (whole.gram - block.gram) / variance + rough.precision(hyper)
+    rest = (whole.cross_um - block.cross_um) / variance
+    columns = jax.scipy.linalg.solve(precision, rest, assume_a="pos")
+    left = block.energy_um2 - 2 * columns @ block.cross_um + columns @ block.gram @ columns
+    return jnp.maximum(left, 0) / block.count

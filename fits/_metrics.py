@@ -1,0 +1,109 @@
+"""The paper's error figures (Eq. 34-36)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# A loop must span this fraction of the largest excursion to be measured.
+_SPAN = 0.95
+
+
+@dataclass(frozen=True)
+class Errors:
+    """How far a prediction is from a measurement.
+
+    Attributes
+    ----------
+    samples
+        Number of samples compared.
+    rms_um, max_um
+        Root mean square and largest absolute error.
+    range_um
+        Range of the measurement, which the percentages refer to.
+    """
+
+    samples: int
+    rms_um: float
+    max_um: float
+    range_um: float
+
+    @property
+    def e_rms_pct(self) -> float:
+        """Root mean square error in percent of the measured range (Eq. 36)."""
+        return 100 * self.rms_um / self.range_um
+
+    @property
+    def e_max_pct(self) -> float:
+        """Largest error in percent of the measured range (Eq. 35)."""
+        return 100 * self.max_um / self.range_um
+
+
+def errors(measured_um: np.ndarray, predicted_um: np.ndarray) -> Errors:
+    """Compare a prediction with a measurement.
+
+    Parameters
+    ----------
+    measured_um, predicted_um
+        Shape `(n,)`, in um.
+
+    Raises
+    ------
+    ValueError
+        If there is nothing to compare, or the measurement does not move.
+    """
+    if len(measured_um) == 0 or np.ptp(measured_um) == 0:
+        raise ValueError("errors need a measurement that moves")
+    off = measured_um - predicted_um
+    rms, worst = float(np.sqrt(np.mean(off**2))), float(np.max(np.abs(off)))
+    return Errors(len(off), rms, worst, float(np.ptp(measured_um)))
+
+
+def loop_width_pct(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float | None:
+    """Width of the widest loop in percent of its height (Eq. 34).
+
+    The paper divides by the largest displacement, which depends on where the sensor's zero is; here the loop's own
+    height is meant (errata 34 and 38).
+
+    Parameters
+    ----------
+    voltage_V, displacement_um
+        Shape `(n,)`.
+
+    Returns
+    -------
+    float or None
+        None where the record holds no up and down branch of the largest excursion.
+    """
+    low, high = voltage_V.min(), voltage_V.max()
+    span = high - low
+    near_low, near_high = voltage_V <= low + (1 - _SPAN) * span / 2, voltage_V >= high - (1 - _SPAN) * span / 2
+    ends = np.flatnonzero(near_low | near_high)
+    at_top = near_high[ends]
+    # Passages from one end of the range to the other.
+    turns = np.flatnonzero(np.diff(at_top))
+    up: list[tuple[int, int]] = [(ends[k], ends[k + 1]) for k in turns if at_top[k + 1]]
+    down: list[tuple[int, int]] = [(ends[k], ends[k + 1]) for k in turns if at_top[k]]
+    if not up or not down:
+        return None
+    level = np.linspace(low + (1 - _SPAN) * span, high - (1 - _SPAN) * span, 201)
+    widths = []
+    # A loop is a passage and the next one back.
+    for first, second in zip(*_paired(up, down), strict=True):
+        branches = [_branch(voltage_V, displacement_um, passage, level) for passage in (first, second)]
+        widths.append(np.max(np.abs(branches[0] - branches[1])))
+    return float(100 * np.median(widths) / np.ptp(displacement_um))
+
+
+def _paired(
+    up: list[tuple[int, int]], down: list[tuple[int, int]]
+) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    passages = sorted(up + down)
+    return passages[:-1], passages[1:]
+
+
+def _branch(
+    voltage_V: np.ndarray, displacement_um: np.ndarray, passage: tuple[int, int], level: np.ndarray
+) -> np.ndarray:
+    piece = slice(passage[0], passage[1] + 1)
+    order = np.argsort(voltage_V[piece], kind="stable")
+    return np.interp(level, voltage_V[piece][order], displacement_um[piece][order])

@@ -1,0 +1,189 @@
+"""All that least squares needs to know of records: sums of products, per block."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits._compress import Compressed, compress
+from fits._design import Grid, design
+from fits._run import Run
+from microid import Staircase, remember
+
+# Groups of four pseudo-samples that go through the compiled regression at a time.
+_GROUPS = 128
+BLOCKS = 5
+
+
+class Moments(eqx.Module):
+    """Sums over samples of the products of responses and displacement, each run counted from its own mean.
+
+    Attributes
+    ----------
+    gram
+        Responses with responses, shape `(D, D)`; dimensionless.
+    cross_um
+        Responses with displacement, shape `(D,)`.
+    energy_um2
+        Displacement with itself.
+    count
+        Number of samples.
+    """
+
+    gram: Float[Array, "D D"]
+    cross_um: Float[Array, " D"]
+    energy_um2: Float[Array, ""]
+    count: Float[Array, ""]
+
+    def __add__(self, other: "Moments") -> "Moments":
+        return Moments(
+            self.gram + other.gram,
+            self.cross_um + other.cross_um,
+            self.energy_um2 + other.energy_um2,
+            self.count + other.count,
+        )
+
+    def scaled(self, count: Float[Array, ""] | float, unit_um: float) -> "Moments":
+        """Measure displacement in `unit_um`, and count each sample as `count` independent ones."""
+        return Moments(
+            self.gram * count,
+            self.cross_um * (count / unit_um),
+            self.energy_um2 * (count / unit_um**2),
+            self.count * count,
+        )
+
+    def project(self, basis: Float[Array, "D d"]) -> "Moments":
+        """Keep only combinations of columns."""
+        return Moments(basis.T @ self.gram @ basis, basis.T @ self.cross_um, self.energy_um2, self.count)
+
+
+@dataclass(frozen=True)
+class RunMean:
+    """Mean response and displacement of a run: its sensor offset is `displacement_um - response @ solution`."""
+
+    response: Float[Array, " D"]
+    displacement_um: float
+    count: float
+
+
+@dataclass(frozen=True)
+class Data:
+    """Moments of all runs on one grid.
+
+    Attributes
+    ----------
+    grid
+        The columns.
+    total
+        Over all fitted samples, each run from its own mean.
+    blocks
+        Over consecutive fifths of every run's fitted samples, each from its own mean.
+    means
+        Of every run.
+    """
+
+    grid: Grid
+    total: Moments
+    blocks: tuple[Moments, ...]
+    means: tuple[RunMean, ...]
+
+
+def blocks_of(run: Run) -> np.ndarray:
+    """Number consecutive fifths of the fitted samples, -1 elsewhere, shape `(n,)`."""
+    order = np.cumsum(run.fitted) - 1
+    return np.where(run.fitted, order * BLOCKS // max(1, run.fitted.sum()), -1)
+
+
+def gather(grid: Grid, runs: Sequence[Run]) -> Data:
+    """Pass the runs through the regression once.
+
+    Parameters
+    ----------
+    grid
+        The columns.
+    runs
+        Prepared runs with displacement.
+    """
+    totals, means = [], []
+    blocks: list[list[Moments]] = [[] for _ in range(BLOCKS)]
+    levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
+    for run in runs:
+        squeezed = compress(
+            run.record.voltage_V, run.displacement_um, run.anchor_V, run.rising, blocks_of(run), levels_V
+        )
+        sums = _sums(grid, squeezed, run.starts[0])
+        for block, part in enumerate(sums):
+            blocks[block].append(_centre(part)[0])
+        total, mean = _centre(sum(sums[1:], start=sums[0]))
+        totals.append(total)
+        means.append(mean)
+    return Data(
+        grid,
+        sum(totals[1:], start=totals[0]),
+        tuple(sum(parts[1:], start=parts[0]) for parts in blocks),
+        tuple(means),
+    )
+
+
+def _sums(grid: Grid, groups: Compressed, start: Staircase) -> list[Moments]:
+    """Moments per block, with a column of ones at the end and no mean taken off."""
+    size = grid.columns + 1
+    zero = Moments(jnp.zeros((size, size)), jnp.zeros(size), jnp.asarray(0.0), jnp.asarray(0.0))
+    sums = [zero] * BLOCKS
+    border = np.flatnonzero(np.diff(groups.block)) + 1
+    for first, last in zip([0, *border], [*border, len(groups.block)], strict=True):
+        block = int(groups.block[first])
+        for begin in range(first, last, _GROUPS):
+            end = min(begin + _GROUPS, last)
+            pad = _GROUPS - (end - begin)
+            voltage = np.pad(groups.voltage_V[begin:end].ravel(), (0, 4 * pad), mode="edge")
+            mix = np.pad(groups.mix[begin:end], ((0, pad), (0, 0), (0, 0)))
+            target = np.pad(groups.target_um[begin:end], ((0, pad), (0, 0)))
+            if block < 0:
+                start = _pass(jnp.asarray(voltage), start)
+                continue
+            gram, cross, energy, start = _regress(
+                grid, jnp.asarray(voltage), start, jnp.asarray(mix), jnp.asarray(target)
+            )
+            energy = energy + groups.residue_um2[begin:end].sum()
+            sums[block] = sums[block] + Moments(
+                gram, cross, energy, jnp.asarray(float(groups.count[begin:end].sum()))
+            )
+    return sums
+
+
+@eqx.filter_jit
+def _pass(voltage_V: Float[Array, " n"], start: Staircase) -> Staircase:
+    return remember(voltage_V, start).end()
+
+
+@eqx.filter_jit
+def _regress(
+    grid: Grid,
+    voltage_V: Float[Array, " n"],
+    start: Staircase,
+    mix: Float[Array, "groups 4 4"],
+    target_um: Float[Array, "groups 4"],
+) -> tuple[Float[Array, "E E"], Float[Array, " E"], Float[Array, ""], Staircase]:
+    response, end = design(grid, voltage_V, start)
+    response = jnp.concatenate([response, jnp.ones_like(response[:, :1])], axis=1)
+    groups = response.reshape(*mix.shape[:2], -1)
+    rows = jnp.einsum("gij,gjd->dgi", mix, groups).reshape(response.shape[1], -1)
+    target = target_um.ravel()
+    return rows @ rows.T, rows @ target, target @ target, end
+
+
+def _centre(sums: Moments) -> tuple[Moments, RunMean]:
+    """Take the mean off, and with it the last column."""
+    count = jnp.maximum(sums.count, 1.0)
+    response, displacement = sums.gram[-1, :-1] / count, sums.cross_um[-1] / count
+    centred = Moments(
+        sums.gram[:-1, :-1] - count * response[:, None] * response[None, :],
+        sums.cross_um[:-1] - count * response * displacement,
+        sums.energy_um2 - count * displacement**2,
+        sums.count,
+    )
+    return centred, RunMean(response, float(displacement), float(sums.count))

@@ -1,0 +1,43 @@
+"""How many samples of a residual are worth one independent one."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import fft
+
+# Sokal's window: sum the correlations up to this many correlation times.
+_WINDOW = 5.0
+
+
+def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
+    """Estimate the integrated correlation time of residuals, in samples.
+
+    White noise gives 1: each sample counts. Misfit and coloured noise give more, and least squares then rests on
+    `n / correlation_samples` samples' worth of evidence.
+
+    Parameters
+    ----------
+    residuals
+        Of each run, shape `(n,)` each; runs are not continued into each other.
+
+    Returns
+    -------
+    float
+        At least 1.
+
+    Notes
+    -----
+    A. Sokal, "Monte Carlo Methods in Statistical Mechanics" (1997), section 3.
+    """
+    longest = max(len(r) for r in residuals)
+    total = np.zeros(longest)
+    for residual in residuals:
+        n = len(residual)
+        spectrum = np.abs(fft.rfft(residual - residual.mean(), fft.next_fast_len(2 * n))) ** 2
+        total[:n] += fft.irfft(spectrum)[:n]
+    if total[0] <= 0:
+        return 1.0
+    time = 1 + 2 * np.cumsum(total[1:] / total[0])
+    lag = np.arange(1, longest)
+    inside = np.flatnonzero(lag >= _WINDOW * time)
+    return float(max(1.0, time[inside[0]] if len(inside) else time.max(initial=1.0)))
