@@ -47,6 +47,7 @@ class Grid(eqx.Module):
         zeros = jnp.zeros((self.levels, self.levels), packed.dtype)
         return zeros.at[np.tril_indices(self.levels)].set(packed)
 
+    @eqx.filter_jit
     def model(self, columns_um: Float[Array, " D"], offset_um: Float[Array, ""]) -> Preisach:
         """Turn a solution, in um, into a model."""
         weights, slopes = columns_um[: self.weights], columns_um[self.weights :]
@@ -55,6 +56,7 @@ class Grid(eqx.Module):
         return Preisach(density, Reversible(slopes / self.range_V, self.lower_V, self.upper_V), offset_um)
 
 
+@eqx.filter_jit
 def columns_of(model: Preisach) -> Float[Array, " D"]:
     """Read the columns of any family's model, in um: the inverse of `Grid.model` where the family is a grid."""
     range_V = model.density.upper_V - model.density.lower_V

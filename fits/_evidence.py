@@ -31,6 +31,12 @@ class Posterior(eqx.Module):
     root: Float[Array, "D D"]
     effective: Float[Array, ""]
 
+    @eqx.filter_jit
+    def factor(self) -> Float[Array, "D D"]:
+        """Factor of the covariance: `factor @ factor.T` is the inverse of the precision."""
+        unit = jnp.eye(self.mean.shape[0])
+        return jax.scipy.linalg.solve_triangular(self.root, unit, lower=True).T
+
 
 def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array, ""]:
     """Negative logarithm of the evidence (MacKay 1992; Rasmussen & Williams 2006, ch. 2), but for a constant."""

@@ -137,7 +137,7 @@ def fit(
         uncertainty = _uncertainty(data, solution.factor_um, tried, stroke)
     offsets = _offsets(model, data)
     first = eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offsets[0]))
-    noise = float(jnp.exp(tried.solution.hyper.log_variance / 2)) * stroke
+    noise = _noise_um(tried, stroke)
 
     progress("comparing with the measurement")
     reports = [_report(_with_offset(model, o), run, noise) for o, run in zip(offsets, runs, strict=True)]
@@ -153,7 +153,7 @@ def fit(
         remarks=tuple(remarks),
         noise_um=noise,
         correlation_samples=tried.correlation,
-        smoothness=float(jnp.exp(tried.solution.hyper.log_density)),
+        smoothness=float(np.exp(tried.solution.hyper.log_density)),
         trials=tuple(trials),
         runs=tuple(reports),
     )
@@ -181,7 +181,7 @@ def _try(grid: Grid, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
     correlation = 1.0
     solution = solve_grid(data, stroke, correlation, hyper)
     _check(solution.result)
-    model = grid.model(solution.columns * stroke, jnp.asarray(0.0))
+    model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
     found = correlation_samples([(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs])
     if found > _WHITE:
@@ -202,19 +202,22 @@ def _check(result: RESULTS) -> None:
 
 def _from_grid(tried: _Trial, stroke: float) -> tuple[Preisach, Uncertainty, Data]:
     belief = tried.solution.belief
-    inverse = jax.scipy.linalg.solve_triangular(belief.root, jnp.eye(belief.root.shape[0]), lower=True)
-    model = tried.data.grid.model(tried.solution.columns * stroke, jnp.asarray(0.0))
-    return model, _uncertainty(tried.data, inverse.T * stroke, tried, stroke), tried.data
+    model = tried.data.grid.model(np.asarray(tried.solution.columns) * stroke, np.zeros(()))
+    return model, _uncertainty(tried.data, belief.factor() * stroke, tried, stroke), tried.data
 
 
 def _uncertainty(data: Data, factor_um: jax.Array, tried: _Trial, stroke: float) -> Uncertainty:
     mean = data.means[0]
-    noise = float(jnp.exp(tried.solution.hyper.log_variance / 2)) * stroke
-    return perturbations(data.grid, factor_um, mean.response, noise * (tried.correlation / mean.count) ** 0.5)
+    offset_sd = _noise_um(tried, stroke) * (tried.correlation / mean.count) ** 0.5
+    return perturbations(data.grid, factor_um, jnp.asarray(mean.response), jnp.asarray(offset_sd))
+
+
+def _noise_um(tried: _Trial, stroke: float) -> float:
+    return float(np.exp(tried.solution.hyper.log_variance / 2)) * stroke
 
 
 def _offsets(model: Preisach, data: Data) -> list[float]:
-    columns = columns_of(model)
+    columns = np.asarray(columns_of(model))
     return [mean.displacement_um - float(mean.response @ columns) for mean in data.means]
 
 

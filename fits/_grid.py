@@ -68,7 +68,7 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
     for _ in range(_NOISE_ROUNDS):
         hyper = renew_noise(moments, hyper, belief)
         belief = posterior(moments, rough, hyper)
-    if bool(jnp.all(belief.mean >= 0)):
+    if np.all(np.asarray(belief.mean) >= 0):
         return GridSolution(belief.mean, belief, hyper, result)
     columns, constrained = _constrained(belief)
     worst = constrained if constrained != RESULTS.successful else result

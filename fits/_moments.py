@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +17,11 @@ from microid import Staircase, remember
 # Groups of four pseudo-samples that go through the compiled regression at a time.
 _GROUPS = 128
 BLOCKS = 5
+
+
+def _zero_dimensional(value: Any) -> Any:
+    # NumPy's arithmetic turns arrays without axes into scalars.
+    return np.asarray(value) if isinstance(value, float | np.generic) else value
 
 
 class Moments(eqx.Module):
@@ -33,10 +39,10 @@ class Moments(eqx.Module):
         Number of samples.
     """
 
-    gram: Float[Array, "D D"]
-    cross_um: Float[Array, " D"]
-    energy_um2: Float[Array, ""]
-    count: Float[Array, ""]
+    gram: Float[Array | np.ndarray, "D D"]
+    cross_um: Float[Array | np.ndarray, " D"]
+    energy_um2: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
+    count: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
 
     def __add__(self, other: "Moments") -> "Moments":
         return Moments(
@@ -64,7 +70,7 @@ class Moments(eqx.Module):
 class RunMean:
     """Mean response and displacement of a run: its sensor offset is `displacement_um - response @ solution`."""
 
-    response: Float[Array, " D"]
+    response: np.ndarray
     displacement_um: float
     count: float
 
@@ -131,7 +137,7 @@ def gather(grid: Grid, runs: Sequence[Run]) -> Data:
 def _sums(grid: Grid, groups: Compressed, start: Staircase) -> list[Moments]:
     """Moments per block, with a column of ones at the end and no mean taken off."""
     size = grid.columns + 1
-    zero = Moments(jnp.zeros((size, size)), jnp.zeros(size), jnp.asarray(0.0), jnp.asarray(0.0))
+    zero = Moments(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(()))
     sums = [zero] * BLOCKS
     border = np.flatnonzero(np.diff(groups.block)) + 1
     for first, last in zip([0, *border], [*border, len(groups.block)], strict=True):
@@ -178,7 +184,7 @@ def _regress(
 
 def _centre(sums: Moments) -> tuple[Moments, RunMean]:
     """Take the mean off, and with it the last column."""
-    count = jnp.maximum(sums.count, 1.0)
+    count = np.maximum(sums.count, 1.0)
     response, displacement = sums.gram[-1, :-1] / count, sums.cross_um[-1] / count
     centred = Moments(
         sums.gram[:-1, :-1] - count * response[:, None] * response[None, :],

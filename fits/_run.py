@@ -127,10 +127,9 @@ def _known(voltage: np.ndarray, lower_V: float, upper_V: float) -> np.ndarray:
 
 def _walk(voltage: np.ndarray, start: Staircase) -> tuple[tuple[Staircase, ...], np.ndarray, np.ndarray]:
     for size in _STAIRCASES:
-        try:
-            return _pieces(voltage, _resized(start, size))
-        except eqx.EquinoxRuntimeError:
-            continue
+        walked = _pieces(voltage, _resized(start, size))
+        if walked is not None:
+            return walked
     raise DataError(
         f"the voltage nests more than {_STAIRCASES[-1]} loops into each other: that is noise, not a drive; "
         "use the commanded voltage"
@@ -145,13 +144,15 @@ def _resized(start: Staircase, size: int) -> Staircase:
     return Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
 
 
-def _pieces(voltage: np.ndarray, start: Staircase) -> tuple[tuple[Staircase, ...], np.ndarray, np.ndarray]:
+def _pieces(voltage: np.ndarray, start: Staircase) -> tuple[tuple[Staircase, ...], np.ndarray, np.ndarray] | None:
     starts, anchors, risings = [], [], []
     for piece in split(voltage):
         starts.append(start)
         anchor, rising, start = _remember(jnp.asarray(piece), start)
         anchors.append(anchor)
         risings.append(rising)
+        if np.isnan(start.extremes_V[0]):
+            return None
     n = len(voltage)
     return tuple(starts), np.concatenate(anchors)[:n], np.concatenate(risings)[:n]
 

@@ -57,11 +57,12 @@ class Uncertainty(eqx.Module):
         return jnp.sqrt(jnp.sum(each, axis=0))
 
 
+@eqx.filter_jit
 def perturbations(
     grid: Grid,
     factor_um: Float[Array, "D k"],
     mean_response: Float[Array, " D"],
-    offset_sd_um: float,
+    offset_sd_um: Float[Array, ""],
 ) -> Uncertainty:
     """Turn a factor of the covariance into perturbations of a model.
 
@@ -84,7 +85,6 @@ def perturbations(
     return Uncertainty(columns, offsets, grid)
 
 
-@eqx.filter_jit
 def _shown(grid: Grid, factor_um: Float[Array, "D k"]) -> Float[Array, "D k"]:
     """Rotate the perturbations so that those come first that move displacements most."""
     unit = Grid(jnp.asarray(0.0), jnp.asarray(1.0), grid.levels)

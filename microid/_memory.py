@@ -28,23 +28,23 @@ class Staircase(eqx.Module):
     count: Int[Array, ""]
 
 
-def _staircase(extremes: list[Float[Array, ""]], size: int) -> Staircase:
-    if len(extremes) > size:
-        raise ValueError(f"{len(extremes)} extremes do not fit into a staircase of size {size}: raise its size")
-    padded = jnp.stack([jnp.asarray(e, dtype=float) for e in extremes + extremes[-1:] * (size - len(extremes))])
-    return Staircase(padded, jnp.asarray(len(extremes), dtype=jnp.int32))
+def _staircase(extremes_V: Float[Array, " used"], size: int) -> Staircase:
+    used = extremes_V.shape[0]
+    if used > size:
+        raise ValueError(f"{used} extremes do not fit into a staircase of size {size}: raise its size")
+    return Staircase(jnp.pad(extremes_V, (0, size - used), mode="edge"), jnp.asarray(used, dtype=jnp.int32))
 
 
 def negative_saturation(lower_V: Float[Array, ""] | float, size: int = _SIZE) -> Staircase:
     """All relays off: the voltage came up from the lower end of the range."""
-    return _staircase([jnp.asarray(lower_V)], size)
+    return _staircase(jnp.asarray(lower_V, dtype=float)[None], size)
 
 
 def positive_saturation(
     lower_V: Float[Array, ""] | float, upper_V: Float[Array, ""] | float, size: int = _SIZE
 ) -> Staircase:
     """All relays on: the voltage came down from the upper end of the range."""
-    return _staircase([jnp.asarray(lower_V), jnp.asarray(upper_V)], size)
+    return _staircase(jnp.stack([jnp.asarray(lower_V, dtype=float), jnp.asarray(upper_V, dtype=float)]), size)
 
 
 def demagnetised(
@@ -67,11 +67,9 @@ def demagnetised(
     lower, upper = jnp.asarray(lower_V, dtype=float), jnp.asarray(upper_V, dtype=float)
     rest = (lower + upper) / 2 if rest_V is None else jnp.asarray(rest_V, dtype=float)
     swings = (size - 1) // 2
-    extremes = []
-    for swing in range(swings):
-        left = 1 - swing / swings
-        extremes += [rest + (lower - rest) * left, rest + (upper - rest) * left]
-    return _staircase([*extremes, rest], size)
+    left = 1 - jnp.arange(swings, dtype=rest.dtype) / swings
+    pairs = rest + left[:, None] * (jnp.stack([lower, upper]) - rest)[None, :]
+    return _staircase(jnp.append(pairs.ravel(), rest), size)
 
 
 class Memory(eqx.Module):
@@ -108,28 +106,23 @@ class Memory(eqx.Module):
         size
             Size of the staircase; that of the starting one by default.
 
-        Raises
-        ------
-        RuntimeError
-            If more extremes are remembered than fit.
+        Returns
+        -------
+        Staircase
+            If more than `size` extremes are remembered, its extremes are NaN: give the start a larger size.
         """
         size = self._lead if size is None else size
-        last = self.path_V.shape[0] - 1
+        last = jnp.asarray(self.path_V.shape[0] - 1, dtype=self.anchor.dtype)
 
         def back(index: Int[Array, ""], _: None) -> tuple[Int[Array, ""], Int[Array, ""]]:
             return self.anchor[index], index
 
-        _, chain = lax.scan(back, jnp.asarray(last, dtype=self.anchor.dtype), None, length=size)
+        _, chain = lax.scan(back, last, None, length=size)
         count = jnp.sum(chain > 0, dtype=jnp.int32) + 1
-        count = eqx.error_if(
-            count,
-            count > size,
-            f"more than {size} extremes are remembered: give the start a larger size; or the voltage is noise",
-        )
-        number = jnp.arange(size, dtype=jnp.int32)
-        place = jnp.clip(count - 1 - number, min=0)
-        values = self.path_V[chain]
-        return Staircase(jnp.where(number < count, values[place], values[0]), count)
+        # Newest first along the chain, oldest first in the staircase; unused places repeat the present voltage.
+        place = jnp.clip(count - 1 - jnp.arange(size, dtype=jnp.int32), min=0)
+        # NaN rather than an exception: it survives jit and vmap, and cannot be overlooked in what follows.
+        return Staircase(jnp.where(chain[-1] == 0, self.path_V[chain][place], jnp.nan), count)
 
 
 def remember(voltage_V: Float[Array, " n"], start: Staircase) -> Memory:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 
@@ -97,17 +98,19 @@ class AbstractDensity(eqx.Module):
         return jnp.where(inside, value, 0)
 
 
-def node_areas(levels: int) -> Float[Array, "N N"]:
+def node_areas(levels: int) -> np.ndarray:
     """Integrate the interpolating function of each node over the half-plane, in units of the range squared.
 
     Shape `(levels, levels)`; zero above the diagonal.
     """
-    edge = jnp.ones(levels).at[jnp.array([0, -1])].set(0.5)
-    area = jnp.tril(edge[:, None] * edge[None, :], -1)
+    edge = np.ones(levels)
+    edge[[0, -1]] = 1 / 2
+    area = np.tril(edge[:, None] * edge, -1)
     # A cell on the diagonal is a triangle: a third of a half goes to each of its nodes, not a quarter of a square.
-    area = area - jnp.diag(jnp.full(levels - 1, 1 / 4 - 1 / 6), -1)
-    inner = jnp.full(levels, 2 / 6 + 1 / 4).at[jnp.array([0, -1])].set(1 / 6)
-    return (area + jnp.diag(inner)) / (levels - 1) ** 2
+    area -= np.diag(np.full(levels - 1, 1 / 4 - 1 / 6), -1)
+    inner = np.full(levels, 2 / 6 + 1 / 4)
+    inner[[0, -1]] = 1 / 6
+    return (area + np.diag(inner)) / (levels - 1) ** 2
 
 
 FAMILIES: dict[str, type[AbstractDensity]] = {}

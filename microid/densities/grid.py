@@ -41,9 +41,9 @@ class GridDensity(AbstractDensity):
     def nodes_um_per_V2(self) -> Float[Array, "N N"]:
         """Density at the nodes, shape `(N, N)`."""
         n = self.levels
-        weights = jnp.zeros((n, n), self.packed_um.dtype).at[np.tril_indices(n)].set(self.packed_um)
-        areas = node_areas(n) * (self.upper_V - self.lower_V) ** 2
-        return jnp.where(areas > 0, weights / jnp.where(areas > 0, areas, 1), 0).astype(weights.dtype)
+        areas = node_areas(n)[np.tril_indices(n)] * (self.upper_V - self.lower_V) ** 2
+        nodes = jnp.zeros((n, n), self.packed_um.dtype)
+        return nodes.at[np.tril_indices(n)].set(self.packed_um / areas.astype(self.packed_um.dtype))
 
     @classmethod
     def start(
@@ -56,4 +56,4 @@ class GridDensity(AbstractDensity):
     ) -> Self:
         """Spread the stroke evenly over the half-plane; the fit is convex, so the key is not used."""
         areas = node_areas(levels)[np.tril_indices(levels)]
-        return cls(stroke_um * areas / jnp.sum(areas), lower_V, upper_V)
+        return cls(stroke_um * (areas / areas.sum()), lower_V, upper_V)

@@ -1,0 +1,75 @@
+"""An independent virtual test bench for a piezo-driven micro-positioner.
+
+It makes CSV files of voltage and displacement from a truth that shares no numerics with `microid`: NumPy, SciPy and
+the standard library only, and neither of the other packages.
+"""
+
+from data_synth._bench import Bench as Bench
+from data_synth._bench import Record as Record
+from data_synth._bench import simulate as simulate
+from data_synth._errors import ScenarioError as ScenarioError
+from data_synth._history import initial_history as initial_history
+from data_synth._plays import PlayShape as PlayShape
+from data_synth._plays import PlaySum as PlaySum
+from data_synth._programs import chirp as chirp
+from data_synth._programs import forc as forc
+from data_synth._programs import hold as hold
+from data_synth._programs import nested as nested
+from data_synth._programs import ramp as ramp
+from data_synth._programs import random_reversals as random_reversals
+from data_synth._programs import sine as sine
+from data_synth._programs import steps as steps
+from data_synth._programs import triangle as triangle
+from data_synth._relays import RelayGrid as RelayGrid
+from data_synth._relays import plain_relays as plain_relays
+from data_synth._rig import Rig as Rig
+from data_synth._rig import random_rig as random_rig
+from data_synth._scenario import RigSettings as RigSettings
+from data_synth._scenario import Run as Run
+from data_synth._scenario import Scenario as Scenario
+from data_synth._scenario import Segment as Segment
+from data_synth._scenario import load_scenario as load_scenario
+from data_synth._scenario import parse_scenario as parse_scenario
+from data_synth._scenario import scenario_names as scenario_names
+from data_synth._sensor import Sensor as Sensor
+from data_synth._truth_density import Bump as Bump
+from data_synth._truth_density import Density as Density
+from data_synth._truth_density import Reversible as Reversible
+from data_synth._truth_density import Ridge as Ridge
+from data_synth._write import write as write
+
+__all__ = [
+    "Bench",
+    "Bump",
+    "Density",
+    "PlayShape",
+    "PlaySum",
+    "Record",
+    "RelayGrid",
+    "Reversible",
+    "Ridge",
+    "Rig",
+    "RigSettings",
+    "Run",
+    "Scenario",
+    "ScenarioError",
+    "Segment",
+    "Sensor",
+    "chirp",
+    "forc",
+    "hold",
+    "initial_history",
+    "load_scenario",
+    "nested",
+    "parse_scenario",
+    "plain_relays",
+    "ramp",
+    "random_reversals",
+    "random_rig",
+    "scenario_names",
+    "simulate",
+    "sine",
+    "steps",
+    "triangle",
+    "write",
+]

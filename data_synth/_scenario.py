@@ -1,0 +1,262 @@
+"""A scenario is data: what stage stands on the bench, what is played to it, and what the sensor adds."""
+
+import importlib.resources
+import inspect
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_synth._errors import ScenarioError
+from data_synth._programs import PROGRAMS
+from data_synth._rig import Kind, Rig, random_rig
+from data_synth._sensor import Sensor
+from data_synth._table import build, nearest, read_arguments
+from data_synth._types import FloatArray, Initial
+
+
+def _require(holds: bool, sentence: str) -> None:
+    if not holds:
+        raise ValueError(sentence)
+
+
+@dataclass(frozen=True)
+class RigSettings:
+    """The table `[rig]`. Shapes are always drawn from the seed; these are the numbers one may want to state.
+
+    Attributes
+    ----------
+    random
+        Whether `kind`, `stroke_um`, `reversible_share` and `loop_width` are drawn where they are not stated.
+        Otherwise they are `"relays"`, 40 um, 0.65 and 0.13.
+    kind
+        Sort of hysteresis.
+    lower_V, upper_V
+        The range of the voltage, in V.
+    stroke_um
+        The displacement over the range, in um.
+    reversible_share
+        The part of the stroke that has no memory.
+    loop_width
+        The widest gap of the major loop over the stroke.
+    relays
+        The number of relays along one side of their grid.
+    plays
+        The number of play operators.
+    """
+
+    random: bool = False
+    kind: Kind | None = None
+    lower_V: float = 0.0
+    upper_V: float = 120.0
+    stroke_um: float | None = None
+    reversible_share: float | None = None
+    loop_width: float | None = None
+    relays: int = 2000
+    plays: int = 400
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a rig that cannot be."""
+        _require(
+            -math.inf < self.lower_V < self.upper_V < math.inf,
+            f"lower_V must be below upper_V, got {self.lower_V} and {self.upper_V}",
+        )
+        _require(
+            self.stroke_um is None or 0 < self.stroke_um < math.inf,
+            f"stroke_um must be positive, got {self.stroke_um}",
+        )
+        for name in ("reversible_share", "loop_width"):
+            share = getattr(self, name)
+            _require(share is None or 0 < share < 1, f"{name} must be between 0 and 1, got {share}")
+        _require(2 <= self.relays <= 10_000, f"relays must be 2 to 10000, got {self.relays}")
+        _require(20 <= self.plays <= 100_000, f"plays must be 20 to 100000, got {self.plays}")
+
+    def draw(self, rng: np.random.Generator) -> Rig:
+        """Draw the rig. Raises ValueError where no hysteresis has so wide a loop."""
+        usual: dict[str, Any] = {"kind": "relays", "stroke_um": 40.0, "reversible_share": 0.65, "loop_width": 0.13}
+        stated = {name: getattr(self, name) for name in usual}
+        if not self.random:
+            stated = {name: usual[name] if value is None else value for name, value in stated.items()}
+        return random_rig(
+            rng, **stated, lower_V=self.lower_V, upper_V=self.upper_V, relays=self.relays, plays=self.plays
+        )
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One table `[[runs.program]]`: a program by its `kind`, and its keyword arguments."""
+
+    kind: str
+    settings: Mapping[str, Any]
+
+    @classmethod
+    def from_table(cls, table: object, where: str) -> "Segment":
+        """Read a table, whose keys are the program's arguments; the rig supplies a missing `lower_V` or `upper_V`."""
+        if not isinstance(table, dict):
+            raise ScenarioError(f"{where} must be a table, got {table!r}")
+        settings = dict(table)
+        kind = settings.pop("kind", None)
+        if kind is None:
+            raise ScenarioError(f"{where}: key 'kind' is missing")
+        if not isinstance(kind, str) or kind not in PROGRAMS:
+            raise ScenarioError(f"{where}: unknown kind {kind!r}, {nearest(str(kind), PROGRAMS)}")
+        supplied, optional = ("start_V", "sample_rate_Hz", "rng"), ("lower_V", "upper_V")
+        return cls(kind, read_arguments(PROGRAMS[kind], settings, where, supplied, optional))
+
+    def voltage_V(
+        self, start_V: float, sample_rate_Hz: float, lower_V: float, upper_V: float, rng: np.random.Generator
+    ) -> FloatArray:
+        """Sample the program, shape (n,), in V. Raises ValueError where a setting makes no sense to it."""
+        program = PROGRAMS[self.kind]
+        surroundings = {"sample_rate_Hz": sample_rate_Hz, "lower_V": lower_V, "upper_V": upper_V, "rng": rng}
+        wanted = {name: surroundings[name] for name in inspect.signature(program).parameters if name in surroundings}
+        voltage_V = program(start_V, **(wanted | dict(self.settings)))
+        for extreme_V in (voltage_V.min(initial=start_V), voltage_V.max(initial=start_V)):
+            _require(
+                lower_V - 1e-9 <= extreme_V <= upper_V + 1e-9,
+                f"the program reaches {extreme_V:.6g} V, outside of the rig's {lower_V:g} to {upper_V:g} V",
+            )
+        return voltage_V
+
+
+@dataclass(frozen=True)
+class Run:
+    """One table `[[runs]]`: a record, which becomes one CSV.
+
+    Attributes
+    ----------
+    name
+        Name of the CSV, without the ending.
+    sample_rate_Hz
+        Samples per second.
+    program
+        What is played, one program after another.
+    initial
+        What the stage remembers at the start.
+    """
+
+    name: str
+    sample_rate_Hz: float
+    program: tuple[Segment, ...]
+    initial: Initial = "negative"
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a run that cannot be played or written."""
+        _require(
+            re.fullmatch(r"[A-Za-z0-9_-]+", self.name) is not None,
+            f"name must be made of letters, digits, '_' and '-', got {self.name!r}",
+        )
+        _require(0 < self.sample_rate_Hz < math.inf, f"sample_rate_Hz must be positive, got {self.sample_rate_Hz}")
+        _require(len(self.program) > 0, "program must hold at least one table")
+
+    def voltage_V(self, start_V: float, lower_V: float, upper_V: float, rng: np.random.Generator) -> FloatArray:
+        """Sample the whole record, shape (n,), in V, from `start_V` on. Raises ValueError as the programs do."""
+        pieces = [np.array([start_V])]
+        for k, segment in enumerate(self.program):
+            try:
+                pieces.append(segment.voltage_V(float(pieces[-1][-1]), self.sample_rate_Hz, lower_V, upper_V, rng))
+            except ValueError as error:
+                raise ValueError(f"program[{k}] ({segment.kind}): {error}") from error
+            if len(pieces[-1]) == 0:
+                pieces.pop()
+        return np.concatenate(pieces)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A whole scenario.
+
+    Attributes
+    ----------
+    name, description
+        What it is called and what it is for.
+    rig
+        The stage; all runs share it.
+    runs
+        The records.
+    sensor
+        What the sensor adds.
+    seed
+        Where all randomness starts; a fresh one for each simulation if it is None.
+    file
+        Where the scenario was read, for messages.
+    text
+        The TOML as it was read.
+    """
+
+    name: str
+    description: str
+    rig: RigSettings
+    runs: tuple[Run, ...]
+    sensor: Sensor = field(default_factory=Sensor)
+    seed: int | None = None
+    file: str = "scenario"
+    text: str = ""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for runs that cannot be played."""
+        _require(self.seed is None or self.seed >= 0, f"seed must be zero or positive, got {self.seed}")
+        _require(len(self.runs) > 0, "runs must hold at least one table")
+        names = [run.name.casefold() for run in self.runs]  # not every file system tells Train from train
+        for k, run in enumerate(self.runs):
+            _require(names.count(names[k]) == 1, f"runs[{k}]: name {run.name!r} is taken by another run")
+            # Programs are tried once, so that a bad number is refused before anything is simulated.
+            try:
+                run.voltage_V(self.rig.lower_V, self.rig.lower_V, self.rig.upper_V, np.random.default_rng(0))
+            except ValueError as error:
+                raise ValueError(f"runs[{k}]: {error}") from error
+
+
+def parse_scenario(text: str, file: str = "scenario") -> Scenario:
+    """Read a scenario from TOML text.
+
+    Parameters
+    ----------
+    text
+        The TOML.
+    file
+        What to call it in messages.
+
+    Raises
+    ------
+    ScenarioError
+        For the first thing in it that is not as it should be.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{file}: not valid TOML: {error}") from error
+    scenario: Scenario = build(Scenario, table, file, file=file, text=text)
+    return scenario
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that come with the package, in alphabetical order."""
+    folder = importlib.resources.files("data_synth") / "scenarios"
+    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def load_scenario(scenario: str) -> Scenario:
+    """Read a scenario by the name it is shipped under, or from a file whose path ends in `.toml`.
+
+    Raises
+    ------
+    ScenarioError
+        If there is no such scenario, or as `parse_scenario` does.
+    """
+    if not scenario.endswith(".toml"):
+        if scenario not in scenario_names():
+            raise ScenarioError(f"no scenario is called '{scenario}': {nearest(scenario, scenario_names())}")
+        shipped = importlib.resources.files("data_synth") / "scenarios" / f"{scenario}.toml"
+        return parse_scenario(shipped.read_text(encoding="utf-8"), f"{scenario}.toml")
+    try:
+        text = Path(scenario).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ScenarioError(f"{scenario}: cannot be read: {reason}") from error
+    return parse_scenario(text, scenario)

@@ -1,0 +1,72 @@
+"""Records to CSV files, and the truth to a file of its own."""
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+
+from data_synth._bench import Bench, Record
+from data_synth._errors import ScenarioError
+
+SCHEMA = "data_synth.truth/1"
+"""What `truth.json` calls itself."""
+
+
+def write(bench: Bench, folder: str | Path) -> list[Path]:
+    """Write `<run>.csv` for each run, and `truth.json`, into a folder that is made if need be.
+
+    A CSV has the columns `time_s,voltage_V,displacement_um` and nothing else: what is true stands in `truth.json`
+    only. Each file is written under a temporary name and renamed. The same seed gives the same bytes.
+
+    Returns
+    -------
+    list[Path]
+        The files, `truth.json` last.
+
+    Raises
+    ------
+    ScenarioError
+        If the folder cannot be written to.
+    """
+    folder = Path(folder)
+    contents = {f"{record.name}.csv": _csv(record) for record in bench.records} | {"truth.json": _truth(bench)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in contents.items():
+            _replace(folder / name, text)
+    except OSError as error:
+        raise ScenarioError(f"{folder}: cannot be written to: {error.strerror}") from error
+    return [folder / name for name in contents]
+
+
+def _replace(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(text.encode())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _csv(record: Record) -> str:
+    columns = (record.time_s.tolist(), record.voltage_V.tolist(), record.displacement_um.tolist())
+    rows = [f"{time_s!r},{voltage_V!r},{um!r}" for time_s, voltage_V, um in zip(*columns, strict=True)]
+    return "\n".join(["time_s,voltage_V,displacement_um", *rows, ""])
+
+
+def _truth(bench: Bench) -> str:
+    truth = {
+        "schema": SCHEMA,
+        "scenario": {"name": bench.scenario.name, "text": bench.scenario.text},
+        "seed": bench.seed,
+        "rig": asdict(bench.rig),
+        "sensor": asdict(bench.scenario.sensor),
+        "runs": {
+            record.name: {
+                "history_V": record.history_V.tolist(),
+                "displacement_um": record.true_displacement_um.tolist(),
+            }
+            for record in bench.records
+        },
+    }
+    return json.dumps(truth, indent=1, allow_nan=False) + "\n"
