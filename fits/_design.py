@@ -1,5 +1,7 @@
 """The Preisach operator as a linear regression: one column per weight and slope."""
 
+from functools import lru_cache
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -65,13 +67,17 @@ def columns_of(model: Preisach) -> Float[Array, " D"]:
     return jnp.concatenate([weights, model.reversible.slope_um_per_V * range_V])
 
 
-def design(grid: Grid, voltage_V: Float[Array, " n"], start: Staircase) -> tuple[Float[Array, "n D"], Staircase]:
+def design(
+    grid: Grid, table: Float[Array, "4 k D"], voltage_V: Float[Array, " n"], start: Staircase
+) -> tuple[Float[Array, "n D"], Staircase]:
     """Respond with every column alone.
 
     Parameters
     ----------
     grid
         The columns.
+    table
+        Their branch polynomials, from `branch_table`.
     voltage_V
         Shape `(n,)`.
     start
@@ -92,20 +98,14 @@ def design(grid: Grid, voltage_V: Float[Array, " n"], start: Staircase) -> tuple
     # A branch adds or takes off the rectangle between its anchor and the present voltage (see microid.Everett).
     high = jnp.where(up, -reach, reach[anchor])
     low = jnp.where(up, reach[anchor], reach)
-    rectangle = high[:, :, None] * low[:, None, :]
-    total = forest_sum(rectangle.at[0].set(0), anchor)[memory.lead :]
-    # Nodes under the diagonal triangles are not free: they continue the three corners linearly.
-    ghost = jnp.diagonal(total, 1, axis1=1, axis2=2)
-    i = np.arange(n - 1)
-    total = total.at[:, i, i].add(ghost).at[:, i + 1, i + 1].add(ghost).at[:, i + 1, i].add(-ghost)
-    packed = total.reshape(total.shape[0], n * n)[:, np.ravel_multi_index(np.tril_indices(n), (n, n))]
+    total = forest_sum(_rectangles(high, low).at[0].set(0), anchor)[memory.lead :]
 
     x, rising = x[memory.lead :], memory.rising[memory.lead :]
     cell = jnp.clip(x.astype(jnp.int32), 0, n - 2)
     s = (x - cell.astype(x.dtype))[:, None]
-    c0, c1, c2, c3 = _branch_table(n)[:, jnp.where(rising, cell, cell + (n - 1))]
+    c0, c1, c2, c3 = table[:, jnp.where(rising, cell, cell + (n - 1))]
     branch = c0 + s * (c1 + s * (c2 + s * c3))
-    return branch.at[:, : grid.weights].add(packed), memory.end()
+    return branch + jnp.pad(total, ((0, 0), (0, n))), memory.end()
 
 
 def _reach(x: Float[Array, " m"], n: int) -> Float[Array, "m N"]:
@@ -115,12 +115,32 @@ def _reach(x: Float[Array, " m"], n: int) -> Float[Array, "m N"]:
     return rise.at[:, 0].add(-0.5) / (n - 1)
 
 
-def _branch_table(n: int) -> Float[Array, "4 k D"]:
-    """Branch polynomials of every column, taken from the model itself."""
-    grid = Grid(jnp.asarray(0.0), jnp.asarray(1.0), n)
+def _rectangles(high: Float[Array, "m N"], low: Float[Array, "m N"]) -> Float[Array, "m p"]:
+    """Products of the two along all pairs `(i, j <= i)`, packed row by row.
 
+    The nodes under the diagonal triangles are not free: they continue the three corners linearly, so what they
+    would add goes to those.
+    """
+    n = high.shape[1]
+    i, j = np.tril_indices(n)
+    ghost = jnp.pad(high[:, :-1] * low[:, 1:], ((0, 0), (1, 1)))
+    # Column k + 1 holds ghost k; the first and last are zero.
+    after = np.where(i == j, i + 1, 0)
+    before = np.where(i == j, i, 0)
+    beside = np.where(i == j + 1, i, 0)
+    return high[:, i] * low[:, j] + ghost[:, after] + ghost[:, before] - ghost[:, beside]
+
+
+@lru_cache(maxsize=16)
+def branch_table(levels: int) -> np.ndarray:
+    """Branch polynomials of every column, taken from the model itself, shape `(4, 2 (levels - 1), D)`."""
+    return np.asarray(_branch_table(Grid(jnp.zeros(()), jnp.ones(()), levels)))
+
+
+@eqx.filter_jit
+def _branch_table(unit: Grid) -> Float[Array, "4 k D"]:
     def branch(column: Float[Array, " D"]) -> Float[Array, "4 k"]:
-        nodes, slopes = grid.nodes(column[: grid.weights]), column[grid.weights :]
-        return everett(nodes, slopes, grid.lower_V, grid.upper_V).branch_um
+        nodes, slopes = unit.nodes(column[: unit.weights]), column[unit.weights :]
+        return everett(nodes, slopes, unit.lower_V, unit.upper_V).branch_um
 
-    return jnp.moveaxis(jax.vmap(branch)(jnp.eye(grid.columns)), 0, -1)
+    return jnp.moveaxis(jax.vmap(branch)(jnp.eye(unit.columns)), 0, -1)

@@ -21,13 +21,16 @@ class Posterior(eqx.Module):
     ----------
     mean
         Shape `(D,)`.
+    precision
+        Inverse of the covariance, shape `(D, D)`.
     root
-        Lower Cholesky factor of the precision, shape `(D, D)`.
+        Its lower Cholesky factor, shape `(D, D)`.
     effective
         Number of columns that the data, not the prior, determine.
     """
 
     mean: Float[Array, " D"]
+    precision: Float[Array, "D D"]
     root: Float[Array, "D D"]
     effective: Float[Array, ""]
 
@@ -77,10 +80,11 @@ def posterior(moments: Moments, rough: Roughness, hyper: Hyper) -> Posterior:
     """Condition the prior on the data."""
     prior = rough.precision(hyper)
     variance = jnp.exp(hyper.log_variance)
-    root = jnp.linalg.cholesky(moments.gram / variance + prior)
+    precision = moments.gram / variance + prior
+    root = jnp.linalg.cholesky(precision)
     mean = jax.scipy.linalg.cho_solve((root, True), moments.cross_um / variance)
-    held = jax.scipy.linalg.cho_solve((root, True), prior)
-    return Posterior(mean, root, prior.shape[0] - jnp.trace(held))
+    held = jax.scipy.linalg.solve_triangular(root, jnp.linalg.cholesky(prior), lower=True)
+    return Posterior(mean, precision, root, prior.shape[0] - jnp.sum(held**2))
 
 
 @eqx.filter_jit

@@ -11,7 +11,7 @@ from optimistix import RESULTS
 
 from fits._design import Grid, columns_of
 from fits._errors import DataError
-from fits._grid import GridSolution, cross_validate, solve_grid
+from fits._grid import GridSolution, covariance_factor, cross_validate, solve_grid
 from fits._history import estimate_start
 from fits._metrics import Errors, errors, loop_width_pct
 from fits._moments import Data, gather
@@ -24,8 +24,8 @@ from fits._shapes import solve_shape
 from fits._uncertainty import Uncertainty, perturbations
 from microid import FAMILIES, Preisach
 
-# Resolutions in steps of the square root of two: intervals double every second one.
-LADDER = (8, 12, 17, 24, 34, 48, 68)
+# Resolutions in steps of the square root of two.
+LADDER = (16, 23, 32, 45, 64, 90)
 # Refining goes on while it takes this fraction off the error of predicted blocks.
 _WORTH = 0.005
 # A residual less correlated than this counts as white.
@@ -41,7 +41,6 @@ class _Trial:
     data: Data
     solution: GridSolution
     correlation: float
-    error: float
 
 
 def fit(
@@ -113,7 +112,7 @@ def fit(
 
     def trial(n: int, hyper: Hyper) -> _Trial:
         progress(f"{n} levels")
-        return _try(Grid(jnp.asarray(lower), jnp.asarray(upper), n), runs, stroke, hyper)
+        return _try(gather(Grid(jnp.asarray(lower), jnp.asarray(upper), n), runs), runs, stroke, hyper)
 
     tried, trials = _resolve(trial, levels, stroke)
     remarks = _remarks(runs, tried, trials, levels)
@@ -134,7 +133,7 @@ def fit(
                 f"only one of {starts} starts reached the best fit, so there may be a better one: raise --starts"
             )
         model, data = solution.model, tried.data
-        uncertainty = _uncertainty(data, solution.factor_um, tried, stroke)
+        uncertainty = _uncertainty(data, np.asarray(solution.factor_um), tried, stroke)
     offsets = _offsets(model, data)
     first = eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offsets[0]))
     noise = _noise_um(tried, stroke)
@@ -164,20 +163,25 @@ def _resolve(
 ) -> tuple[_Trial, list[LevelTrial]]:
     """Refine until it no longer pays; the coarser of two equals is kept."""
     best = trial(levels or LADDER[0], Hyper.start())
-    trials = [LevelTrial(best.data.grid.levels, best.error * stroke)]
     if levels is not None:
-        return best, trials
+        return best, []
+    trials = [_assess(best, stroke)]
     for n in LADDER[1:]:
         finer = trial(n, best.solution.hyper)
-        trials.append(LevelTrial(n, finer.error * stroke))
-        if not finer.error < (1 - _WORTH) * best.error:
+        trials.append(_assess(finer, stroke))
+        if not trials[-1].error_um < (1 - _WORTH) * trials[-2].error_um:
             break
         best = finer
     return best, trials
 
 
-def _try(grid: Grid, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
-    data = gather(grid, runs)
+def _assess(tried: _Trial, stroke: float) -> LevelTrial:
+    squares = cross_validate(tried.data, stroke, tried.correlation, tried.solution.hyper)
+    return LevelTrial(tried.data.grid.levels, float(np.sqrt(np.mean(squares))) * stroke)
+
+
+def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
+    grid = data.grid
     correlation = 1.0
     solution = solve_grid(data, stroke, correlation, hyper)
     _check(solution.result)
@@ -188,8 +192,7 @@ def _try(grid: Grid, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
         correlation = found
         solution = solve_grid(data, stroke, correlation, hyper)
         _check(solution.result)
-    error = float(np.sqrt(np.mean(cross_validate(data, stroke, correlation, solution.hyper))))
-    return _Trial(data, solution, correlation, error)
+    return _Trial(data, solution, correlation)
 
 
 def _check(result: RESULTS) -> None:
@@ -201,15 +204,15 @@ def _check(result: RESULTS) -> None:
 
 
 def _from_grid(tried: _Trial, stroke: float) -> tuple[Preisach, Uncertainty, Data]:
-    belief = tried.solution.belief
+    factor = covariance_factor(tried.data, tried.solution, stroke, tried.correlation)
     model = tried.data.grid.model(np.asarray(tried.solution.columns) * stroke, np.zeros(()))
-    return model, _uncertainty(tried.data, belief.factor() * stroke, tried, stroke), tried.data
+    return model, _uncertainty(tried.data, factor, tried, stroke), tried.data
 
 
-def _uncertainty(data: Data, factor_um: jax.Array, tried: _Trial, stroke: float) -> Uncertainty:
+def _uncertainty(data: Data, factor_um: np.ndarray, tried: _Trial, stroke: float) -> Uncertainty:
     mean = data.means[0]
     offset_sd = _noise_um(tried, stroke) * (tried.correlation / mean.count) ** 0.5
-    return perturbations(data.grid, factor_um, jnp.asarray(mean.response), jnp.asarray(offset_sd))
+    return perturbations(data.grid, jnp.asarray(factor_um), jnp.asarray(mean.response), jnp.asarray(offset_sd))
 
 
 def _noise_um(tried: _Trial, stroke: float) -> float:

@@ -1,6 +1,7 @@
 """Fitting the weights of a grid: a smooth, non-negative regression, convex and therefore without a start."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,8 +18,10 @@ from fits._prior import Hyper, Roughness, interpolation, roughness
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
 _EVIDENCE_LEVELS = 16
-_NOISE_ROUNDS = 2
+# And this many to say how sure predictions are; finer perturbations move no displacement.
+_BELIEF_LEVELS = 24
 _ATOL = 1e-9
+_STEPS = 100
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
     else:
         hyper, result = maximise_evidence(moments, rough, start)
     belief = posterior(moments, rough, hyper)
-    for _ in range(_NOISE_ROUNDS):
+    if data.grid.levels > _EVIDENCE_LEVELS:
+        # What the coarse levels could not follow was noise to them.
         hyper = renew_noise(moments, hyper, belief)
         belief = posterior(moments, rough, hyper)
     if np.all(np.asarray(belief.mean) >= 0):
@@ -78,12 +82,19 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
 @eqx.filter_jit
 def _constrained(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
-    precision = belief.root @ belief.root.T
-    scale = jnp.sqrt(jnp.diagonal(precision))
-    quadratic = precision / (scale[:, None] * scale[None, :]), belief.mean * scale
-    start = jnp.maximum(quadratic[1], 0)
-    solver = NonNegativeNewton(atol=_ATOL)
-    solution = optx.minimise(_distance, solver, start, args=quadratic, max_steps=100, throw=False)
+    scale = jnp.sqrt(jnp.diagonal(belief.precision))
+    scaled = belief.precision / (scale[:, None] * scale[None, :])
+    mean = belief.mean * scale
+    solver: Any = NonNegativeNewton(atol=_ATOL)
+    solution: Any = optx.minimise(
+        _distance,
+        solver,
+        jnp.maximum(mean, 0),
+        args=(scaled, mean),
+        options={"hessian": scaled},
+        max_steps=_STEPS,
+        throw=False,
+    )
     return solution.value / scale, solution.result
 
 
@@ -91,6 +102,23 @@ def _distance(y: Float[Array, " D"], args: tuple[Float[Array, "D D"], Float[Arra
     precision, mean = args
     off = y - mean
     return off @ (precision @ off) / 2
+
+
+def covariance_factor(data: Data, solution: GridSolution, stroke_um: float, correlation: float) -> np.ndarray:
+    """Factor the covariance of the columns.
+
+    Returns
+    -------
+    ndarray
+        `factor @ factor.T` is the covariance in um^2, shape `(D, k)`.
+    """
+    levels = data.grid.levels
+    if levels <= _BELIEF_LEVELS:
+        return np.asarray(solution.belief.factor()) * stroke_um
+    basis = interpolation(_BELIEF_LEVELS, levels)
+    moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
+    belief = posterior(moments, roughness(levels).project(basis), solution.hyper)
+    return basis @ np.asarray(belief.factor()) * stroke_um
 
 
 def cross_validate(data: Data, stroke_um: float, correlation: float, hyper: Hyper) -> np.ndarray:

@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits._compress import Compressed, compress
-from fits._design import Grid, design
+from fits._design import Grid, branch_table, design
 from fits._run import Run
-from microid import Staircase, remember
+from microid import Staircase
 
-# Groups of four pseudo-samples that go through the compiled regression at a time.
-_GROUPS = 128
+# Groups of four pseudo-samples that go through the compiled regression at a time: few, so that little is padded,
+# or many, where the products of many columns pay for it.
+_FEW, _MANY = 256, 512
+_MANY_LEVELS = 32
 BLOCKS = 5
 
 
@@ -137,49 +139,41 @@ def gather(grid: Grid, runs: Sequence[Run]) -> Data:
 def _sums(grid: Grid, groups: Compressed, start: Staircase) -> list[Moments]:
     """Moments per block, with a column of ones at the end and no mean taken off."""
     size = grid.columns + 1
-    zero = Moments(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(()))
-    sums = [zero] * BLOCKS
-    border = np.flatnonzero(np.diff(groups.block)) + 1
-    for first, last in zip([0, *border], [*border, len(groups.block)], strict=True):
-        block = int(groups.block[first])
-        for begin in range(first, last, _GROUPS):
-            end = min(begin + _GROUPS, last)
-            pad = _GROUPS - (end - begin)
-            voltage = np.pad(groups.voltage_V[begin:end].ravel(), (0, 4 * pad), mode="edge")
-            mix = np.pad(groups.mix[begin:end], ((0, pad), (0, 0), (0, 0)))
-            target = np.pad(groups.target_um[begin:end], ((0, pad), (0, 0)))
+    sums = [Moments(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(())) for _ in range(BLOCKS)]
+    table = jnp.asarray(branch_table(grid.levels))
+    length = _MANY if grid.levels > _MANY_LEVELS else _FEW
+    for begin in range(0, len(groups.block), length):
+        piece = slice(begin, begin + length)
+        pad = (0, length - len(groups.block[piece]))
+        voltage = np.pad(groups.voltage_V[piece].ravel(), (0, 4 * pad[1]), mode="edge")
+        mix = np.pad(groups.mix[piece], (pad, (0, 0), (0, 0)))
+        mixed, start = _regress(grid, table, jnp.asarray(voltage), start, jnp.asarray(mix))
+        rows = np.asarray(mixed)
+        for block in np.unique(groups.block[piece]):
             if block < 0:
-                start = _pass(jnp.asarray(voltage), start)
                 continue
-            gram, cross, energy, start = _regress(
-                grid, jnp.asarray(voltage), start, jnp.asarray(mix), jnp.asarray(target)
-            )
-            energy = energy + groups.residue_um2[begin:end].sum()
-            sums[block] = sums[block] + Moments(
-                gram, cross, energy, jnp.asarray(float(groups.count[begin:end].sum()))
-            )
+            # Blocks are consecutive, so this is one slice; NumPy hands `a.T @ a` to BLAS as a rank-k update.
+            which = np.flatnonzero(groups.block[piece] == block)
+            part = rows[4 * which[0] : 4 * (which[-1] + 1)]
+            target = groups.target_um[piece][which[0] : which[-1] + 1].ravel()
+            energy = target @ target + groups.residue_um2[piece][which].sum()
+            count = np.asarray(groups.count[piece][which].sum(), dtype=float)
+            sums[block] = sums[block] + Moments(part.T @ part, target @ part, energy, count)
     return sums
-
-
-@eqx.filter_jit
-def _pass(voltage_V: Float[Array, " n"], start: Staircase) -> Staircase:
-    return remember(voltage_V, start).end()
 
 
 @eqx.filter_jit
 def _regress(
     grid: Grid,
+    table: Float[Array, "4 k D"],
     voltage_V: Float[Array, " n"],
     start: Staircase,
     mix: Float[Array, "groups 4 4"],
-    target_um: Float[Array, "groups 4"],
-) -> tuple[Float[Array, "E E"], Float[Array, " E"], Float[Array, ""], Staircase]:
-    response, end = design(grid, voltage_V, start)
+) -> tuple[Float[Array, "n E"], Staircase]:
+    response, end = design(grid, table, voltage_V, start)
     response = jnp.concatenate([response, jnp.ones_like(response[:, :1])], axis=1)
-    groups = response.reshape(*mix.shape[:2], -1)
-    rows = jnp.einsum("gij,gjd->dgi", mix, groups).reshape(response.shape[1], -1)
-    target = target_um.ravel()
-    return rows @ rows.T, rows @ target, target @ target, end
+    mixed = jnp.einsum("gij,gjd->gid", mix, response.reshape(*mix.shape[:2], -1))
+    return mixed.reshape(response.shape), end
 
 
 def _centre(sums: Moments) -> tuple[Moments, RunMean]:

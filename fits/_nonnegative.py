@@ -24,7 +24,8 @@ class NonNegativeNewton(optx.AbstractMinimiser[Float[Array, " D"], Any, _State])
 
     Newton steps on the variables that are not held at their bound, bent along the boundary, with an Armijo search
     (Bertsekas, SIAM J. Control Optim. 20, 1982). Weights that the data want to be zero become exactly zero, which
-    a bijection would only approach. The Hessian is taken once: the function must be quadratic.
+    a bijection would only approach. The function must be quadratic: its Hessian is taken once, at the start, or from
+    `options["hessian"]`.
 
     Attributes
     ----------
@@ -38,8 +39,8 @@ class NonNegativeNewton(optx.AbstractMinimiser[Float[Array, " D"], Any, _State])
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:  # type: ignore[no-untyped-def]
         """Take the Hessian at the start."""
-        del options, f_struct, tags
-        hessian = jax.hessian(lambda z: fn(z, args)[0])(y)
+        del f_struct, aux_struct, tags
+        hessian = options["hessian"] if "hessian" in options else jax.hessian(lambda z: fn(z, args)[0])(y)
         value, gradient, aux = _evaluate(fn, y, args)
         return _State(hessian, gradient, value, _violation(y, gradient, hessian), aux)
 

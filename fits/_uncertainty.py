@@ -1,7 +1,6 @@
 """How sure a prediction is."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -12,8 +11,6 @@ from fits._run import Run, split
 from microid import Staircase, everett, remember
 
 _BATCH = 32
-# Of more perturbations than this only those are kept that displacements show most; records determine some 100 to 200.
-_MANY = 400
 
 
 class Uncertainty(eqx.Module):
@@ -77,27 +74,10 @@ def perturbations(
     offset_sd_um
         Standard deviation of that mean.
     """
-    if factor_um.shape[1] > _MANY:
-        factor_um = _shown(grid, factor_um)[:, :_MANY]
     # The offset makes up for what a perturbation does to the mean of the record.
     columns = jnp.concatenate([factor_um.T, jnp.zeros((1, grid.columns))])
     offsets = jnp.append(-(mean_response @ factor_um), offset_sd_um)
     return Uncertainty(columns, offsets, grid)
-
-
-def _shown(grid: Grid, factor_um: Float[Array, "D k"]) -> Float[Array, "D k"]:
-    """Rotate the perturbations so that those come first that move displacements most."""
-    unit = Grid(jnp.asarray(0.0), jnp.asarray(1.0), grid.levels)
-    high, low = np.tril_indices(grid.levels, -1)
-    level = jnp.linspace(0.0, 1.0, grid.levels)
-
-    def triangles(column: Float[Array, " D"]) -> Float[Array, " t"]:
-        surface = everett(unit.nodes(column[: grid.weights]), column[grid.weights :], unit.lower_V, unit.upper_V)
-        return surface(level[high], level[low])
-
-    effect = jax.vmap(triangles, in_axes=1, out_axes=1)(factor_um)
-    _, rotation = jnp.linalg.eigh(effect.T @ effect)
-    return factor_um @ rotation[:, ::-1]
 
 
 @eqx.filter_jit

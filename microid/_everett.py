@@ -115,33 +115,46 @@ def everett(
     ghost = corner[:-1] + corner[1:] - jnp.diagonal(density_um_per_V2, -1)
     nodes = density_um_per_V2 + jnp.diag(ghost, 1)
     window = h**2 * _running(_running(nodes).T).T
-    rising, falling = _triangle(nodes), _triangle(nodes.T)
-    reversible = _pieces(reversible_um_per_V[:-1], jnp.diff(reversible_um_per_V) / 2, jnp.zeros_like(ghost), h)
+    # Along the diagonal: trapezoids of the rows up to it above, and of the columns of ghosts below it.
+    rows = jnp.sum(density_um_per_V2, axis=1) - (density_um_per_V2[:, 0] + corner) / 2
+    side = jnp.diagonal(density_um_per_V2, -1)
+    rising = _triangle(nodes, rows[:-1], rows[1:] - (corner[1:] + side) / 2)
+    inner = jnp.arange(n - 1) > 0
+    before = jnp.pad(ghost, (1, 0))[:-1] - jnp.pad(ghost[:1] / 2, (1, n - 2))[: n - 1]
+    falling = _triangle(nodes.T, jnp.where(inner, before + corner[:-1] / 2, 0), jnp.where(inner, ghost / 2, 0))
+    slope = reversible_um_per_V[:-1]
+    reversible = h * _pieces(slope, jnp.diff(reversible_um_per_V) / 2, jnp.zeros_like(slope))
     branch = jnp.concatenate([h**2 * rising + reversible, reversible - h**2 * falling], axis=1)
     return Everett(lower_V, upper_V, window.ravel(), branch)
 
 
-def _running(nodes: Float[Array, "N k"]) -> Float[Array, "M k"]:
+def _sums(values: Float[Array, " k *more"]) -> Float[Array, " k+1 *more"]:
+    """Running sums along axis 0, from zero on; a scan compiles and runs several times faster than `cumsum`."""
+
+    def add(total: Array, value: Array) -> tuple[Array, Array]:
+        return total + value, total + value
+
+    zero = jnp.zeros_like(values[0])
+    return jnp.concatenate([zero[None], lax.scan(add, zero, values)[1]])
+
+
+def _running(nodes: Float[Array, "N k"]) -> Float[Array, "N+1 k"]:
     """B-spline coefficients of the integral, from the first node on, of the hat functions along axis 0."""
-    start = -nodes[:1] / 2
-    return jnp.concatenate([start, start + jnp.cumsum(nodes, axis=0)])
+    return _sums(nodes) - nodes[:1] / 2
 
 
-def _pieces(
-    c1: Float[Array, " k"], c2: Float[Array, " k"], c3: Float[Array, " k"], scale: Float[Array, ""] | float
-) -> Float[Array, "4 k"]:
-    total = jnp.cumsum(c1 + c2 + c3)
-    return scale * jnp.stack([jnp.concatenate([jnp.zeros_like(total[:1]), total[:-1]]), c1, c2, c3])
+def _pieces(c1: Float[Array, " k"], c2: Float[Array, " k"], c3: Float[Array, " k"]) -> Float[Array, "4 k"]:
+    return jnp.stack([_sums(c1 + c2 + c3)[:-1], c1, c2, c3])
 
 
-def _triangle(nodes: Float[Array, "N N"]) -> Float[Array, "4 k"]:
-    """Integrate over `0 <= y <= x` up to `x`: cubics on every interval, in units of the step squared."""
-    halves = (nodes[:, :-1] + nodes[:, 1:]) / 2
-    sums = jnp.concatenate([jnp.zeros_like(nodes[:, :1]), jnp.cumsum(halves, axis=1)], axis=1)
-    here, next_ = jnp.diagonal(sums)[:-1], jnp.diagonal(sums, -1)
+def _triangle(nodes: Float[Array, "N N"], here: Float[Array, " k"], next_: Float[Array, " k"]) -> Float[Array, "4 k"]:
+    """Integrate over `0 <= y <= x` up to `x`: cubics on every interval, in units of the step squared.
+
+    `here` and `next_` are the integrals along `y`, up to interval `i`, in the rows `x = i` and `x = i + 1`.
+    """
     p = jnp.diagonal(nodes)[:-1]
     q, r = jnp.diagonal(nodes, -1) - p, jnp.diagonal(nodes, 1) - p
-    return _pieces(here, (next_ - here + p) / 2, (q + r / 2) / 3, 1.0)
+    return _pieces(here, (next_ - here + p) / 2, (q + r / 2) / 3)
 
 
 def _pick(table: Float[Array, " q"], index: Int[Array, " n"]) -> Float[Array, " n"]:

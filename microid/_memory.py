@@ -156,40 +156,36 @@ def remember(voltage_V: Float[Array, " n"], start: Staircase) -> Memory:
     return Memory(path, anchor, rising, size)
 
 
-def _rising(path: Float[Array, " m"]) -> Bool[Array, " m"]:
-    """Direction of arrival; a sample that does not move keeps its predecessor's."""
-    sign = jnp.sign(jnp.diff(path, prepend=path[:1])).astype(jnp.int32)
-    moved = jnp.where(sign != 0, jnp.arange(path.shape[0], dtype=jnp.int32), 0)
-    return sign[lax.cummax(moved)] >= 0
-
-
 def _by_stack(path: Float[Array, " m"]) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:
-    rising = _rising(path)
     n = path.shape[0]
 
-    def visit(t: Int[Array, ""], carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        top, stack, anchor = carry
-        x, up = path[t], rising[t]
-        turned = up != rising[t - 1]
+    def visit(t: Int[Array, ""], carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        top, was_up, stack, anchor, rising = carry
+        x, before = path[t], path[t - 1]
+        # A sample that does not move belongs to its predecessor's branch.
+        up = jnp.where(x == before, was_up, x > before)
+        turned = up != was_up
         top = jnp.where(turned, top + 1, top)
         stack = stack.at[top].set(jnp.where(turned, t - 1, stack[top]))
 
         def wiped(top: Int[Array, ""]) -> Bool[Array, ""]:
-            below = path[stack[top - 1]]
-            return (top >= 2) & jnp.where(up, below <= x, below >= x)
+            old = path[stack[top - 1]]
+            return (top >= 2) & jnp.where(up, old <= x, old >= x)
 
         top = lax.while_loop(wiped, lambda k: k - 2, top)
-        return top, stack, anchor.at[t].set(stack[top])
+        return top, up, stack, anchor.at[t].set(stack[top]), rising.at[t].set(up)
 
     zeros = jnp.zeros(n, dtype=jnp.int32)
+    start = (jnp.asarray(0, dtype=jnp.int32), jnp.asarray(True), zeros, zeros, jnp.ones(n, dtype=bool))
     # NumPy bounds: the trip count stays static and the index int32 in both x64 modes.
-    start = (jnp.asarray(0, dtype=jnp.int32), zeros, zeros)
-    _, _, anchor = lax.fori_loop(np.int32(1), np.int32(n), visit, start)
+    _, _, _, anchor, rising = lax.fori_loop(np.int32(1), np.int32(n), visit, start)
     return anchor, rising
 
 
 def _by_lifting(path: Float[Array, " m"]) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:
-    rising = _rising(path)
+    sign = jnp.sign(jnp.diff(path, prepend=path[:1])).astype(jnp.int32)
+    moved = jnp.where(sign != 0, jnp.arange(path.shape[0], dtype=jnp.int32), 0)
+    rising = sign[lax.cummax(moved)] >= 0
     lowest = _lowest_since_above(path)
     highest = _lowest_since_above(-path)
     return jnp.where(rising, lowest, highest).at[0].set(0), rising

@@ -41,9 +41,11 @@ class GridDensity(AbstractDensity):
     def nodes_um_per_V2(self) -> Float[Array, "N N"]:
         """Density at the nodes, shape `(N, N)`."""
         n = self.levels
-        areas = node_areas(n)[np.tril_indices(n)] * (self.upper_V - self.lower_V) ** 2
-        nodes = jnp.zeros((n, n), self.packed_um.dtype)
-        return nodes.at[np.tril_indices(n)].set(self.packed_um / areas.astype(self.packed_um.dtype))
+        areas = node_areas(n)[np.tril_indices(n)].astype(self.packed_um.dtype)
+        # A gather from a list that ends in a zero is faster than a scatter.
+        place = np.full((n, n), len(areas))
+        place[np.tril_indices(n)] = np.arange(len(areas))
+        return jnp.append(self.packed_um / areas, 0)[place] / (self.upper_V - self.lower_V) ** 2
 
     @classmethod
     def start(
