@@ -1,5 +1,7 @@
 """How smooth and how noisy: found by maximising the probability of the data (the evidence), not set by hand."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,8 +12,8 @@ from optimistix import RESULTS
 from fits._moments import Moments
 from fits._prior import Hyper, Roughness
 
-# Beyond these the evidence is flat: the prior then says "straight" or nothing at all.
-_LOWEST, _HIGHEST = -25.0, 25.0
+# Where the evidence is flat the smoothness stays within a few times this factor, in e-folds, of a middling one.
+_MIDDLE, _WIDTH = -4.6, 6.0
 
 
 class Posterior(eqx.Module):
@@ -51,10 +53,9 @@ def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array,
     misfit = moments.energy_um2 / variance - half @ half
     volume = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
     prior_volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(prior))))
-    # A fence far out keeps the search from running along a flat valley for ever.
-    values = jnp.stack([hyper.log_density, hyper.log_reversible])
-    fence = jnp.sum(jnp.maximum(values - _HIGHEST, 0) ** 2 + jnp.maximum(_LOWEST - values, 0) ** 2)
-    return (moments.count * hyper.log_variance + misfit + volume - prior_volume) / 2 + fence
+    weights = jnp.stack([hyper.log_density, hyper.log_along, hyper.log_reversible])
+    unlikely = jnp.sum(((weights - _MIDDLE) / _WIDTH) ** 2)
+    return (moments.count * hyper.log_variance + misfit + volume - prior_volume + unlikely) / 2
 
 
 @eqx.filter_jit
@@ -70,8 +71,8 @@ def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> tuple
     start
         Where the search begins.
     """
-    solver = optx.BFGS(rtol=1e-3, atol=1e-2)
-    solution = optx.minimise(_negative_log, solver, start, args=(moments, rough), max_steps=128, throw=False)
+    solver: Any = optx.BFGS(rtol=1e-3, atol=1e-2)
+    solution: Any = optx.minimise(_negative_log, solver, start, args=(moments, rough), max_steps=256, throw=False)
     return solution.value, solution.result
 
 
@@ -92,4 +93,4 @@ def renew_noise(moments: Moments, hyper: Hyper, belief: Posterior) -> Hyper:
     """Re-estimate the noise from what is left at the full resolution (MacKay's fixed point)."""
     left = moments.energy_um2 - 2 * belief.mean @ moments.cross_um + belief.mean @ moments.gram @ belief.mean
     variance = jnp.maximum(left, 0) / jnp.maximum(moments.count - belief.effective, 1)
-    return Hyper(hyper.log_density, hyper.log_reversible, jnp.log(jnp.maximum(variance, 1e-30)))
+    return eqx.tree_at(lambda h: h.log_variance, hyper, jnp.log(jnp.maximum(variance, 1e-30)))

@@ -41,6 +41,8 @@ class _Trial:
     data: Data
     solution: GridSolution
     correlation: float
+    error_um: float
+    discrepancy_um: float
 
 
 def fit(
@@ -114,7 +116,7 @@ def fit(
         progress(f"{n} levels")
         return _try(gather(Grid(jnp.asarray(lower), jnp.asarray(upper), n), runs), runs, stroke, hyper)
 
-    tried, trials = _resolve(trial, levels, stroke)
+    tried, trials = _resolve(trial, levels)
     remarks = _remarks(runs, tried, trials, levels)
     if family == "grid":
         model, uncertainty, data = _from_grid(tried, stroke)
@@ -158,26 +160,17 @@ def fit(
     )
 
 
-def _resolve(
-    trial: Callable[[int, Hyper], _Trial], levels: int | None, stroke: float
-) -> tuple[_Trial, list[LevelTrial]]:
+def _resolve(trial: Callable[[int, Hyper], _Trial], levels: int | None) -> tuple[_Trial, list[LevelTrial]]:
     """Refine until it no longer pays; the coarser of two equals is kept."""
     best = trial(levels or LADDER[0], Hyper.start())
-    if levels is not None:
-        return best, []
-    trials = [_assess(best, stroke)]
-    for n in LADDER[1:]:
+    trials = [LevelTrial(best.data.grid.levels, best.error_um)]
+    for n in LADDER[1:] if levels is None else ():
         finer = trial(n, best.solution.hyper)
-        trials.append(_assess(finer, stroke))
-        if not trials[-1].error_um < (1 - _WORTH) * trials[-2].error_um:
+        trials.append(LevelTrial(n, finer.error_um))
+        if not finer.error_um < (1 - _WORTH) * best.error_um:
             break
         best = finer
     return best, trials
-
-
-def _assess(tried: _Trial, stroke: float) -> LevelTrial:
-    squares = cross_validate(tried.data, stroke, tried.correlation, tried.solution.hyper)
-    return LevelTrial(tried.data.grid.levels, float(np.sqrt(np.mean(squares))) * stroke)
 
 
 def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
@@ -192,7 +185,8 @@ def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
         correlation = found
         solution = solve_grid(data, stroke, correlation, hyper)
         _check(solution.result)
-    return _Trial(data, solution, correlation)
+    error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper)
+    return _Trial(data, solution, correlation, error, discrepancy)
 
 
 def _check(result: RESULTS) -> None:
@@ -212,7 +206,13 @@ def _from_grid(tried: _Trial, stroke: float) -> tuple[Preisach, Uncertainty, Dat
 def _uncertainty(data: Data, factor_um: np.ndarray, tried: _Trial, stroke: float) -> Uncertainty:
     mean = data.means[0]
     offset_sd = _noise_um(tried, stroke) * (tried.correlation / mean.count) ** 0.5
-    return perturbations(data.grid, jnp.asarray(factor_um), jnp.asarray(mean.response), jnp.asarray(offset_sd))
+    return perturbations(
+        data.grid,
+        jnp.asarray(factor_um),
+        jnp.asarray(mean.response),
+        jnp.asarray(offset_sd),
+        jnp.asarray(tried.discrepancy_um),
+    )
 
 
 def _noise_um(tried: _Trial, stroke: float) -> float:

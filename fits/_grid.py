@@ -1,5 +1,6 @@
 """Fitting the weights of a grid: a smooth, non-negative regression, convex and therefore without a start."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +13,11 @@ from jaxtyping import Array, Float
 from optimistix import RESULTS
 
 from fits._evidence import Posterior, maximise_evidence, posterior, renew_noise
-from fits._moments import Data, Moments
+from fits._moments import Data, Moments, blocks_of
+from fits._noise import shared_square
 from fits._nonnegative import NonNegativeNewton
-from fits._prior import Hyper, Roughness, interpolation, roughness
+from fits._prior import Hyper, interpolation, roughness
+from fits._run import Run, simulate_run
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
 _EVIDENCE_LEVELS = 16
@@ -121,25 +124,39 @@ def covariance_factor(data: Data, solution: GridSolution, stroke_um: float, corr
     return basis @ np.asarray(belief.factor()) * stroke_um
 
 
-def cross_validate(data: Data, stroke_um: float, correlation: float, hyper: Hyper) -> np.ndarray:
+def cross_validate(
+    data: Data, runs: Sequence[Run], stroke_um: float, correlation: float, hyper: Hyper
+) -> tuple[float, float]:
     """Predict each block of every run from the others, with the smoothness and noise given.
 
     Returns
     -------
-    ndarray
-        Mean squared error of each block, up to the block's own constant, in squared strokes, shape `(blocks,)`.
+    error_um
+        Root mean square error, up to a constant in each block.
+    discrepancy_um
+        Standard deviation of what the posterior does not own up to: the part of the error that neighbouring samples
+        share, and that therefore is not noise, beyond the posterior's own. Zero where there is none.
     """
     rough = roughness(data.grid.levels)
-    blocks = [b.scaled(1 / correlation, stroke_um) for b in data.blocks if float(b.count) > 0]
-    whole = sum(blocks[1:], start=blocks[0])
-    return np.array([float(_left_out(whole, block, rough, hyper)) for block in blocks])
+    whole = sum(data.blocks[1:], start=data.blocks[0])
+    pairs = [(run, blocks_of(run)) for run in runs]
+    squares = shared = expected = count = 0.0
+    for number, block in enumerate(data.blocks):
+        if not block.count > 0:
+            continue
+        rest = Moments(*(a - b for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(block), strict=True)))
+        belief = posterior(rest.scaled(1 / correlation, stroke_um), rough, hyper)
+        model = data.grid.model(np.asarray(belief.mean) * stroke_um, np.zeros(()))
+        off = [(run.displacement_um - simulate_run(model, run))[label == number] for run, label in pairs]
+        squares += sum(float(np.sum((o - o.mean()) ** 2)) for o in off)
+        shared += sum(shared_square(o) * len(o) for o in off)
+        expected += float(_expected_square(belief, block)) * stroke_um**2
+        count += float(block.count)
+    return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
 
 
 @eqx.filter_jit
-def _left_out(whole: Moments, block: Moments, rough: Roughness, hyper: Hyper) -> Float[Array, ""]:
-    variance = jnp.exp(hyper.log_variance)
-    precision = (whole.gram - block.gram) / variance + rough.precision(hyper)
-    rest = (whole.cross_um - block.cross_um) / variance
-    columns = jax.scipy.linalg.solve(precision, rest, assume_a="pos")
-    left = block.energy_um2 - 2 * columns @ block.cross_um + columns @ block.gram @ columns
-    return jnp.maximum(left, 0) / block.count
+def _expected_square(belief: Posterior, block: Moments) -> Float[Array, ""]:
+    """Sum over a block of the variances that the posterior gives its predictions."""
+    half = jax.scipy.linalg.solve_triangular(belief.root, block.gram, lower=True)
+    return jnp.trace(jax.scipy.linalg.solve_triangular(belief.root, half.T, lower=True))

@@ -9,6 +9,21 @@ from scipy import fft
 _WINDOW = 5.0
 
 
+# Neighbours this close share an error of the model, but not white noise.
+_NEIGHBOURS = 10
+
+
+def shared_square(residual: np.ndarray) -> float:
+    """Mean square of the part of a residual that neighbouring samples share, in its unit squared.
+
+    That is the mean of the autocovariances at lags 1 to 10: white noise has none, errors of a model do. As an
+    estimate it can come out negative.
+    """
+    centred = residual - residual.mean()
+    products = [float(np.mean(centred[lag:] * centred[:-lag])) for lag in range(1, _NEIGHBOURS + 1)]
+    return float(np.mean(products))
+
+
 def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     """Estimate the integrated correlation time of residuals, in samples.
 

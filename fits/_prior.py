@@ -17,7 +17,9 @@ class Hyper(eqx.Module):
     Attributes
     ----------
     log_density
-        Of the weight on the integrated squared curvature of the density.
+        Of the weight on the integrated squared curvature of the density, in all directions.
+    log_along
+        Of the additional weight on its curvature along the diagonal: loops of one size are alike at all biases.
     log_reversible
         Of the weight on the integrated squared curvature of the reversible slope.
     log_variance
@@ -25,13 +27,15 @@ class Hyper(eqx.Module):
     """
 
     log_density: Float[Array, ""]
+    log_along: Float[Array, ""]
     log_reversible: Float[Array, ""]
     log_variance: Float[Array, ""]
 
     @classmethod
     def start(cls) -> "Hyper":
         """Curvatures of about ten strokes per squared range, noise of a thousandth of the stroke."""
-        return cls(jnp.asarray(np.log(1e-2)), jnp.asarray(np.log(1e-2)), jnp.asarray(np.log(1e-6)))
+        weight = jnp.asarray(np.log(1e-2))
+        return cls(weight, weight, weight, jnp.asarray(np.log(1e-6)))
 
 
 class Roughness(eqx.Module):
@@ -41,57 +45,69 @@ class Roughness(eqx.Module):
     ----------
     density
         Integral over the half-plane of the squared second derivatives of the density, shape `(D, D)`.
+    along
+        The same of the second derivative along the diagonal alone, shape `(D, D)`.
     reversible
         Integral of the squared second derivative of the reversible slope, shape `(D, D)`.
     """
 
     density: Float[Array, "D D"]
+    along: Float[Array, "D D"]
     reversible: Float[Array, "D D"]
 
     def precision(self, hyper: Hyper) -> Float[Array, "D D"]:
         """Prior precision of the columns in strokes, shape `(D, D)`; positive definite."""
-        wide = jnp.eye(self.density.shape[0]) / _WIDE**2
-        return jnp.exp(hyper.log_density) * self.density + jnp.exp(hyper.log_reversible) * self.reversible + wide
+        return (
+            jnp.exp(hyper.log_density) * self.density
+            + jnp.exp(hyper.log_along) * self.along
+            + jnp.exp(hyper.log_reversible) * self.reversible
+            + jnp.eye(self.density.shape[0]) / _WIDE**2
+        )
 
     def project(self, basis: Float[Array, "D d"]) -> "Roughness":
         """Keep only combinations of columns."""
-        return Roughness(basis.T @ self.density @ basis, basis.T @ self.reversible @ basis)
+        return Roughness(*(basis.T @ form @ basis for form in (self.density, self.along, self.reversible)))
 
 
 def roughness(levels: int) -> Roughness:
-    """Build the two forms for a grid of `levels`."""
-    density, reversible = _matrices(levels)
-    return Roughness(jnp.asarray(density), jnp.asarray(reversible))
+    """Build the forms for a grid of `levels`."""
+    return Roughness(*(jnp.asarray(form) for form in _matrices(levels)))
 
 
 @lru_cache(maxsize=16)
-def _matrices(n: int) -> tuple[np.ndarray, np.ndarray]:
+def _matrices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    second = np.array([1.0, -2.0, 1.0])
+    # Along alpha, along beta, and the mixed derivative, which counts twice.
+    density = (
+        _squared(n, ((-1, 0), (0, 0), (1, 0)), second)
+        + _squared(n, ((0, -1), (0, 0), (0, 1)), second)
+        + _squared(n, ((0, 0), (1, 0), (0, 1), (1, 1)), np.sqrt(2.0) * np.array([1.0, -1.0, -1.0, 1.0]))
+    )
+    along = _squared(n, ((-1, -1), (0, 0), (1, 1)), second)
+    slope = np.diff(np.eye(n), 2, axis=0)
+    weights = len(density)
+    forms = np.zeros((3, weights + n, weights + n))
+    # A second difference over a step of 1 / (n - 1) is a derivative times the step squared.
+    forms[0, :weights, :weights] = density * (n - 1) ** 2
+    forms[1, :weights, :weights] = along * (n - 1) ** 2
+    forms[2, weights:, weights:] = slope.T @ slope * (n - 1) ** 3
+    return forms[0], forms[1], forms[2]
+
+
+def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) -> np.ndarray:
+    """Sum the squares of a stencil over all places where it fits into the half-plane, as a quadratic form."""
     weights = n * (n + 1) // 2
     place = -np.ones((n, n), dtype=np.int64)
     place[np.tril_indices(n)] = np.arange(weights)
     i, j = np.tril_indices(n)
-    stencils = [
-        # Along alpha, along beta, and the mixed derivative, which counts twice.
-        (((-1, 0), (0, 0), (1, 0)), (1.0, -2.0, 1.0)),
-        (((0, -1), (0, 0), (0, 1)), (1.0, -2.0, 1.0)),
-        (((0, 0), (1, 0), (0, 1), (1, 1)), np.sqrt(2.0) * np.array([1.0, -1.0, -1.0, 1.0])),
-    ]
-    density = np.zeros((weights, weights))
-    for offsets, factors in stencils:
-        rows = np.array([(i + di, j + dj) for di, dj in offsets])
-        inside = np.all((rows >= 0) & (rows < n), axis=(0, 1)) & np.all(rows[:, 0] >= rows[:, 1], axis=0)
-        nodes = place[rows[:, 0][:, inside], rows[:, 1][:, inside]]
-        for one, left in zip(nodes, factors, strict=True):
-            for other, right in zip(nodes, factors, strict=True):
-                np.add.at(density, (one, other), left * right)
-    # A second difference over a step of 1 / (n - 1) is a derivative times the step squared.
-    density *= (n - 1) ** 2
-    second = np.diff(np.eye(n), 2, axis=0)
-    size = weights + n
-    full, line = np.zeros((size, size)), np.zeros((size, size))
-    full[:weights, :weights] = density
-    line[weights:, weights:] = second.T @ second * (n - 1) ** 3
-    return full, line
+    nodes = np.array([(i + di, j + dj) for di, dj in offsets])
+    inside = np.all((nodes >= 0) & (nodes < n), axis=(0, 1)) & np.all(nodes[:, 0] >= nodes[:, 1], axis=0)
+    columns = place[nodes[:, 0][:, inside], nodes[:, 1][:, inside]]
+    form = np.zeros((weights, weights))
+    for one, left in zip(columns, factors, strict=True):
+        for other, right in zip(columns, factors, strict=True):
+            np.add.at(form, (one, other), left * right)
+    return form
 
 
 @lru_cache(maxsize=16)

@@ -17,8 +17,8 @@ class Uncertainty(eqx.Module):
     """Independent perturbations of a model, each one standard deviation long.
 
     The variance of a prediction is the sum of the squared responses to all of them: the covariance of the weights,
-    carried through the linear operator. It is the uncertainty of the noise-free displacement that comes from noise
-    and smoothing; sensor noise is not in it, nor what the model leaves out.
+    carried through the linear operator. To that comes what the model is seen to leave out. It is the uncertainty of
+    the noise-free displacement: sensor noise is not in it.
 
     Attributes
     ----------
@@ -26,12 +26,15 @@ class Uncertainty(eqx.Module):
         Perturbations of the columns of the grid, shape `(k, D)`.
     offset_um
         And of the sensor offset, shape `(k,)`.
+    discrepancy_um
+        Standard deviation of the model's own error, as predicting parts of the record from others shows it.
     grid
         The columns.
     """
 
     columns_um: Float[Array, "k D"]
     offset_um: Float[Array, " k"]
+    discrepancy_um: Float[Array, ""]
     grid: Grid
 
     def sd_um(self, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
@@ -51,7 +54,7 @@ class Uncertainty(eqx.Module):
 
         # In batches: all at once would take k times the memory of a simulation.
         each = lax.map(variance, (self.columns_um, self.offset_um), batch_size=_BATCH)
-        return jnp.sqrt(jnp.sum(each, axis=0))
+        return jnp.sqrt(jnp.sum(each, axis=0) + self.discrepancy_um**2)
 
 
 @eqx.filter_jit
@@ -60,6 +63,7 @@ def perturbations(
     factor_um: Float[Array, "D k"],
     mean_response: Float[Array, " D"],
     offset_sd_um: Float[Array, ""],
+    discrepancy_um: Float[Array, ""],
 ) -> Uncertainty:
     """Turn a factor of the covariance into perturbations of a model.
 
@@ -73,11 +77,13 @@ def perturbations(
         Mean response of the run whose mean displacement fixes the offset.
     offset_sd_um
         Standard deviation of that mean.
+    discrepancy_um
+        See `Uncertainty`.
     """
     # The offset makes up for what a perturbation does to the mean of the record.
     columns = jnp.concatenate([factor_um.T, jnp.zeros((1, grid.columns))])
     offsets = jnp.append(-(mean_response @ factor_um), offset_sd_um)
-    return Uncertainty(columns, offsets, grid)
+    return Uncertainty(columns, offsets, discrepancy_um, grid)
 
 
 @eqx.filter_jit
