@@ -161,15 +161,16 @@ def fit(
 
 
 def _resolve(trial: Callable[[int, Hyper], _Trial], levels: int | None) -> tuple[_Trial, list[LevelTrial]]:
-    """Refine until it no longer pays; the coarser of two equals is kept."""
+    """Refine until it no longer pays; the finest that predicts no worse is kept, as its grid is least felt."""
     best = trial(levels or LADDER[0], Hyper.start())
     trials = [LevelTrial(best.data.grid.levels, best.error_um)]
     for n in LADDER[1:] if levels is None else ():
         finer = trial(n, best.solution.hyper)
         trials.append(LevelTrial(n, finer.error_um))
-        if not finer.error_um < (1 - _WORTH) * best.error_um:
+        pays = finer.error_um < (1 - _WORTH) * best.error_um
+        best = finer if finer.error_um <= best.error_um else best
+        if not pays:
             break
-        best = finer
     return best, trials
 
 

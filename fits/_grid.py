@@ -40,7 +40,7 @@ class GridSolution:
     hyper
         Smoothness and noise that the data chose.
     result
-        Status of the least successful solver on the way.
+        Status of the regression.
     """
 
     columns: Float[Array, " D"]
@@ -67,19 +67,18 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
     rough = roughness(data.grid.levels)
     if data.grid.levels > _EVIDENCE_LEVELS:
         basis = jnp.asarray(interpolation(_EVIDENCE_LEVELS, data.grid.levels))
-        hyper, result = maximise_evidence(moments.project(basis), rough.project(basis), start)
+        hyper = maximise_evidence(moments.project(basis), rough.project(basis), start)
     else:
-        hyper, result = maximise_evidence(moments, rough, start)
+        hyper = maximise_evidence(moments, rough, start)
     belief = posterior(moments, rough, hyper)
     if data.grid.levels > _EVIDENCE_LEVELS:
         # What the coarse levels could not follow was noise to them.
         hyper = renew_noise(moments, hyper, belief)
         belief = posterior(moments, rough, hyper)
     if np.all(np.asarray(belief.mean) >= 0):
-        return GridSolution(belief.mean, belief, hyper, result)
-    columns, constrained = _constrained(belief)
-    worst = constrained if constrained != RESULTS.successful else result
-    return GridSolution(columns, belief, hyper, worst)
+        return GridSolution(belief.mean, belief, hyper, RESULTS.successful)
+    columns, result = _constrained(belief)
+    return GridSolution(columns, belief, hyper, result)
 
 
 @eqx.filter_jit

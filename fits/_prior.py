@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 # Standard deviation, in strokes, beyond which no density is believed even where the smoothness does not bind.
 _WIDE = 100.0
+_ROUNDING = 1e-14
 
 
 class Hyper(eqx.Module):
@@ -57,12 +58,14 @@ class Roughness(eqx.Module):
 
     def precision(self, hyper: Hyper) -> Float[Array, "D D"]:
         """Prior precision of the columns in strokes, shape `(D, D)`; positive definite."""
-        return (
+        curvature = (
             jnp.exp(hyper.log_density) * self.density
             + jnp.exp(hyper.log_along) * self.along
             + jnp.exp(hyper.log_reversible) * self.reversible
-            + jnp.eye(self.density.shape[0]) / _WIDE**2
         )
+        # What is straight has no curvature; a great weight on the rest must not make it negative by rounding.
+        floor = 1 / _WIDE**2 + _ROUNDING * jnp.max(jnp.diagonal(curvature))
+        return curvature + floor * jnp.eye(curvature.shape[0])
 
     def project(self, basis: Float[Array, "D d"]) -> "Roughness":
         """Keep only combinations of columns."""
