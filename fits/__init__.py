@@ -10,9 +10,15 @@ if TYPE_CHECKING:
     from fits._metrics import Errors as Errors
     from fits._metrics import errors as errors
     from fits._metrics import loop_width_pct as loop_width_pct
+    from fits._model_file import ModelFile as ModelFile
+    from fits._model_file import load_model as load_model
+    from fits._model_file import save_model as save_model
+    from fits._plots import plot_fit as plot_fit
     from fits._read_csv import read_csv as read_csv
     from fits._read_csv import read_runs as read_runs
     from fits._record import Record as Record
+    from fits._report import describe as describe
+    from fits._report import fit_report as fit_report
     from fits._result import FitError as FitError
     from fits._result import FitResult as FitResult
     from fits._result import FitStatus as FitStatus
@@ -31,16 +37,22 @@ _HOMES = {
     "FitStatus": "_result",
     "LADDER": "_fit",
     "LevelTrial": "_result",
+    "ModelFile": "_model_file",
     "Prediction": "_result",
     "Record": "_record",
     "RunReport": "_result",
     "Uncertainty": "_uncertainty",
+    "describe": "_report",
     "errors": "_metrics",
     "fit": "_fit",
+    "fit_report": "_report",
+    "load_model": "_model_file",
     "loop_width_pct": "_metrics",
+    "plot_fit": "_plots",
     "predict": "_result",
     "read_csv": "_read_csv",
     "read_runs": "_read_csv",
+    "save_model": "_model_file",
 }
 
 

@@ -11,7 +11,8 @@ from optimistix import RESULTS
 
 from fits._design import Grid, columns_of
 from fits._errors import DataError
-from fits._grid import GridSolution, covariance_factor, cross_validate, solve_grid
+from fits._estimate import Estimate
+from fits._grid import GridSolution, cross_validate, grid_estimate, solve_grid
 from fits._history import estimate_start
 from fits._metrics import Errors, errors, loop_width_pct
 from fits._moments import Data, gather
@@ -32,8 +33,9 @@ _WORTH = 0.005
 _WHITE = 1.2
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
-# Largest derivative, per coordinate and in squared noise standard deviations, that counts as zero.
-_STATIONARY = 0.1
+# Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
+_EDGE = 0.02
+_MINOR = 0.01
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def fit(
     RuntimeError
         If JAX computes in single precision.
     """
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
     if family not in FAMILIES:
         raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
@@ -108,39 +110,37 @@ def fit(
     voltages = [record.voltage_V for record in (*records, *aside)]
     lower, upper = min(v.min() for v in voltages), max(v.max() for v in voltages)
     runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]
-    stroke = max(float(np.ptp(run.displacement_um[run.fitted])) for run in runs)
-    if stroke == 0:
-        raise DataError(f"{records[0].source}: the displacement does not move in the samples to be fitted")
+    stroke = max(_stroke(run) for run in runs)
 
     def trial(n: int, hyper: Hyper) -> _Trial:
         progress(f"{n} levels")
         return _try(gather(Grid(jnp.asarray(lower), jnp.asarray(upper), n), runs), runs, stroke, hyper)
 
     tried, trials = _resolve(trial, levels)
-    remarks = _remarks(runs, tried, trials, levels)
+    remarks = _remarks(runs)
     if family == "grid":
-        model, uncertainty, data = _from_grid(tried, stroke)
+        found = grid_estimate(tried.data, tried.solution, stroke, tried.correlation, tried.discrepancy_um)
+        if levels is None and tried.data.grid.levels == LADDER[-1]:
+            remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try --levels 100")
     else:
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
             tried = trial(_SHAPE_LEVELS, tried.solution.hyper)
-        key = jax.random.key(seed)
-        solution = solve_shape(
-            family, tried.data, stroke, tried.correlation, tried.solution.hyper, starts, key, progress
-        )
-        _check(solution.result)
-        if not solution.gradient < _STATIONARY:
-            raise FitError(FitStatus.NOT_STATIONARY)
-        if solution.agreeing == 1 and starts > 1:
+        smooth, key = tried.solution.hyper, jax.random.key(seed)
+        found, agreeing = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
+        if agreeing == 1 and starts > 1:
             remarks.append(
                 f"only one of {starts} starts reached the best fit, so there may be a better one: raise --starts"
             )
-        model, data = solution.model, tried.data
-        uncertainty = _uncertainty(data, np.asarray(solution.factor_um), tried, stroke)
-    offsets = _offsets(model, data)
-    first = eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offsets[0]))
-    noise = _noise_um(tried, stroke)
+    if found.correlation > _WHITE:
+        remarks.append(
+            f"neighbouring residuals agree over {found.correlation:.0f} samples: something other than sensor noise "
+            "(creep, rate, drift or a density this family cannot follow) is left that this model does not describe"
+        )
+    model = found.model
+    offsets = _offsets(model, tried.data)
 
     progress("comparing with the measurement")
+    noise = found.noise_um
     reports = [_report(_with_offset(model, o), run, noise) for o, run in zip(offsets, runs, strict=True)]
     for record in aside:
         run = prepare_run(record, lower, upper, initial, holdout=1.0)
@@ -148,12 +148,12 @@ def fit(
         off = float(np.mean((run.displacement_um - simulate_run(model, run))[run.known]))
         reports.append(_report(_with_offset(model, off), run, noise))
     return FitResult(
-        model=first,
-        uncertainty=uncertainty,
+        model=_with_offset(model, offsets[0]),
+        uncertainty=_uncertainty(tried.data, found),
         status=FitStatus.CONVERGED,
         remarks=tuple(remarks),
         noise_um=noise,
-        correlation_samples=tried.correlation,
+        correlation_samples=found.correlation,
         smoothness=float(np.exp(tried.solution.hyper.log_density)),
         trials=tuple(trials),
         runs=tuple(reports),
@@ -190,6 +190,18 @@ def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
     return _Trial(data, solution, correlation, error, discrepancy)
 
 
+def _stroke(run: Run) -> float:
+    voltage, displacement = run.record.voltage_V[run.fitted], run.displacement_um[run.fitted]
+    if np.ptp(displacement) == 0 or np.ptp(voltage) == 0:
+        raise DataError(f"{run.record.source}: nothing moves in the samples to be fitted; hold out less")
+    if np.cov(voltage, displacement)[0, 1] < 0:
+        raise DataError(
+            f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
+            "change the sign of one of the two columns"
+        )
+    return float(np.ptp(displacement))
+
+
 def _check(result: RESULTS) -> None:
     if result == RESULTS.successful:
         return
@@ -198,26 +210,15 @@ def _check(result: RESULTS) -> None:
     raise FitError(FitStatus.NONFINITE)
 
 
-def _from_grid(tried: _Trial, stroke: float) -> tuple[Preisach, Uncertainty, Data]:
-    factor = covariance_factor(tried.data, tried.solution, stroke, tried.correlation)
-    model = tried.data.grid.model(np.asarray(tried.solution.columns) * stroke, np.zeros(()))
-    return model, _uncertainty(tried.data, factor, tried, stroke), tried.data
-
-
-def _uncertainty(data: Data, factor_um: np.ndarray, tried: _Trial, stroke: float) -> Uncertainty:
+def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
     mean = data.means[0]
-    offset_sd = _noise_um(tried, stroke) * (tried.correlation / mean.count) ** 0.5
     return perturbations(
         data.grid,
-        jnp.asarray(factor_um),
+        jnp.asarray(found.factor_um),
         jnp.asarray(mean.response),
-        jnp.asarray(offset_sd),
-        jnp.asarray(tried.discrepancy_um),
+        jnp.asarray(found.noise_um * (found.correlation / mean.count) ** 0.5),
+        jnp.asarray(found.discrepancy_um),
     )
-
-
-def _noise_um(tried: _Trial, stroke: float) -> float:
-    return float(np.exp(tried.solution.hyper.log_variance / 2)) * stroke
 
 
 def _offsets(model: Preisach, data: Data) -> list[float]:
@@ -252,7 +253,7 @@ def _report(model: Preisach, run: Run, noise_um: float) -> RunReport:
     )
 
 
-def _remarks(runs: list[Run], tried: _Trial, trials: list[LevelTrial], levels: int | None) -> list[str]:
+def _remarks(runs: list[Run]) -> list[str]:
     remarks = []
     for run in runs:
         remarks += list(run.record.warnings)
@@ -262,11 +263,20 @@ def _remarks(runs: list[Run], tried: _Trial, trials: list[LevelTrial], levels: i
                 f"{run.record.source}: the first {lost} samples depend on what the rig went through before; "
                 "they were not used for the weights, and the initial state was estimated from them"
             )
-    if tried.correlation > _WHITE:
+    lower, upper = min(run.lower_V for run in runs), max(run.upper_V for run in runs)
+    edge = _EDGE * (upper - lower)
+    anchors = np.concatenate([run.anchor_V[run.fitted] for run in runs])
+    if np.mean((anchors > lower + edge) & (anchors < upper - edge)) < _MINOR:
         remarks.append(
-            f"neighbouring residuals agree over {tried.correlation:.0f} samples: something other than sensor noise "
-            "is left that this model does not describe, and the band covers the model's own uncertainty only"
+            "the fitted samples hold no loop smaller than the full range: what the model says about smaller loops "
+            "rests on the smoothness of the density alone and its band there is too narrow; "
+            "record reversals inside the range"
         )
-    if levels is None and len(trials) == len(LADDER) and tried.data.grid.levels == LADDER[-1]:
-        remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try --levels 100")
+    voltage = np.concatenate([run.record.voltage_V[run.fitted] for run in runs])
+    low, high = float(voltage.min()), float(voltage.max())
+    if low > lower + edge or high < upper - edge:
+        remarks.append(
+            f"the fitted samples only span {low:.4g} to {high:.4g} V of {lower:.4g} to {upper:.4g} V: "
+            "beyond them the model is extrapolated"
+        )
     return remarks

@@ -12,10 +12,11 @@ import optimistix as optx
 from jaxtyping import Array, Float
 from optimistix import RESULTS
 
+from fits._estimate import Estimate
 from fits._evidence import Posterior, maximise_evidence, posterior, renew_noise
 from fits._moments import Data, Moments, blocks_of
 from fits._noise import shared_square
-from fits._nonnegative import NonNegativeNewton
+from fits._nonnegative import BlockPivoting
 from fits._prior import Hyper, interpolation, roughness
 from fits._run import Run, simulate_run
 
@@ -23,8 +24,8 @@ from fits._run import Run, simulate_run
 _EVIDENCE_LEVELS = 16
 # And this many to say how sure predictions are; finer perturbations move no displacement.
 _BELIEF_LEVELS = 24
-_ATOL = 1e-9
-_STEPS = 100
+_ATOL = 1e-6
+_STEPS = 500
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def _constrained(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     scale = jnp.sqrt(jnp.diagonal(belief.precision))
     scaled = belief.precision / (scale[:, None] * scale[None, :])
     mean = belief.mean * scale
-    solver: Any = NonNegativeNewton(atol=_ATOL)
+    solver: Any = BlockPivoting(atol=_ATOL)
     solution: Any = optx.minimise(
         _distance,
         solver,
@@ -106,21 +107,24 @@ def _distance(y: Float[Array, " D"], args: tuple[Float[Array, "D D"], Float[Arra
     return off @ (precision @ off) / 2
 
 
-def covariance_factor(data: Data, solution: GridSolution, stroke_um: float, correlation: float) -> np.ndarray:
-    """Factor the covariance of the columns.
-
-    Returns
-    -------
-    ndarray
-        `factor @ factor.T` is the covariance in um^2, shape `(D, k)`.
-    """
+def grid_estimate(
+    data: Data, solution: GridSolution, stroke_um: float, correlation: float, discrepancy_um: float
+) -> Estimate:
+    """Turn a solution in strokes into an estimate in um; the last two arguments are those of `Estimate`."""
     levels = data.grid.levels
     if levels <= _BELIEF_LEVELS:
-        return np.asarray(solution.belief.factor()) * stroke_um
-    basis = interpolation(_BELIEF_LEVELS, levels)
-    moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
-    belief = posterior(moments, roughness(levels).project(basis), solution.hyper)
-    return basis @ np.asarray(belief.factor()) * stroke_um
+        factor = solution.belief.factor()
+    else:
+        basis = interpolation(_BELIEF_LEVELS, levels)
+        moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
+        factor = basis @ posterior(moments, roughness(levels).project(basis), solution.hyper).factor()
+    return Estimate(
+        model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
+        factor_um=jnp.asarray(factor) * stroke_um,
+        noise_um=float(jnp.exp(solution.hyper.log_variance / 2)) * stroke_um,
+        correlation=correlation,
+        discrepancy_um=discrepancy_um,
+    )
 
 
 def cross_validate(

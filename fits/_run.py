@@ -1,6 +1,6 @@
 """A record made ready for fitting: its memory, which samples count, and where it is held out."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ class Run:
     ----------
     record
         The measured columns.
+    lower_V, upper_V
+        Range of the switching voltages.
     starts
         Memory at the beginning of every piece.
     anchor_V, rising
@@ -39,6 +41,8 @@ class Run:
     """
 
     record: Record
+    lower_V: float
+    upper_V: float
     starts: tuple[Staircase, ...]
     anchor_V: np.ndarray
     rising: np.ndarray
@@ -56,11 +60,6 @@ class Run:
     def held_out(self) -> np.ndarray:
         """Samples that are predicted, not fitted, shape `(n,)`."""
         return self.known & ~self.fitted
-
-    def with_start(self, start: Staircase, lower_V: float, upper_V: float) -> "Run":
-        """Replace the memory before the first sample, keeping which samples are used."""
-        starts, anchor_V, rising = _walk(self.record.voltage_V, start)
-        return replace(self, starts=starts, anchor_V=anchor_V, rising=rising)
 
 
 def prepare_run(record: Record, lower_V: float, upper_V: float, initial: str, holdout: float) -> Run:
@@ -94,7 +93,7 @@ def prepare_run(record: Record, lower_V: float, upper_V: float, initial: str, ho
             "the voltage has been at an end of its range, where its unknown history still counts, or are held out; "
             "state the initial state with --initial, hold out less, or record a full loop first"
         )
-    return Run(record, starts, anchor_V, rising, known, fitted)
+    return Run(record, lower_V, upper_V, starts, anchor_V, rising, known, fitted)
 
 
 def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:

@@ -1,123 +1,93 @@
-"""Fitting densities with few or tangled parameters: Levenberg-Marquardt from several starts."""
+"""Fitting densities with few or tangled parameters: Powell's dogleg from several starts."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PRNGKeyArray
-from optimistix import RESULTS
 
 from fits._design import columns_of
+from fits._estimate import Estimate
 from fits._moments import Data, Moments
+from fits._noise import correlation_samples, shared_square
 from fits._prior import Hyper, roughness
+from fits._result import FitError, FitStatus
+from fits._run import Run, simulate_run
 from microid import FAMILIES, Coordinates, Preisach, Reversible
 
-_STEPS = 400
-_ROUNDS = 3
+_STEPS = 200
+_ROUNDS = 4
+# Noise, in strokes, at which starts are compared.
+_COARSE = 3e-3
 # Starts whose cost comes this close to the best one's agree with it, in units of the noise.
 _AGREE = 2.0
+# A fit ends where the optimum is closer than this, in standard deviations of the parameters.
+_STATIONARY = 0.1
 # Directions of the data that hold less than this fraction of its largest are rounding.
 _DUST = 1e-13
 
 
-@dataclass(frozen=True)
-class ShapeSolution:
-    """A fitted density of any family.
-
-    Attributes
-    ----------
-    model
-        The best of all starts, in um.
-    factor_um
-        Factor of the covariance of its columns (Laplace), shape `(D, k)`.
-    result
-        Status of the solver at the best start.
-    agreeing
-        Number of starts that ended as well as the best one.
-    starts
-        Number of starts.
-    gradient
-        Largest derivative of the cost that is left, per coordinate.
-    """
-
-    model: Preisach
-    factor_um: Float[Array, "D k"]
-    result: RESULTS
-    agreeing: int
-    starts: int
-    gradient: float
-
-
 class _Problem(eqx.Module):
-    """The data as a short regression: `root @ columns ~ target`, in noise standard deviations."""
+    """The data as a short regression: `scale (root @ columns - target)`, in noise standard deviations."""
 
     root: Float[Array, "D D"]
     target: Float[Array, " D"]
+    scale: Float[Array, ""]
     slopes: Float[Array, "s N"]
+    precision: Float[Array, ""]
     coordinates: Coordinates[Preisach]
     stroke_um: Float[Array, ""]
 
 
-def _residual(
-    z: Float[Array, " k"], args: tuple[_Problem, Float[Array, ""]]
-) -> tuple[Float[Array, " D"], Float[Array, " s"], Float[Array, " k"]]:
-    problem, precision = args
+def _residual(z: Float[Array, " k"], problem: _Problem) -> Float[Array, " m"]:
     model = problem.coordinates(z)
     columns = columns_of(model) / problem.stroke_um
     slopes = columns[-model.reversible.levels :]
-    return problem.root @ columns - problem.target, problem.slopes @ slopes, jnp.sqrt(precision) * z
+    misfit = problem.scale * (problem.root @ columns - problem.target)
+    return jnp.concatenate([misfit, problem.slopes @ slopes, jnp.sqrt(problem.precision) * z])
 
 
 @eqx.filter_jit
-def _solve(
-    problem: _Problem, start: Float[Array, " k"], precision: Float[Array, ""]
-) -> tuple[Float[Array, " k"], RESULTS, Float[Array, ""], Float[Array, ""]]:
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
-    args = (problem, precision)
-    solution = optx.least_squares(_residual, solver, start, args=args, max_steps=_STEPS, throw=False)
-
-    def cost(z: Float[Array, " k"]) -> Float[Array, ""]:
-        return sum(jnp.sum(r**2) / 2 for r in _residual(z, args))
-
-    value, gradient = jax.value_and_grad(cost)(solution.value)
-    return solution.value, solution.result, value, jnp.max(jnp.abs(gradient))
+def _solve(problem: _Problem, start: Float[Array, " k"]) -> tuple[Float[Array, " k"], Float[Array, ""]]:
+    """Descend from a start; returns the end and its cost."""
+    solver: Any = optx.Dogleg(rtol=1e-8, atol=1e-8)
+    solution: Any = optx.least_squares(_residual, solver, start, args=problem, max_steps=_STEPS, throw=False)
+    return solution.value, jnp.sum(_residual(solution.value, problem) ** 2) / 2
 
 
 @eqx.filter_jit
 def _laplace(
-    problem: _Problem, z: Float[Array, " k"], precision: Float[Array, ""]
-) -> tuple[Float[Array, "D k"], Float[Array, ""]]:
-    """Factor of the covariance of the columns, and the precision that the coordinates' spread calls for."""
-
-    def stacked(z: Float[Array, " k"]) -> Float[Array, " m"]:
-        return jnp.concatenate(_residual(z, (problem, precision)))
-
-    jacobian = jax.jacfwd(stacked)(z)
-    curvature = jacobian.T @ jacobian
-    root = jnp.linalg.cholesky(curvature)
+    problem: _Problem, z: Float[Array, " k"]
+) -> tuple[Float[Array, "D k"], Float[Array, ""], Float[Array, ""]]:
+    """Factor of the covariance of the columns, number of coordinates the data determine, Newton decrement."""
+    jacobian = jax.jacfwd(_residual)(z, problem)
+    root = jnp.linalg.cholesky(jacobian.T @ jacobian)
     inverse = jax.scipy.linalg.solve_triangular(root, jnp.eye(z.shape[0]), lower=True)
-    determined = z.shape[0] - precision * jnp.sum(inverse**2)
+    determined = z.shape[0] - problem.precision * jnp.sum(inverse**2)
     columns = jax.jacfwd(lambda z: columns_of(problem.coordinates(z)))(z)
-    return columns @ inverse.T, jnp.maximum(determined, 1e-3) / jnp.sum(z**2)
+    slope = jacobian.T @ _residual(z, problem)
+    return columns @ inverse.T, determined, jnp.linalg.norm(inverse @ slope)
 
 
 def solve_shape(
     family: str,
     data: Data,
+    runs: Sequence[Run],
     stroke_um: float,
-    correlation: float,
     hyper: Hyper,
     starts: int,
     key: PRNGKeyArray,
     progress: Callable[[str], None],
-) -> ShapeSolution:
+) -> tuple[Estimate, int]:
     """Fit a family that is not linear in its parameters.
 
     The record enters through its moments only, so that a start costs milliseconds whatever the record's length.
-    The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point).
+    The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise
+    is what this family leaves, which may be more than the grid's.
 
     Parameters
     ----------
@@ -125,10 +95,10 @@ def solve_shape(
         Name in `microid.FAMILIES`.
     data
         Moments of the runs.
+    runs
+        The runs themselves.
     stroke_um
         Displacement that the relays account for, roughly.
-    correlation
-        Samples that are worth one independent one.
     hyper
         Noise, and smoothness of the reversible part, as the grid found them.
     starts
@@ -137,10 +107,22 @@ def solve_shape(
         Draws the starts.
     progress
         Told what is being done.
+
+    Returns
+    -------
+    Estimate
+        The best of all starts.
+    agreeing
+        Number of starts that came as far.
+
+    Raises
+    ------
+    FitError
+        If no start gives a finite cost, or the best one does not become stationary.
     """
     grid = data.grid
-    moments = data.total.scaled(1 / correlation, stroke_um)
-    variance = jnp.exp(hyper.log_variance)
+    moments = data.total.scaled(1.0, stroke_um)
+    variance = float(jnp.exp(hyper.log_variance))
 
     def draw(key: PRNGKeyArray) -> Preisach:
         half = jnp.asarray(stroke_um / 2)
@@ -150,35 +132,61 @@ def solve_shape(
 
     keys = jax.random.split(key, starts)
     coordinates = Coordinates(draw(keys[0]), free=lambda info: info.path != "offset_um")
-    root, target = _square_root(moments, variance)
+    root, target = _square_root(moments)
     rough = roughness(grid.levels).reversible[grid.weights :, grid.weights :]
     values, vectors = jnp.linalg.eigh(rough * jnp.exp(hyper.log_reversible))
     slopes = jnp.sqrt(jnp.maximum(values, 0))[:, None] * vectors.T
-    problem = _Problem(root, target, slopes, coordinates, jnp.asarray(stroke_um))
+    unit = jnp.asarray(1.0)
+    # Starts race on a coarse scale: at the grid's own noise, most would crawl along narrow valleys.
+    scale = jnp.asarray(1 / max(variance, _COARSE**2) ** 0.5)
+    problem = _Problem(root, target, scale, slopes, unit, coordinates, jnp.asarray(stroke_um))
 
-    precision = jnp.asarray(1.0)
     ends = []
     for number, one in enumerate(keys):
         progress(f"{family}: start {number + 1} of {starts}")
-        ends.append(_solve(problem, coordinates.of(draw(one)), precision))
-    costs = jnp.stack([end[2] for end in ends])
-    best = int(jnp.nanargmin(costs)) if bool(jnp.any(jnp.isfinite(costs))) else 0
-    agreeing = int(jnp.sum(costs < costs[best] + _AGREE))
-    z, result, _, gradient = ends[best]
-    factor = jnp.zeros((grid.columns, 0))
+        ends.append(_solve(problem, coordinates.of(draw(one))))
+    costs = np.asarray([float(end[1]) for end in ends])
+    if not np.isfinite(costs).any():
+        raise FitError(FitStatus.NONFINITE)
+    best = int(np.nanargmin(costs))
+    agreeing = int(np.sum(costs < costs[best] + _AGREE))
+
+    z, count = ends[best][0], float(moments.count)
+    precision, determined = 1.0, 0.0
     for number in range(_ROUNDS):
         progress(f"{family}: weighing the prior, round {number + 1} of {_ROUNDS}")
-        factor, precision = _laplace(problem, z, precision)
-        z, result, _, gradient = _solve(problem, z, precision)
-    factor, _ = _laplace(problem, z, precision)
-    return ShapeSolution(coordinates(z), factor, result, agreeing, starts, float(gradient))
+        model = coordinates(z)
+        off = [(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
+        off = [o - o.mean() for o in off]
+        variance = sum(float(np.sum(o**2)) for o in off) / stroke_um**2 / max(count - determined, 1)
+        correlation = correlation_samples(off)
+        problem = eqx.tree_at(
+            lambda p: (p.scale, p.precision),
+            problem,
+            (jnp.asarray((variance * correlation) ** -0.5), jnp.asarray(precision)),
+        )
+        z, _ = _solve(problem, z)
+        factor, known, distance = _laplace(problem, z)
+        determined = float(known)
+        precision = max(determined, 1e-3) / float(jnp.sum(z**2))
+    if not float(distance) < _STATIONARY:
+        raise FitError(FitStatus.NOT_STATIONARY)
+    shared = sum(shared_square(o) * len(o) for o in off) / sum(len(o) for o in off)
+    estimate = Estimate(
+        model=coordinates(z),
+        factor_um=factor,
+        noise_um=variance**0.5 * stroke_um,
+        correlation=correlation,
+        discrepancy_um=max(0.0, shared) ** 0.5,
+    )
+    return estimate, agreeing
 
 
 @eqx.filter_jit
-def _square_root(moments: Moments, variance: Float[Array, ""]) -> tuple[Float[Array, "D D"], Float[Array, " D"]]:
-    """Factor the moments: `root' root` is the Gram matrix over the variance, `root' target` the cross products."""
-    value, vector = jnp.linalg.eigh(moments.gram / variance)
+def _square_root(moments: Moments) -> tuple[Float[Array, "D D"], Float[Array, " D"]]:
+    """Factor the moments: `root' root` is the Gram matrix, `root' target` the cross products."""
+    value, vector = jnp.linalg.eigh(moments.gram)
     kept = value > _DUST * value[-1]
     scale = jnp.sqrt(jnp.where(kept, value, 0))
-    seen = vector.T @ moments.cross_um / variance
+    seen = vector.T @ moments.cross_um
     return scale[:, None] * vector.T, jnp.where(kept, seen / jnp.where(kept, scale, 1), 0)

@@ -1,0 +1,184 @@
+"""The `microid` command: what can be asked of it.
+
+Only the standard library and click are imported here; the work and its heavy imports are in `_cli_work` and `_cli_synth`.
+"""
+
+import functools
+import sys
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+from fits._errors import DataError
+
+_Command = TypeVar("_Command", bound=Callable[..., None])
+
+
+def _in_sentences(command: _Command) -> _Command:
+    """Turn bad input and interruption into one line on stderr and an exit status."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except KeyboardInterrupt:
+            click.echo("Interrupted: nothing was written.", err=True)
+            sys.exit(130)
+        except DataError as error:
+            click.echo(" ".join(str(error).split()), err=True)
+            sys.exit(2)
+
+    return run  # type: ignore[return-value]
+
+
+def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        from fits._version import written_by
+
+        click.echo(written_by())
+        context.exit()
+
+
+def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        from fits._cli_synth import scenario_lines
+
+        click.echo("\n".join(scenario_lines()))
+        context.exit()
+
+
+_columns = click.option(
+    "--columns",
+    metavar="NAME=SOURCE,...",
+    default="",
+    help="Which columns to read, such as voltage_V=u1_V,displacement_um=-height[nm].",
+)
+_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+_quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=_show_version,
+    help="Show the version and exit.",
+)
+def cli() -> None:
+    """Identify a piezo-driven micro-positioner from CSV files of voltage and displacement.
+
+    Bad input ends with status 2 and one sentence on stderr. Compiled functions are kept in the user's cache folder;
+    MICROID_CACHE names another, and MICROID_CACHE=off keeps none.
+    """
+
+
+@cli.command()
+@click.argument("runs", metavar="RUN.csv [MORE.csv ...]", nargs=-1, required=True)
+@click.option("--out", required=True, metavar="MODEL.json", help="Model file to write.")
+@click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
+@click.option(
+    "--family", default="grid", show_default=True, metavar="NAME", help="Density: grid, mixture or network."
+)
+@click.option("--levels", type=int, help="Number of switching voltages; found from the data by default.")
+@click.option(
+    "--holdout",
+    multiple=True,
+    metavar="FRACTION|FILE",
+    help="Fraction at the end of every run that is only predicted (default 0.2), or a CSV that is; give it again for "
+    "more files.",
+)
+@_columns
+@click.option(
+    "--initial",
+    type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
+    default="unknown",
+    show_default=True,
+    help="Memory before each run.",
+)
+@click.option(
+    "--starts",
+    type=click.IntRange(min=1),
+    default=8,
+    show_default=True,
+    help="Starts for families whose fit is not convex.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the starts.")
+@_json
+@_quiet
+@_in_sentences
+def fit(**options: Any) -> None:
+    """Fit Preisach weights to measured loops.
+
+    The files are runs of one rig, with the columns time_s, voltage_V and displacement_um.
+    """
+    from fits._cli_work import run_fit
+
+    run_fit(**options)
+
+
+@cli.command()
+@click.argument("model", metavar="MODEL.json")
+@click.argument("program", metavar="PROGRAM.csv")
+@click.option("--out", required=True, metavar="PREDICTION.csv", help="CSV to write; .gz is compressed.")
+@click.option(
+    "--initial",
+    type=click.Choice(["negative", "positive", "demagnetised"]),
+    default="negative",
+    show_default=True,
+    help="Memory before the program.",
+)
+@_columns
+@_json
+@_in_sentences
+def simulate(**options: Any) -> None:
+    """Predict the displacement of a voltage program, with its standard deviation.
+
+    PROGRAM.csv needs the columns time_s and voltage_V. The prediction has time_s, voltage_V, displacement_um and
+    displacement_sd_um; sensor noise is not in the last.
+    """
+    from fits._cli_work import run_simulate
+
+    run_simulate(**options)
+
+
+@cli.command()
+@click.argument("scenario")
+@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed; the scenario's own by default.")
+@click.option(
+    "--list",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=_list_scenarios,
+    help="List the scenarios and exit.",
+)
+@_json
+@_in_sentences
+def synth(**options: Any) -> None:
+    """Write example CSVs from a virtual test bench.
+
+    SCENARIO is one of those that --list shows, or a .toml file.
+    """
+    from fits._cli_synth import run_synth
+
+    run_synth(**options)
+
+
+@cli.command()
+@click.argument("model", metavar="MODEL.json")
+@_json
+@_in_sentences
+def info(**options: Any) -> None:
+    """Say what a model file holds."""
+    from fits._cli_work import run_info
+
+    run_info(**options)
+
+
+def main() -> None:
+    """Run the command."""
+    cli(prog_name="microid")
