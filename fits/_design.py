@@ -50,12 +50,17 @@ class Grid(eqx.Module):
         return zeros.at[np.tril_indices(self.levels)].set(packed)
 
     @eqx.filter_jit
-    def model(self, columns_um: Float[Array, " D"], offset_um: Float[Array, ""]) -> Preisach:
+    def model(
+        self, columns_um: Float[Array | np.ndarray, " D"], offset_um: Float[Array | np.ndarray, ""]
+    ) -> Preisach:
         """Turn a solution, in um, into a model."""
-        weights, slopes = columns_um[: self.weights], columns_um[self.weights :]
+        columns = jnp.asarray(columns_um)
+        weights, slopes = columns[: self.weights], columns[self.weights :]
         packed = weights * node_areas(self.levels)[np.tril_indices(self.levels)]
         density = GridDensity(packed, self.lower_V, self.upper_V)
-        return Preisach(density, Reversible(slopes / self.range_V, self.lower_V, self.upper_V), offset_um)
+        return Preisach(
+            density, Reversible(slopes / self.range_V, self.lower_V, self.upper_V), jnp.asarray(offset_um)
+        )
 
 
 @eqx.filter_jit

@@ -226,6 +226,9 @@ def _decode_network(item: dict[str, Any], where: str, spec: ParameterSpec | None
         for key in ("weight", "bias")
     ]
 
+    if not all(isinstance(array, jax.Array) and array.ndim for array in arrays):
+        raise DataError(f"{where}: expected arrays in the layers of the network")
+
     def empty() -> eqx.nn.MLP:
         return eqx.nn.MLP(
             item["in_size"],
@@ -243,7 +246,7 @@ def _decode_network(item: dict[str, Any], where: str, spec: ParameterSpec | None
         skeleton = eqx.filter_eval_shape(empty)
     except (TypeError, ValueError, IndexError) as error:
         raise DataError(f"{where}: the sizes of the network make no sense") from error
-    if [slot.shape for slot in slots(skeleton)] != [getattr(array, "shape", None) for array in arrays]:
+    if [slot.shape for slot in slots(skeleton)] != [array.shape for array in arrays]:
         raise DataError(f"{where}: the layers do not fit together")
     network: eqx.nn.MLP = eqx.tree_at(slots, skeleton, arrays)
     return network

@@ -54,7 +54,7 @@ def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array,
     prior_volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(prior))))
     weights = jnp.stack([hyper.log_density, hyper.log_along, hyper.log_reversible])
     unlikely = jnp.sum(((weights - _MIDDLE) / _WIDTH) ** 2)
-    return (moments.count * hyper.log_variance + misfit + volume - prior_volume + unlikely) / 2
+    return jnp.asarray(moments.count * hyper.log_variance + misfit + volume - prior_volume + unlikely) / 2
 
 
 @eqx.filter_jit
@@ -81,7 +81,7 @@ def posterior(moments: Moments, rough: Roughness, hyper: Hyper) -> Posterior:
     """Condition the prior on the data."""
     prior = rough.precision(hyper)
     variance = jnp.exp(hyper.log_variance)
-    precision = moments.gram / variance + prior
+    precision = jnp.asarray(moments.gram / variance + prior)
     root = jnp.linalg.cholesky(precision)
     mean = jax.scipy.linalg.cho_solve((root, True), moments.cross_um / variance)
     held = jax.scipy.linalg.solve_triangular(root, jnp.linalg.cholesky(prior), lower=True)

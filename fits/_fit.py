@@ -126,10 +126,10 @@ def fit(
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
             tried = trial(_SHAPE_LEVELS, tried.solution.hyper)
         smooth, key = tried.solution.hyper, jax.random.key(seed)
-        found, agreeing = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
-        if agreeing == 1 and starts > 1:
+        found, agree = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
+        if not agree:
             remarks.append(
-                f"only one of {starts} starts reached the best fit, so there may be a better one: raise --starts"
+                f"the best two of {starts} starts ended at different fits; there may be a better one: raise --starts"
             )
     if found.correlation > _WHITE:
         remarks.append(

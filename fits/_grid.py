@@ -77,7 +77,8 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
         hyper = renew_noise(moments, hyper, belief)
         belief = posterior(moments, rough, hyper)
     if np.all(np.asarray(belief.mean) >= 0):
-        return GridSolution(belief.mean, belief, hyper, RESULTS.successful)
+        done: Any = RESULTS.successful
+        return GridSolution(belief.mean, belief, hyper, done)
     columns, result = _constrained(belief)
     return GridSolution(columns, belief, hyper, result)
 
@@ -88,7 +89,7 @@ def _constrained(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     scale = jnp.sqrt(jnp.diagonal(belief.precision))
     scaled = belief.precision / (scale[:, None] * scale[None, :])
     mean = belief.mean * scale
-    solver: Any = BlockPivoting(atol=_ATOL)
+    solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
     solution: Any = optx.minimise(
         _distance,
         solver,
@@ -117,7 +118,7 @@ def grid_estimate(
     else:
         basis = interpolation(_BELIEF_LEVELS, levels)
         moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
-        factor = basis @ posterior(moments, roughness(levels).project(basis), solution.hyper).factor()
+        factor = jnp.asarray(basis) @ posterior(moments, roughness(levels).project(basis), solution.hyper).factor()
     return Estimate(
         model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
         factor_um=jnp.asarray(factor) * stroke_um,

@@ -1,5 +1,7 @@
 """What a rig must have been through before its record began."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,18 +33,18 @@ def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Arr
 
 def _residual(
     z: Float[Array, "2 pairs_1"], args: tuple[Preisach, Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
-) -> tuple[Float[Array, " n"], Float[Array, "2 pairs_1"]]:
+) -> Float[Array, " m"]:
     model, voltage_V, displacement_um, weight = args
     start = _staircase(z, model, voltage_V[0])
     # A faint pull towards an even decay decides what the samples leave open.
-    return weight * (model(voltage_V, start) - displacement_um), 1e-2 * z
+    return jnp.concatenate([weight * (model(voltage_V, start) - displacement_um), 1e-2 * z.ravel()])
 
 
 @eqx.filter_jit
 def _solve(args: tuple[Preisach, Array, Array, Array]) -> Staircase:
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
     start = jnp.zeros((2, _PAIRS + 1))
-    solution = optx.least_squares(_residual, solver, start, args=args, max_steps=100, throw=False)
+    solution: Any = optx.least_squares(_residual, solver, start, args=args, max_steps=100, throw=False)
     return _staircase(solution.value, args[0], args[1][0])
 
 

@@ -23,10 +23,10 @@ of its input and output, the name of its activation, and layers with `weight`, s
 
 Without microid, the weights of Eq. 9 of a grid and the perturbations are read by
 
-    import base64, json
+    import base64, json, pathlib
     import numpy as np
 
-    content = json.load(open("model.json", encoding="utf-8"))
+    content = json.loads(pathlib.Path("model.json").read_text(encoding="utf-8"))
     packed_um = np.array(content["model"]["density"]["packed_um"]["value"])
     n = (round((8 * len(packed_um) + 1) ** 0.5) - 1) // 2
     weights_um = np.zeros((n, n))
@@ -152,7 +152,7 @@ def load_model(path: str | os.PathLike[str]) -> ModelFile:
     RuntimeError
         If JAX computes in single precision.
     """
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('model files hold float64: jax.config.update("jax_enable_x64", True)')
     shown = os.fspath(path)
     content = _read(shown)

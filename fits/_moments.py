@@ -63,7 +63,7 @@ class Moments(eqx.Module):
             self.count * count,
         )
 
-    def project(self, basis: Float[Array, "D d"]) -> "Moments":
+    def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Moments":
         """Keep only combinations of columns."""
         return Moments(basis.T @ self.gram @ basis, basis.T @ self.cross_um, self.energy_um2, self.count)
 
@@ -186,4 +186,4 @@ def _centre(sums: Moments) -> tuple[Moments, RunMean]:
         sums.energy_um2 - count * displacement**2,
         sums.count,
     )
-    return centred, RunMean(response, float(displacement), float(sums.count))
+    return centred, RunMean(np.asarray(response), float(displacement), float(sums.count))

@@ -37,13 +37,15 @@ class BlockPivoting(optx.AbstractMinimiser[Float[Array, " D"], Any, _State]):
 
     Attributes
     ----------
+    rtol, norm
+        Part of every optimistix solver; not used.
     atol
         Largest violation of the optimality conditions, in the units of the variables and of the gradient.
     """
 
+    rtol: float
     atol: float
-    rtol: float = 0.0
-    norm: Callable[[PyTree], Scalar] = optx.max_norm
+    norm: Callable[[PyTree], Scalar]
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:  # type: ignore[no-untyped-def]
         """Take the Hessian at the start, and the gradient at zero."""

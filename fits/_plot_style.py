@@ -1,5 +1,6 @@
 """The look of all pictures, set on the figures themselves: Matplotlib's own settings stay as the user has them."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 
 from fits._atomic import atomic_path
@@ -14,26 +16,36 @@ from fits._atomic import atomic_path
 # One and two columns of a journal, 90 mm and 180 mm.
 NARROW_in, WIDE_in = 3.54, 7.09
 DARK, LIGHT = "0.1", "0.75"
-MEASURED: dict[str, Any] = {"color": "0.65", "linewidth": 1.6}
-MODEL: dict[str, Any] = {"color": "0.0", "linewidth": 0.7, "linestyle": (0, (4, 1.5))}
+MEASURED: dict[str, Any] = {"color": "0.65", "linewidth": 1.5}
+MODEL: dict[str, Any] = {"color": "0.0", "linewidth": 0.5}
 _FONT_pt = 8
 _DPI = 200
 # More points than this do not show at this size.
 _POINTS = 6000
 
 
-def figure(width_in: float, height_in: float) -> Figure:
-    """Make an empty figure with a canvas of its own."""
-    made = Figure(figsize=(width_in, height_in), layout="constrained")
+def figure(width_in: float, height_in: float, gap: float = 0.02) -> Figure:
+    """Make an empty figure with a canvas of its own, and a gap between columns as a fraction of their width."""
+    made = Figure(figsize=(width_in, height_in), layout=ConstrainedLayoutEngine(wspace=gap, compress=True))
     FigureCanvasAgg(made)
     return made
 
 
-def label(axes: Axes, x: str, y: str) -> None:
-    """Name the axes; the frame is open at the top and right."""
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
+def label(axes: Axes, x: str = "", y: str = "") -> None:
+    """Name the axes, where there is a name; the frame is open at the top and right."""
+    axes.set_xlabel(x or axes.get_xlabel())
+    axes.set_ylabel(y or axes.get_ylabel())
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def legend(picture: Figure, axes: Iterable[Axes]) -> None:
+    """Explain the curves of some axes in one line above the picture."""
+    curves, names = [], []
+    for each in axes:
+        found = each.get_legend_handles_labels()
+        curves += found[0]
+        names += found[1]
+    picture.legend(curves, names, loc="outside upper center", ncols=len(names), frameon=False, handlelength=1.8)
 
 
 def thinned(values: np.ndarray) -> np.ndarray:
@@ -63,9 +75,6 @@ def save(picture: Figure, path: Path) -> Path:
         axes.tick_params(labelsize=_FONT_pt, width=0.6, length=2.5)
         for spine in axes.spines.values():
             spine.set_linewidth(0.6)
-        legend = axes.get_legend()
-        if legend is not None:
-            legend.set_frame_on(False)
     for text in picture.findobj(Text):
         text.set_fontsize(min(_FONT_pt, text.get_fontsize()))
     with atomic_path(path) as unfinished:

@@ -8,20 +8,24 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fits._plot_style import DARK, LIGHT, MEASURED, MODEL, NARROW_in, WIDE_in, figure, label, save, thinned
+from fits._metrics import Errors
+from fits._plot_style import DARK, LIGHT, MEASURED, MODEL, NARROW_in, WIDE_in, figure, label, legend, save, thinned
 from fits._record import Record
 from fits._result import FitResult, RunReport
-from fits._run import Run, prepare_run, simulate_run
+from fits._run import Run, prepare_run, simulate_run, split
 from fits._uncertainty import sd_run
+from microid import Preisach, Reversible, Staircase, remember
 
 # Half-width of a 95 % interval in standard deviations.
 _TWO_SIDED_95 = 1.959964
 # Runs side by side in one picture.
 _MOST_RUNS = 3
 _MESH = 361
+_ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
 
 
 @dataclass(frozen=True)
@@ -31,10 +35,6 @@ class _Drawn:
     run: Run
     report: RunReport
     predicted_um: np.ndarray
-
-    @property
-    def error_um(self) -> np.ndarray:
-        return self.run.displacement_um - self.predicted_um
 
 
 def plot_fit(
@@ -81,10 +81,11 @@ def plot_fit(
         runs.append(replace(run, fitted=np.zeros_like(run.known)))
     drawn = [_simulated(result, run, report) for run, report in zip(runs, result.runs, strict=True)]
 
+    voltage, (density, everett) = _over_half_plane(result.model)
     pictures = {
         "loops": _loops(drawn[: len(records)]),
-        "density": _density(result),
-        "everett": _everett(result),
+        "density": _density(voltage, density, result.model.reversible),
+        "everett": _everett(voltage, everett),
     }
     held_out = [each for each in drawn if each.run.held_out.any()]
     if held_out:
@@ -93,87 +94,100 @@ def plot_fit(
 
 
 def _simulated(result: FitResult, run: Run, report: RunReport) -> _Drawn:
-    density = result.model.density
     model = eqx.tree_at(lambda m: m.offset_um, result.model, jnp.asarray(report.offset_um))
     predicted = simulate_run(model, run)
     if not run.known.all():
-        started = run.with_start(report.start, float(density.lower_V), float(density.upper_V))
         # The reported errors are those of the known samples; the start was estimated from the others.
-        predicted = np.where(run.known, predicted, simulate_run(model, started))
+        predicted = np.where(run.known, predicted, simulate_run(model, _started(run, report.start)))
     return _Drawn(run, report, predicted)
 
 
-def _columns(runs: Sequence[_Drawn]) -> tuple[Figure, np.ndarray]:
+def _started(run: Run, start: Staircase) -> Run:
+    """Let a run begin with another memory."""
+    size = run.starts[0].extremes_V.shape[0]
+    starts = [Staircase(jnp.pad(start.extremes_V, (0, size - start.extremes_V.shape[0]), mode="edge"), start.count)]
+    for piece in split(run.record.voltage_V)[:-1]:
+        starts.append(_end(jnp.asarray(piece), starts[-1]))
+    return replace(run, starts=tuple(starts))
+
+
+@eqx.filter_jit
+def _end(voltage_V: Float[Array, " n"], start: Staircase) -> Staircase:
+    return remember(voltage_V, start).end()
+
+
+def _columns(runs: Sequence[_Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
     """Two rows of axes, values above errors, with a column for each of the first runs."""
     shown = min(len(runs), _MOST_RUNS)
-    picture = figure(NARROW_in if shown == 1 else WIDE_in, 3.4)
+    picture = figure(width_in if shown == 1 else WIDE_in, 3.6)
     axes = picture.subplots(2, shown, squeeze=False, sharex="col", height_ratios=(2.2, 1))
-    for number, each in enumerate(runs[:shown]):
-        title = each.report.source if number < shown - 1 or len(runs) == shown else f"{each.report.source} (and more)"
-        axes[0, number].set_title(title)
+    label(axes[0, 0], "", "displacement (µm)")
+    label(axes[1, 0], "", "error (µm)")
     return picture, axes
 
 
+def _caption(axes: Axes, report: RunReport, errors: Errors | None) -> None:
+    figures = "" if errors is None else f"\ne_rms {errors.e_rms_pct:.3g} %, e_max {errors.e_max_pct:.3g} %"
+    axes.set_title(report.source + figures, loc="left", fontsize=7)
+
+
 def _loops(runs: Sequence[_Drawn]) -> Figure:
-    picture, axes = _columns(runs)
-    for number, each in enumerate(runs[:_MOST_RUNS]):
-        loop, error = axes[0, number], axes[1, number]
-        voltage = each.run.record.voltage_V
-        keep = thinned(each.run.displacement_um)
-        loop.plot(voltage[keep], each.run.displacement_um[keep], label="measured", **MEASURED)
-        loop.plot(voltage[keep], each.predicted_um[keep], label="fitted", **MODEL)
-        loop.legend(loc="upper left")
-        keep = thinned(each.error_um)
+    picture, axes = _columns(runs, NARROW_in)
+    for each, (loop, error) in zip(runs, axes.T, strict=False):
+        voltage, measured = each.run.record.voltage_V, each.run.displacement_um
+        keep = thinned(measured)
+        # Nested loops lie close together, so the lines are thinner than elsewhere.
+        loop.plot(voltage[keep], measured[keep], label="measured", **MEASURED | {"linewidth": 1.1})
+        loop.plot(voltage[keep], each.predicted_um[keep], label="fitted", **MODEL | {"linewidth": 0.3})
+        off = (measured - each.predicted_um)[each.run.known]
+        keep = thinned(off)
         error.axhline(0.0, color=LIGHT, linewidth=0.6)
-        error.plot(voltage[keep], each.error_um[keep], color=DARK, linewidth=0.4)
-        label(error, "voltage (V)", "error (µm)" if number == 0 else "")
-        label(loop, "", "displacement (µm)" if number == 0 else "")
-        _caption(error, each.report, held_out=False)
+        error.plot(voltage[each.run.known][keep], off[keep], color=DARK, linewidth=0.25)
+        label(error, "voltage (V)")
+        label(loop)
+        _caption(error, each.report, each.report.in_sample)
+    legend(picture, axes[:1, 0])
     return picture
 
 
 def _heldout(result: FitResult, runs: Sequence[_Drawn]) -> Figure:
-    picture, axes = _columns(runs)
-    for number, each in enumerate(runs[:_MOST_RUNS]):
-        above, below = axes[0, number], axes[1, number]
+    picture, axes = _columns(runs, WIDE_in)
+    for each, (above, below) in zip(runs, axes.T, strict=False):
         samples = each.run.held_out
-        time, measured, predicted = each.run.record.time_s, each.run.displacement_um, each.predicted_um
-        time, measured, predicted = time[samples], measured[samples], predicted[samples]
+        time_s, measured = each.run.record.time_s[samples], each.run.displacement_um[samples]
+        predicted = each.predicted_um[samples]
         half = _TWO_SIDED_95 * sd_run(result.uncertainty, each.run)[samples]
-        wide = np.hypot(half, _TWO_SIDED_95 * result.noise_um)
+        noisy = np.hypot(half, _TWO_SIDED_95 * result.noise_um)
         keep = thinned(measured)
-        band = {"color": LIGHT, "linewidth": 0, "label": "95 % band"}
-        above.fill_between(time[keep], (predicted - half)[keep], (predicted + half)[keep], **band)
-        above.plot(time[keep], measured[keep], label="measured", **MEASURED)
-        above.plot(time[keep], predicted[keep], label="predicted", **MODEL)
-        above.margins(y=0.25)
-        above.legend(loc="upper center", ncols=3)
+        above.plot(time_s[keep], measured[keep], label="measured", **MEASURED)
+        above.plot(time_s[keep], predicted[keep], label="predicted", **MODEL)
+        low, high = (predicted - half)[keep], (predicted + half)[keep]
+        above.fill_between(time_s[keep], low, high, color="0.3", linewidth=0, zorder=1)
         keep = thinned(measured - predicted)
-        below.plot(time[keep], (measured - predicted)[keep], color="0.55", linewidth=0.4, label="error")
-        for curve, style, name in ((half, "-", "95 %"), (wide, ":", "with noise")):
-            below.plot(time[keep], curve[keep], color=DARK, linestyle=style, linewidth=0.8, label=name)
-            below.plot(time[keep], -curve[keep], color=DARK, linestyle=style, linewidth=0.8)
-        below.margins(y=0.3)
-        label(below, "time (s)", "error (µm)" if number == 0 else "")
-        label(above, "", "displacement (µm)" if number == 0 else "")
-        _caption(below, each.report, held_out=True)
+        below.plot(time_s[keep], (measured - predicted)[keep], color="0.6", linewidth=0.35, label="error")
+        for curve, style, name in ((half, "-", "95 % band"), (noisy, ":", "95 % band with noise")):
+            below.plot(time_s[keep], curve[keep], color=DARK, linestyle=style, linewidth=0.9, label=name)
+            below.plot(time_s[keep], -curve[keep], color=DARK, linestyle=style, linewidth=0.9)
+        label(below, "time (s)")
+        label(above)
+        _caption(below, each.report, each.report.held_out)
+    legend(picture, axes[:, 0])
     return picture
 
 
-def _caption(axes: Axes, report: RunReport, held_out: bool) -> None:
-    errors = report.held_out if held_out else report.in_sample
-    if errors is not None:
-        name = "held-out" if held_out else "in-sample"
-        text = f"{name} e_rms {errors.e_rms_pct:.3g} %, e_max {errors.e_max_pct:.3g} %"
-        axes.set_title(text, loc="left", fontsize=7)
+@eqx.filter_jit
+def _surfaces(
+    model: Preisach, alpha_V: Float[Array, "m m"], beta_V: Float[Array, "m m"]
+) -> tuple[Float[Array, "m m"], Float[Array, "m m"]]:
+    return model.density(alpha_V, beta_V), model.everett(alpha_V, beta_V)
 
 
-def _mesh(result: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Voltages, and the pairs `(alpha, beta)` of all of them; beta along the last axis."""
-    density = result.model.density
-    voltage = np.linspace(float(density.lower_V), float(density.upper_V), _MESH)
+def _over_half_plane(model: Preisach) -> tuple[np.ndarray, list[np.ma.MaskedArray]]:
+    """Evaluate the density and the Everett surface on a mesh of voltages; beta runs along the last axis."""
+    voltage = np.linspace(float(model.density.lower_V), float(model.density.upper_V), _MESH)
     alpha, beta = np.meshgrid(voltage, voltage, indexing="ij")
-    return voltage, alpha, beta
+    surfaces = _surfaces(model, jnp.asarray(alpha), jnp.asarray(beta))
+    return voltage, [np.ma.masked_where(alpha < beta, np.asarray(surface)) for surface in surfaces]
 
 
 def _half_plane(axes: Axes, voltage: np.ndarray) -> None:
@@ -181,35 +195,27 @@ def _half_plane(axes: Axes, voltage: np.ndarray) -> None:
     axes.set_aspect("equal")
 
 
-def _density(result: FitResult) -> Figure:
-    density, reversible = result.model.density, result.model.reversible
-    voltage, alpha, beta = _mesh(result)
-    values = np.ma.masked_where(alpha < beta, np.asarray(density(jnp.asarray(alpha), jnp.asarray(beta))))
-    picture = figure(WIDE_in, 2.9)
+def _density(voltage: np.ndarray, values: np.ma.MaskedArray, reversible: Reversible) -> Figure:
+    picture = figure(WIDE_in, 2.9, gap=0.08)
     plane, curve = picture.subplots(1, 2, width_ratios=(1.25, 1))
-    # The darkest hundredth would otherwise leave the rest white: densities peak at the diagonal.
-    top = float(np.quantile(values.compressed(), 0.99)) or None
+    # One sharp peak at the diagonal would otherwise leave the rest white.
+    top = float(np.quantile(values.compressed(), 0.995)) or None
     mesh = plane.pcolormesh(voltage, voltage, values, cmap="Greys", vmin=0, vmax=top, rasterized=True)
     _half_plane(plane, voltage)
-    label(plane, "switching down, β (V)", "switching up, α (V)")
-    bar = picture.colorbar(mesh, ax=plane, extend="max")
-    bar.set_label("density (µm/V²)")
+    label(plane, "switching down at β (V)", f"switching up at {_ALPHA} (V)")
+    picture.colorbar(mesh, ax=plane, extend="max").set_label("density (µm/V²)")
     curve.plot(np.linspace(voltage[0], voltage[-1], reversible.levels), reversible.slope_um_per_V, color=DARK)
     curve.set_ylim(bottom=0)
     label(curve, "voltage (V)", "reversible slope (µm/V)")
     return picture
 
 
-def _everett(result: FitResult) -> Figure:
-    voltage, alpha, beta = _mesh(result)
-    values = np.asarray(result.everett(jnp.asarray(alpha), jnp.asarray(beta)))
+def _everett(voltage: np.ndarray, values: np.ma.MaskedArray) -> Figure:
     picture = figure(NARROW_in, 2.9)
     axes = picture.subplots()
-    masked = np.ma.masked_where(alpha < beta, values)
-    filled = axes.contourf(voltage, voltage, masked, levels=12, cmap="Greys")
-    axes.contour(voltage, voltage, masked, levels=filled.levels, colors=DARK, linewidths=0.4)
+    filled = axes.contourf(voltage, voltage, values, levels=12, cmap="Greys")
+    axes.contour(voltage, voltage, values, levels=filled.levels, colors=DARK, linewidths=0.4)
     _half_plane(axes, voltage)
-    label(axes, "fall to (V)", "fall from (V)")
-    bar = picture.colorbar(filled, ax=axes)
-    bar.set_label("Everett surface (µm)")
+    label(axes, "fall to β (V)", f"fall from {_ALPHA} (V)")
+    picture.colorbar(filled, ax=axes).set_label("Everett surface (µm)")
     return picture

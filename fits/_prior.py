@@ -67,9 +67,9 @@ class Roughness(eqx.Module):
         floor = 1 / _WIDE**2 + _ROUNDING * jnp.max(jnp.diagonal(curvature))
         return curvature + floor * jnp.eye(curvature.shape[0])
 
-    def project(self, basis: Float[Array, "D d"]) -> "Roughness":
+    def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Roughness":
         """Keep only combinations of columns."""
-        return Roughness(*(basis.T @ form @ basis for form in (self.density, self.along, self.reversible)))
+        return Roughness(*(jnp.asarray(basis.T @ f @ basis) for f in (self.density, self.along, self.reversible)))
 
 
 def roughness(levels: int) -> Roughness:

@@ -54,5 +54,5 @@ class NetworkDensity(AbstractDensity):
         key: PRNGKeyArray,
     ) -> Self:
         """Draw the weights at random."""
-        network = eqx.nn.MLP(2, "scalar", width_size=12, depth=2, activation=jnp.tanh, key=key)
+        network = eqx.nn.MLP(2, "scalar", width_size=8, depth=2, activation=jnp.tanh, key=key)
         return cls(network, stroke_um, lower_V, upper_V, levels)
