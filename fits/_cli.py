@@ -1,6 +1,7 @@
 """The `microid` command: what can be asked of it.
 
-Only the standard library and click are imported here; the work and its heavy imports are in `_cli_work` and `_cli_synth`.
+Only the standard library and click are imported here; the work, and what it imports, is in `_cli_work` and
+`_cli_synth`.
 """
 
 import functools
@@ -23,7 +24,7 @@ def _in_sentences(command: _Command) -> _Command:
         try:
             command(*args, **kwargs)
         except KeyboardInterrupt:
-            click.echo("Interrupted: nothing was written.", err=True)
+            click.echo("Interrupted: no unfinished file was left.", err=True)
             sys.exit(130)
         except DataError as error:
             click.echo(" ".join(str(error).split()), err=True)

@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import click
+import numpy as np
 
 from fits._atomic import atomic_path, write_csv
 from fits._cli_jax import start_jax
@@ -99,7 +100,7 @@ def run_simulate(*, model: str, program: str, out: str, initial: str, columns: s
         "samples": len(record),
         "displacement_min_um": float(prediction.displacement_um.min()),
         "displacement_max_um": float(prediction.displacement_um.max()),
-        "displacement_sd_median_um": float(sorted(prediction.displacement_sd_um)[len(record) // 2]),
+        "displacement_sd_median_um": float(np.median(prediction.displacement_sd_um)),
         "remarks": list(record.warnings),
     }
     if as_json:

@@ -1,0 +1,24 @@
+"""Running the `microid` command in tests."""
+
+from click.testing import CliRunner
+
+from fits._cli import cli
+
+OFF = {"MICROID_CACHE": "off"}
+
+
+def run(*arguments):
+    return CliRunner(env=OFF).invoke(cli, [str(argument) for argument in arguments])
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def refused(result, *words):
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    lines = [line for line in result.stderr.splitlines() if " s  " not in line[:12]]  # but for the progress
+    assert len(lines) == 1
+    for word in words:
+        assert word in lines[0]

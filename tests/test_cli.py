@@ -1,0 +1,253 @@
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from _command import OFF, files, refused, run
+
+import fits._cli_work
+from fits._cli import cli
+from fits._cli_jax import _cache_folder
+from fits._run import INITIAL_STATES
+from microid import FAMILIES
+
+ROOT = Path(__file__).parents[1]
+
+
+def shell(*arguments, **options):
+    env = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"} | OFF | options.pop("env", {})
+    command = [sys.executable, "-m", "fits", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env, **options)
+
+
+def read(path):
+    header, *rows = path.read_text().splitlines()
+    return dict(zip(header.split(","), np.array([row.split(",") for row in rows], dtype=float).T, strict=True))
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A folder with example CSVs, and what `synth` and `fit` said about them."""
+    folder = tmp_path_factory.mktemp("bench")
+    synth = run("synth", "quickstart", "--out", folder / "csv", "--seed", 5)
+    train, heldout = folder / "csv" / "train.csv", folder / "csv" / "heldout.csv"
+    out, plots = folder / "model.json", folder / "new" / "plots"
+    fit = run("fit", train, "--holdout", heldout, "--levels", 8, "--out", out, "--plots", plots)
+    return folder, synth, fit
+
+
+def test_synth_writes_records_and_truth(bench):
+    folder, synth, _ = bench
+    assert synth.exit_code == 0
+    assert files(folder / "csv") == ["heldout.csv", "train.csv", "truth.json"]
+    for line in synth.stdout.splitlines()[1:]:
+        assert Path(line).exists()
+
+
+def test_fit_reports_in_words_and_writes_model_and_plots(bench):
+    folder, _, fit = bench
+    assert fit.exit_code == 0, fit.stderr
+    for words in ("8 levels from 0 to 120 V", "in-sample", "held-out", "e_loop", "model.json", "heldout.png"):
+        assert words in fit.stdout
+    assert "8 levels" in fit.stderr
+    assert "Traceback" not in fit.stderr
+    assert files(folder / "new") == ["plots", *(f"plots/{n}.png" for n in ("density", "everett", "heldout", "loops"))]
+    assert sorted(path.name for path in folder.iterdir()) == ["csv", "model.json", "new"]
+
+
+def test_prediction_agrees_with_the_truth_of_the_bench(bench, tmp_path):
+    folder, _, _ = bench
+    program = folder / "csv" / "heldout.csv"
+    result = run("simulate", folder / "model.json", program, "--out", tmp_path / "p.csv", "--json")
+    assert result.exit_code == 0, result.stderr
+    predicted, measured = read(tmp_path / "p.csv"), read(program)
+    assert list(predicted) == ["time_s", "voltage_V", "displacement_um", "displacement_sd_um"]
+    for column in ("time_s", "voltage_V"):
+        assert np.array_equal(predicted[column], measured[column])
+    truth = json.loads((folder / "csv" / "truth.json").read_text())["runs"]["heldout"]["displacement_um"]
+    assert np.std(predicted["displacement_um"] - truth) < 0.05  # the sensor's noise is 0.03 um, the stroke 40 um
+    assert np.all(predicted["displacement_sd_um"] > 0)
+    summary = json.loads(result.stdout)
+    assert summary["samples"] == len(measured["time_s"])
+    assert summary["displacement_max_um"] == predicted["displacement_um"].max()
+
+
+def test_programs_need_no_displacement_and_initial_states_differ(bench, tmp_path):
+    folder, _, _ = bench
+    program = tmp_path / "program.csv"
+    program.write_text("t_ms,u_mV\n0,40000\n1,50000\n2,40000\n")
+    found = {}
+    for state in ("negative", "positive", "demagnetised"):
+        out = tmp_path / f"{state}.csv"
+        columns = "time_s=t_ms,voltage_V=u_mV"
+        result = run(
+            "simulate", folder / "model.json", program, "--out", out, "--initial", state, "--columns", columns
+        )
+        assert result.exit_code == 0, result.stderr
+        assert str(out) in result.stdout
+        found[state] = read(out)
+    assert found["negative"]["voltage_V"].tolist() == [40.0, 50.0, 40.0]
+    first = {state: columns["displacement_um"][0] for state, columns in found.items()}
+    assert first["negative"] < first["demagnetised"] < first["positive"]
+
+
+def test_json_and_info_agree(bench, tmp_path):
+    folder, _, fit = bench
+    out = tmp_path / "model.json"
+    again = run(
+        "fit", folder / "csv" / "train.csv", "--holdout", folder / "csv" / "heldout.csv", "--levels", 8, "--out", out,
+        "--json", "--quiet",
+    )  # fmt: skip
+    assert again.exit_code == 0
+    assert again.stderr == ""
+    assert out.read_bytes() == (folder / "model.json").read_bytes()
+    report = json.loads(again.stdout)
+    assert report.pop("out") == str(out)
+    assert report.pop("plots") == []
+    info = json.loads(run("info", out, "--json").stdout)
+    assert info["model"] == "Preisach"
+    assert info["fit"] == report
+    assert {"path": "density.packed_um", "shape": [36], "unit": "um"} in info["parameters"]
+
+    measured = read(folder / "csv" / "heldout.csv")["displacement_um"]
+    assert report["held_out"]["range_um"] == np.ptp(measured)
+    assert report["held_out"]["e_rms_pct"] == pytest.approx(100 * report["held_out"]["rms_um"] / np.ptp(measured))
+    assert 0.05 < report["held_out"]["e_rms_pct"] < 0.15
+    assert [run["source"] for run in report["runs"]] == ["train.csv", "heldout.csv"]
+    words = run("info", out)
+    assert words.exit_code == 0
+    assert fit.stdout.split("\n\nmodel ")[0] in words.stdout
+
+
+@pytest.mark.parametrize("step", ["fit", "plot_fit", "model_text"])
+def test_an_interruption_leaves_nothing(bench, tmp_path, monkeypatch, step):
+    folder, _, _ = bench
+    old = tmp_path / "m.json"
+    old.write_text("old")
+
+    def interrupt(*arguments, **_):
+        for argument in arguments:
+            if isinstance(argument, Path):
+                (argument / "loops.png").write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fits._cli_work, step, interrupt)
+    csv = folder / "csv" / "train.csv"
+    result = run("fit", csv, "--out", old, "--plots", tmp_path / "plots", "--levels", 8)
+    assert result.exit_code == 130
+    assert result.stderr.splitlines()[-1] == "Interrupted: no unfinished file was left."
+    assert result.stdout == ""
+    assert files(tmp_path) == ["m.json"]
+    assert old.read_text() == "old"
+
+
+def test_simulate_refuses_what_it_cannot_predict(bench, tmp_path):
+    folder, _, _ = bench
+    model, out, program = folder / "model.json", tmp_path / "p.csv", tmp_path / "program.csv"
+    program.write_text("time_s,voltage_V\n0,10\n1,130\n")
+    refused(run("simulate", model, program, "--out", out), "program.csv", "130 V", "120 V")
+    program.write_text("time_s,displacement_um\n0,10\n1,130\n")
+    refused(run("simulate", model, program, "--out", out), "program.csv", "voltage_V")
+    program.write_text("time_s,voltage_V\n0,10\n1,20\n")
+    refused(run("simulate", model, tmp_path / "none.csv", "--out", out), "none.csv")
+    refused(run("simulate", model, program, "--out", tmp_path / "none" / "p.csv"), "none")
+    refused(run("simulate", model, program, "--out", program), "overwrite")
+    refused(run("simulate", program, program, "--out", out), "program.csv")
+    text = model.read_text()
+    for changed in (text.replace("microid.model/1", "microid.model/2"), text.replace("0.", "1.", 1), text[:1000]):
+        (tmp_path / "changed.json").write_text(changed)
+        refused(run("simulate", tmp_path / "changed.json", program, "--out", out), "changed.json")
+        refused(run("info", tmp_path / "changed.json"), "changed.json")
+    assert files(tmp_path) == ["changed.json", "program.csv"]
+
+
+def test_synth_refuses_unknown_scenarios_and_places(tmp_path):
+    (tmp_path / "file").write_text("")
+    refused(run("synth", "quickstrat", "--out", tmp_path / "q"), "quickstart")
+    refused(run("synth", "quickstart", "--out", tmp_path / "file"), "file")
+    assert files(tmp_path) == ["file"]
+    listed = run("synth", "--list")
+    assert listed.exit_code == 0
+    assert {"quickstart", "plays"} <= {line.split()[0] for line in listed.stdout.splitlines()}
+    seeded = json.loads(run("synth", "quickstart", "--out", tmp_path / "q", "--seed", 3, "--json").stdout)
+    assert seeded["seed"] == 3
+    assert sorted(seeded["files"]) == [
+        str(tmp_path / "q" / name) for name in ("heldout.csv", "train.csv", "truth.json")
+    ]
+
+
+def test_choices_in_the_help_are_those_of_the_library():
+    options = {option.name: option for option in cli.commands["fit"].params}
+    assert tuple(options["initial"].type.choices) == INITIAL_STATES
+    for family in FAMILIES:
+        assert family in options["family"].help
+    assert run("simulate", "m", "p", "--out", "o", "--initial", "unknown").exit_code == 2
+
+
+def test_version():
+    result = run("--version")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("microid")
+
+
+def test_compiled_functions_are_kept_where_the_user_says(tmp_path, monkeypatch):
+    monkeypatch.setenv("MICROID_CACHE", str(tmp_path / "a" / "b"))
+    assert _cache_folder() == tmp_path / "a" / "b"
+    assert _cache_folder().is_dir()
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("MICROID_CACHE", str(tmp_path / "file" / "below"))
+    assert _cache_folder() is None
+    for off in ("", "off", "0"):
+        monkeypatch.setenv("MICROID_CACHE", off)
+        assert _cache_folder() is None
+    monkeypatch.delenv("MICROID_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert _cache_folder() == tmp_path / "xdg" / "microid" / "jax"
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert _cache_folder() is None
+
+
+def test_help_does_not_wait_for_heavy_libraries():
+    code = (
+        "import sys\n"
+        "from fits._cli import cli\n"
+        "for arguments in (['--help'], ['fit', '--help'], ['synth', '--help'], ['--version']):\n"
+        "    cli(arguments, standalone_mode=False)\n"
+        "print(sorted({'jax', 'pandas', 'matplotlib', 'numpy', 'scipy'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "simulate" in done.stdout
+
+
+def test_a_real_interruption_and_a_closed_pipe(bench, tmp_path):
+    folder, _, _ = bench
+    shutil.copy(folder / "csv" / "train.csv", tmp_path / "train.csv")
+    process = shell("fit", "train.csv", "--out", "m.json", "--plots", "plots", cwd=tmp_path)
+    assert "levels" in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate()
+    assert (process.returncode, stdout) == (130, "")
+    assert stderr.splitlines()[-1] == "Interrupted: no unfinished file was left."
+    assert "Traceback" not in stderr
+    assert files(tmp_path) == ["train.csv"]
+
+    process = shell("info", folder / "model.json")
+    process.stdout.close()
+    stderr = process.stderr.read()
+    process.stderr.close()
+    assert process.wait() != 0
+    assert "Traceback" not in stderr
+
+
+def test_double_precision_is_on(bench):
+    assert jax.config.read("jax_enable_x64")
+    model = json.loads((bench[0] / "model.json").read_text())["model"]
+    values = np.array(model["density"]["packed_um"]["value"])
+    assert np.any(values.astype(np.float32).astype(float) != values)

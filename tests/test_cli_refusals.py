@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+from _command import files, refused, run
+
+import fits._cli_work
+from fits import FitError, FitStatus
+from microid import FAMILIES
+
+
+def write_csv(path, time_s, voltage_V, displacement_um):
+    rows = [f"{t},{v},{x}" for t, v, x in zip(time_s, voltage_V, displacement_um, strict=True)]
+    path.write_text("\n".join(["time_s,voltage_V,displacement_um", *rows]) + "\n")
+
+
+def bad_csv(path, kind):
+    time = [0.01 * k for k in range(200)]
+    voltage = [60 - 60 * np.cos(k / 10) for k in range(200)]
+    moved: list = [v / 3 for v in voltage]
+    if kind == "text":
+        moved[7] = "high"
+    elif kind == "nan":
+        moved[7] = "nan"
+    elif kind == "backwards":
+        time[7] = 0.0
+    elif kind == "short":
+        time, voltage, moved = time[:49], voltage[:49], moved[:49]
+    elif kind == "still":
+        voltage = [1.0] * 200
+    elif kind == "inverted":
+        moved = [-x for x in moved]
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "empty":
+        path.write_text("")
+    elif kind == "binary":
+        path.write_bytes(bytes(range(256)) * 9)
+    elif kind == "headers":
+        path.write_text("a,b,c\n1,2,3\n")
+    elif kind != "missing":
+        write_csv(path, time, voltage, moved)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["missing", "folder", "empty", "binary", "headers", "text", "nan", "backwards", "short", "still", "inverted"],
+)
+def test_bad_records_end_in_one_sentence(tmp_path, kind):
+    path = tmp_path / "bad.csv"
+    bad_csv(path, kind)
+    before = files(tmp_path)
+    refused(run("fit", path, "--out", tmp_path / "m.json", "--plots", tmp_path / "plots"), "bad.csv")
+    assert files(tmp_path) == before
+
+
+@pytest.fixture
+def good_csv(tmp_path):
+    path = tmp_path / "good.csv"
+    bad_csv(path, "good")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--family", "spline"], ["spline", *sorted(FAMILIES)]),
+        (["--levels", "3"], ["levels"]),
+        (["--holdout", "1.5"], ["--holdout", "1.5"]),
+        (["--holdout", "nan"], ["--holdout"]),
+        (["--holdout", "0.1", "--holdout", "good.csv"], ["--holdout"]),
+        (["--holdout", "none.csv"], ["none.csv"]),
+        (["--holdout", "0.9", "--levels", "8"], ["good.csv"]),
+        (["--columns", "voltage_V"], ["--columns"]),
+        (["--columns", "voltage_V=u_V"], ["u_V"]),
+        (["--out", "no/such/m.json"], ["no/such/m.json"]),
+        (["--out", "."], ["folder"]),
+        (["--out", "good.csv"], ["good.csv", "overwrite"]),
+        (["--plots", "good.csv"], ["good.csv"]),
+        (["--plots", "good.csv/plots"], ["good.csv"]),
+    ],
+)
+def test_bad_options_end_in_one_sentence(good_csv, monkeypatch, options, words):
+    monkeypatch.chdir(good_csv.parent)
+    before = good_csv.read_bytes()
+    refused(run("fit", good_csv, "--out", "m.json", *options), *words)
+    assert files(good_csv.parent) == ["good.csv"]
+    assert good_csv.read_bytes() == before
+
+
+@pytest.mark.parametrize("status", [FitStatus.MAX_STEPS, FitStatus.NONFINITE])
+def test_a_failed_fit_ends_in_its_sentence(good_csv, monkeypatch, status):
+    def fail(*_, **__):
+        raise FitError(status)
+
+    monkeypatch.setattr(fits._cli_work, "fit", fail)
+    refused(run("fit", good_csv, "--out", good_csv.parent / "m.json", "--plots", good_csv.parent / "p"), status.value)
+    assert files(good_csv.parent) == ["good.csv"]
+
+
+def test_other_mistakes_are_not_hidden(good_csv, monkeypatch):
+    monkeypatch.setattr(fits._cli_work, "fit", lambda *_, **__: 1 / 0)
+    assert isinstance(run("fit", good_csv, "--out", good_csv.parent / "m.json").exception, ZeroDivisionError)
+    assert files(good_csv.parent) == ["good.csv"]

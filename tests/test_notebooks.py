@@ -1,0 +1,41 @@
+"""Every notebook runs from its first cell to its last, and is committed without outputs."""
+
+import os
+import warnings
+from pathlib import Path
+
+import pytest
+
+# The kernel's tools are not ours, and some of them warn of one another on import.
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import nbclient
+    import nbformat
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_notebook_is_clean(path):
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type == "code":
+            assert cell.outputs == [], "clear all outputs before saving"
+            assert cell.execution_count is None, "clear all outputs before saving"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_notebook_runs(path, tmp_path):
+    notebook = nbformat.read(path, as_version=4)
+    client = nbclient.NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    )
+    # The kernel works on this checkout even where another one is installed.
+    client.execute(
+        env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )  # raises CellExecutionError with the cell and its traceback
+    assert any(cell.get("outputs") for cell in notebook.cells)

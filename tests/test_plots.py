@@ -1,0 +1,144 @@
+import itertools
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+import fits
+import microid
+from fits import DataError, FitResult, FitStatus, LevelTrial, Record, RunReport, Uncertainty
+from fits._design import Grid
+from fits._plot_style import thinned
+
+LOWER_V, UPPER_V, LEVELS = 0.0, 100.0, 9
+
+
+@pytest.fixture(scope="module")
+def model():
+    lower, upper = jnp.asarray(LOWER_V), jnp.asarray(UPPER_V)
+    density = microid.GridDensity.start(lower, upper, LEVELS, jnp.asarray(15.0), jax.random.key(0))
+    return microid.Preisach(density, microid.Reversible(jnp.full(LEVELS, 0.2), lower, upper), jnp.asarray(3.0))
+
+
+def record(rng, model, voltage, offset_um=0.0, source="run.csv", start=None):
+    noise = rng.normal(scale=0.05, size=len(voltage))
+    displacement = np.asarray(eqx.filter_jit(model)(jnp.asarray(voltage), start)) + offset_um + noise
+    return Record(np.arange(len(voltage)) / 100, voltage, displacement, source=source)
+
+
+def result_of(model, reports, rng):
+    grid = Grid(jnp.asarray(LOWER_V), jnp.asarray(UPPER_V), LEVELS)
+    columns = jnp.asarray(rng.normal(scale=1e-3, size=(2, grid.columns)))
+    uncertainty = Uncertainty(columns, jnp.zeros(2), jnp.asarray(0.01), grid)
+    trial = LevelTrial(LEVELS, 0.05)
+    return FitResult(model, uncertainty, FitStatus.CONVERGED, (), 0.05, 1.0, 1.0, (trial,), tuple(reports))
+
+
+def report(source, offset_um=3.0, held_out=True, start=None):
+    errors = fits.errors(np.array([0.0, 1.0]), np.array([0.1, 1.0]))
+    start = microid.negative_saturation(LOWER_V) if start is None else start
+    return RunReport(source, offset_um, errors, errors if held_out else None, 0, start, 10.0, 10.0)
+
+
+def waves(samples, cycles):
+    return UPPER_V / 2 * (1 - np.cos(np.linspace(0, 2 * np.pi * cycles, samples)))
+
+
+def pixels(path):
+    image = imread(path)[..., :3].mean(axis=-1)
+    assert image.std() > 0.02  # something is drawn
+    # Nothing is cut off: the rim stays white.
+    assert np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).min() > 0.99
+    return image
+
+
+def test_a_fit_is_drawn_in_four_pictures_that_fit_columns(tmp_path, rng, model):
+    settings = dict(mpl.rcParams)
+    measured = record(rng, model, waves(3000, 3))
+    result = result_of(model, [report("run.csv")], rng)
+    paths = fits.plot_fit(result, [measured], tmp_path, holdout=0.3)
+    assert sorted(path.name for path in paths) == ["density.png", "everett.png", "heldout.png", "loops.png"]
+    assert sorted(paths) == sorted(tmp_path.iterdir())
+    for path in paths:
+        width_mm = pixels(path).shape[1] / 200 * 25.4
+        assert min(abs(width_mm - 90), abs(width_mm - 180)) < 1
+    assert dict(mpl.rcParams) == settings
+    assert plt.get_fignums() == []
+
+
+def test_nothing_held_out_is_not_drawn(tmp_path, rng, model):
+    result = result_of(model, [report("run.csv", held_out=False)], rng)
+    paths = fits.plot_fit(result, [record(rng, model, waves(500, 2))], tmp_path, holdout=0.0)
+    assert sorted(path.name for path in paths) == ["density.png", "everett.png", "loops.png"]
+
+
+def test_several_runs_and_an_unknown_start(tmp_path, rng, model, monkeypatch):
+    drawn = {}
+
+    def remember_curves(picture, path):
+        drawn[path.stem] = [[line.get_xydata() for line in axes.lines] for axes in picture.axes]
+        return path
+
+    monkeypatch.setattr("fits._plots.save", remember_curves)
+    start = microid.demagnetised(LOWER_V, UPPER_V)
+    first = record(rng, model, np.concatenate([np.linspace(50, 100, 400), waves(1600, 2)]), 5.0, "a.csv", start)
+    others = [record(rng, model, waves(9000, 2), 0.0, f"{name}.csv") for name in "bcd"]
+    aside = [record(rng, model, waves(700, 1.4), -2.0, "e.csv")]
+    reports = [report("a.csv", 8.0, start=start), *(report(f"{name}.csv") for name in "bcd"), report("e.csv", 1.0)]
+    fits.plot_fit(result_of(model, reports, rng), [first, *others], tmp_path, holdout=aside)
+
+    # Three of four runs side by side, values above errors; the curves lie within the noise of each other.
+    assert len(drawn["loops"]) == 6
+    measured, fitted = drawn["loops"][0]
+    assert len(measured) == 2000
+    assert np.abs(measured[:, 1] - first.displacement_um).max() == 0
+    assert np.abs(fitted[:, 1] - measured[:, 1]).max() < 6 * 0.05
+    error = drawn["loops"][3][1]
+    assert len(error) == 1600 + 1  # from the first sample at an end of the range on
+    assert 0.03 < error[:, 1].std() < 0.07
+    measured, predicted = drawn["heldout"][0]
+    assert np.array_equal(measured[:, 0], aside[0].time_s)
+    assert np.abs(predicted[:, 1] - measured[:, 1]).max() < 6 * 0.05
+    error, upper, lower, with_noise, _ = drawn["heldout"][1]
+    assert np.array_equal(upper[:, 1], -lower[:, 1])
+    assert np.all(upper[:, 1] > 1.95 * 0.01)
+    assert np.mean(np.abs(error[:, 1]) < with_noise[:, 1]) > 0.9
+
+
+def test_a_run_that_is_missing_and_a_folder_that_is(tmp_path, rng, model):
+    measured = record(rng, model, waves(500, 2))
+    result = result_of(model, [report("run.csv")], rng)
+    with pytest.raises(ValueError, match="the result has 1 runs, and 2"):
+        fits.plot_fit(result, [measured, measured], tmp_path)
+    with pytest.raises(DataError, match="does not exist"):
+        fits.plot_fit(result, [measured], tmp_path / "none")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_vanishing_density_is_drawn(tmp_path, rng, model):
+    empty = eqx.tree_at(lambda m: m.density.packed_um, model, jnp.zeros_like(model.density.packed_um))
+    result = replace(result_of(empty, [report("run.csv")], rng))
+    assert len(fits.plot_fit(result, [record(rng, empty, waves(500, 2))], tmp_path)) == 4
+
+
+def test_thinning_keeps_every_extreme(rng):
+    values = rng.normal(size=rng.integers(100_000, 200_000))
+    kept = thinned(values)
+    assert len(kept) < 7000
+    assert np.all(np.diff(kept) > 0)
+    assert {0, len(values) - 1} <= set(kept)
+    edges = np.linspace(0, len(values), 301).astype(int)
+    for low, high in itertools.pairwise(edges):
+        inside = kept[(kept >= low) & (kept < high)]
+        # Stretches do not end at these edges: what is kept is at least as extreme as all but a stretch at either end.
+        inner = values[low + 70 : high - 70]
+        assert values[inside].max() >= inner.max()
+        assert values[inside].min() <= inner.min()
+    short = rng.normal(size=10)
+    assert np.array_equal(thinned(short), np.arange(10))
