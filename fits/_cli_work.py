@@ -66,7 +66,6 @@ def run_fit(
         except FitError as error:
             raise DataError(f"{error}.") from error
         report = fit_report(result)
-        report["remarks"] += [warning for record in aside for warning in record.warnings]
         drawn = []
         if drawings is not None:
             progress("drawing")

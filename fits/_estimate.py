@@ -15,8 +15,10 @@ class Estimate:
     ----------
     model
         In um, with no offset.
+    levels
+        Of the grid on which the covariance is given; it may be coarser than the model's.
     factor_um
-        `factor_um @ factor_um.T` is the covariance of its columns, shape `(D, k)`.
+        `factor_um @ factor_um.T` is the covariance of the columns of that grid, shape `(D, k)`.
     noise_um
         Standard deviation of the residual.
     correlation
@@ -26,6 +28,7 @@ class Estimate:
     """
 
     model: Preisach
+    levels: int
     factor_um: Float[Array, "D k"]
     noise_um: float
     correlation: float

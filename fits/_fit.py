@@ -17,7 +17,7 @@ from fits._history import estimate_start
 from fits._metrics import Errors, errors, loop_width_pct
 from fits._moments import Data, gather
 from fits._noise import correlation_samples
-from fits._prior import Hyper
+from fits._prior import Hyper, interpolation
 from fits._record import Record
 from fits._result import FitError, FitResult, FitStatus, LevelTrial, RunReport
 from fits._run import Run, prepare_run, simulate_run
@@ -118,6 +118,7 @@ def fit(
 
     tried, trials = _resolve(trial, levels)
     remarks = _remarks(runs)
+    remarks += [warning for record in aside for warning in record.warnings]
     if family == "grid":
         found = grid_estimate(tried.data, tried.solution, stroke, tried.correlation, tried.discrepancy_um)
         if levels is None and tried.data.grid.levels == LADDER[-1]:
@@ -212,10 +213,13 @@ def _check(result: RESULTS) -> None:
 
 def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
     mean = data.means[0]
+    response = mean.response
+    if found.levels < data.grid.levels:
+        response = interpolation(found.levels, data.grid.levels).T @ response
     return perturbations(
-        data.grid,
-        jnp.asarray(found.factor_um),
-        jnp.asarray(mean.response),
+        Grid(data.grid.lower_V, data.grid.upper_V, found.levels),
+        found.factor_um,
+        jnp.asarray(response),
         jnp.asarray(found.noise_um * (found.correlation / mean.count) ** 0.5),
         jnp.asarray(found.discrepancy_um),
     )
@@ -234,11 +238,12 @@ def _report(model: Preisach, run: Run, noise_um: float) -> RunReport:
     start = estimate_start(model, run, noise_um)
     predicted = simulate_run(model, run)
     measured = run.displacement_um
+    range_um = float(np.ptp(measured[run.known]))
 
     def compare(samples: np.ndarray) -> Errors | None:
-        if not samples.any() or np.ptp(measured[samples]) == 0:
+        if not samples.any() or range_um == 0:
             return None
-        return errors(measured[samples], predicted[samples])
+        return errors(measured[samples], predicted[samples], range_um)
 
     voltage = run.record.voltage_V[run.known]
     return RunReport(

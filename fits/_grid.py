@@ -112,16 +112,16 @@ def grid_estimate(
     data: Data, solution: GridSolution, stroke_um: float, correlation: float, discrepancy_um: float
 ) -> Estimate:
     """Turn a solution in strokes into an estimate in um; the last two arguments are those of `Estimate`."""
-    levels = data.grid.levels
-    if levels <= _BELIEF_LEVELS:
-        factor = solution.belief.factor()
-    else:
-        basis = interpolation(_BELIEF_LEVELS, levels)
+    levels = min(data.grid.levels, _BELIEF_LEVELS)
+    belief = solution.belief
+    if levels < data.grid.levels:
+        basis = interpolation(levels, data.grid.levels)
         moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
-        factor = jnp.asarray(basis) @ posterior(moments, roughness(levels).project(basis), solution.hyper).factor()
+        belief = posterior(moments, roughness(data.grid.levels).project(basis), solution.hyper)
     return Estimate(
         model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
-        factor_um=jnp.asarray(factor) * stroke_um,
+        levels=levels,
+        factor_um=belief.factor() * stroke_um,
         noise_um=float(jnp.exp(solution.hyper.log_variance / 2)) * stroke_um,
         correlation=correlation,
         discrepancy_um=discrepancy_um,

@@ -19,7 +19,7 @@ class Errors:
     rms_um, max_um
         Root mean square and largest absolute error.
     range_um
-        Range of the measurement, which the percentages refer to.
+        Range of the measurement that the percentages refer to.
     """
 
     samples: int
@@ -38,24 +38,29 @@ class Errors:
         return 100 * self.max_um / self.range_um
 
 
-def errors(measured_um: np.ndarray, predicted_um: np.ndarray) -> Errors:
+def errors(measured_um: np.ndarray, predicted_um: np.ndarray, range_um: float | None = None) -> Errors:
     """Compare a prediction with a measurement.
 
     Parameters
     ----------
     measured_um, predicted_um
         Shape `(n,)`, in um.
+    range_um
+        What percentages refer to: the range of the whole run, where these samples are a part of it. By default the
+        range of `measured_um`.
 
     Raises
     ------
     ValueError
-        If there is nothing to compare, or the measurement does not move.
+        If there is nothing to compare, or the range is zero.
     """
-    if len(measured_um) == 0 or np.ptp(measured_um) == 0:
-        raise ValueError("errors need a measurement that moves")
+    if range_um is None:
+        range_um = float(np.ptp(measured_um)) if len(measured_um) else 0.0
+    if len(measured_um) == 0 or not range_um > 0:
+        raise ValueError("errors need samples, and a measurement that moves")
     off = measured_um - predicted_um
     rms, worst = float(np.sqrt(np.mean(off**2))), float(np.max(np.abs(off)))
-    return Errors(len(off), rms, worst, float(np.ptp(measured_um)))
+    return Errors(len(off), rms, worst, range_um)
 
 
 def loop_width_pct(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float | None:
