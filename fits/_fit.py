@@ -12,7 +12,7 @@ from optimistix import RESULTS
 from fits._design import Grid, columns_of
 from fits._errors import DataError
 from fits._estimate import Estimate
-from fits._grid import GridSolution, cross_validate, grid_estimate, solve_grid
+from fits._grid import BELIEF_LEVELS, GridSolution, cross_validate, grid_estimate, solve_grid
 from fits._history import estimate_start
 from fits._metrics import Errors, errors, loop_width_pct
 from fits._moments import Data, gather
@@ -114,7 +114,9 @@ def fit(
 
     def trial(n: int, hyper: Hyper) -> _Trial:
         progress(f"{n} levels")
-        return _try(gather(Grid(jnp.asarray(lower), jnp.asarray(upper), n), runs), runs, stroke, hyper)
+        return _try(
+            gather(Grid(jnp.asarray(lower), jnp.asarray(upper), n), runs), runs, stroke, hyper, levels is None
+        )
 
     tried, trials = _resolve(trial, levels)
     remarks = _remarks(runs)
@@ -175,7 +177,7 @@ def _resolve(trial: Callable[[int, Hyper], _Trial], levels: int | None) -> tuple
     return best, trials
 
 
-def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
+def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper, compare: bool) -> _Trial:
     grid = data.grid
     correlation = 1.0
     solution = solve_grid(data, stroke, correlation, hyper)
@@ -187,7 +189,8 @@ def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper) -> _Trial:
         correlation = found
         solution = solve_grid(data, stroke, correlation, hyper)
         _check(solution.result)
-    error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper)
+    n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
+    error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
     return _Trial(data, solution, correlation, error, discrepancy)
 
 

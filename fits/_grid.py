@@ -23,7 +23,9 @@ from fits._run import Run, simulate_run
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
 _EVIDENCE_LEVELS = 16
 # And this many to say how sure predictions are; finer perturbations move no displacement.
-_BELIEF_LEVELS = 24
+BELIEF_LEVELS = 24
+# Noise that changes by less, in the logarithm of its variance, is not worth another factorisation.
+_SAME_NOISE = 0.02
 _ATOL = 1e-6
 _STEPS = 500
 
@@ -74,8 +76,9 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
     belief = posterior(moments, rough, hyper)
     if data.grid.levels > _EVIDENCE_LEVELS:
         # What the coarse levels could not follow was noise to them.
-        hyper = renew_noise(moments, hyper, belief)
-        belief = posterior(moments, rough, hyper)
+        renewed = renew_noise(moments, hyper, belief)
+        if abs(float(renewed.log_variance - hyper.log_variance)) > _SAME_NOISE:
+            hyper, belief = renewed, posterior(moments, rough, renewed)
     if np.all(np.asarray(belief.mean) >= 0):
         done: Any = RESULTS.successful
         return GridSolution(belief.mean, belief, hyper, done)
@@ -112,7 +115,7 @@ def grid_estimate(
     data: Data, solution: GridSolution, stroke_um: float, correlation: float, discrepancy_um: float
 ) -> Estimate:
     """Turn a solution in strokes into an estimate in um; the last two arguments are those of `Estimate`."""
-    levels = min(data.grid.levels, _BELIEF_LEVELS)
+    levels = min(data.grid.levels, BELIEF_LEVELS)
     belief = solution.belief
     if levels < data.grid.levels:
         basis = interpolation(levels, data.grid.levels)
@@ -129,9 +132,11 @@ def grid_estimate(
 
 
 def cross_validate(
-    data: Data, runs: Sequence[Run], stroke_um: float, correlation: float, hyper: Hyper
+    data: Data, runs: Sequence[Run], stroke_um: float, correlation: float, hyper: Hyper, levels: int
 ) -> tuple[float, float]:
     """Predict each block of every run from the others, with the smoothness and noise given.
+
+    Done with at most `levels` levels: the grid's own to compare resolutions, fewer where only the discrepancy counts.
 
     Returns
     -------
@@ -141,16 +146,20 @@ def cross_validate(
         Standard deviation of what the posterior does not own up to: the part of the error that neighbouring samples
         share, and that therefore is not noise, beyond the posterior's own. Zero where there is none.
     """
-    rough = roughness(data.grid.levels)
-    whole = sum(data.blocks[1:], start=data.blocks[0])
+    rough, blocks, basis = roughness(data.grid.levels), data.blocks, None
+    if levels < data.grid.levels:
+        basis = interpolation(levels, data.grid.levels)
+        rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
+    whole = sum(blocks[1:], start=blocks[0])
     pairs = [(run, blocks_of(run)) for run in runs]
     squares = shared = expected = count = 0.0
-    for number, block in enumerate(data.blocks):
+    for number, block in enumerate(blocks):
         if not block.count > 0:
             continue
         rest = Moments(*(a - b for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(block), strict=True)))
         belief = posterior(rest.scaled(1 / correlation, stroke_um), rough, hyper)
-        model = data.grid.model(np.asarray(belief.mean) * stroke_um, np.zeros(()))
+        columns = np.asarray(belief.mean if basis is None else basis @ belief.mean)
+        model = data.grid.model(columns * stroke_um, np.zeros(()))
         off = [(run.displacement_um - simulate_run(model, run))[label == number] for run, label in pairs]
         squares += sum(float(np.sum((o - o.mean()) ** 2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)

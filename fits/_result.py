@@ -46,7 +46,8 @@ class LevelTrial:
     levels
         Number of levels `N`.
     error_um
-        Root mean square error on blocks of the fitted samples, each predicted from the others.
+        Root mean square error on blocks of the fitted samples, each predicted from the others; on at most 24 levels
+        where the resolution was given and there was nothing to compare.
     """
 
     levels: int

@@ -86,6 +86,7 @@ class Everett(eqx.Module):
         return c0 + s * (c1 + s * (c2 + s * c3))
 
 
+@eqx.filter_jit
 def everett(
     density_um_per_V2: Float[Array, "N N"],
     reversible_um_per_V: Float[Array, " N"],

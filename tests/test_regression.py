@@ -1,0 +1,181 @@
+"""The regression behind a fit, against dense algebra, SciPy and the model itself."""
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from scipy.optimize import nnls
+from scipy.stats import multivariate_normal
+
+import fits
+from fits._design import Grid, columns_of
+from fits._evidence import _negative_log, maximise_evidence, posterior
+from fits._moments import gather
+from fits._noise import correlation_samples, shared_square
+from fits._nonnegative import BlockPivoting
+from fits._prior import Hyper, interpolation, roughness
+from fits._run import prepare_run, simulate_run
+
+LEVELS = 6
+
+
+def _record(rng, n=700, lower_V=-10.0, upper_V=90.0):
+    turns = np.concatenate([[lower_V, upper_V], rng.uniform(lower_V, upper_V, 30), [lower_V]])
+    voltage_V = np.interp(np.linspace(0, len(turns) - 1, n), np.arange(len(turns)), turns)
+    return fits.Record(np.arange(n) * 0.01, voltage_V, voltage_V * 0.3 + rng.normal(0, 0.1, n))
+
+
+@pytest.fixture
+def problem(rng):
+    runs = [prepare_run(_record(rng), -10.0, 90.0, "negative", 0.0) for _ in range(2)]
+    grid = Grid(jnp.asarray(-10.0), jnp.asarray(90.0), LEVELS)
+    return grid, runs, gather(grid, runs)
+
+
+def _dense(grid, runs):
+    """Responses of every column alone, as the model itself gives them, each run from its mean."""
+    blocks = []
+    for run in runs:
+        columns = [simulate_run(grid.model(np.eye(grid.columns)[k], np.zeros(())), run) for k in range(grid.columns)]
+        response = np.stack(columns, axis=1)
+        blocks.append(response - response.mean(axis=0))
+    return np.concatenate(blocks)
+
+
+def test_moments_of_the_compressed_record_are_those_of_all_samples(problem):
+    grid, runs, data = problem
+    dense = _dense(grid, runs)
+    target = np.concatenate([run.displacement_um - run.displacement_um.mean() for run in runs])
+    np.testing.assert_allclose(data.total.gram, dense.T @ dense, rtol=0, atol=1e-10 * len(dense))
+    np.testing.assert_allclose(data.total.cross_um, dense.T @ target, rtol=0, atol=1e-10 * np.abs(target).sum())
+    np.testing.assert_allclose(float(data.total.energy_um2), target @ target, rtol=1e-12)
+    assert float(data.total.count) == len(target)
+
+
+def test_blocks_add_up_to_consecutive_fifths(problem):
+    _, runs, data = problem
+    counts = [float(block.count) for block in data.blocks]
+    assert counts == [2 * 140.0] * 5
+    one = runs[0].displacement_um[:140], runs[1].displacement_um[:140]
+    np.testing.assert_allclose(float(data.blocks[0].energy_um2), sum(np.sum((y - y.mean()) ** 2) for y in one))
+
+
+def test_columns_are_read_back_from_a_model(rng):
+    grid = Grid(jnp.asarray(-3.0), jnp.asarray(7.0), LEVELS)
+    columns = rng.uniform(0, 1, grid.columns)
+    np.testing.assert_allclose(columns_of(grid.model(columns, np.zeros(()))), columns, rtol=1e-13)
+
+
+def test_evidence_is_the_density_of_the_data_under_the_prior(rng):
+    grid = Grid(jnp.zeros(()), jnp.ones(()), 4)
+    run = prepare_run(_record(rng, 60, 0.0, 1.0), 0.0, 1.0, "negative", 0.0)
+    data = gather(grid, [run])
+    design, target = _dense(grid, [run]), run.displacement_um - run.displacement_um.mean()
+    rough = roughness(4)
+
+    def cost(density, along, reversible, variance):
+        hyper = Hyper(*(jnp.asarray(v) for v in (density, along, reversible, variance)))
+        prior = np.asarray(rough.precision(hyper))
+        covariance = np.exp(variance) * np.eye(len(target)) + design @ np.linalg.solve(prior, design.T)
+        ours = float(_negative_log(hyper, (data.total, rough)))
+        smooth = np.array([density, along, reversible])
+        weak = np.sum(((smooth + 4.6) / 6.0) ** 2) / 2
+        return ours - weak, -multivariate_normal(np.zeros(len(target)), covariance).logpdf(target)
+
+    pairs = [cost(*point) for point in ((-3.0, -4.0, -2.0, -1.0), (1.0, 0.5, -1.0, -3.0), (-5.0, 0.0, 2.0, 0.0))]
+    gaps = [ours - exact for ours, exact in pairs]
+    np.testing.assert_allclose(gaps, gaps[0], rtol=0, atol=1e-6)
+    assert abs(pairs[0][1] - pairs[1][1]) > 1  # the points differ, so agreement means something
+
+    found = maximise_evidence(data.total, rough, Hyper.start())
+    best = float(_negative_log(found, (data.total, rough)))
+    assert all(best <= float(ours) + 30 for ours, _ in pairs)
+
+
+def test_posterior_is_that_of_dense_bayesian_regression(problem):
+    grid, runs, data = problem
+    hyper = Hyper(*(jnp.asarray(v) for v in (-2.0, -3.0, -1.0, -4.0)))
+    rough = roughness(LEVELS)
+    belief = posterior(data.total, rough, hyper)
+    design = _dense(grid, runs)
+    target = np.concatenate([run.displacement_um - run.displacement_um.mean() for run in runs])
+    precision = design.T @ design * np.exp(4.0) + np.asarray(rough.precision(hyper))
+    covariance = np.linalg.inv(precision)
+    np.testing.assert_allclose(belief.mean, covariance @ design.T @ target * np.exp(4.0), rtol=1e-6, atol=1e-8)
+    factor = np.asarray(belief.factor())
+    np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-5, atol=1e-9 * covariance.max())
+
+
+def test_roughness_is_the_integral_of_squared_curvature():
+    # A quadratic has constant second derivatives: 2a, 2c and b along the two axes and mixed.
+    n, (a, b, c) = 40, (1.3, -0.7, 0.4)
+    v = np.linspace(0, 1, n)
+    alpha, beta = (w[np.tril_indices(n)] for w in np.meshgrid(v, v, indexing="ij"))
+    columns = np.concatenate([a * alpha**2 + b * alpha * beta + c * beta**2, 2 * v**2])
+    rough = roughness(n)
+    curvature = ((2 * a) ** 2 + 2 * b**2 + (2 * c) ** 2) / 2
+    np.testing.assert_allclose(columns @ rough.density @ columns, curvature, rtol=0.15)
+    np.testing.assert_allclose(columns @ rough.along @ columns, (2 * a + 2 * b + 2 * c) ** 2 / 2, rtol=0.15)
+    np.testing.assert_allclose(columns @ rough.reversible @ columns, 16.0, rtol=0.1)
+    straight = np.concatenate([3 + 2 * alpha - beta, 1 - v])
+    for form in (rough.density, rough.along, rough.reversible):
+        assert abs(straight @ form @ straight) < 1e-6
+
+
+def test_interpolated_columns_respond_as_the_coarse_ones_where_the_grids_share_nodes(rng):
+    coarse, fine = (Grid(jnp.zeros(()), jnp.ones(()), n) for n in (5, 9))
+    columns = rng.uniform(0, 1, coarse.columns)
+    run = prepare_run(_record(rng, 300, 0.0, 1.0), 0.0, 1.0, "negative", 0.0)
+    one = simulate_run(coarse.model(columns, np.zeros(())), run)
+    other = simulate_run(fine.model(interpolation(5, 9) @ columns, np.zeros(())), run)
+    np.testing.assert_allclose(one, other, rtol=0, atol=0.02 * np.ptp(one))
+
+
+@pytest.mark.parametrize("condition", [1e1, 1e6, 1e10])
+def test_block_pivoting_finds_the_minimum_that_nnls_finds(rng, condition):
+    size = 40
+    rotation = np.linalg.qr(rng.normal(size=(size, size)))[0]
+    root = rotation * np.geomspace(1, condition**-0.5, size) @ rotation.T
+    hessian = root.T @ root
+    target = rng.normal(size=size)
+    linear = root.T @ target
+
+    def cost(y, _):
+        return y @ (hessian @ y) / 2 - linear @ y
+
+    solver = BlockPivoting(rtol=0.0, atol=1e-8, norm=optx.max_norm)
+    found = optx.minimise(cost, solver, jnp.asarray(rng.normal(size=size)), max_steps=400, throw=False)
+    assert found.result == optx.RESULTS.successful
+    exact, _ = nnls(root, target, maxiter=10000)
+    y = np.asarray(found.value)
+    assert np.all(y >= 0)
+    assert np.any(y == 0)
+    np.testing.assert_allclose(cost(y, None), cost(exact, None), rtol=1e-7)
+    gradient = hessian @ y - linear
+    assert np.all(gradient > -1e-6)
+    assert np.all(np.abs(gradient[y > 0]) < 1e-6)
+
+
+def test_block_pivoting_says_when_it_ran_out_of_steps(rng):
+    root = rng.normal(size=(30, 30))
+    hessian, linear = root.T @ root, root.T @ rng.normal(size=30)
+    solver = BlockPivoting(rtol=0.0, atol=1e-10, norm=optx.max_norm)
+    short = optx.minimise(
+        lambda y, _: y @ (hessian @ y) / 2 - linear @ y, solver, jnp.zeros(30), max_steps=1, throw=False
+    )
+    assert short.result == optx.RESULTS.nonlinear_max_steps_reached
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.6, 0.9])
+def test_correlation_time_of_an_autoregression(rng, memory):
+    n = 200_000
+    noise = rng.normal(size=n)
+    series = np.empty(n)
+    series[0] = noise[0]
+    for k in range(1, n):
+        series[k] = memory * series[k - 1] + noise[k]
+    found = correlation_samples([series[: n // 2], series[n // 2 :]])
+    np.testing.assert_allclose(found, (1 + memory) / (1 - memory), rtol=0.15)
+    # Autocovariance at lag k is memory**k / (1 - memory**2).
+    shared = np.mean(memory ** np.arange(1, 11)) / (1 - memory**2)
+    np.testing.assert_allclose(shared_square(series), shared, rtol=0.1, atol=0.01)
