@@ -26,14 +26,11 @@ class Posterior(eqx.Module):
         Inverse of the covariance, shape `(D, D)`.
     root
         Its lower Cholesky factor, shape `(D, D)`.
-    effective
-        Number of columns that the data, not the prior, determine.
     """
 
     mean: Float[Array, " D"]
     precision: Float[Array, "D D"]
     root: Float[Array, "D D"]
-    effective: Float[Array, ""]
 
     @eqx.filter_jit
     def factor(self) -> Float[Array, "D D"]:
@@ -84,13 +81,20 @@ def posterior(moments: Moments, rough: Roughness, hyper: Hyper) -> Posterior:
     precision = jnp.asarray(moments.gram / variance + prior)
     root = jnp.linalg.cholesky(precision)
     mean = jax.scipy.linalg.cho_solve((root, True), moments.cross_um / variance)
-    held = jax.scipy.linalg.solve_triangular(root, jnp.linalg.cholesky(prior), lower=True)
-    return Posterior(mean, precision, root, prior.shape[0] - jnp.sum(held**2))
+    return Posterior(mean, precision, root)
 
 
 @eqx.filter_jit
-def renew_noise(moments: Moments, hyper: Hyper, belief: Posterior) -> Hyper:
+def effective(rough: Roughness, hyper: Hyper, belief: Posterior) -> Float[Array, ""]:
+    """Count the columns that the data, not the prior, determine."""
+    prior = jnp.linalg.cholesky(rough.precision(hyper))
+    held = jax.scipy.linalg.solve_triangular(belief.root, prior, lower=True)
+    return prior.shape[0] - jnp.sum(held**2)
+
+
+@eqx.filter_jit
+def renew_noise(moments: Moments, hyper: Hyper, belief: Posterior, determined: Float[Array, ""]) -> Hyper:
     """Re-estimate the noise from what is left at the full resolution (MacKay's fixed point)."""
     left = moments.energy_um2 - 2 * belief.mean @ moments.cross_um + belief.mean @ moments.gram @ belief.mean
-    variance = jnp.maximum(left, 0) / jnp.maximum(moments.count - belief.effective, 1)
+    variance = jnp.maximum(left, 0) / jnp.maximum(moments.count - determined, 1)
     return eqx.tree_at(lambda h: h.log_variance, hyper, jnp.log(jnp.maximum(variance, 1e-30)))

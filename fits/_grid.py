@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from optimistix import RESULTS
 
 from fits._estimate import Estimate
-from fits._evidence import Posterior, maximise_evidence, posterior, renew_noise
+from fits._evidence import Posterior, effective, maximise_evidence, posterior, renew_noise
 from fits._moments import Data, Moments, blocks_of
 from fits._noise import shared_square
 from fits._nonnegative import BlockPivoting
@@ -28,6 +28,8 @@ BELIEF_LEVELS = 24
 _SAME_NOISE = 0.02
 _ATOL = 1e-6
 _STEPS = 500
+# At least this many columns are bounded at first.
+_FEW = 64
 
 
 @dataclass(frozen=True)
@@ -69,29 +71,56 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
     if data.grid.levels > _EVIDENCE_LEVELS:
-        basis = jnp.asarray(interpolation(_EVIDENCE_LEVELS, data.grid.levels))
-        hyper = maximise_evidence(moments.project(basis), rough.project(basis), start)
-    else:
-        hyper = maximise_evidence(moments, rough, start)
-    belief = posterior(moments, rough, hyper)
-    if data.grid.levels > _EVIDENCE_LEVELS:
+        basis = interpolation(_EVIDENCE_LEVELS, data.grid.levels)
+        few, even = moments.project(basis), rough.project(basis)
+        hyper = maximise_evidence(few, even, start)
+        belief = posterior(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
-        renewed = renew_noise(moments, hyper, belief)
+        determined = effective(even, hyper, posterior(few, even, hyper))
+        renewed = renew_noise(moments, hyper, belief, determined)
         if abs(float(renewed.log_variance - hyper.log_variance)) > _SAME_NOISE:
             hyper, belief = renewed, posterior(moments, rough, renewed)
+    else:
+        hyper = maximise_evidence(moments, rough, start)
+        belief = posterior(moments, rough, hyper)
     if np.all(np.asarray(belief.mean) >= 0):
         done: Any = RESULTS.successful
         return GridSolution(belief.mean, belief, hyper, done)
-    columns, result = _constrained(belief)
+    columns, result = _non_negative(belief)
     return GridSolution(columns, belief, hyper, result)
 
 
+def _non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+    """Find the mode of the belief among non-negative columns.
+
+    Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
+    those ends up below zero, more are bounded. The answer is that of all bounds together.
+    """
+    scale = np.sqrt(np.diagonal(belief.precision))
+    lowest = np.asarray(belief.mean) * scale
+    size = len(lowest)
+    bounded = _FEW
+    while True:
+        bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
+        order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
+        columns, result = _bounded(belief, jnp.asarray(order))
+        left = np.asarray(columns) * scale
+        if result != RESULTS.successful or bounded == size or np.all(left >= -_ATOL):
+            return jnp.maximum(columns, 0), result
+        lowest = np.minimum(lowest, left)
+        bounded *= 2
+
+
 @eqx.filter_jit
-def _constrained(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+def _bounded(belief: Posterior, which: Int[Array, " k"]) -> tuple[Float[Array, " D"], RESULTS]:
+    rows = jax.nn.one_hot(which, belief.mean.shape[0], dtype=belief.mean.dtype)
+    spread = jax.scipy.linalg.cho_solve((belief.root, True), rows.T)
+    covariance = spread[which]
+    precision = jnp.linalg.inv((covariance + covariance.T) / 2)
     # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
-    scale = jnp.sqrt(jnp.diagonal(belief.precision))
-    scaled = belief.precision / (scale[:, None] * scale[None, :])
-    mean = belief.mean * scale
+    scale = jnp.sqrt(jnp.diagonal(precision))
+    scaled = precision / (scale[:, None] * scale[None, :])
+    mean = belief.mean[which] * scale
     solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
     solution: Any = optx.minimise(
         _distance,
@@ -102,10 +131,12 @@ def _constrained(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
         max_steps=_STEPS,
         throw=False,
     )
-    return solution.value / scale, solution.result
+    columns = belief.mean + spread @ (precision @ ((solution.value - mean) / scale))
+    # Where a bound holds it holds exactly.
+    return columns.at[which].set(solution.value / scale), solution.result
 
 
-def _distance(y: Float[Array, " D"], args: tuple[Float[Array, "D D"], Float[Array, " D"]]) -> Float[Array, ""]:
+def _distance(y: Float[Array, " k"], args: tuple[Float[Array, "k k"], Float[Array, " k"]]) -> Float[Array, ""]:
     precision, mean = args
     off = y - mean
     return off @ (precision @ off) / 2

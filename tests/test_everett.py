@@ -70,6 +70,30 @@ def test_everett_surface_is_the_integral_of_the_density(rng):
     assert expected_um[3] == pytest.approx(stroke_um(model), rel=1e-12)
 
 
+def test_everett_surface_has_the_density_for_its_mixed_derivative(rng):
+    """Second derivatives too are exact within a cell: Newton's method on a branch may use them."""
+    model = random_model(rng)
+    lower_V, upper_V = limits_V(model)
+    low_V, high_V = np.sort(rng.uniform(lower_V, upper_V, (2, 40)), axis=0)
+
+    @compiled
+    def derivatives(model, high_V, low_V):
+        def in_high(low_V):
+            return jax.grad(lambda high_V: model.everett(high_V, low_V).sum())(high_V)
+
+        return jax.jvp(in_high, (low_V,), (np.ones(len(low_V)),))
+
+    in_high, mixed = derivatives(model, high_V, low_V)
+    density, slope = densities_of(model)
+    expected = [
+        sum(scipy.integrate.quad(lambda b: density(high, b), *ends)[0] for ends in itertools.pairwise(betas_V))  # noqa: B023
+        for high, low in zip(high_V, low_V, strict=True)
+        for betas_V in [np.unique(np.clip(np.append(model.density.levels_V, [low, high]), low, high))]
+    ]
+    np.testing.assert_allclose(in_high, slope(high_V) + expected, rtol=1e-10)
+    np.testing.assert_allclose(mixed, -density(high_V, low_V), rtol=0, atol=1e-10 * density(high_V, low_V).max())
+
+
 def test_everett_surface_saturates_and_vanishes(rng):
     model = random_model(rng)
     lower_V, upper_V = limits_V(model)
@@ -91,6 +115,10 @@ def test_reversible_part_is_the_integral_of_its_slope(rng):
     expected_um = [scipy.integrate.quad(slope, lower_V, v, points=levels_V[1:-1])[0] for v in within_V]
     got_um = compiled(lambda reversible, v: reversible(v))(model.reversible, voltage_V)
     np.testing.assert_allclose(got_um, expected_um, rtol=1e-12, atol=1e-12)
+    # At an end it has the slope of the end, not the mean of that and zero.
+    derivative = compiled(lambda reversible, v: jax.vmap(jax.grad(reversible))(v))(model.reversible, voltage_V)
+    expected = np.where(voltage_V == within_V, slope(voltage_V), 0)
+    np.testing.assert_allclose(derivative, expected, rtol=1e-12)
 
 
 def test_a_major_loop_lies_on_the_everett_surface(rng):
