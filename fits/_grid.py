@@ -111,29 +111,53 @@ def _non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
         bounded *= 2
 
 
-@eqx.filter_jit
 def _bounded(belief: Posterior, which: Int[Array, " k"]) -> tuple[Float[Array, " D"], RESULTS]:
+    spread, precision, mean, scale = _marginal(belief, which)
+    y, result = _pivot(precision, mean)
+    return _follow(belief, which, spread, precision, (y - mean, y), scale), result
+
+
+@eqx.filter_jit
+def _marginal(
+    belief: Posterior, which: Int[Array, " k"]
+) -> tuple[Float[Array, "D k"], Float[Array, "k k"], Float[Array, " k"], Float[Array, " k"]]:
+    """Covariance of all columns with the chosen ones, and the belief about those alone, scaled."""
     rows = jax.nn.one_hot(which, belief.mean.shape[0], dtype=belief.mean.dtype)
     spread = jax.scipy.linalg.cho_solve((belief.root, True), rows.T)
     covariance = spread[which]
     precision = jnp.linalg.inv((covariance + covariance.T) / 2)
     # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
     scale = jnp.sqrt(jnp.diagonal(precision))
-    scaled = precision / (scale[:, None] * scale[None, :])
-    mean = belief.mean[which] * scale
+    return spread, precision / (scale[:, None] * scale[None, :]), belief.mean[which] * scale, scale
+
+
+@eqx.filter_jit
+def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Float[Array, " k"], RESULTS]:
     solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
     solution: Any = optx.minimise(
         _distance,
         solver,
         jnp.maximum(mean, 0),
-        args=(scaled, mean),
-        options={"hessian": scaled},
+        args=(precision, mean),
+        options={"hessian": precision},
         max_steps=_STEPS,
         throw=False,
     )
-    columns = belief.mean + spread @ (precision @ ((solution.value - mean) / scale))
-    # Where a bound holds it holds exactly.
-    return columns.at[which].set(solution.value / scale), solution.result
+    return solution.value, solution.result
+
+
+@eqx.filter_jit
+def _follow(
+    belief: Posterior,
+    which: Int[Array, " k"],
+    spread: Float[Array, "D k"],
+    precision: Float[Array, "k k"],
+    moved: tuple[Float[Array, " k"], Float[Array, " k"]],
+    scale: Float[Array, " k"],
+) -> Float[Array, " D"]:
+    """Move all columns along with the chosen ones; where a bound holds it holds exactly."""
+    by, to = moved
+    return (belief.mean + spread @ (scale * (precision @ by))).at[which].set(to / scale)
 
 
 def _distance(y: Float[Array, " k"], args: tuple[Float[Array, "k k"], Float[Array, " k"]]) -> Float[Array, ""]:

@@ -47,7 +47,7 @@ class Everett(eqx.Module):
         That is the density integrated over the triangle `low <= beta <= alpha <= high`, the part on the diagonal
         included. Zero where `low_V >= high_V`.
         """
-        high, low = jnp.asarray(high_V, dtype=float), jnp.asarray(low_V, dtype=float)
+        high, low = (jnp.asarray(v, dtype=self.window_um.dtype) for v in (high_V, low_V))
         high, low = jnp.broadcast_arrays(high, jnp.minimum(low, high))
         a, b = self._place(high.ravel()), self._place(low.ravel())
         up, down = jnp.ones_like(a[0], dtype=bool), jnp.zeros_like(a[0], dtype=bool)
@@ -70,9 +70,11 @@ class Everett(eqx.Module):
     def _place(self, voltage_V: Float[Array, " n"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
         """Interval and fraction of it; beyond the range there are no relays, so the voltage saturates."""
         n = self.intervals
-        x = (voltage_V - self.lower_V) * (n / (self.upper_V - self.lower_V))
-        # Not clip: it halves the derivative of a sample that stands exactly at the end of the range.
-        x = jnp.where(x < 0, 0, jnp.where(x > n, n, x))
+        # Not clip: it halves the derivative of a sample that stands exactly at the end of the range. And not after
+        # scaling, which rounds: such a sample could come to lie beyond the end and lose its derivative.
+        capped = jnp.where(voltage_V > self.upper_V, self.upper_V, voltage_V)
+        inside = jnp.where(voltage_V < self.lower_V, self.lower_V, capped)
+        x = (inside - self.lower_V) * (n / (self.upper_V - self.lower_V))
         interval = jnp.clip(lax.stop_gradient(x).astype(jnp.int32), 0, n - 1)
         return interval, x - interval.astype(x.dtype)
 

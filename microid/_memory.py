@@ -6,6 +6,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from microid._param import _as_inexact
+
 _SIZE = 64
 
 
@@ -37,14 +39,14 @@ def _staircase(extremes_V: Float[Array, " used"], size: int) -> Staircase:
 
 def negative_saturation(lower_V: Float[Array, ""] | float, size: int = _SIZE) -> Staircase:
     """All relays off: the voltage came up from the lower end of the range."""
-    return _staircase(jnp.asarray(lower_V, dtype=float)[None], size)
+    return _staircase(_as_inexact(lower_V)[None], size)
 
 
 def positive_saturation(
     lower_V: Float[Array, ""] | float, upper_V: Float[Array, ""] | float, size: int = _SIZE
 ) -> Staircase:
     """All relays on: the voltage came down from the upper end of the range."""
-    return _staircase(jnp.stack([jnp.asarray(lower_V, dtype=float), jnp.asarray(upper_V, dtype=float)]), size)
+    return _staircase(jnp.stack([_as_inexact(lower_V), _as_inexact(upper_V)]), size)
 
 
 def demagnetised(
@@ -64,8 +66,10 @@ def demagnetised(
     size
         Number of extremes; the decay has as many swings as fit.
     """
-    lower, upper = jnp.asarray(lower_V, dtype=float), jnp.asarray(upper_V, dtype=float)
-    rest = (lower + upper) / 2 if rest_V is None else jnp.asarray(rest_V, dtype=float)
+    lower, upper = _as_inexact(lower_V), _as_inexact(upper_V)
+    rest = (lower + upper) / 2 if rest_V is None else jnp.asarray(rest_V, dtype=lower.dtype)
+    if size < 3:
+        raise ValueError(f"a demagnetised staircase needs size 3 or more for its first swing, got {size}")
     swings = (size - 1) // 2
     left = 1 - jnp.arange(swings, dtype=rest.dtype) / swings
     pairs = rest + left[:, None] * (jnp.stack([lower, upper]) - rest)[None, :]
@@ -186,9 +190,12 @@ def _by_lifting(path: Float[Array, " m"]) -> tuple[Int[Array, " m"], Bool[Array,
     sign = jnp.sign(jnp.diff(path, prepend=path[:1])).astype(jnp.int32)
     moved = jnp.where(sign != 0, jnp.arange(path.shape[0], dtype=jnp.int32), 0)
     rising = sign[lax.cummax(moved)] >= 0
-    lowest = _lowest_since_above(path)
-    highest = _lowest_since_above(-path)
-    return jnp.where(rising, lowest, highest).at[0].set(0), rising
+    anchor = jnp.where(rising, _lowest_since_above(path), _lowest_since_above(-path))
+    # The root is never wiped out: what stands above all before hangs from it, and not from a later equal.
+    highest = rising & (path >= lax.cummax(path))
+    # Nothing may hang from itself, NaN included: pointer jumping would never end.
+    itself = anchor >= jnp.arange(path.shape[0], dtype=jnp.int32)
+    return jnp.where(highest | itself, 0, anchor), rising
 
 
 def _lowest_since_above(x: Float[Array, " m"]) -> Int[Array, " m"]:

@@ -50,7 +50,7 @@ def _as_inexact(value: Any) -> Any:
         return value
     keep = getattr(value, "dtype", None)
     if keep is not None and jnp.issubdtype(keep, jnp.inexact):
-        return jnp.asarray(value)
+        return jnp.asarray(value, dtype=keep)
     return jnp.asarray(value, dtype=float)
 
 

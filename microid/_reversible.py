@@ -39,7 +39,10 @@ class Reversible(eqx.Module):
         """Displacement, zero at the lower end of the range, in um."""
         n = self.levels - 1
         step = (self.upper_V - self.lower_V) / n
-        x = jnp.clip((jnp.asarray(voltage_V, dtype=float) - self.lower_V) / step, 0, n)
+        voltage = jnp.asarray(voltage_V, dtype=self.lower_V.dtype)
+        # Not clip: it halves the derivative at the ends of the range.
+        capped = jnp.where(voltage > self.upper_V, self.upper_V, voltage)
+        x = (jnp.where(voltage < self.lower_V, self.lower_V, capped) - self.lower_V) / step
         i = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, n - 1)
         s = x - i.astype(x.dtype)
         slope, rise = self.slope_um_per_V[:-1], jnp.diff(self.slope_um_per_V)

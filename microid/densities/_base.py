@@ -78,11 +78,13 @@ class AbstractDensity(eqx.Module):
         With relays that give 0 or 1 their sum is the irreversible stroke. Zero for `j > i`: only the
         `N (N + 1) / 2` with `j <= i` exist (erratum 15).
         """
-        return self.nodes_um_per_V2() * node_areas(self.levels) * (self.upper_V - self.lower_V) ** 2
+        nodes = self.nodes_um_per_V2()
+        return nodes * node_areas(self.levels).astype(nodes.dtype) * (self.upper_V - self.lower_V) ** 2
 
     def __call__(self, alpha_V: Float[Array, "..."], beta_V: Float[Array, "..."]) -> Float[Array, "..."]:
         """Evaluate the density, in um/V^2; zero outside the range and for `alpha < beta`."""
-        alpha, beta = jnp.broadcast_arrays(jnp.asarray(alpha_V, dtype=float), jnp.asarray(beta_V, dtype=float))
+        dtype = self.lower_V.dtype
+        alpha, beta = jnp.broadcast_arrays(jnp.asarray(alpha_V, dtype=dtype), jnp.asarray(beta_V, dtype=dtype))
         n = self.levels - 1
         scale = n / (self.upper_V - self.lower_V)
         x, y = (alpha - self.lower_V) * scale, (beta - self.lower_V) * scale
