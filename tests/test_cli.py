@@ -20,9 +20,15 @@ from microid import FAMILIES
 ROOT = Path(__file__).parents[1]
 
 
+# A shell that runs in the background makes its children ignore interrupts.
+HEEDING = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from fits._cli import main; main()"
+)
+
+
 def shell(*arguments, **options):
     env = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"} | OFF | options.pop("env", {})
-    command = [sys.executable, "-m", "fits", *map(str, arguments)]
+    command = [sys.executable, "-c", HEEDING, *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env, **options)
 
 
