@@ -33,6 +33,8 @@ _WORTH = 0.005
 _WHITE = 1.2
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
+# Correlation of displacement with voltage below which there is no loop.
+_FOLLOWS = 0.3
 # Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
 _EDGE = 0.02
 _MINOR = 0.01
@@ -198,7 +200,13 @@ def _stroke(run: Run) -> float:
     voltage, displacement = run.record.voltage_V[run.fitted], run.displacement_um[run.fitted]
     if np.ptp(displacement) == 0 or np.ptp(voltage) == 0:
         raise DataError(f"{run.record.source}: nothing moves in the samples to be fitted; hold out less")
-    if np.cov(voltage, displacement)[0, 1] < 0:
+    together = float(np.corrcoef(voltage, displacement)[0, 1])
+    if abs(together) < _FOLLOWS:
+        raise DataError(
+            f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so there "
+            "is no hysteresis loop to fit; check that --columns names the right ones"
+        )
+    if together < 0:
         raise DataError(
             f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
             "change the sign of one of the two columns"

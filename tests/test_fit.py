@@ -137,7 +137,11 @@ def test_a_second_record_of_the_same_length_compiles_nothing():
 def test_records_that_cannot_be_fitted_are_refused(bench):
     train, _ = records(bench)
     turned = fits.Record(train.time_s, train.voltage_V, -train.displacement_um, source="turned.csv")
+    noise = fits.Record(
+        train.time_s, train.voltage_V, np.random.default_rng(0).normal(size=len(train)), source="noise.csv"
+    )
     for bad, options, words in [
+        ([noise], {}, "noise.csv: the displacement hardly follows the voltage"),
         ([], {}, "no record"),
         ([train], {"family": "spline"}, "unknown density family 'spline'"),
         ([train], {"levels": 3}, "between 4 and 100"),
