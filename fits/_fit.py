@@ -203,8 +203,8 @@ def _stroke(run: Run) -> float:
     together = float(np.corrcoef(voltage, displacement)[0, 1])
     if abs(together) < _FOLLOWS:
         raise DataError(
-            f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so there "
-            "is no hysteresis loop to fit; check that --columns names the right ones"
+            f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so "
+            "there is no hysteresis loop to fit; check that --columns names the right ones"
         )
     if together < 0:
         raise DataError(
