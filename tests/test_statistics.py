@@ -18,7 +18,7 @@ def study():
     seed = int(np.random.SeedSequence().generate_state(1)[0])
     print(f"study seed {seed}")
     plain = data_synth.load_scenario("quickstart")
-    scenario = replace(plain, rig=replace(plain.rig, relays=6000))
+    scenario = replace(plain, rig=replace(plain.rig, relays=4000))
     ratios, coverage, alarms = [], [], []
     for number in range(_RIGS):
         bench = data_synth.simulate(scenario, seed=seed + number)
