@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from _inputs import BENCH, Case, SLOPE_um_per_V, model_of, random_path, shared_case, smooth_density, synthetic_case
 from _peers import fit_lsq_linear, fit_nnls, numpy_relays, relay_design, scan_relays, thresholds
+from _plant_rows import plant as plant_rows
 from _timing import Line, Table, cpu_seconds, seconds, side_by_side
 
 import fits
@@ -244,4 +245,17 @@ def cold(settings: Settings, table: Table) -> None:
     table.add(Line(what, "", f"{figures['first_s']:.3g} s", note=note))
 
 
-ROWS = {"forward": forward, "gradient": gradient, "levels": levels, "fit": fit, "record": record, "cold": cold}
+def plant(settings: Settings, table: Table) -> None:
+    """The linear plant, against SciPy's simulation."""
+    plant_rows(settings.samples, settings.repeats, settings.seed, table)
+
+
+ROWS = {
+    "forward": forward,
+    "gradient": gradient,
+    "levels": levels,
+    "fit": fit,
+    "record": record,
+    "plant": plant,
+    "cold": cold,
+}

@@ -55,6 +55,7 @@ _columns = click.option(
     default="",
     help="Which columns to read, such as voltage_V=u1_V,displacement_um=-height[nm].",
 )
+_limits = click.option("--limits", metavar="LOW,HIGH", help="Voltages allowed, in V; the model's range by default.")
 _json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 _quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")
 
@@ -143,6 +144,56 @@ def simulate(**options: Any) -> None:
     from fits._cli_work import run_simulate
 
     run_simulate(**options)
+
+
+@cli.command()
+@click.argument("model", metavar="MODEL.json")
+@click.argument("reference", metavar="REFERENCE.csv")
+@click.option("--out", required=True, metavar="VOLTAGE.csv", help="CSV to write; .gz is compressed.")
+@click.option(
+    "--static", "way", flag_value="static", default="static", help="Compensate the hysteresis only: the default."
+)
+@click.option("--dynamic", "way", flag_value="dynamic", help="Compensate the mechanics and the driver too.")
+@click.option("--clip", is_flag=True, help="Where the reference is out of reach take the nearest that is not.")
+@_limits
+@click.option(
+    "--initial",
+    type=click.Choice(["negative", "positive", "demagnetised"]),
+    default="negative",
+    show_default=True,
+    help="Memory before the reference.",
+)
+@click.option("--plots", metavar="DIR", help="Folder for a plot; it is made if need be.")
+@_columns
+@_json
+@_in_sentences
+def compensate(**options: Any) -> None:
+    """Find the voltage that makes the stage follow a reference.
+
+    REFERENCE.csv needs the columns time_s and displacement_um: what the sensor is to read, its offset included. The
+    result has time_s, voltage_V and displacement_um, which is what the model then does.
+    """
+    from fits._cli_compensate import run_compensate
+
+    run_compensate(**options)
+
+
+@cli.command()
+@click.argument("model", metavar="MODEL.json")
+@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+@click.option("--name", default="compensator", show_default=True, help="Name of the files, before all names in them.")
+@click.option("--memory", type=int, default=128, show_default=True, help="Extremes remembered, two per nested loop.")
+@_limits
+@_json
+@_in_sentences
+def export(**options: Any) -> None:
+    """Write a model and its inverse as C99 for a controller.
+
+    The header and the source need no library and allocate nothing.
+    """
+    from fits._cli_compensate import run_export
+
+    run_export(**options)
 
 
 @cli.command()

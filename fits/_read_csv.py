@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits._errors import DataError
-from fits._record import Record
+from fits._record import Record, Reference
 from fits._table import Table, data_error, open_table
 from fits._units import Source, find_sources, known_quantity
 
@@ -96,6 +96,23 @@ def read_runs(
     if not paths:
         raise DataError("Expected at least one CSV file, found none; name the files of the runs.")
     return tuple(read_csv(path, columns) for path in paths)
+
+
+def read_reference(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> Reference:
+    """Read a displacement to follow, with the columns `time_s` and `displacement_um`; others are not looked at.
+
+    Arguments and errors are those of `read_csv`.
+    """
+    table = open_table(path)
+    place = f"{table.path}, line {table.header_line}"
+    sources = find_sources(table.names, columns or {}, ("time_s", "displacement_um"), place)
+    wanted = {name: sources[name] for name in ("time_s", "displacement_um")}
+    values, _ = table.read({source.column for source in wanted.values()})
+    time_s, displacement_um = (_converted(table, name, source, values) for name, source in wanted.items())
+    _check_time(table, sources["time_s"].column, time_s)
+    with np.errstate(all="ignore"):
+        warnings = tuple(_odd_gaps(table, sources["time_s"].column, time_s))
+    return Reference(time_s, displacement_um, os.path.basename(table.path), warnings)
 
 
 def _converted(table: Table, column: str, source: Source, values: Mapping[str, FloatArray]) -> FloatArray:

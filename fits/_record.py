@@ -1,4 +1,4 @@
-"""One measured run: read-only arrays in s, V and um."""
+"""One measured run, or a reference to follow: read-only arrays in s, V and um."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -90,3 +90,41 @@ class Record:
             self.source,
             self.warnings,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A displacement wanted over time, `n` samples long.
+
+    Parameters
+    ----------
+    time_s
+        Sample times in s, shape (n,), strictly increasing.
+    displacement_um
+        Displacement in um as the sensor would read it, shape (n,).
+    source
+        Name of the file, without its folder.
+    warnings
+        What looked odd when the file was read, one sentence each.
+
+    Raises
+    ------
+    ValueError
+        The arrays are not one-dimensional or differ in length.
+    """
+
+    time_s: FloatArray
+    displacement_um: FloatArray
+    source: str = ""
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "displacement_um"):
+            object.__setattr__(self, name, _read_only(getattr(self, name)))
+        if self.displacement_um.shape != (self.time_s.size,):
+            raise ValueError(
+                f"displacement_um has shape {self.displacement_um.shape}, expected ({self.time_s.size},)."
+            )
+
+    def __len__(self) -> int:
+        return self.time_s.size

@@ -129,6 +129,23 @@ class Memory(eqx.Module):
         return Staircase(jnp.where(chain[-1] == 0, self.path_V[chain][place], jnp.nan), count)
 
 
+def _as_entries(start: Staircase) -> Memory:
+    """The remembered extremes as a record of their own, unused places repeating the last."""
+    path = _filled(start)
+    anchor, rising = _branches(path)
+    return Memory(path, anchor, rising, 0)
+
+
+def _filled(start: Staircase) -> Float[Array, " size"]:
+    used = jnp.arange(start.extremes_V.shape[0], dtype=jnp.int32) < start.count
+    tip = start.extremes_V[jnp.clip(start.count - 1, min=0)]
+    return jnp.where(used, start.extremes_V, tip)
+
+
+def _branches(path: Float[Array, " m"]) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:
+    return lax.platform_dependent(lax.stop_gradient(path), cpu=_by_stack, default=_by_lifting)
+
+
 def remember(voltage_V: Float[Array, " n"], start: Staircase) -> Memory:
     """Find, for every sample of a voltage, the remembered extreme that its branch hangs from.
 
@@ -152,12 +169,9 @@ def remember(voltage_V: Float[Array, " n"], start: Staircase) -> Memory:
     On a CPU one pass with a stack, some 20 ns a sample; elsewhere in parallel, by binary lifting over range
     extremes in O(n log n).
     """
-    size = start.extremes_V.shape[0]
-    used = jnp.arange(size, dtype=jnp.int32) < start.count
-    tip = start.extremes_V[jnp.clip(start.count - 1, min=0)]
-    path = jnp.concatenate([jnp.where(used, start.extremes_V, tip), voltage_V])
-    anchor, rising = lax.platform_dependent(lax.stop_gradient(path), cpu=_by_stack, default=_by_lifting)
-    return Memory(path, anchor, rising, size)
+    path = jnp.concatenate([_filled(start), voltage_V])
+    anchor, rising = _branches(path)
+    return Memory(path, anchor, rising, start.extremes_V.shape[0])
 
 
 def _by_stack(path: Float[Array, " m"]) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:

@@ -64,7 +64,14 @@ def static() -> Any:
     return eqx.field(static=True)
 
 
-def param(*, unit: str, scale: float = 1.0, lower: float = -math.inf, upper: float = math.inf) -> Any:
+def param(
+    *,
+    unit: str,
+    scale: float = 1.0,
+    lower: float = -math.inf,
+    upper: float = math.inf,
+    default: float | None = None,
+) -> Any:
     """Declare a field that can be fitted, with its unit, scale and bounds beside it.
 
     Every floating-point array at or below the field is a parameter. Bounds become bijections in
@@ -74,6 +81,8 @@ def param(*, unit: str, scale: float = 1.0, lower: float = -math.inf, upper: flo
     ----------
     unit, scale, lower, upper
         See `ParameterSpec`.
+    default
+        What the field is if nothing is said; by default it must be given.
 
     Raises
     ------
@@ -85,7 +94,8 @@ def param(*, unit: str, scale: float = 1.0, lower: float = -math.inf, upper: flo
     if not lower < upper:
         raise ValueError(f"lower must be less than upper, got {lower} and {upper}")
     spec = ParameterSpec(unit, float(scale), float(lower), float(upper))
-    return eqx.field(converter=_as_inexact, metadata={_KEY: spec})
+    given: dict[str, Any] = {} if default is None else {"default": default}
+    return eqx.field(converter=_as_inexact, metadata={_KEY: spec}, **given)
 
 
 def _spec_of(model: Any, path: tuple[Any, ...]) -> ParameterSpec | None:

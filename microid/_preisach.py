@@ -1,16 +1,16 @@
 """The Preisach operator: hysteresis as a density of relays (Eq. 8-11)."""
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
 from microid._everett import Everett, everett
 from microid._memory import Memory, Staircase, negative_saturation, remember
 from microid._param import param
+from microid._part import AbstractHysteresis
 from microid._reversible import Reversible
 from microid.densities import AbstractDensity
 
 
-class Preisach(eqx.Module):
+class Preisach(AbstractHysteresis):
     """Displacement of a piezo stack under a voltage, with its memory.
 
     The relays are 0/1 and the output is `offset_um` at negative saturation; with the paper's +1/-1 relays the

@@ -80,3 +80,28 @@ def central_differences(function, x, step):
         move[k] = h
         columns.append((np.asarray(function(x + move)) - np.asarray(function(x - move))) / (2 * h))
     return np.stack(columns, axis=-1)
+
+
+def invert_relays(weights_um, thresholds_V, reference_um):
+    """Find voltages by bisection, looking at every relay: the lowest at which the output reaches the reference."""
+    on = np.zeros(weights_um.shape, dtype=bool)
+    cell_V = thresholds_V[1] - thresholds_V[0]
+
+    def after(count):
+        new = on.copy()
+        new[:count] = True
+        new[:, count:] = False
+        return new
+
+    voltage_V = []
+    for wanted in reference_um:
+        few, many = 0, len(thresholds_V)
+        while few < many:
+            middle = (few + many) // 2
+            if np.sum(weights_um, where=after(middle)) < wanted:
+                few = middle + 1
+            else:
+                many = middle
+        on = after(few)
+        voltage_V.append(thresholds_V[0] + (few - 0.5) * cell_V)
+    return np.array(voltage_V)

@@ -96,7 +96,7 @@ def listed(package):
     return names
 
 
-@pytest.mark.parametrize("package", [*PACKAGES, "microid.densities"])
+@pytest.mark.parametrize("package", [*PACKAGES, "microid.densities", "microid.hysteresis"])
 def test_public_names_are_the_listed_ones(package):
     module, names = importlib.import_module(package), listed(package)
     assert names
@@ -126,7 +126,7 @@ def test_names_of_data_synth_are_in_its_all():
 
 
 def test_everything_that_microid_defines_without_an_underscore_is_public():
-    names = set(listed("microid")) | set(listed("microid.densities"))
+    names = set(listed("microid")) | set(listed("microid.densities")) | set(listed("microid.hysteresis"))
     for path in (ROOT / "microid").rglob("*.py"):
         defined = ast.parse(path.read_text(encoding="utf-8")).body
         found = {node.name for node in defined if isinstance(node, ast.FunctionDef | ast.ClassDef)}
@@ -149,7 +149,7 @@ def documented(owner, value):
                 yield f"{owner}.{name}", bool(inspect.getdoc(member))
 
 
-@pytest.mark.parametrize("package", [*PACKAGES, "microid.densities"])
+@pytest.mark.parametrize("package", [*PACKAGES, "microid.densities", "microid.hysteresis"])
 def test_public_names_have_docstrings(package):
     module = importlib.import_module(package)
     values = {name: getattr(module, name) for name in listed(package)}

@@ -1,0 +1,111 @@
+"""The commands `microid compensate` and `microid export`: the work."""
+
+import json
+from pathlib import Path
+
+import click
+import numpy as np
+
+from fits._atomic import atomic_path, write_csv
+from fits._cli_jax import start_jax
+from fits._cli_work import _folder, _keep_inputs, _preisach
+from fits._compensate import compensate
+from fits._errors import DataError
+from fits._export_c import export_c
+from fits._model_file import load_model
+from fits._plot_compensation import plot_compensation
+from fits._read_csv import read_reference
+from fits._record import Record
+from fits._result import predict
+from fits._units import parse_columns
+
+
+def run_compensate(
+    *,
+    model: str,
+    reference: str,
+    out: str,
+    way: str,
+    clip: bool,
+    limits: str | None,
+    initial: str,
+    plots: str | None,
+    columns: str,
+    as_json: bool,
+) -> None:
+    """Do `microid compensate`; the options are the command's."""
+    start_jax()
+    _keep_inputs(out, [model, reference])
+    loaded = load_model(model)
+    hysteresis = _preisach(model, loaded)
+    if way == "dynamic":
+        raise DataError(
+            f"{model}: expected a model with mechanics for --dynamic, found a Preisach model, which has none; "
+            "leave out --dynamic, or fit a whole stage."
+        )
+    wanted = read_reference(reference, parse_columns(columns))
+    # Entered before the work, so that a place that cannot be written to is refused before the wait.
+    with atomic_path(out) as unfinished, _folder(plots) as drawings:
+        found = compensate(hysteresis, wanted, initial, clip, _limits(limits))
+        program = Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
+        sd_um = predict(hysteresis, loaded.uncertainty, program, initial).displacement_sd_um
+        drawn = []
+        if drawings is not None:
+            drawn = plot_compensation(hysteresis, wanted, found, sd_um, drawings(), initial=initial)
+        columns_out = {
+            "time_s": wanted.time_s,
+            "voltage_V": found.voltage_V,
+            "displacement_um": found.displacement_um,
+        }
+        write_csv(unfinished, columns_out)
+    off = np.abs(found.displacement_um - found.reference_um)
+    places = [str(Path(plots) / path.name) for path in drawn] if plots else []
+    summary = {
+        "out": out,
+        "plots": places,
+        "samples": len(wanted),
+        "clipped": int(found.clipped.sum()),
+        "voltage_min_V": float(found.voltage_V.min()),
+        "voltage_max_V": float(found.voltage_V.max()),
+        "offset_um": float(hysteresis.offset_um),
+        "error_max_um": float(off.max()),
+        "error_max_within_reach_um": float(off[~found.clipped].max(initial=0.0)),
+        "displacement_sd_median_um": float(np.median(sd_um)),
+        "remarks": list(wanted.warnings),
+    }
+    if as_json:
+        click.echo(json.dumps(summary, indent=1, allow_nan=False))
+        return
+    lines = [
+        f"{len(wanted)} samples, {summary['voltage_min_V']:.6g} to {summary['voltage_max_V']:.6g} V",
+        f"by the model   within {summary['error_max_within_reach_um']:.3g} um of the reference where it is in reach",
+        f"expected       standard deviation {summary['displacement_sd_median_um']:.3g} um in the median",
+        f"offset         the reference is a sensor's reading, {summary['offset_um']:.6g} um at negative saturation",
+    ]
+    if summary["clipped"]:
+        lines.append(f"clipped        {summary['clipped']} samples out of reach, off by at most {off.max():.3g} um")
+    lines += [f"Note: {remark}" for remark in wanted.warnings]
+    click.echo("\n".join([*lines, f"voltage        {out}", *(f"plot           {place}" for place in places)]))
+
+
+def run_export(*, model: str, out: str, name: str, memory: int, limits: str | None, as_json: bool) -> None:
+    """Do `microid export`; the options are the command's."""
+    start_jax()
+    loaded = load_model(model)
+    files = export_c(_preisach(model, loaded), out, name, size=memory, limits_V=_limits(limits))
+    if as_json:
+        click.echo(json.dumps({"files": [str(file) for file in files]}, indent=1))
+    else:
+        click.echo("\n".join(map(str, files)))
+
+
+def _limits(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise DataError(
+            f"--limits: expected two voltages such as 0,100, found '{text}'; write LOW,HIGH in V."
+        ) from None
+    return low, high

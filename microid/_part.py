@@ -1,0 +1,119 @@
+"""What a part of a stage is: something that turns one sampled signal into another."""
+
+import abc
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Complex, Float
+
+from microid._linear import Hold, LinearSystem, Times
+
+
+class Signal(eqx.Module):
+    """A signal on its way from one part to the next.
+
+    Attributes
+    ----------
+    values
+        Samples, shape `(t,)`, in the unit that the part before gives.
+    before
+        The constant value before the first sample, at which everything was at rest.
+    hold
+        How the signal runs between samples: in lines, `"first"`, or in steps, `"zero"`.
+    """
+
+    values: Float[Array, " t"]
+    before: Float[Array, ""]
+    hold: Hold = eqx.field(static=True)
+
+
+class AbstractPart(eqx.Module):
+    """One link of the chain that a `Stage` is.
+
+    Attributes
+    ----------
+    takes, gives
+        Units of the signals that go in and come out.
+    """
+
+    takes: eqx.AbstractClassVar[str]
+    gives: eqx.AbstractClassVar[str]
+
+    @abc.abstractmethod
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Pass a signal on.
+
+        Parameters
+        ----------
+        time_s
+            Times of the samples, shape `(t,)`, or the one interval between them, shape `()`.
+        signal
+            What goes in.
+        start
+            State before the first sample, for parts that need to be told.
+        """
+
+
+class AbstractLinear(AbstractPart):
+    """A part with a transfer function. Neighbours of this kind are solved together, exactly."""
+
+    @abc.abstractmethod
+    def system(self) -> LinearSystem:
+        """The part as differential equations."""
+
+    @abc.abstractmethod
+    def transfer(self, s_rad_per_s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+        """Transfer function at complex frequencies, output unit per input unit."""
+
+    @property
+    @abc.abstractmethod
+    def poles_rad_per_s(self) -> Complex[Array, " n"]:
+        """Poles of the transfer function, shape `(n,)`."""
+
+    @property
+    def static_gain(self) -> Float[Array, ""]:
+        """Output per input at rest."""
+        return self.system().gain
+
+    def frequency_response(self, frequency_Hz: Float[Array, "..."]) -> Complex[Array, "..."]:
+        """Transfer function along the imaginary axis."""
+        return self.transfer(_imaginary(frequency_Hz))
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Pass a signal on; linear parts start from rest."""
+        return _run_linear(self.system(), time_s, signal)
+
+
+class AbstractHysteresis(AbstractPart):
+    """A rate-independent law between voltage and displacement: its output depends on the path, not on its speed."""
+
+    takes: ClassVar[str] = "V"
+    gives: ClassVar[str] = "um"
+
+    @abc.abstractmethod
+    def __call__(self, voltage_V: Float[Array, " t"], start: Any = None) -> Float[Array, " t"]:
+        """Displacement in um under a voltage, shape `(t,)`; `start` is the state before the first sample."""
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Pass a voltage on, which has come from `start` to its value before the first sample."""
+        displacement_um = self(jnp.concatenate([signal.before[None], signal.values]), start)
+        return Signal(displacement_um[1:], displacement_um[0], signal.hold)
+
+
+def _run_linear(system: LinearSystem, time_s: Times, signal: Signal) -> Signal:
+    """Pass a signal through a linear system that was at rest."""
+    values = system.respond(time_s, signal.values, signal.before, signal.hold)
+    before = system.offset + system.gain * signal.before
+    # What comes out of an inertia runs smoothly, however its input was held.
+    return Signal(values, before, "first" if system.order else signal.hold)
+
+
+def _imaginary(frequency_Hz: Float[Array, "..."]) -> Complex[Array, "..."]:
+    """Complex frequencies, in rad/s, of oscillations that neither grow nor decay."""
+    return 2j * jnp.pi * _complex(jnp.asarray(frequency_Hz))
+
+
+def _complex(value: Float[Array, "..."]) -> Complex[Array, "..."]:
+    return lax.complex(value, jnp.zeros_like(value))

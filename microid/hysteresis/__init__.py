@@ -1,0 +1,12 @@
+"""Hysteresis laws beside `Preisach`, one file each, to be put into a stage in its place.
+
+Each gives the displacement in um under a voltage in V, whatever the speed: `law(voltage_V, start)`. In the literature
+most of them are friction forces that run ahead of a displacement; a piezo's displacement stays behind its voltage, so
+here they are subtracted from a proportional part.
+"""
+
+from microid.hysteresis.bouc_wen import BoucWen as BoucWen
+from microid.hysteresis.dahl import Dahl as Dahl
+from microid.hysteresis.duhem import Duhem as Duhem
+from microid.hysteresis.maxwell_slip import MaxwellSlip as MaxwellSlip
+from microid.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
