@@ -2,6 +2,9 @@
 
 It makes CSV files of voltage and displacement from a truth that shares no numerics with `microid`: NumPy, SciPy and
 the standard library only, and neither of the other packages.
+
+A stage with dynamics, the table `[plant]` of a scenario, is driven by the CSV's voltages joined by straight lines, or
+held from sample to sample with `hold = "zero"`, and is at rest before the first sample.
 """
 
 from data_synth._bench import Bench as Bench
@@ -9,11 +12,14 @@ from data_synth._bench import Record as Record
 from data_synth._bench import simulate as simulate
 from data_synth._errors import ScenarioError as ScenarioError
 from data_synth._history import initial_history as initial_history
+from data_synth._plant import Plant as Plant
+from data_synth._plant import random_plant as random_plant
 from data_synth._plays import PlayShape as PlayShape
 from data_synth._plays import PlaySum as PlaySum
 from data_synth._programs import chirp as chirp
 from data_synth._programs import forc as forc
 from data_synth._programs import hold as hold
+from data_synth._programs import multisine as multisine
 from data_synth._programs import nested as nested
 from data_synth._programs import ramp as ramp
 from data_synth._programs import random_reversals as random_reversals
@@ -24,6 +30,7 @@ from data_synth._relays import RelayGrid as RelayGrid
 from data_synth._relays import plain_relays as plain_relays
 from data_synth._rig import Rig as Rig
 from data_synth._rig import random_rig as random_rig
+from data_synth._scenario import PlantSettings as PlantSettings
 from data_synth._scenario import RigSettings as RigSettings
 from data_synth._scenario import Run as Run
 from data_synth._scenario import Scenario as Scenario
@@ -42,6 +49,8 @@ __all__ = [
     "Bench",
     "Bump",
     "Density",
+    "Plant",
+    "PlantSettings",
     "PlayShape",
     "PlaySum",
     "Record",
@@ -60,10 +69,12 @@ __all__ = [
     "hold",
     "initial_history",
     "load_scenario",
+    "multisine",
     "nested",
     "parse_scenario",
     "plain_relays",
     "ramp",
+    "random_plant",
     "random_reversals",
     "random_rig",
     "scenario_names",

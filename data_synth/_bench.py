@@ -7,6 +7,7 @@ import numpy as np
 
 from data_synth._errors import ScenarioError
 from data_synth._history import initial_history
+from data_synth._plant import Plant
 from data_synth._rig import Rig
 from data_synth._scenario import Run, Scenario
 from data_synth._types import FloatArray, Hysteresis
@@ -38,12 +39,16 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A simulated scenario: its records, the rig they were measured on, and the seed that gives them again."""
+    """A simulated scenario: its records, the rig and plant they were measured on, and the seed that gives them again.
+
+    `plant` is None where the scenario says nothing of dynamics.
+    """
 
     scenario: Scenario
     seed: int
     rig: Rig
     records: tuple[Record, ...]
+    plant: Plant | None = None
 
 
 def simulate(scenario: Scenario, seed: int | None = None) -> Bench:
@@ -73,21 +78,30 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Bench:
         rig = scenario.rig.draw(rig_rng)
     except ValueError as error:
         raise ScenarioError(f"{scenario.file}: rig: {error}") from error
+    # A child of the rig's generator: dynamics change nothing else, and neither do more runs change the dynamics.
+    plant = None if scenario.plant is None else scenario.plant.draw(rig_rng.spawn(1)[0])
     hysteresis = rig.hysteresis()
     records = tuple(
-        _measure(run, rig, hysteresis, scenario, rng) for run, rng in zip(scenario.runs, run_rngs, strict=True)
+        _measure(run, rig, plant, hysteresis, scenario, rng) for run, rng in zip(scenario.runs, run_rngs, strict=True)
     )
-    return Bench(scenario, seed, rig, records)
+    return Bench(scenario, seed, rig, records, plant)
 
 
-def _measure(run: Run, rig: Rig, hysteresis: Hysteresis, scenario: Scenario, rng: np.random.Generator) -> Record:
+def _measure(
+    run: Run, rig: Rig, plant: Plant | None, hysteresis: Hysteresis, scenario: Scenario, rng: np.random.Generator
+) -> Record:
     history_rng, program_rng, sensor_rng = rng.spawn(3)
     history_V = initial_history(run.initial, rig.lower_V, rig.upper_V, history_rng)
     voltage_V = run.voltage_V(float(history_V[-1]), rig.lower_V, rig.upper_V, program_rng)
     # The driver's last digit is 1 uV: the CSV stays short, and the stage is driven by just what the CSV says.
     voltage_V = np.clip(np.round(voltage_V, 6), rig.lower_V, rig.upper_V)
     hysteresis.play(history_V)
-    true_displacement_um = rig.reversible(voltage_V) + hysteresis.play(voltage_V)
+    if plant is None:
+        true_displacement_um = rig.reversible(voltage_V) + hysteresis.play(voltage_V)
+    else:
+        true_displacement_um = plant.respond(
+            voltage_V, run.sample_rate_Hz, lambda path_V: rig.reversible(path_V) + hysteresis.glide(path_V)
+        )
     return Record(
         name=run.name,
         time_s=np.round(np.arange(len(voltage_V)) / run.sample_rate_Hz, 9),

@@ -63,3 +63,13 @@ class PlaySum:
             self._play_V = np.clip(self._play_V, voltage - self._radii_V, voltage + self._radii_V)
             displacement_um[sample] = (self._play_V - self._lowest_V) @ self._weights_um_per_V
         return displacement_um
+
+    def glide(self, voltage_V: FloatArray) -> FloatArray:
+        """Play voltages, shape (n,), in V, that only rise or only fall, also from the ones before.
+
+        Then each operator's state follows from its first state and the voltage now. Returns the same as `play`.
+        """
+        line_V = voltage_V[:, None]
+        plays_V = np.clip(self._play_V, line_V - self._radii_V, line_V + self._radii_V)
+        self._play_V = plays_V[-1]
+        return (plays_V - self._lowest_V) @ self._weights_um_per_V

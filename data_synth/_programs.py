@@ -207,6 +207,42 @@ def chirp(
     return np.concatenate([way, bias_V + amplitude_V * np.sin(2 * np.pi * cycles)])
 
 
+def multisine(
+    start_V: float,
+    *,
+    amplitude_V: float,
+    low_Hz: float,
+    high_Hz: float,
+    period_s: float,
+    periods: int,
+    sample_rate_Hz: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Play `periods` times the same sum of sines of equal amplitude and random phase about the voltage it starts at.
+
+    The frequencies are all the multiples of `1 / period_s` from `low_Hz` to `high_Hz` (Hz); the period is rounded to
+    whole samples. The sum is scaled to go as far as `amplitude_V` (V) from the start. It begins where it is closest
+    to that, so that nothing jumps.
+    """
+    _require_positive(
+        amplitude_V=amplitude_V, low_Hz=low_Hz, high_Hz=high_Hz, period_s=period_s, sample_rate_Hz=sample_rate_Hz
+    )
+    _require_count(periods=periods)
+    samples = _whole(period_s * sample_rate_Hz)
+    _whole(float(samples) * periods)
+    if high_Hz >= sample_rate_Hz / 2:
+        raise ValueError(f"high_Hz must be below half of sample_rate_Hz, {sample_rate_Hz / 2} Hz, got {high_Hz}")
+    # The small number keeps a line that is just at the end of the band.
+    orders = np.arange(samples // 2 + 1) * (sample_rate_Hz / max(samples, 1))
+    lines = (orders >= low_Hz * (1 - 1e-9)) & (orders <= high_Hz * (1 + 1e-9))
+    if not lines.any():
+        raise ValueError(f"low_Hz to high_Hz must hold a multiple of 1 / period_s, got {low_Hz} to {high_Hz}")
+    spectrum = np.where(lines, np.exp(2j * np.pi * rng.random(len(lines))), 0)
+    wave = np.fft.irfft(spectrum, samples)
+    wave = np.roll(wave, -1 - int(np.abs(wave).argmin()))
+    return start_V + np.tile(amplitude_V * wave / np.abs(wave).max(), periods)
+
+
 def steps(
     start_V: float,
     *,
@@ -227,7 +263,7 @@ def steps(
 PROGRAMS: Mapping[str, Callable[..., FloatArray]] = MappingProxyType(
     {
         program.__name__: program
-        for program in (ramp, hold, triangle, sine, forc, nested, random_reversals, chirp, steps)
+        for program in (ramp, hold, triangle, sine, forc, nested, random_reversals, chirp, multisine, steps)
     }
 )
 """The programs a scenario can name, by the `kind` it names them with."""

@@ -1,5 +1,7 @@
 """Hysteresis as an explicit sum of hard relays on a grid of switching values."""
 
+import math
+
 import numpy as np
 
 from data_synth._truth_density import Density
@@ -61,6 +63,29 @@ class RelayGrid:
             elif level < self._level:
                 self._fall(level)
             displacement_um[sample] = self._sum_um
+        return displacement_um
+
+    def glide(self, voltage_V: FloatArray) -> FloatArray:
+        """Play voltages, shape (n,), in V, that only rise or only fall, also from the ones before.
+
+        Returns what `play` does at the edges of the cells, and straight lines between these: without treads, which
+        would shake a stage that has mass. So a reversal is remembered at the last edge that was reached before it.
+        """
+        relays, level = len(self.thresholds_V), self._level
+        cell_V = self.thresholds_V[1] - self.thresholds_V[0]
+        cells = np.clip((voltage_V - self.thresholds_V[0]) / cell_V + 0.5, 0, relays)
+        lowest, highest = min(int(cells.min()), level), max(math.ceil(cells.max()), level)
+        # Before the voltage turns, a row or column switches once: what it was before is all that counts.
+        rows, columns = slice(level, highest), slice(lowest, level)
+        gains_um = np.sum(self._rows_um[rows, :highest], axis=1, where=~self._on[rows, :highest])
+        losses_um = np.sum(self._columns_um[columns, lowest:], axis=1, where=self._on[lowest:, columns].T)
+        below_um = self._sum_um - np.cumsum(losses_um[::-1])[::-1]
+        edges_um = np.concatenate([below_um, [self._sum_um], self._sum_um + np.cumsum(gains_um)])
+        displacement_um = np.interp(cells, np.arange(lowest, highest + 1), edges_um)
+        if cells[-1] >= level + 1:
+            self._rise(int(cells[-1]))
+        elif cells[-1] <= level - 1:
+            self._fall(math.ceil(cells[-1]))
         return displacement_um
 
     def _rise(self, level: int) -> None:

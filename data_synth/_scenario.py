@@ -1,5 +1,6 @@
 """A scenario is data: what stage stands on the bench, what is played to it, and what the sensor adds."""
 
+import functools
 import importlib.resources
 import inspect
 import math
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from data_synth._errors import ScenarioError
+from data_synth._plant import Hold, Plant, random_plant
 from data_synth._programs import PROGRAMS
 from data_synth._rig import Kind, Rig, random_rig
 from data_synth._sensor import Sensor
@@ -84,6 +86,47 @@ class RigSettings:
             stated = {name: usual[name] if value is None else value for name, value in stated.items()}
         return random_rig(
             rng, **stated, lower_V=self.lower_V, upper_V=self.upper_V, relays=self.relays, plays=self.plays
+        )
+
+
+@dataclass(frozen=True)
+class PlantSettings:
+    """The table `[plant]`. Without it the stage is quasi-static: it follows the voltage at once.
+
+    Attributes
+    ----------
+    random
+        Whether what is not stated is drawn. Otherwise it is not there: no driver, or no mass.
+    time_constant_s
+        Of the driver, in s.
+    natural_frequency_Hz, damping_ratio
+        Of the mass on its spring, in Hz and dimensionless.
+    hold
+        What the command does between two samples: a straight line (`first`), or nothing and a jump (`zero`).
+    """
+
+    random: bool = False
+    time_constant_s: float | None = None
+    natural_frequency_Hz: float | None = None
+    damping_ratio: float | None = None
+    hold: Hold = "first"
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a plant that cannot be."""
+        plant = self.draw(np.random.default_rng(0))
+        _require(
+            plant.time_constant_s is not None or plant.natural_frequency_Hz is not None,
+            "time_constant_s, or natural_frequency_Hz and damping_ratio, or random = true must be stated",
+        )
+
+    def draw(self, rng: np.random.Generator) -> Plant:
+        """Draw the plant."""
+        make = functools.partial(random_plant, rng) if self.random else Plant
+        return make(
+            time_constant_s=self.time_constant_s,
+            natural_frequency_Hz=self.natural_frequency_Hz,
+            damping_ratio=self.damping_ratio,
+            hold=self.hold,
         )
 
 
@@ -181,6 +224,8 @@ class Scenario:
         The records.
     sensor
         What the sensor adds.
+    plant
+        Its dynamics; None for a quasi-static stage.
     seed
         Where all randomness starts; a fresh one for each simulation if it is None.
     file
@@ -194,6 +239,7 @@ class Scenario:
     rig: RigSettings
     runs: tuple[Run, ...]
     sensor: Sensor = field(default_factory=Sensor)
+    plant: PlantSettings | None = None
     seed: int | None = None
     file: str = "scenario"
     text: str = ""

@@ -21,3 +21,11 @@ class Hysteresis(Protocol):
         Returns the irreversible displacement, shape (n,), in um: zero in negative saturation.
         """
         ...
+
+    def glide(self, voltage_V: FloatArray) -> FloatArray:
+        """Play voltages, shape (n,), in V, that only rise or only fall, also from the ones before.
+
+        The voltage is taken to move without a jump, and the displacement that is returned, shape (n,), in um, has
+        none either.
+        """
+        ...

@@ -60,6 +60,7 @@ def _truth(bench: Bench) -> str:
         "scenario": {"name": bench.scenario.name, "text": bench.scenario.text},
         "seed": bench.seed,
         "rig": asdict(bench.rig),
+        **({} if bench.plant is None else {"plant": asdict(bench.plant)}),
         "sensor": asdict(bench.scenario.sensor),
         "runs": {
             record.name: {

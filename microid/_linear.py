@@ -107,6 +107,7 @@ class LinearSystem(eqx.Module):
         """
         if hold not in ("first", "zero"):
             raise ValueError(f"hold must be 'first' or 'zero', got {hold!r}")
+        signal = _as_inexact(signal)
         level = self.offset + self.gain * signal
         if self.order == 0:
             return level
@@ -132,7 +133,7 @@ class LinearSystem(eqx.Module):
             )
         return jnp.concatenate([first[None], level[1:] + moved])
 
-    def _advance(
+    def advance(
         self, interval_s: Float[Array, " k"], hold: Hold
     ) -> tuple[Float[Array, "n n k"], Float[Array, "n k"]]:
         """Matrices `exp(A h)`, and what the states lose by an input that rises by one."""
@@ -176,7 +177,7 @@ class LinearSystem(eqx.Module):
         # In pieces, each made again when it is differentiated: all doublings of all samples would not fit.
         pieces = -(-interval_s.shape[0] // _PIECE)
         filled = jnp.pad(interval_s, (0, pieces * _PIECE - interval_s.shape[0]), mode="edge").reshape(pieces, _PIECE)
-        advance = jax.checkpoint(lambda system, piece: system._advance(piece, hold))
+        advance = jax.checkpoint(lambda system, piece: system.advance(piece, hold))
         every = lax.map(lambda piece: advance(self, piece), filled)
         step, taken = (jnp.moveaxis(x, -1, 1).reshape(-1, *x.shape[1:-1])[: interval_s.shape[0]] for x in every)
         push = -taken * change[:, None]
@@ -186,7 +187,7 @@ class LinearSystem(eqx.Module):
         self, interval_s: Float[Array, ""], start: Float[Array, " n"], change: Float[Array, " k"], hold: Hold
     ) -> Float[Array, " k"]:
         """Answer of each block of samples to itself as one product, then of the blocks to those before them."""
-        step, taken = (x[..., 0] for x in self._advance(interval_s[None], hold))
+        step, taken = (x[..., 0] for x in self.advance(interval_s[None], hold))
         blocks = -(-change.shape[0] // _BLOCK)
         inside = jnp.pad(change, (0, blocks * _BLOCK - change.shape[0])).reshape(blocks, _BLOCK)
         # Column j: the states j samples after a change of one, and what states add to the output j + 1 samples on.

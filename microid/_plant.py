@@ -162,8 +162,9 @@ class Mechanics(AbstractLinear):
     def poles_rad_per_s(self) -> Complex[Array, " 2"]:
         """Two poles, conjugate below critical damping. At it they meet, and have no derivative."""
         damping = _complex(self.damping_ratio)
-        root = jnp.sqrt(damping * damping - 1)
-        return _complex(2 * jnp.pi * self.natural_frequency_Hz) * jnp.stack([root - damping, -root - damping])
+        fast = -damping - jnp.sqrt(damping * damping - 1)
+        # Their product is one. The difference of damping and root would lose the digits of a slow pole.
+        return _complex(2 * jnp.pi * self.natural_frequency_Hz) * jnp.stack([1 / fast, fast])
 
 
 class Sensor(AbstractLinear):

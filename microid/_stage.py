@@ -111,7 +111,7 @@ class Stage(eqx.Module):
             Measured displacement in um, shape `(t,)`.
         """
         start = Start() if start is None else start
-        time, voltage = _refined(jnp.asarray(time_s), jnp.asarray(voltage_V), self.substeps, self.hold)
+        time, voltage = _refined(_as_inexact(time_s), _as_inexact(voltage_V), self.substeps, self.hold)
         before = voltage[0] if start.rest_V is None else start.rest_V.astype(voltage.dtype)
         signal = Signal(voltage, before, self.hold)
         for link in self._links():

@@ -163,3 +163,38 @@ def test_numbers_without_sense_are_refused_by_name(program, settings, sentence):
 def test_a_chirp_above_half_the_sample_rate_is_refused():
     with pytest.raises(ValueError, match="at most half of sample_rate_Hz"):
         ds.chirp(0.0, bias_V=0.0, amplitude_V=1.0, start_Hz=1.0, stop_Hz=6.0, duration_s=1.0, **SENSIBLE)
+
+
+BAND = {"amplitude_V": 12.0, "low_Hz": 3.0, "high_Hz": 600.0, "period_s": 0.5, "periods": 3, "sample_rate_Hz": 5000.0}
+
+
+def test_a_multisine_has_equal_lines_in_its_band_and_none_outside(rng):
+    voltage_V = ds.multisine(60.0, **BAND, rng=rng)
+    wave_V = voltage_V.reshape(3, 2500) - 60.0
+    np.testing.assert_array_equal(wave_V[0], wave_V[2])
+    lines_V = np.abs(np.fft.rfft(wave_V[0])) / 1250
+    frequency_Hz = np.fft.rfftfreq(2500, 1 / 5000.0)
+    inside = (frequency_Hz >= 3.0) & (frequency_Hz <= 600.0)
+    assert inside.sum() == 299
+    np.testing.assert_allclose(lines_V[inside], lines_V[inside].mean(), rtol=1e-9)
+    np.testing.assert_allclose(lines_V[~inside], 0, atol=1e-9)
+    assert np.abs(wave_V).max() == pytest.approx(12.0, rel=1e-12)
+    # It ends where it is closest to the start, and so begins one sample after that.
+    assert abs(wave_V[0, -1]) == np.abs(wave_V[0]).min()
+    assert not np.allclose(ds.multisine(60.0, **BAND, rng=rng), voltage_V)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"amplitude_V": 0.0}, "amplitude_V must be positive"),
+        ({"periods": 0}, "periods must be 1 to"),
+        ({"high_Hz": 2500.0}, "high_Hz must be below half of sample_rate_Hz, 2500"),
+        ({"low_Hz": 3.1, "high_Hz": 3.9}, "low_Hz to high_Hz must hold a multiple of 1 / period_s"),
+        ({"period_s": 1e-9}, "low_Hz to high_Hz must hold"),
+        ({"period_s": 2000.0}, "more than ten million"),
+    ],
+)
+def test_multisines_without_sense_are_refused_by_name(settings, sentence, rng):
+    with pytest.raises(ValueError, match=sentence):
+        ds.multisine(0.0, **{**BAND, **settings}, rng=rng)

@@ -131,7 +131,7 @@ def test_a_scenario_is_read_from_a_file(tmp_path):
 
 def test_shipped_scenarios_are_the_ones_that_are_promised():
     promised = {"quickstart", "major_loops", "forc", "nested", "random_reversals"}
-    promised |= {"holds_and_steps", "chirp", "unknown_history", "plays"}
+    promised |= {"holds_and_steps", "chirp", "unknown_history", "plays", "stage"}
     assert promised <= set(ds.scenario_names())
     assert ds.scenario_names() == sorted(ds.scenario_names())
 
@@ -149,9 +149,10 @@ def test_shipped_scenarios_can_be_measured_and_written(name, tmp_path, seed):
         assert record.voltage_V[0] == pytest.approx(record.history_V[-1], abs=1e-6)
         assert record.voltage_V.min() >= bench.rig.lower_V
         assert record.voltage_V.max() <= bench.rig.upper_V
-        # Whatever the history, the displacement lies between the two saturations.
-        assert record.true_displacement_um.min() >= -1e-9
-        assert record.true_displacement_um.max() <= bench.rig.stroke_um * 1.001
+        # Whatever the history, the displacement lies between the two saturations; a mass may swing beyond.
+        beyond_um = 0 if bench.plant is None else 0.05 * bench.rig.stroke_um
+        assert record.true_displacement_um.min() >= -1e-9 - beyond_um
+        assert record.true_displacement_um.max() <= bench.rig.stroke_um * 1.001 + beyond_um
         np.testing.assert_allclose(np.diff(record.time_s), 1 / run.sample_rate_Hz, atol=2e-9)
     files = ds.write(bench, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in files)

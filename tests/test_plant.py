@@ -83,7 +83,7 @@ def test_plant_is_that_of_the_matrix_exponential(name, hold, even, rng):
 def test_derivatives_are_finite_and_right_at_every_limit(name, even, rng):
     time_s, signal = times(rng, even), commands(rng)
     parameters = np.array(PLANTS[name])
-    _, forward, reverse = jacobian(parameters, time_s, signal)
+    forward, reverse = (np.asarray(x) for x in jacobian(parameters, time_s, signal)[1:])
     assert np.all(np.isfinite(forward))
     scale = np.abs(forward).max(axis=0)
     np.testing.assert_allclose(forward / scale, reverse / scale, rtol=0, atol=1e-10)
@@ -197,6 +197,16 @@ def test_poles_meet_at_critical_damping():
     np.testing.assert_array_equal(poles, [-20 * np.pi, -20 * np.pi])
 
 
+@pytest.mark.parametrize("damping", [1.5, 1e4, 1e9])
+def test_the_slow_pole_keeps_its_digits(damping):
+    """Above critical damping it is that of spring and damper, `-k / c`, to second order in `1 / zeta`."""
+    slow, fast = np.asarray(m.Mechanics(1 / (2 * np.pi), damping).poles_rad_per_s)
+    np.testing.assert_allclose(slow * fast, 1, rtol=1e-14)
+    np.testing.assert_allclose(slow + fast, -2 * damping, rtol=1e-14)
+    if damping > 100:
+        np.testing.assert_allclose(slow, -1 / (2 * damping), rtol=1e-7)
+
+
 def test_a_sine_settles_to_the_frequency_response(rng):
     plant = linear_stage(2e-3, 60.0, 0.2, 0.4)
     frequency_Hz = rng.uniform(20, 120)
@@ -238,6 +248,16 @@ def test_times_rounded_in_single_precision_count_as_even():
     exact_s = np.arange(SAMPLES) * (float(time_s[-1]) - float(time_s[0])) / (SAMPLES - 1)
     expected = states(*driver_and_mechanics(2e-3, 60.0, 0.1), exact_s, signal.astype(float), "first")[:, 1]
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-4)
+
+
+def test_whole_volts_are_no_integers():
+    """An interval rounded to a whole number of seconds is none."""
+    system, before = m.Driver(1e-3).system(), np.asarray(0.0)
+    whole_V = np.array([0, 3, -2, 5])
+    expected = system.respond(np.asarray(1e-3), whole_V.astype(float), before)
+    np.testing.assert_array_equal(system.respond(np.asarray(1e-3), whole_V, before), expected)
+    stage = m.Stage.of(driver=m.Driver(1e-3), piezo=m.Piezo(1.0))
+    np.testing.assert_array_equal(stage(np.asarray(1e-3), whole_V, m.Start(rest_V=before)), expected)
 
 
 def test_an_unknown_hold_is_refused():
