@@ -10,14 +10,19 @@ from fits._atomic import atomic_path, write_csv
 from fits._cli_jax import start_jax
 from fits._cli_work import _folder, _keep_inputs, _preisach
 from fits._compensate import compensate
+from fits._compensate_stage import static_equivalent
 from fits._errors import DataError
 from fits._export_c import export_c
-from fits._model_file import load_model
+from fits._model_file import ModelFile, load_model
 from fits._plot_compensation import plot_compensation
 from fits._read_csv import read_reference
 from fits._record import Record
 from fits._result import predict
+from fits._uncertainty import Uncertainty
 from fits._units import parse_columns
+from microid import Preisach, Stage
+
+_STATIC_ONLY = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
 
 
 def run_compensate(
@@ -37,8 +42,8 @@ def run_compensate(
     start_jax()
     _keep_inputs(out, [model, reference])
     loaded = load_model(model)
-    hysteresis = _preisach(model, loaded)
-    if way == "dynamic":
+    stage = _compensable(model, loaded)
+    if way == "dynamic" and isinstance(stage, Preisach):
         raise DataError(
             f"{model}: expected a model with mechanics for --dynamic, found a Preisach model, which has none; "
             "leave out --dynamic, or fit a whole stage."
@@ -46,12 +51,12 @@ def run_compensate(
     wanted = read_reference(reference, parse_columns(columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with atomic_path(out) as unfinished, _folder(plots) as drawings:
-        found = compensate(hysteresis, wanted, initial, clip, _limits(limits))
+        found = compensate(stage, wanted, initial, clip, _limits(limits), "dynamic" if way == "dynamic" else "static")
         program = Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
-        sd_um = predict(hysteresis, loaded.uncertainty, program, initial).displacement_sd_um
+        sd_um = _displacement_sd_um(loaded, program, initial)
         drawn = []
         if drawings is not None:
-            drawn = plot_compensation(hysteresis, wanted, found, sd_um, drawings(), initial=initial)
+            drawn = plot_compensation(stage, wanted, found, sd_um, drawings(), initial=initial)
         columns_out = {
             "time_s": wanted.time_s,
             "voltage_V": found.voltage_V,
@@ -60,6 +65,7 @@ def run_compensate(
         write_csv(unfinished, columns_out)
     off = np.abs(found.displacement_um - found.reference_um)
     places = [str(Path(plots) / path.name) for path in drawn] if plots else []
+    remarks = [*wanted.warnings, *found.remarks]
     summary = {
         "out": out,
         "plots": places,
@@ -67,11 +73,11 @@ def run_compensate(
         "clipped": int(found.clipped.sum()),
         "voltage_min_V": float(found.voltage_V.min()),
         "voltage_max_V": float(found.voltage_V.max()),
-        "offset_um": float(hysteresis.offset_um),
+        "offset_um": float((static_equivalent(stage) if isinstance(stage, Stage) else stage).offset_um),
         "error_max_um": float(off.max()),
         "error_max_within_reach_um": float(off[~found.clipped].max(initial=0.0)),
-        "displacement_sd_median_um": float(np.median(sd_um)),
-        "remarks": list(wanted.warnings),
+        "displacement_sd_median_um": None if sd_um is None else float(np.median(sd_um)),
+        "remarks": remarks,
     }
     if as_json:
         click.echo(json.dumps(summary, indent=1, allow_nan=False))
@@ -79,12 +85,13 @@ def run_compensate(
     lines = [
         f"{len(wanted)} samples, {summary['voltage_min_V']:.6g} to {summary['voltage_max_V']:.6g} V",
         f"by the model   within {summary['error_max_within_reach_um']:.3g} um of the reference where it is in reach",
-        f"expected       standard deviation {summary['displacement_sd_median_um']:.3g} um in the median",
         f"offset         the reference is a sensor's reading, {summary['offset_um']:.6g} um at negative saturation",
     ]
+    if sd_um is not None:
+        lines.insert(2, f"expected       standard deviation {np.median(sd_um):.3g} um in the median")
     if summary["clipped"]:
         lines.append(f"clipped        {summary['clipped']} samples out of reach, off by at most {off.max():.3g} um")
-    lines += [f"Note: {remark}" for remark in wanted.warnings]
+    lines += [f"Note: {remark}" for remark in remarks]
     click.echo("\n".join([*lines, f"voltage        {out}", *(f"plot           {place}" for place in places)]))
 
 
@@ -92,11 +99,26 @@ def run_export(*, model: str, out: str, name: str, memory: int, limits: str | No
     """Do `microid export`; the options are the command's."""
     start_jax()
     loaded = load_model(model)
-    files = export_c(_preisach(model, loaded), out, name, size=memory, limits_V=_limits(limits))
+    stage = _compensable(model, loaded)
+    hysteresis = static_equivalent(stage) if isinstance(stage, Stage) else stage
+    files = export_c(hysteresis, out, name, size=memory, limits_V=_limits(limits))
+    # The inverse of mechanics needs the samples to come, which a controller does not have.
+    remarks = [_STATIC_ONLY] if isinstance(stage, Stage) else []
     if as_json:
-        click.echo(json.dumps({"files": [str(file) for file in files]}, indent=1))
+        click.echo(json.dumps({"files": [str(file) for file in files], "remarks": remarks}, indent=1))
     else:
-        click.echo("\n".join(map(str, files)))
+        click.echo("\n".join([*(f"Note: {remark}" for remark in remarks), *map(str, files)]))
+
+
+def _compensable(path: str, loaded: ModelFile) -> Preisach | Stage:
+    return loaded.model if isinstance(loaded.model, Stage) else _preisach(path, loaded)
+
+
+def _displacement_sd_um(loaded: ModelFile, program: Record, initial: str) -> np.ndarray | None:
+    """Standard deviation of a model's displacement, where the file says enough for one."""
+    if not isinstance(loaded.model, Preisach) or not isinstance(loaded.uncertainty, Uncertainty):
+        return None
+    return predict(loaded.model, loaded.uncertainty, program, initial).displacement_sd_um
 
 
 def _limits(text: str | None) -> tuple[float, float] | None:

@@ -1,16 +1,20 @@
 """Feedforward: the voltage that makes a stage follow a reference (Eq. 19-21)."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits._compensate_stage import begins_in_motion, command, demand, simulate_model, static_equivalent, turns
 from fits._errors import DataError
 from fits._record import Record, Reference
-from fits._run import initial_state, prepare_run, simulate_run
-from microid import Inversion, Preisach, Staircase, invert
+from fits._run import initial_state
+from microid import Inversion, Preisach, Stage, Staircase, invert
+
+Way = Literal["static", "dynamic"]
 
 # References pass through compiled functions in multiples of this many samples.
 _PIECE = 8192
@@ -18,6 +22,10 @@ _PIECE = 8192
 _SLACK = 1e-9
 # What can be reached depends on the past, so it is found again until it stays; two or three times are usual.
 _PASSES = 50
+# At an end of the range what a stage needs may overshoot by this fraction of it, and is cut, before that is refused.
+_TOLERABLE = 0.01
+# What is cut off a command by less than this fraction of the limits' width does not show.
+_WORTH_SAYING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -29,27 +37,31 @@ class Compensation:
     voltage_V
         Shape `(n,)`, within the limits.
     displacement_um
-        Response of the model, sensor offset included, shape `(n,)`.
+        Response of the whole model, sensor offset included, shape `(n,)`.
     reference_um
         What was asked for, shape `(n,)`.
     clipped
-        Samples out of reach, where the nearest displacement that can be reached was taken, shape `(n,)`.
+        Samples out of reach, where the nearest voltage or displacement that can be reached was taken, shape `(n,)`.
+    remarks
+        What keeps a stage from following, one sentence each.
     """
 
     voltage_V: np.ndarray
     displacement_um: np.ndarray
     reference_um: np.ndarray
     clipped: np.ndarray
+    remarks: tuple[str, ...] = ()
 
 
 def compensate(
-    model: Preisach,
+    model: Preisach | Stage,
     reference: Reference | Record,
     initial: str = "negative",
     clip: bool = False,
     limits_V: tuple[float, float] | None = None,
+    way: Way = "static",
 ) -> Compensation:
-    """Find the voltage whose displacement is the reference, by the exact inverse of the hysteresis.
+    """Find the voltage whose displacement is the reference.
 
     Parameters
     ----------
@@ -63,37 +75,89 @@ def compensate(
     clip
         Take the nearest that can be reached where the reference is out of reach, instead of refusing it.
     limits_V
-        Lowest and highest voltage allowed; the range the model was fitted on by default.
+        Lowest and highest voltage allowed; the range the model was fitted on by default. For a stage these are
+        commands, and its range is that of its hysteresis over the gain of its driver.
+    way
+        `"static"`: by the exact inverse of the hysteresis, with the static gains of a stage; its response then lags
+        and rings. `"dynamic"`: by the inverse of the whole stage, for references that are smooth and begin at rest;
+        see `microid.invert_stage`.
 
     Raises
     ------
     DataError
-        If the reference cannot be followed, or the limits are not within the model's range.
+        If the reference cannot be followed, the limits are not within the model's range, or the model has nothing
+        dynamic to compensate.
     """
     if reference.displacement_um is None:
         raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
-    wanted = reference.displacement_um
-    lower, upper = float(model.density.lower_V), float(model.density.upper_V)
-    limits = within_range(model, limits_V)
+    wanted, time_s = reference.displacement_um, reference.time_s
+    law = static_equivalent(model) if isinstance(model, Stage) else model
+    needed, doubt_um = wanted, 0.0
+    if way == "dynamic":
+        if not isinstance(model, Stage):
+            raise DataError("expected a stage for --dynamic, found a Preisach model, which has no mechanics.")
+        needed, doubt_um = demand(model, time_s, wanted, reference.source)
+    elif way != "static":
+        raise ValueError(f"way must be 'static' or 'dynamic', got {way!r}")
+    turning = turns(wanted, doubt_um)
+    remarks = turning + begins_in_motion(wanted, needed, doubt_um)
+    lower, upper = float(law.density.lower_V), float(law.density.upper_V)
+    limits = within_range(law, limits_V)
     start = initial_state(initial, lower, upper)
-    voltage, lowest, highest = _follow(model, wanted, start, limits)
-    slack = _SLACK * float(np.max(highest) - np.min(lowest))
-    clipped = (wanted < lowest - slack) | (wanted > highest + slack)
+    voltage, lowest, highest = _follow(law, needed, start, limits)
+    # Less than it is uncertain by is not out of reach: splines swing a little where a reference leaves an end.
+    stroke = float(np.max(highest) - np.min(lowest))
+    slack = max(_SLACK * stroke, min(doubt_um, _TOLERABLE * stroke))
+    clipped = (needed < lowest - slack) | (needed > highest + slack)
     if clipped.any() and not clip:
         k = int(np.argmax(clipped))
-        bind = (
-            f"the model was fitted between {lower:g} and {upper:g} V"
-            if limits == (lower, upper)
-            else (f"the voltage is limited to {limits[0]:g} to {limits[1]:g} V")
-        )
+        asked = f"asks for {wanted[k]:.6g} um"
+        if way == "dynamic":
+            asked += f", which takes {needed[k]:.6g} um of the piezo in the sensor's units"
+        if turning and lowest[k] <= wanted[k] <= highest[k]:
+            raise DataError(f"{reference.source}: sample {k + 1} (time {time_s[k]:g} s) {asked}, but {turning[0]}")
         raise DataError(
-            f"{reference.source}: sample {k + 1} (time {reference.time_s[k]:g} s) asks for {wanted[k]:.6g} um, but "
-            f"{lowest[k]:.6g} to {highest[k]:.6g} um can be reached there, sensor offset included, because {bind}; "
-            f"{int(clipped.sum())} of {len(wanted)} samples are out of reach: shift or shrink the reference, or take "
-            "the nearest that can be reached with --clip."
+            f"{reference.source}: sample {k + 1} (time {time_s[k]:g} s) {asked}, but "
+            f"{lowest[k]:.6g} to {highest[k]:.6g} um can be reached there, sensor offset included, because "
+            f"{_bind(limits, (lower, upper))}; {int(clipped.sum())} of {len(wanted)} samples are out of reach: shift "
+            f"or shrink the reference,{' slow it down,' if way == 'dynamic' else ''} or take the nearest that can be "
+            "reached with --clip."
         )
-    run = prepare_run(Record(reference.time_s, voltage, None, source=reference.source), lower, upper, initial, 1.0)
-    return Compensation(voltage, simulate_run(model, run), wanted, clipped)
+    if isinstance(model, Stage) and way == "dynamic":
+        voltage, cut, more = _led(model, reference, voltage, limits, clip, _bind(limits, (lower, upper)))
+        clipped, remarks = clipped | cut, remarks + more
+    played = simulate_model(model, Record(time_s, voltage, None, source=reference.source), initial)
+    return Compensation(voltage, played, wanted, clipped, tuple(remarks))
+
+
+def _bind(limits: tuple[float, float], whole: tuple[float, float]) -> str:
+    if limits == whole:
+        return f"the model was fitted between {whole[0]:g} and {whole[1]:g} V"
+    return f"the voltage is limited to {limits[0]:g} to {limits[1]:g} V"
+
+
+def _led(
+    stage: Stage,
+    reference: Reference | Record,
+    static_V: np.ndarray,
+    limits: tuple[float, float],
+    clip: bool,
+    bind: str,
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Lead the driver, within the limits; which samples were cut, and what to say of that."""
+    asked_V = command(stage, reference.time_s, static_V)
+    voltage_V = np.clip(asked_V, *limits)
+    excess_V, width_V = np.abs(asked_V - voltage_V), limits[1] - limits[0]
+    if excess_V.max() > _TOLERABLE * width_V and not clip:
+        k = int(np.argmax(excess_V > _TOLERABLE * width_V))
+        raise DataError(
+            f"{reference.source}: sample {k + 1} (time {reference.time_s[k]:g} s) needs a command of "
+            f"{asked_V[k]:.6g} V to make up for the driver's lag, but {bind}; slow the reference down, keep it away "
+            "from the ends of the range, or cut the command there with --clip."
+        )
+    cut = excess_V > _WORTH_SAYING * width_V
+    said = [f"{int(cut.sum())} samples of the command were cut to the limits, by at most {excess_V.max():.3g} V."]
+    return voltage_V, cut, said if cut.any() else []
 
 
 def within_range(model: Preisach, limits_V: tuple[float, float] | None) -> tuple[float, float]:

@@ -41,7 +41,9 @@ _MINOR = 0.01
 
 
 @dataclass(frozen=True)
-class _Trial:
+class GridTrial:
+    """A resolution that was tried: its data, its solution, and how it predicts blocks from the others."""
+
     data: Data
     solution: GridSolution
     correlation: float
@@ -112,15 +114,7 @@ def fit(
     voltages = [record.voltage_V for record in (*records, *aside)]
     lower, upper = min(v.min() for v in voltages), max(v.max() for v in voltages)
     runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]
-    stroke = max(_stroke(run) for run in runs)
-
-    def trial(n: int, hyper: Hyper) -> _Trial:
-        progress(f"{n} levels")
-        return _try(
-            gather(Grid(jnp.asarray(lower), jnp.asarray(upper), n), runs), runs, stroke, hyper, levels is None
-        )
-
-    tried, trials = _resolve(trial, levels)
+    stroke, tried, trials = choose_grid(runs, levels, progress)
     remarks = _remarks(runs)
     remarks += [warning for record in aside for warning in record.warnings]
     if family == "grid":
@@ -129,7 +123,8 @@ def fit(
             remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try --levels 100")
     else:
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
-            tried = trial(_SHAPE_LEVELS, tried.solution.hyper)
+            grid = Grid(tried.data.grid.lower_V, tried.data.grid.upper_V, _SHAPE_LEVELS)
+            tried = _try(gather(grid, runs), runs, stroke, tried.solution.hyper, True)
         smooth, key = tried.solution.hyper, jax.random.key(seed)
         found, agree = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
         if not agree:
@@ -165,7 +160,39 @@ def fit(
     )
 
 
-def _resolve(trial: Callable[[int, Hyper], _Trial], levels: int | None) -> tuple[_Trial, list[LevelTrial]]:
+def choose_grid(
+    runs: Sequence[Run], levels: int | None, progress: Callable[[str], None]
+) -> tuple[float, GridTrial, list[LevelTrial]]:
+    """Fit grids of rising resolution, or of the one given, and keep the one that predicts best.
+
+    Returns
+    -------
+    stroke_um
+        Unit of the columns.
+    kept
+        The finest grid that predicts no worse than the others, as it is least felt.
+    trials
+        All that were tried.
+
+    Raises
+    ------
+    DataError
+        If there is no loop to fit.
+    FitError
+        If a solver fails.
+    """
+    lower, upper = jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V)
+    stroke = max(_stroke(run) for run in runs)
+
+    def trial(n: int, hyper: Hyper) -> GridTrial:
+        progress(f"{n} levels")
+        return _try(gather(Grid(lower, upper, n), runs), runs, stroke, hyper, levels is None)
+
+    tried, trials = _resolve(trial, levels)
+    return stroke, tried, trials
+
+
+def _resolve(trial: Callable[[int, Hyper], GridTrial], levels: int | None) -> tuple[GridTrial, list[LevelTrial]]:
     """Refine until it no longer pays; the finest that predicts no worse is kept, as its grid is least felt."""
     best = trial(levels or LADDER[0], Hyper.start())
     trials = [LevelTrial(best.data.grid.levels, best.error_um)]
@@ -179,7 +206,7 @@ def _resolve(trial: Callable[[int, Hyper], _Trial], levels: int | None) -> tuple
     return best, trials
 
 
-def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper, compare: bool) -> _Trial:
+def _try(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compare: bool) -> GridTrial:
     grid = data.grid
     correlation = 1.0
     solution = solve_grid(data, stroke, correlation, hyper)
@@ -193,7 +220,7 @@ def _try(data: Data, runs: list[Run], stroke: float, hyper: Hyper, compare: bool
         _check(solution.result)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
-    return _Trial(data, solution, correlation, error, discrepancy)
+    return GridTrial(data, solution, correlation, error, discrepancy)
 
 
 def _stroke(run: Run) -> float:

@@ -7,20 +7,20 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from fits._compensate import Compensation
+from fits._compensate_stage import simulate_model
 from fits._plot_style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned
 from fits._record import Record, Reference
-from fits._run import prepare_run, simulate_run
-from microid import Preisach
+from microid import Preisach, Stage
 
 # Half-width of a 95 % interval in standard deviations.
 _TWO_SIDED_95 = 1.959964
 
 
 def plot_compensation(
-    model: Preisach,
+    model: Preisach | Stage,
     reference: Reference | Record,
     compensation: Compensation,
-    displacement_sd_um: np.ndarray,
+    displacement_sd_um: np.ndarray | None,
     folder: str | os.PathLike[str],
     *,
     initial: str = "negative",
@@ -37,7 +37,7 @@ def plot_compensation(
     compensation
         From `compensate`.
     displacement_sd_um
-        Standard deviation of the model's displacement, shape `(n,)`; from `predict`.
+        Standard deviation of the model's displacement, shape `(n,)`, from `predict`; no band is drawn if None.
     folder
         Existing folder for `compensation.png`; 200 dots per inch.
 
@@ -53,9 +53,7 @@ def plot_compensation(
     """
     wanted, voltage, reached = compensation.reference_um, compensation.voltage_V, compensation.displacement_um
     straight_V = _straight(wanted, voltage)
-    lower, upper = float(model.density.lower_V), float(model.density.upper_V)
-    run = prepare_run(Record(reference.time_s, straight_V, None, source=reference.source), lower, upper, initial, 1.0)
-    plain = simulate_run(model, run)
+    plain = simulate_model(model, Record(reference.time_s, straight_V, None, source=reference.source), initial)
 
     picture = figure(WIDE_in, 4.8, gap=0.08)
     (loop, inverse), (output, error) = picture.subplots(2, 2)
@@ -66,13 +64,17 @@ def plot_compensation(
     _line(output, wanted, plain, MEASURED)
     _line(output, wanted, reached, MODEL)
     label(output, "reference (µm)", "displacement (µm)")
-    off, half = reached - wanted, _TWO_SIDED_95 * displacement_sd_um
+    off = reached - wanted
     error.axhline(0.0, color=LIGHT, linewidth=0.6)
     _line(error, reference.time_s, off, MODEL)
-    keep = thinned(half)
-    for side in (-half, half):
-        name = "95 % band of the model" if side is half else ""
-        error.plot(reference.time_s[keep], (off + side)[keep], color=DARK, linestyle=":", linewidth=0.7, label=name)
+    if displacement_sd_um is not None:
+        half = _TWO_SIDED_95 * displacement_sd_um
+        keep = thinned(half)
+        for side in (-half, half):
+            name = "95 % band of the model" if side is half else ""
+            error.plot(
+                reference.time_s[keep], (off + side)[keep], color=DARK, linestyle=":", linewidth=0.7, label=name
+            )
     label(error, "time (s)", "error (µm)")
     for axes, title in zip((loop, inverse, output, error), ("loop", "inverse loop", "output", "error"), strict=True):
         axes.set_title(title, loc="left", fontsize=7)

@@ -83,7 +83,7 @@ def prepare_run(record: Record, lower_V: float, upper_V: float, initial: str, ho
     """
     voltage = record.voltage_V
     starts, anchor_V, rising = _walk(voltage, initial_state(initial, lower_V, upper_V))
-    known = np.ones(len(voltage), dtype=bool) if initial != "unknown" else _known(voltage, lower_V, upper_V)
+    known = np.ones(len(voltage), dtype=bool) if initial != "unknown" else known_samples(voltage, lower_V, upper_V)
     fitted = known.copy()
     if holdout > 0:
         fitted[len(voltage) - round(holdout * len(voltage)) :] = False
@@ -111,7 +111,7 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
     raise DataError(f"unknown initial state {name!r}: choose one of {', '.join(INITIAL_STATES)}")
 
 
-def _known(voltage: np.ndarray, lower_V: float, upper_V: float) -> np.ndarray:
+def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float) -> np.ndarray:
     """Mark what no longer depends on the past.
 
     At an end of the range every relay is in a known state. Short of that, relays outside the extremes that this

@@ -5,6 +5,10 @@ from microid._everett import everett as everett
 from microid._forest import forest_sum as forest_sum
 from microid._inverse import Inversion as Inversion
 from microid._inverse import invert as invert
+from microid._inverse_stage import StageInversion as StageInversion
+from microid._inverse_stage import driver_command as driver_command
+from microid._inverse_stage import invert_stage as invert_stage
+from microid._inverse_stage import piezo_demand as piezo_demand
 from microid._linear import LinearSystem as LinearSystem
 from microid._linear import recur as recur
 from microid._memory import Memory as Memory
@@ -13,6 +17,9 @@ from microid._memory import demagnetised as demagnetised
 from microid._memory import negative_saturation as negative_saturation
 from microid._memory import positive_saturation as positive_saturation
 from microid._memory import remember as remember
+from microid._modes import HystereticModes as HystereticModes
+from microid._modes import Modes as Modes
+from microid._modes import with_plays as with_plays
 from microid._param import Coordinates as Coordinates
 from microid._param import ParameterInfo as ParameterInfo
 from microid._param import ParameterSpec as ParameterSpec

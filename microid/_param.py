@@ -188,7 +188,7 @@ class Coordinates(eqx.Module, Generic[_Model]):
     """
 
     _rest: PyTree
-    _slots: tuple[tuple[int, tuple[int, ...], ParameterSpec], ...] = eqx.field(static=True)
+    _slots: tuple[tuple[int, ParameterInfo], ...] = eqx.field(static=True)
     _treedef: Any = eqx.field(static=True)
 
     def __init__(self, model: _Model, free: Callable[[ParameterInfo], bool] = lambda _: True):
@@ -211,7 +211,7 @@ class Coordinates(eqx.Module, Generic[_Model]):
         rest: list[Any] = []
         for index, (name, leaf, spec) in enumerate(_walk(model)):
             if spec is not None and free(ParameterInfo(name, leaf.shape, spec)):
-                slots.append((index, leaf.shape, spec))
+                slots.append((index, ParameterInfo(name, leaf.shape, spec)))
                 rest.append(None)
             else:
                 rest.append(leaves[index])
@@ -222,7 +222,12 @@ class Coordinates(eqx.Module, Generic[_Model]):
     @property
     def size(self) -> int:
         """Number of coordinates."""
-        return sum(math.prod(shape) for _, shape, _ in self._slots)
+        return sum(math.prod(info.shape) for info in self.table)
+
+    @property
+    def table(self) -> tuple[ParameterInfo, ...]:
+        """The parameters that are free, in the order of the coordinates."""
+        return tuple(info for _, info in self._slots)
 
     def of(self, model: _Model) -> Float[Array, " size"]:
         """Read the coordinates of a model of the same structure.
@@ -236,21 +241,30 @@ class Coordinates(eqx.Module, Generic[_Model]):
         if treedef != self._treedef:
             raise ValueError("the model has another structure than the one these coordinates were made for")
         parts = []
-        for index, _, spec in self._slots:
+        for index, info in self._slots:
             value = leaves[index]
             if not isinstance(value, jax.core.Tracer):
-                _refuse_outside(spec, np.asarray(value))
-            parts.append(jnp.ravel(_unconstrain(spec, value)))
+                _refuse_outside(info.spec, np.asarray(value))
+            parts.append(jnp.ravel(_unconstrain(info.spec, value)))
         return jnp.concatenate(parts)
+
+    def values(self, vector: Float[Array, " size"]) -> Float[Array, " size"]:
+        """The parameters themselves, in their units, that coordinates stand for: each depends on its own alone."""
+        return jnp.concatenate([jnp.ravel(value) for _, value in self._constrained(vector)])
+
+    def _constrained(self, vector: Float[Array, " size"]) -> list[tuple[int, Array]]:
+        found, start = [], 0
+        for index, info in self._slots:
+            stop = start + math.prod(info.shape)
+            found.append((index, _constrain(info.spec, vector[start:stop].reshape(info.shape))))
+            start = stop
+        return found
 
     def __call__(self, vector: Float[Array, " size"]) -> _Model:
         """Build the model that has these coordinates."""
         leaves = list(self._rest)
-        start = 0
-        for index, shape, spec in self._slots:
-            stop = start + math.prod(shape)
-            leaves[index] = _constrain(spec, vector[start:stop].reshape(shape))
-            start = stop
+        for index, value in self._constrained(vector):
+            leaves[index] = value
         return jax.tree_util.tree_unflatten(self._treedef, leaves)
 
 

@@ -21,7 +21,8 @@ class Signal(eqx.Module):
     before
         The constant value before the first sample, at which everything was at rest.
     hold
-        How the signal runs between samples: in lines, `"first"`, or in steps, `"zero"`.
+        How the signal runs between samples: in lines, `"first"`, in steps, `"zero"`, or `"smooth"`, as what comes out
+        of an inertia does.
     """
 
     values: Float[Array, " t"]
@@ -106,8 +107,7 @@ def _run_linear(system: LinearSystem, time_s: Times, signal: Signal) -> Signal:
     """Pass a signal through a linear system that was at rest."""
     values = system.respond(time_s, signal.values, signal.before, signal.hold)
     before = system.offset + system.gain * signal.before
-    # What comes out of an inertia runs smoothly, however its input was held.
-    return Signal(values, before, "first" if system.order else signal.hold)
+    return Signal(values, before, "smooth" if system.order else signal.hold)
 
 
 def _imaginary(frequency_Hz: Float[Array, "..."]) -> Complex[Array, "..."]:

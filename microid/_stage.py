@@ -36,8 +36,9 @@ class Stage(eqx.Module):
     """Parts in series, from command voltage to measured displacement, differentiable from end to end.
 
     Neighbouring linear parts are solved together, exactly for the hold of the command. A hysteresis sees the voltage
-    at the samples only, exactly so far as no extreme falls between two of them, and what follows it sees its output
-    joined by lines: an error that falls with the square of the interval, and that `substeps` makes smaller.
+    at the samples only, exactly so far as no extreme falls between two of them. What follows it sees its output
+    joined smoothly if an inertia comes before, and by lines otherwise: an error that falls with the fourth power of
+    the interval, or the square, and that `substeps` makes smaller.
 
     Attributes
     ----------
@@ -132,6 +133,10 @@ class Stage(eqx.Module):
             else:
                 links.append(part.system())
         return links
+
+    def with_substeps(self, substeps: int) -> Self:
+        """Return a stage that divides every interval into so many steps."""
+        return type(self)(self.parts, self.names, self.hold, substeps, self.frozen)
 
     def __getitem__(self, name: str) -> AbstractPart:
         return self.parts[self._place(name)]

@@ -1,0 +1,247 @@
+"""From slow and fast records to a whole fitted stage."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fits._errors import DataError
+from fits._fit import choose_grid
+from fits._prior import Hyper
+from fits._record import Record
+from fits._result import FitError, FitStatus
+from fits._run import prepare_run, simulate_run
+from fits._stage_checks import compare_gains, refuse_unseen
+from fits._stage_moments import Chain
+from fits._stage_result import StageFit
+from fits._stage_run import StageRun, place_of_hysteresis, prepare_stage_run, simulate_stage
+from fits._stage_solve import LOSSES, Solved, solve_chain
+from fits._stage_start import measure_response, start_stages
+from fits._stage_summary import summarise
+from fits._stage_uncertainty import Precision, offsets_out
+from microid import Driver, GridDensity, Mechanics, Preisach, Reversible, Stage
+
+# Runs whose voltage moves less than this many times faster than that of the slowest are slow.
+_SLOW = 4.0
+# Steps per sample are doubled until the error of the finite step moves no parameter by this many standard deviations.
+_BIAS = 0.1
+_FINEST = 32
+
+
+def default_stage() -> Stage:
+    """The stage of Section 3.1: driver, Preisach operator and mechanics, with all gain in the operator.
+
+    A gain anywhere else would only be seen together with it.
+    """
+    flat = Preisach(
+        GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
+        Reversible(jnp.ones(4), jnp.asarray(0.0), jnp.asarray(1.0)),
+        jnp.asarray(0.0),
+    )
+    stage = Stage.of(
+        driver=Driver(jnp.asarray(1e-3)),
+        hysteresis=flat,
+        mechanics=Mechanics(jnp.asarray(100.0), jnp.asarray(0.1)),
+    )
+    return stage.freeze("driver.gain", "mechanics.gain")
+
+
+def fit_stage(
+    records: Sequence[Record],
+    *,
+    stage: Stage | None = None,
+    levels: int | None = None,
+    holdout: float | Sequence[Record] = 0.2,
+    initial: str | Sequence[str] = "unknown",
+    loss: str = "squares",
+    progress: Callable[[str], None] = lambda _: None,
+) -> StageFit:
+    """Fit driver, hysteresis and mechanics jointly to slow and fast runs of one rig.
+
+    The slow runs give a first hysteresis, what the fast ones make of it a frequency response, and that the poles to
+    start from. Then all runs are fitted together: the hysteresis is a smooth non-negative regression as in `fit`,
+    solved for exactly while the other parameters follow damped Gauss-Newton steps.
+
+    Parameters
+    ----------
+    records
+        Runs of one rig, at whatever rates. Each has its own sensor offset.
+    stage
+        What is fitted: all its parameters that are not frozen. A `Preisach` operator on a grid is fitted as `fit`
+        does, whatever its present values; drivers and mechanics start from the data; other parts start from their
+        present values. By default the stage of `default_stage`.
+    levels
+        Number of switching voltages; chosen from the slow runs by default.
+    holdout
+        Fraction at the end of every run that is only predicted, or records that are.
+    initial
+        Memory before each run, or one for all: `unknown`, `negative`, `positive` or `demagnetised`.
+    loss
+        `squares`, or `huber`, to which outliers count less.
+    progress
+        Told what is being done, a sentence at a time.
+
+    Returns
+    -------
+    StageFit
+        Never the start: a fit that fails raises.
+
+    Raises
+    ------
+    DataError
+        If the records cannot be fitted, do not show the dynamics, or are not of one rig.
+    FitError
+        If a solver fails.
+    RuntimeError
+        If JAX computes in single precision.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
+    if loss not in LOSSES:
+        raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
+    if not records:
+        raise DataError("there is no record to fit")
+    states = [initial] * len(records) if isinstance(initial, str) else list(initial)
+    if len(states) != len(records):
+        raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
+    fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
+    if not 0 <= fraction <= 0.9:
+        raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
+    aside = () if isinstance(holdout, int | float) else tuple(holdout)
+    voltages = [record.voltage_V for record in (*records, *aside)]
+    range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
+    stage = default_stage() if stage is None else stage
+    remembers = place_of_hysteresis(stage) is not None
+    plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, remembers)
+    problem = _start(plan, stage, levels)
+    problem, solved, precision = _refine(plan, problem)
+    progress("comparing with the measurement")
+    held = [prepare_stage_run(r, range_V, "unknown", 1.0, solved.runs[-1].samples.stride, remembers) for r in aside]
+    found = summarise(problem.at(solved), problem.chain.coordinates, solved, precision, held)
+    notes = [warning for record in (*records, *aside) for warning in record.warnings]
+    return replace(found, remarks=(*notes, *problem.remarks, *found.remarks))
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What was asked for."""
+
+    records: tuple[Record, ...]
+    states: tuple[str, ...]
+    fraction: float
+    range_V: tuple[float, float]
+    loss: str
+    progress: Callable[[str], None]
+    remembers: bool
+
+    def runs(self, strides: Sequence[int]) -> list[StageRun]:
+        """The records, each interval divided into so many steps."""
+        return [
+            prepare_stage_run(record, self.range_V, state, self.fraction, stride, self.remembers)
+            for record, state, stride in zip(self.records, self.states, strides, strict=True)
+        ]
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """A stage to be fitted, and where its fit begins."""
+
+    stage: Stage
+    chain: Chain
+    z: np.ndarray
+    columns_um: np.ndarray
+    hyper: Hyper | None
+    stroke_um: float
+    remarks: tuple[str, ...]
+
+    def at(self, solved: Solved) -> Stage:
+        """The stage that a solution stands for."""
+        return self.chain.stage(jnp.asarray(solved.z), jnp.asarray(solved.columns_um))
+
+
+def _start(plan: _Plan, stage: Stage, levels: int | None) -> _Problem:
+    """Read a hysteresis off the slow runs and poles off the others."""
+    speed = [_speed_Hz(record) for record in plan.records]
+    slow = [k for k, one in enumerate(speed) if one <= _SLOW * min(speed)]
+    place = place_of_hysteresis(stage)
+    law = None if place is None else stage.parts[place]
+    grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
+    drives = [record.voltage_V for record in plan.records]
+    name = stage.names[place or 0]
+    if isinstance(law, Preisach) and isinstance(law.density, GridDensity) and name not in stage.frozen:
+        runs = [
+            prepare_run(record, *plan.range_V, state, plan.fraction)
+            for record, state in zip(plan.records, plan.states, strict=True)
+        ]
+        plan.progress(f"hysteresis from {', '.join(plan.records[k].source for k in slow)}")
+        stroke, tried, _ = choose_grid([runs[k] for k in slow], levels, plan.progress)
+        grid, hyper = tried.data.grid, tried.solution.hyper
+        columns = np.asarray(tried.solution.columns) * stroke
+        law = grid.model(columns, np.zeros(()))
+        stage = stage.swap(name, law)
+        drives = [simulate_run(law, run) for run in runs]
+    elif law is not None:
+        drives = [np.asarray(law(jnp.asarray(record.voltage_V))) for record in plan.records]  # type: ignore[operator]
+    runs_at_rate = plan.runs([1] * len(plan.records))
+    lively = [k for k in range(len(plan.records)) if k not in slow] or slow
+    responses = [measure_response(runs_at_rate[k], drives[k]) for k in lively]
+    candidates = start_stages(stage, responses)
+    place = place if grid is not None else None
+    best: tuple[float, Stage, Chain, Solved] | None = None
+    failure = FitError(FitStatus.NONFINITE)
+    for number, candidate in enumerate(candidates):
+        plan.progress(f"poles: start {number + 1} of {len(candidates)}")
+        chain = Chain(offsets_out(candidate, grid is not None), place, grid)
+        z = np.asarray(chain.coordinates.of(candidate))
+        try:
+            solved = solve_chain(chain, z, columns, runs_at_rate, None, stroke, plan.loss, plan.progress)
+        except FitError as error:
+            failure = error
+            continue
+        cost = solved.cost
+        if best is None or cost < best[0]:
+            best = cost, candidate, chain, solved
+    if best is None:
+        raise failure
+    _, stage, chain, solved = best
+    found = chain.stage(jnp.asarray(solved.z), jnp.asarray(columns))
+    refuse_unseen(found, chain.coordinates, solved)
+    remarks = compare_gains(found, runs_at_rate)
+    return _Problem(stage, chain, solved.z, columns, hyper, stroke, tuple(remarks))
+
+
+def _speed_Hz(record: Record) -> float:
+    """Frequency of a sine that moves as fast as a voltage does, for its size."""
+    rate = np.diff(record.voltage_V) / np.diff(record.time_s)
+    size = float(np.std(record.voltage_V))
+    if size == 0:
+        raise DataError(f"{record.source}: the voltage does not move; there is nothing to fit")
+    return float(np.sqrt(np.mean(rate**2))) / (2 * np.pi * size)
+
+
+def _refine(plan: _Plan, problem: _Problem) -> tuple[_Problem, Solved, Precision]:
+    """Fit, and divide the intervals further until that moves no parameter any more."""
+    strides = [1] * len(plan.records)
+    while True:
+        runs = plan.runs(strides)
+        start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
+        solved = solve_chain(problem.chain, *start, plan.loss, plan.progress)
+        problem = replace(problem, z=solved.z, columns_um=solved.columns_um, hyper=solved.hyper)
+        precision = Precision(problem.chain, solved, problem.stroke_um)
+        if place_of_hysteresis(problem.stage) is None:
+            return problem, solved, precision
+        influence = precision.influence()
+        sd = np.sqrt(np.diagonal(precision.covariance(influence)))
+        stage, bias, finer = problem.at(solved), np.zeros_like(sd), []
+        for k, (run, twice) in enumerate(zip(runs, plan.runs([2 * s for s in strides]), strict=True)):
+            off = simulate_stage(stage, run) - simulate_stage(stage, twice)
+            moved = np.abs(influence[k] @ (off - off[run.fitted].mean()))
+            bias += moved
+            if np.any(moved > _BIAS * sd / len(runs)):
+                finer.append(k)
+        if not np.any(bias > _BIAS * sd) or not finer or max(strides[k] for k in finer) >= _FINEST:
+            return problem, solved, precision
+        strides = [2 * s if k in finer else s for k, s in enumerate(strides)]
+        plan.progress(f"dividing the intervals of {', '.join(plan.records[k].source for k in finer)} further")

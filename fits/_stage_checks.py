@@ -1,0 +1,127 @@
+"""Runs that cannot be fitted as one stage: what is wrong with them, in words."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fits._errors import DataError
+from fits._stage_run import StageRun, residual_of, simulate_stage
+from fits._stage_solve import Solved, marginal_information
+from microid import Coordinates, Mechanics, Stage
+
+# Gains that differ by more than this are not those of one rig, and by more than that are worth a remark.
+_REFUSED, _REMARKED = 0.1, 0.05
+# A resonance above this fraction of the sampling rate is hardly told from its mirror image.
+_HIGHEST = 0.45
+# Coordinates are of the order of 1; one that is known no better than this is not seen.
+_UNSEEN = 0.5
+_POLES = ("time_constant_s", "natural_frequency_Hz")
+
+
+def refuse_unseen(stage: Stage, coordinates: Coordinates[Stage], solved: Solved) -> None:
+    """Refuse runs that do not show the dynamics they are fitted with.
+
+    Parameters
+    ----------
+    stage
+        With the poles that explain the runs best.
+    coordinates, solved
+        Of these poles, the hysteresis being given.
+
+    Raises
+    ------
+    DataError
+        If no run moves fast enough, or none is sampled fast enough.
+    """
+    fastest = max(solved.runs, key=lambda run: run.rate_Hz)
+    for part in stage.parts:
+        if isinstance(part, Mechanics) and float(part.natural_frequency_Hz) > _HIGHEST * fastest.rate_Hz:
+            raise DataError(
+                f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, expected a rate well above twice the "
+                f"resonance, which seems to lie near {float(part.natural_frequency_Hz):.3g} Hz or beyond: sample at "
+                "5 times the resonance or more, or fit the hysteresis alone with --model loop"
+            )
+    information = marginal_information(
+        solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
+    )
+    slope = np.abs(_relative(coordinates, solved.z))
+    poles = [k for k, name in enumerate(_names(stage, coordinates)) if name.rpartition(".")[2] in _POLES]
+    if not poles:
+        return
+    sd = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300)) * slope
+    if all(sd[k] > _UNSEEN for k in poles):
+        names = ", ".join(run.record.source for run in solved.runs)
+        raise DataError(
+            f"{names}: the displacement follows the voltage without delay or ringing, so these runs hold nothing of "
+            "the driver and the mechanics; add a run with steps, a chirp or a multisine that goes beyond the "
+            "resonance, or fit the hysteresis alone with --model loop"
+        )
+
+
+def _names(stage: Stage, coordinates: Coordinates[Stage]) -> list[str]:
+    return [stage.named(info.path) for info in coordinates.table for _ in range(int(np.prod(info.shape)))]
+
+
+def _relative(coordinates: Coordinates[Stage], z: np.ndarray) -> np.ndarray:
+    """Change of each parameter's logarithm per coordinate, shape `(p,)`."""
+    value, slope = coordinates_slope(coordinates, z)
+    return slope / np.maximum(np.abs(value), 1e-300)
+
+
+def coordinates_slope(coordinates: Coordinates[Stage], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters and their derivatives, each by its own coordinate, shapes `(p,)`."""
+    point = jnp.asarray(z)
+    value, slope = jax.jvp(coordinates.values, (point,), (jnp.ones_like(point),))
+    return np.asarray(value), np.asarray(slope)
+
+
+def _gains(stage: Stage, runs: Sequence[StageRun]) -> np.ndarray:
+    """How much each run moves for what the stage says it moves."""
+    gains = []
+    for run in runs:
+        predicted, left = simulate_stage(stage, run)[run.fitted], residual_of(stage, run)[run.fitted]
+        predicted = predicted - predicted.mean()
+        gains.append(1 + float(predicted @ left / (predicted @ predicted)))
+    return np.asarray(gains)
+
+
+def compare_gains(stage: Stage, runs: Sequence[StageRun], refuse: bool = False) -> list[str]:
+    """Find runs that move further, or less far, than the others under the same voltage.
+
+    Parameters
+    ----------
+    stage
+        Fitted to all of them.
+    runs
+        The runs.
+    refuse
+        Whether too large a difference is an error.
+
+    Returns
+    -------
+    list of str
+        A remark, if there is anything to say.
+
+    Raises
+    ------
+    DataError
+        If they cannot be of one rig.
+    """
+    gains = _gains(stage, runs)
+    low, high = int(np.argmin(gains)), int(np.argmax(gains))
+    ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
+    one, other = runs[high].record.source, runs[low].record.source
+    if refuse and ratio > 1 + _REFUSED:
+        raise DataError(
+            f"{one} and {other}: under the same voltage the first moves {ratio:.3g} times as far as the second, so "
+            "they are not of one rig in one setting; check the units, the amplifier's gain and the sensor's range, "
+            "or fit them apart"
+        )
+    if ratio > 1 + _REMARKED:
+        return [
+            f"under the same voltage {one} moves {ratio:.3g} times as far as {other}: "
+            "if both are of one rig, its gain depends on amplitude or rate more than the hysteresis explains"
+        ]
+    return []

@@ -1,0 +1,155 @@
+"""What the fit of a stage gives back."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fits._errors import DataError
+from fits._metrics import Errors
+from fits._record import Record
+from fits._result import FitStatus, Prediction, RunReport, pool
+from fits._stage_run import place_of_hysteresis, prepare_stage_run, simulate_stage
+from fits._stage_uncertainty import StageUncertainty
+from microid import Preisach, Stage
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """One parameter of a stage.
+
+    Attributes
+    ----------
+    name
+        Part and field, such as `mechanics.natural_frequency_Hz`.
+    unit
+        Its unit.
+    value
+        The estimate.
+    sd
+        Its standard deviation, the noise as coloured as the residual is.
+    lower, upper
+        Ends of its 95 % interval, within its bounds.
+    """
+
+    name: str
+    unit: str
+    value: float
+    sd: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class StageFit:
+    """A fitted stage, and how far to trust it.
+
+    Attributes
+    ----------
+    model
+        The stage, with the offset of the first run.
+    uncertainty
+        Of its predictions.
+    status
+        How the fit ended.
+    remarks
+        What the user should know, one sentence each.
+    parameters
+        Those outside of the hysteresis' grid, in the order of the solver's coordinates.
+    correlation
+        Between them, shape `(p, p)`.
+    unseen
+        Combinations of parameters that the data leave open, one sentence each.
+    noise_um
+        Standard deviation of each fitted run's residual.
+    correlation_samples
+        Number of residual samples of each run that are worth one independent one.
+    substeps
+        Steps into which each interval of each run was divided.
+    runs
+        One report per fitted run, then one per held-out record.
+    """
+
+    model: Stage
+    uncertainty: StageUncertainty
+    status: FitStatus
+    remarks: tuple[str, ...]
+    parameters: tuple[ParameterEstimate, ...]
+    correlation: np.ndarray
+    unseen: tuple[str, ...]
+    noise_um: tuple[float, ...]
+    correlation_samples: tuple[float, ...]
+    substeps: tuple[int, ...]
+    runs: tuple[RunReport, ...]
+
+    def __getitem__(self, name: str) -> ParameterEstimate:
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise KeyError(
+            f"no parameter {name!r} was fitted: choose one of {', '.join(p.name for p in self.parameters)}"
+        )
+
+    @property
+    def in_sample(self) -> Errors:
+        """Errors on all fitted samples together."""
+        pooled = pool([run.in_sample for run in self.runs])
+        if pooled is None:
+            raise ValueError("no run was fitted")
+        return pooled
+
+    @property
+    def held_out(self) -> Errors | None:
+        """Errors on all held-out samples together; None where nothing was held out."""
+        return pool([run.held_out for run in self.runs])
+
+    def predict(self, record: Record, initial: str = "negative") -> Prediction:
+        """Predict the displacement of a voltage program; see `predict_stage`."""
+        return predict_stage(self.model, self.uncertainty, record, initial)
+
+
+def range_of(stage: Stage) -> tuple[float, float]:
+    """Voltages that a stage was fitted on; unlimited without a Preisach operator."""
+    place = place_of_hysteresis(stage)
+    law = None if place is None else stage.parts[place]
+    if isinstance(law, Preisach):
+        return float(law.density.lower_V), float(law.density.upper_V)
+    return -np.inf, np.inf
+
+
+def predict_stage(
+    stage: Stage, uncertainty: StageUncertainty | None, record: Record, initial: str = "negative"
+) -> Prediction:
+    """Predict the displacement of a voltage program through a whole stage, with its uncertainty.
+
+    Parameters
+    ----------
+    stage, uncertainty
+        From a fit or a model file; without an uncertainty its standard deviations are NaN.
+    record
+        The program; its displacement, if any, is not looked at.
+    initial
+        Memory before the first sample: `negative`, `positive` or `demagnetised`.
+
+    Raises
+    ------
+    DataError
+        If the voltage leaves the range that the stage was fitted on.
+    """
+    lower, upper = range_of(stage)
+    slack = 1e-9 * (upper - lower) if np.isfinite(upper - lower) else 0.0
+    outside = np.flatnonzero((record.voltage_V < lower - slack) | (record.voltage_V > upper + slack))
+    if len(outside):
+        first = int(outside[0])
+        raise DataError(
+            f"{record.source}: sample {first + 1} (time {record.time_s[first]:g} s) asks for "
+            f"{record.voltage_V[first]:g} V, but the stage was fitted between {lower:g} and {upper:g} V: "
+            "clip the program or fit runs that cover it"
+        )
+    program = Record(record.time_s, record.voltage_V, np.zeros(len(record)), source=record.source)
+    run = prepare_stage_run(program, (lower, upper), initial, 1.0, stage.substeps)
+    # The program is refined already.
+    stage = stage.with_substeps(1)
+    sd = np.full(len(record), np.nan)
+    if uncertainty is not None:
+        sd = uncertainty.sd_um(stage, run)
+    return Prediction(simulate_stage(stage, run), sd)

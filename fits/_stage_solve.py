@@ -1,0 +1,210 @@
+"""Fitting a whole stage: damped Gauss-Newton steps, the columns of the hysteresis solved for exactly in each."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from fits._grid import solve_grid
+from fits._moments import Data, Moments
+from fits._prior import Hyper, roughness
+from fits._result import FitError, FitStatus
+from fits._stage_moments import Chain, RunSums, Weighing, run_sums, split_moments
+from fits._stage_run import StageRun, residual_of
+
+_ROUNDS = 40
+# Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
+_DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
+# A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
+_STATIONARY = 0.02
+# Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
+_HUBER = 1.345
+LOSSES = ("squares", "huber")
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Where a fit ended.
+
+    Attributes
+    ----------
+    z
+        Coordinates, shape `(p,)`.
+    columns_um
+        Columns of the grid, shape `(D,)`.
+    hyper
+        Smoothness and noise of the grid; None without one.
+    runs
+        With the weights of their samples.
+    sums
+        Regression at the end, per run.
+    weighing
+        Noise of each run.
+    distance
+        How far the optimum may still be, in standard deviations of the coordinates.
+    """
+
+    z: np.ndarray
+    columns_um: np.ndarray
+    hyper: Hyper | None
+    runs: list[StageRun]
+    sums: list[RunSums]
+    weighing: Weighing
+    distance: float
+
+    @property
+    def cost(self) -> float:
+        """Logarithm of the noise that is left, times the samples that count: smaller is better."""
+        terms = zip(self.runs, self.weighing.noise_um, strict=True)
+        return sum(float(run.fitted.sum()) * float(np.log(noise)) for run, noise in terms)
+
+
+def solve_chain(
+    chain: Chain,
+    z: np.ndarray,
+    columns_um: np.ndarray,
+    runs: Sequence[StageRun],
+    hyper: Hyper | None,
+    stroke_um: float,
+    loss: str,
+    progress: Callable[[str], None],
+) -> Solved:
+    """Find the most probable coordinates of a stage, and the columns of its grid.
+
+    Each round linearises the stage, eliminates the coordinates from the regression, solves it for non-negative smooth
+    columns with the smoothness that maximises the evidence, and damps the step until the true cost falls (variable
+    projection; Golub & Pereyra 2003). Without columns these are Levenberg and Marquardt's steps.
+
+    Parameters
+    ----------
+    chain
+        The stage.
+    z, columns_um
+        Start.
+    runs
+        Prepared.
+    hyper
+        Smoothness and noise of the columns to start from; None to leave the columns as they are.
+    stroke_um
+        Unit of the columns.
+    loss
+        One of `LOSSES`.
+    progress
+        Told what is being done.
+
+    Raises
+    ------
+    FitError
+        If it does not become stationary.
+    """
+    damping = _DAMPING
+    for number in range(_ROUNDS):
+        runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None)
+        progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
+        if not np.all(np.isfinite(weighing.noise_um)):
+            raise FitError(FitStatus.NONFINITE)
+        total = weighing.total(sums)
+        here = weighing.cost_um2(runs, [one.residual_um for one in sums])
+        while True:
+            step, columns, hyper, variance, distance = _step(
+                chain, total, columns_um, hyper, weighing, stroke_um, damping
+            )
+            prior = prior_precision(chain, hyper, stroke_um)
+            there = weighing.cost_um2(runs, _residuals(chain, z + step, columns, runs))
+            old = here / variance + columns_um @ prior @ columns_um
+            new = there / variance + columns @ prior @ columns
+            if new <= old:
+                z, columns_um, damping = z + step, columns, damping / _FACTOR
+                break
+            # Within rounding of the optimum nothing falls any more.
+            if distance < _STATIONARY:
+                break
+            damping *= _FACTOR
+            if damping > _HIGHEST:
+                raise FitError(FitStatus.NOT_STATIONARY)
+        if distance < _STATIONARY:
+            runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None)
+            return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+    raise FitError(FitStatus.MAX_STEPS)
+
+
+def prior_precision(chain: Chain, hyper: Hyper | None, stroke_um: float) -> np.ndarray:
+    """Precision of the columns before the data, in 1/um^2, shape `(D, D)`; zero where they are given."""
+    if hyper is None:
+        return np.zeros((chain.size, chain.size))
+    return np.asarray(roughness(chain.levels).precision(hyper)) / stroke_um**2
+
+
+def _gather(
+    chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun], loss: str, free: bool
+) -> tuple[Sequence[StageRun], list[RunSums], Weighing]:
+    if loss != "squares":
+        left = _residuals(chain, z, columns_um, runs)
+        runs = [robust(run, residual) for run, residual in zip(runs, left, strict=True)]
+    sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
+    return runs, sums, Weighing.of(runs, [one.residual_um for one in sums])
+
+
+def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun]) -> list[np.ndarray]:
+    stage = chain.stage(jnp.asarray(z), jnp.asarray(columns_um))
+    return [residual_of(stage, run) for run in runs]
+
+
+def robust(run: StageRun, residual_um: np.ndarray) -> StageRun:
+    """Weigh a run's samples by what they leave: outliers count linearly (Huber)."""
+    left = residual_um[run.fitted]
+    middle = float(np.median(left))
+    # The median absolute deviation is not moved by the outliers themselves.
+    spread = 1.4826 * float(np.median(np.abs(left - middle))) + 1e-300
+    return run.weighted(_HUBER / np.maximum(np.abs(residual_um - middle) / spread, _HUBER))
+
+
+def _step(
+    chain: Chain,
+    total: Moments,
+    columns_um: np.ndarray,
+    hyper: Hyper | None,
+    weighing: Weighing,
+    stroke_um: float,
+    damping: float,
+) -> tuple[np.ndarray, np.ndarray, Hyper | None, float, float]:
+    """Change of coordinates, columns, their smoothness, noise variance in um^2, and standard deviations moved."""
+    if hyper is None or chain.grid is None:
+        _, step, _ = split_moments(total, 0, damping)
+        variance = weighing.least_um**2
+        information = marginal_information(total, 0, np.zeros((0, 0)), variance)
+        return step, columns_um, hyper, variance, float(step @ information @ step / len(step)) ** 0.5
+    reduced, answer, follow = split_moments(total, chain.size, damping)
+    solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, 1.0, hyper)
+    if solution.result != optx.RESULTS.successful:
+        raise FitError(FitStatus.MAX_STEPS)
+    columns = np.asarray(solution.columns) * stroke_um
+    step = answer - follow @ columns
+    variance = float(jnp.exp(solution.hyper.log_variance)) * stroke_um**2
+    prior = prior_precision(chain, solution.hyper, stroke_um)
+    information = marginal_information(total, chain.size, prior, variance)
+    return step, columns, solution.hyper, variance, float(step @ information @ step / len(step)) ** 0.5
+
+
+def marginal_information(total: Moments, size: int, prior: np.ndarray, variance: float) -> np.ndarray:
+    """Precision of the coordinates, whatever the columns may be, shape `(p, p)`.
+
+    Parameters
+    ----------
+    total
+        Of columns and coordinates.
+    size
+        Number of columns, `D`.
+    prior
+        Precision of the columns before the data, shape `(D, D)`.
+    variance
+        Of the noise.
+    """
+    gram = np.asarray(total.gram) / variance
+    if size == 0:
+        return gram
+    root = np.linalg.cholesky(gram[:size, :size] + prior)
+    half = np.linalg.solve(root, gram[:size, size:])
+    return gram[size:, size:] - half.T @ half
