@@ -10,13 +10,26 @@ if TYPE_CHECKING:
     from fits._export_c import export_c as export_c
     from fits._fit import LADDER as LADDER
     from fits._fit import fit as fit
+    from fits._fit_stage import default_stage as default_stage
+    from fits._fit_stage import fit_stage as fit_stage
+    from fits._frequency import Multisine as Multisine
+    from fits._frequency import ResponseData as ResponseData
+    from fits._frequency import estimate_response as estimate_response
+    from fits._frequency import read_multisine as read_multisine
     from fits._metrics import Errors as Errors
     from fits._metrics import errors as errors
     from fits._metrics import loop_width_pct as loop_width_pct
+    from fits._modal_fit import ModalFit as ModalFit
+    from fits._modal_fit import fit_hysteresis as fit_hysteresis
+    from fits._modal_fit import fit_response as fit_response
+    from fits._modal_fit import relative_error as relative_error
     from fits._model_file import ModelFile as ModelFile
     from fits._model_file import load_model as load_model
     from fits._model_file import save_model as save_model
+    from fits._network_inverse import NetworkInverse as NetworkInverse
+    from fits._network_inverse import fit_network_inverse as fit_network_inverse
     from fits._plot_compensation import plot_compensation as plot_compensation
+    from fits._plot_stage import plot_stage as plot_stage
     from fits._plots import plot_fit as plot_fit
     from fits._read_csv import read_csv as read_csv
     from fits._read_csv import read_reference as read_reference
@@ -32,6 +45,12 @@ if TYPE_CHECKING:
     from fits._result import Prediction as Prediction
     from fits._result import RunReport as RunReport
     from fits._result import predict as predict
+    from fits._stage_report import describe_stage as describe_stage
+    from fits._stage_report import stage_report as stage_report
+    from fits._stage_result import ParameterEstimate as ParameterEstimate
+    from fits._stage_result import StageFit as StageFit
+    from fits._stage_result import predict_stage as predict_stage
+    from fits._stage_uncertainty import StageUncertainty as StageUncertainty
     from fits._uncertainty import Uncertainty as Uncertainty
 
 # Names are looked up when first used, so that the command's help does not wait for JAX and pandas.
@@ -44,27 +63,46 @@ _HOMES = {
     "FitStatus": "_result",
     "LADDER": "_fit",
     "LevelTrial": "_result",
+    "ModalFit": "_modal_fit",
     "ModelFile": "_model_file",
+    "Multisine": "_frequency",
+    "NetworkInverse": "_network_inverse",
+    "ParameterEstimate": "_stage_result",
     "Prediction": "_result",
     "Record": "_record",
     "Reference": "_record",
+    "ResponseData": "_frequency",
     "RunReport": "_result",
+    "StageFit": "_stage_result",
+    "StageUncertainty": "_stage_uncertainty",
     "Uncertainty": "_uncertainty",
     "compensate": "_compensate",
+    "default_stage": "_fit_stage",
     "describe": "_report",
+    "describe_stage": "_stage_report",
     "errors": "_metrics",
+    "estimate_response": "_frequency",
     "export_c": "_export_c",
     "fit": "_fit",
+    "fit_hysteresis": "_modal_fit",
+    "fit_network_inverse": "_network_inverse",
     "fit_report": "_report",
+    "fit_response": "_modal_fit",
+    "fit_stage": "_fit_stage",
     "load_model": "_model_file",
     "loop_width_pct": "_metrics",
     "plot_compensation": "_plot_compensation",
     "plot_fit": "_plots",
+    "plot_stage": "_plot_stage",
     "predict": "_result",
+    "predict_stage": "_stage_result",
     "read_csv": "_read_csv",
+    "read_multisine": "_frequency",
     "read_reference": "_read_csv",
     "read_runs": "_read_csv",
+    "relative_error": "_modal_fit",
     "save_model": "_model_file",
+    "stage_report": "_stage_report",
 }
 
 

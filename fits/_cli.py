@@ -1,7 +1,7 @@
 """The `microid` command: what can be asked of it.
 
-Only the standard library and click are imported here; the work, and what it imports, is in `_cli_work` and
-`_cli_synth`.
+Only the standard library and click are imported here; the work, and what it imports, is in `_cli_work` and other
+modules named `_cli_...`.
 """
 
 import functools
@@ -82,8 +82,13 @@ def cli() -> None:
 @click.option("--out", required=True, metavar="MODEL.json", help="Model file to write.")
 @click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
 @click.option(
-    "--family", default="grid", show_default=True, metavar="NAME", help="Density: grid, mixture or network."
+    "--model",
+    type=click.Choice(["loop", "stage"]),
+    default="loop",
+    show_default=True,
+    help="Hysteresis alone, from slow runs; or the whole stage with driver and mechanics, from slow and fast ones.",
 )
+@click.option("--family", metavar="NAME", help="Density: grid, mixture or network (default grid).")
 @click.option("--levels", type=int, help="Number of switching voltages; found from the data by default.")
 @click.option(
     "--holdout",
@@ -96,29 +101,33 @@ def cli() -> None:
 @click.option(
     "--initial",
     type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
-    default="unknown",
-    show_default=True,
-    help="Memory before each run.",
+    multiple=True,
+    help="Memory before all runs (default unknown); for a stage, give it again for each further run.",
 )
 @click.option(
-    "--starts",
-    type=click.IntRange(min=1),
-    default=8,
-    show_default=True,
-    help="Starts for families whose fit is not convex.",
+    "--loss",
+    type=click.Choice(["squares", "huber"]),
+    help="What the fit of a stage minimises (default squares); outliers count less in huber.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the starts.")
+@click.option("--starts", type=click.IntRange(min=1), help="Starts for families whose fit is not convex (default 8).")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the starts (default 0).")
 @_json
 @_quiet
 @_in_sentences
 def fit(**options: Any) -> None:
-    """Fit Preisach weights to measured loops.
+    """Fit Preisach weights to measured loops, or a whole stage to slow and fast runs.
 
-    The files are runs of one rig, with the columns time_s, voltage_V and displacement_um.
+    The files are runs of one rig, with the columns time_s, voltage_V and displacement_um. A stage needs a slow run
+    over the whole range, and one with steps, a chirp or a multisine beyond the resonance.
     """
-    from fits._cli_work import run_fit
+    if options.pop("model") == "stage":
+        from fits._cli_stage import run_fit_stage
 
-    run_fit(**options)
+        run_fit_stage(**options)
+    else:
+        from fits._cli_work import run_fit
+
+        run_fit(**options)
 
 
 @cli.command()

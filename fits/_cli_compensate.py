@@ -18,6 +18,8 @@ from fits._plot_compensation import plot_compensation
 from fits._read_csv import read_reference
 from fits._record import Record
 from fits._result import predict
+from fits._stage_result import predict_stage
+from fits._stage_uncertainty import StageUncertainty
 from fits._uncertainty import Uncertainty
 from fits._units import parse_columns
 from microid import Preisach, Stage
@@ -116,9 +118,11 @@ def _compensable(path: str, loaded: ModelFile) -> Preisach | Stage:
 
 def _displacement_sd_um(loaded: ModelFile, program: Record, initial: str) -> np.ndarray | None:
     """Standard deviation of a model's displacement, where the file says enough for one."""
-    if not isinstance(loaded.model, Preisach) or not isinstance(loaded.uncertainty, Uncertainty):
-        return None
-    return predict(loaded.model, loaded.uncertainty, program, initial).displacement_sd_um
+    if isinstance(loaded.model, Stage) and isinstance(loaded.uncertainty, StageUncertainty):
+        return predict_stage(loaded.model, loaded.uncertainty, program, initial).displacement_sd_um
+    if isinstance(loaded.model, Preisach) and isinstance(loaded.uncertainty, Uncertainty):
+        return predict(loaded.model, loaded.uncertainty, program, initial).displacement_sd_um
+    return None
 
 
 def _limits(text: str | None) -> tuple[float, float] | None:

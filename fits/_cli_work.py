@@ -18,12 +18,16 @@ from fits._fit import fit
 from fits._model_file import ModelFile, load_model, model_text
 from fits._plots import plot_fit
 from fits._read_csv import read_csv, read_runs
+from fits._record import Record
 from fits._report import describe, fit_report
-from fits._result import FitError, predict
+from fits._result import FitError, Prediction, predict
+from fits._stage_report import describe_stage
+from fits._stage_result import predict_stage
+from fits._stage_uncertainty import StageUncertainty
 from fits._units import parse_columns
-from microid import Preisach, parameter_table
+from microid import Preisach, Stage, parameter_table
 
-_DEFAULT_HOLDOUT = 0.2
+_DEFAULT_HOLDOUT, _DEFAULT_FAMILY, _DEFAULT_INITIAL, _DEFAULT_STARTS = 0.2, "grid", "unknown", 8
 
 
 def run_fit(
@@ -31,18 +35,28 @@ def run_fit(
     runs: Sequence[str],
     out: str,
     plots: str | None,
-    family: str,
+    family: str | None,
     levels: int | None,
+    loss: str | None,
     holdout: Sequence[str],
     columns: str,
-    initial: str,
-    starts: int,
-    seed: int,
+    initial: Sequence[str],
+    starts: int | None,
+    seed: int | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Do `microid fit`; the options are the command's."""
+    """Do `microid fit --model loop`; the options are the command's."""
     start_jax()
+    if loss is not None:
+        raise DataError(
+            f"--loss {loss}: only the fit of a stage has a choice; leave out --loss, or use --model stage."
+        )
+    if len(initial) > 1:
+        raise DataError(
+            f"--initial: expected one state for all runs, found {len(initial)}; give one, or use --model stage."
+        )
+    before = initial[0] if initial else _DEFAULT_INITIAL
     progress = _progress(quiet)
     mapping = parse_columns(columns)
     fraction, files = _holdout(holdout)
@@ -55,12 +69,12 @@ def run_fit(
         try:
             result = fit(
                 records,
-                family=family,
+                family=family or _DEFAULT_FAMILY,
                 levels=levels,
                 holdout=left_out,
-                initial=initial,
-                starts=starts,
-                seed=seed,
+                initial=before,
+                starts=starts or _DEFAULT_STARTS,
+                seed=seed or 0,
                 progress=progress,
             )
         except FitError as error:
@@ -69,7 +83,7 @@ def run_fit(
         drawn = []
         if drawings is not None:
             progress("drawing")
-            drawn = plot_fit(result, records, drawings(), holdout=left_out, initial=initial)
+            drawn = plot_fit(result, records, drawings(), holdout=left_out, initial=before)
         unfinished.write_text(model_text(result.model, result.uncertainty, report), encoding="utf-8")
     places = [str(Path(plots) / path.name) for path in drawn] if plots else []
     if as_json:
@@ -84,7 +98,7 @@ def run_simulate(*, model: str, program: str, out: str, initial: str, columns: s
     _keep_inputs(out, [model, program])
     loaded = load_model(model)
     record = read_csv(program, parse_columns(columns), required=("time_s", "voltage_V"))
-    prediction = predict(_preisach(model, loaded), loaded.uncertainty, record, initial)
+    prediction = _predict(model, loaded, record, initial)
     write_csv(
         out,
         {
@@ -116,8 +130,10 @@ def run_info(*, model: str, as_json: bool) -> None:
     """Do `microid info`; the options are the command's."""
     start_jax()
     loaded = load_model(model)
+    named = loaded.model.named if isinstance(loaded.model, Stage) else str
     parameters = [
-        {"path": row.path, "shape": list(row.shape), "unit": row.spec.unit} for row in parameter_table(loaded.model)
+        {"path": named(row.path), "shape": list(row.shape), "unit": row.spec.unit}
+        for row in parameter_table(loaded.model)
     ]
     kind = type(loaded.model).__name__
     if as_json:
@@ -127,7 +143,16 @@ def run_info(*, model: str, as_json: bool) -> None:
     click.echo(f"{kind}, written by {loaded.written_by}")
     for row in parameters:
         click.echo(f"  {row['path']:28} {'x'.join(map(str, row['shape'])) or '1':>8} {row['unit']}")
-    click.echo(f"\n{describe(loaded.report)}")
+    words = describe_stage if isinstance(loaded.uncertainty, StageUncertainty) else describe
+    click.echo(f"\n{words(loaded.report)}")
+
+
+def _predict(path: str, loaded: ModelFile, record: Record, initial: str) -> Prediction:
+    """Predict with whatever model a file holds."""
+    if isinstance(loaded.uncertainty, StageUncertainty):
+        assert isinstance(loaded.model, Stage)
+        return predict_stage(loaded.model, loaded.uncertainty, record, initial)
+    return predict(_preisach(path, loaded), loaded.uncertainty, record, initial)
 
 
 def _preisach(path: str, loaded: ModelFile) -> Preisach:

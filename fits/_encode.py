@@ -18,6 +18,7 @@ import numpy as np
 import microid
 from fits._design import Grid
 from fits._errors import DataError
+from fits._stage_uncertainty import StageUncertainty
 from fits._uncertainty import Uncertainty
 from microid import ParameterSpec
 
@@ -91,6 +92,7 @@ def _classes() -> dict[str, type[eqx.Module]]:
     }
     return {name: cls for name, cls in modules.items() if not inspect.isabstract(cls)} | {
         "Grid": Grid,
+        "StageUncertainty": StageUncertainty,
         "Uncertainty": Uncertainty,
     }
 

@@ -196,7 +196,7 @@ def _start(plan: _Plan, stage: Stage, levels: int | None) -> _Problem:
         chain = Chain(offsets_out(candidate, grid is not None), place, grid)
         z = np.asarray(chain.coordinates.of(candidate))
         try:
-            solved = solve_chain(chain, z, columns, runs_at_rate, None, stroke, plan.loss, plan.progress)
+            solved = solve_chain(chain, z, columns, runs_at_rate, None, stroke, plan.loss, plan.progress, rough=True)
         except FitError as error:
             failure = error
             continue

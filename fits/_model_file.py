@@ -11,7 +11,7 @@ A model file is one JSON object (UTF-8; no NaN or infinity) with six keys:
 `model`
     The model. Every part is an object whose `type` is the name of a class in `microid`, with one key per field.
 `uncertainty`
-    `fits.Uncertainty` in the same form.
+    `fits.Uncertainty`, or for a whole stage `fits.StageUncertainty`, in the same form.
 `fit`
     The report of the fit, as `microid fit --json` prints it.
 
@@ -19,7 +19,9 @@ A field that holds numbers is `{"unit": "um", "value": 1.5}`, where the value is
 (float64, written with as many digits as reading it back exactly takes; another type is named by the key `dtype`). The
 perturbations of the uncertainty, which are many, are `{"unit": "um", "shape": [k, D], "float64_base64": "..."}`: row
 by row, little-endian float64. A tuple is a list; other fields are plain JSON. A network has `type` `MLP`, the sizes
-of its input and output, the name of its activation, and layers with `weight`, shape `(out, in)`, and `bias`.
+of its input and output, the name of its activation, and layers with `weight`, shape `(out, in)`, and `bias`. A stage
+has its `parts` in the order of the signal, and as many `names`; perturbations of its other parameters, in scaled and
+unbounded coordinates, are `coordinates`.
 
 Without microid, the weights of Eq. 9 of a grid and the perturbations are read by
 
@@ -46,16 +48,19 @@ import equinox as eqx
 import jax
 
 from fits._atomic import atomic_write_text
+from fits._design import Grid
 from fits._encode import decode, encode
 from fits._errors import DataError
+from fits._stage_uncertainty import StageUncertainty, offsets_out
 from fits._uncertainty import Uncertainty
 from fits._version import written_by
+from microid import Preisach, Stage
 
 _FAMILY = "microid.model/"
 SCHEMA = f"{_FAMILY}1"
 _PARTS = ("schema", "sha256", "written_by", "model", "uncertainty", "fit")
 # One number per weight is worth reading; one per weight and perturbation is not.
-_PACKED = ("columns_um",)
+_PACKED = ("columns_um", "coordinates", "mean_um")
 
 
 @dataclass(frozen=True)
@@ -65,23 +70,26 @@ class ModelFile:
     Attributes
     ----------
     model
-        A module of `microid`, usually a `Preisach`.
+        A module of `microid`, usually a `Preisach` or a `Stage`.
     uncertainty
         Of its predictions.
     report
-        What is known of the fit, as `fit_report` makes it.
+        What is known of the fit, as `fit_report` or `stage_report` makes it.
     written_by
         Program and version.
     """
 
     model: eqx.Module
-    uncertainty: Uncertainty
+    uncertainty: Uncertainty | StageUncertainty
     report: dict[str, Any]
     written_by: str
 
 
 def save_model(
-    path: str | os.PathLike[str], model: eqx.Module, uncertainty: Uncertainty, report: Mapping[str, Any]
+    path: str | os.PathLike[str],
+    model: eqx.Module,
+    uncertainty: Uncertainty | StageUncertainty,
+    report: Mapping[str, Any],
 ) -> None:
     """Write a model file, whole or not at all.
 
@@ -94,7 +102,7 @@ def save_model(
     uncertainty
         Of its predictions.
     report
-        JSON values under string keys, such as `fit_report` makes.
+        JSON values under string keys, such as `fit_report` or `stage_report` makes.
 
     Raises
     ------
@@ -108,7 +116,7 @@ def save_model(
     atomic_write_text(path, text)
 
 
-def model_text(model: eqx.Module, uncertainty: Uncertainty, report: Mapping[str, Any]) -> str:
+def model_text(model: eqx.Module, uncertainty: Uncertainty | StageUncertainty, report: Mapping[str, Any]) -> str:
     """Compose the text of a model file; a `DataError` says why it cannot be."""
     content: dict[str, Any] = {
         "schema": SCHEMA,
@@ -161,11 +169,26 @@ def load_model(path: str | os.PathLike[str]) -> ModelFile:
         uncertainty = decode(content["uncertainty"], "uncertainty")
     except DataError as error:
         raise DataError(f"{shown}: {error}; write the file again with 'microid fit'.") from error
-    if not isinstance(model, eqx.Module) or not isinstance(uncertainty, Uncertainty):
+    if not isinstance(model, eqx.Module) or not isinstance(uncertainty, Uncertainty | StageUncertainty):
         raise DataError(f"{shown}: expected a model and its uncertainty; write the file again with 'microid fit'.")
-    if uncertainty.columns_um.shape[1] != uncertainty.grid.columns:
+    if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
+        raise DataError(f"{shown}: the uncertainty does not fit the stage; write the file again with 'microid fit'.")
+    if uncertainty.columns_um.shape[1] != (0 if uncertainty.grid is None else uncertainty.grid.columns):
         raise DataError(f"{shown}: the uncertainty does not fit its grid; write the file again with 'microid fit'.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
+
+
+def _moves(model: eqx.Module, uncertainty: StageUncertainty) -> bool:
+    """Whether perturbations are those of the parameters of a stage, and of its grid if they have one."""
+    if not isinstance(model, Stage) or not isinstance(uncertainty.grid, Grid | None):
+        return False
+    on_grid = uncertainty.grid is not None
+    if on_grid and not any(isinstance(part, Preisach) for part in model.parts):
+        return False
+    try:
+        return uncertainty.coordinates.shape[1] == offsets_out(model, on_grid).size
+    except ValueError:
+        return False
 
 
 def _read(shown: str) -> dict[str, Any]:

@@ -10,6 +10,9 @@ from jaxtyping import Array, Float
 # Standard deviation, in strokes, beyond which no density is believed even where the smoothness does not bind.
 _WIDE = 100.0
 _ROUNDING = 1e-14
+# Curvature counts by the square of the distance from the diagonal, in ranges, increased by this and over that: relays
+# that switch close together are many, and their density changes fast.
+_CLOSE, _FAR = 0.05, 0.35
 
 
 class Hyper(eqx.Module):
@@ -45,7 +48,8 @@ class Roughness(eqx.Module):
     Attributes
     ----------
     density
-        Integral over the half-plane of the squared second derivatives of the density, shape `(D, D)`.
+        Integral over the half-plane of the squared second derivatives of the density, less near the diagonal, shape
+        `(D, D)`.
     along
         The same of the second derivative along the diagonal alone, shape `(D, D)`.
     reversible
@@ -98,7 +102,10 @@ def _matrices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) -> np.ndarray:
-    """Sum the squares of a stencil over all places where it fits into the half-plane, as a quadratic form."""
+    """Sum the squares of a stencil over all places where it fits into the half-plane, as a quadratic form.
+
+    Each counts by the distance of its place from the diagonal.
+    """
     weights = n * (n + 1) // 2
     place = -np.ones((n, n), dtype=np.int64)
     place[np.tril_indices(n)] = np.arange(weights)
@@ -106,10 +113,11 @@ def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) 
     nodes = np.array([(i + di, j + dj) for di, dj in offsets])
     inside = np.all((nodes >= 0) & (nodes < n), axis=(0, 1)) & np.all(nodes[:, 0] >= nodes[:, 1], axis=0)
     columns = place[nodes[:, 0][:, inside], nodes[:, 1][:, inside]]
+    weight = (((i - j)[inside] / (n - 1) + _CLOSE) / _FAR) ** 2
     form = np.zeros((weights, weights))
     for one, left in zip(columns, factors, strict=True):
         for other, right in zip(columns, factors, strict=True):
-            np.add.at(form, (one, other), left * right)
+            np.add.at(form, (one, other), left * right * weight)
     return form
 
 

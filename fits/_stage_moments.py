@@ -16,7 +16,7 @@ from fits._noise import correlation_samples
 from fits._stage_run import Samples, StageRun, ahead, joined, lead_ins, respond, without
 from microid import Coordinates, LinearSystem, Stage, Staircase
 
-# Refined samples that go through the compiled regression at a time.
+# Samples that go through the compiled regression at a time.
 _PIECE = 2048
 
 
@@ -88,9 +88,10 @@ def _linearised(
 @eqx.filter_jit
 def _before_and_after(
     coordinates: Coordinates[Stage], place: int, z: Float[Array, " p"], samples: Samples
-) -> tuple[Float[Array, " m"], LinearSystem | None]:
+) -> tuple[Float[Array, " n"], LinearSystem | None]:
+    """Voltage that the hysteresis sees, at the samples, and the linear system that follows it."""
     stage = coordinates(z)
-    return ahead(stage, place, samples), joined(stage.parts[place + 1 :])
+    return ahead(stage, place, samples)[:: samples.stride], joined(stage.parts[place + 1 :])
 
 
 @eqx.filter_jit
@@ -222,23 +223,27 @@ def along(
         reduce(columns @ directions[0] + slope[first : first + len(columns)] @ directions[1])
         for first, columns in _pieces(chain, z, run, True)
     ]
-    return np.concatenate(moved)[: len(run.record)]
+    return np.concatenate(moved)
 
 
 def _pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the rows of the columns, piece by piece, with the sample that each piece begins at."""
-    samples, grid = run.samples, chain.grid
+    """Yield the rows of the columns, piece by piece, with the sample that each piece begins at.
+
+    They are not refined: as directions to move in they are good enough, and only the residual decides where the fit
+    ends.
+    """
+    samples, grid, n = run.samples, chain.grid, len(run.record)
     if grid is None or chain.place is None or not free:
-        for first in range(0, len(samples.weight), _PIECE):
-            yield first, np.zeros((min(_PIECE, len(samples.weight) - first), 0))
+        for first in range(0, n, _PIECE):
+            yield first, np.zeros((min(_PIECE, n - first), 0))
         return
     voltage, system = _before_and_after(chain.coordinates, chain.place, z, samples)
     table = jnp.asarray(branch_table(grid.levels))
     memory, carried = samples.start.memory, None
-    interval = np.asarray(samples.interval_s)
-    path = np.asarray(voltage)
-    for first in range(0, len(path), _PIECE):
-        pad = (0, max(0, first + _PIECE - len(path)))
+    interval = np.diff(run.record.time_s, prepend=2 * run.record.time_s[0] - run.record.time_s[1])
+    path = np.asarray(voltage)[:n]
+    for first in range(0, n, _PIECE):
+        pad = (0, max(0, first + _PIECE - n))
         piece = slice(first, first + _PIECE)
         rows, memory, carried = _rows(
             grid,
@@ -249,10 +254,7 @@ def _pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> I
             memory,
             carried,
         )
-        # Samples are every stride-th refined one, wherever the piece begins.
-        skip = -first % samples.stride
-        kept = np.asarray(rows)[skip : _PIECE - pad[1] : samples.stride]
-        yield (first + skip) // samples.stride, kept
+        yield first, np.asarray(rows)[: _PIECE - pad[1]]
 
 
 @dataclass(frozen=True)

@@ -54,14 +54,6 @@ class Samples(eqx.Module):
     stride: int = eqx.field(static=True)
     moving: bool = eqx.field(static=True)
 
-    @property
-    def interval_s(self) -> Float[Array, " m"]:
-        """What lies before each refined sample, shape `(m,)`; the first repeats the second."""
-        if self.time_s.ndim == 0:
-            return jnp.broadcast_to(self.time_s, self.voltage_V.shape)
-        step = jnp.diff(self.time_s)
-        return jnp.concatenate([step[:1], step])
-
 
 @dataclass(frozen=True)
 class StageRun:
@@ -227,7 +219,7 @@ def without(
 ) -> Float[Array, " n"]:
     """Take the best combination of some columns off, by weighted least squares."""
     scale = jnp.sqrt(jnp.sum(weight[:, None] * columns**2, axis=0)) + _TINY
-    scaled = columns / scale
+    scaled = columns / scale[None, :]
     weighted = weight[:, None] * scaled
     gram = scaled.T @ weighted + _TINY * jnp.eye(columns.shape[1])
     return values - scaled @ jnp.linalg.solve(gram, weighted.T @ values)

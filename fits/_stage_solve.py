@@ -14,7 +14,7 @@ from fits._result import FitError, FitStatus
 from fits._stage_moments import Chain, RunSums, Weighing, run_sums, split_moments
 from fits._stage_run import StageRun, residual_of
 
-_ROUNDS = 40
+_ROUNDS, _ROUGH = 40, 12
 # Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
 _DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
 # A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
@@ -70,6 +70,7 @@ def solve_chain(
     stroke_um: float,
     loss: str,
     progress: Callable[[str], None],
+    rough: bool = False,
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
@@ -93,6 +94,8 @@ def solve_chain(
         One of `LOSSES`.
     progress
         Told what is being done.
+    rough
+        Whether the place found is only a start for another fit, so that it need not be stationary.
 
     Raises
     ------
@@ -100,7 +103,7 @@ def solve_chain(
         If it does not become stationary.
     """
     damping = _DAMPING
-    for number in range(_ROUNDS):
+    for number in range(_ROUGH if rough else _ROUNDS):
         runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
@@ -123,10 +126,14 @@ def solve_chain(
                 break
             damping *= _FACTOR
             if damping > _HIGHEST:
-                raise FitError(FitStatus.NOT_STATIONARY)
+                break
+        if damping > _HIGHEST and not rough:
+            raise FitError(FitStatus.NOT_STATIONARY)
         if distance < _STATIONARY:
             runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None)
             return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+    if rough:
+        return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
     raise FitError(FitStatus.MAX_STEPS)
 
 

@@ -155,7 +155,8 @@ class _LogResponse:
         measured = np.concatenate([one.response for one in responses])
         coherence = np.concatenate([one.coherence for one in responses])
         for part in fixed:
-            measured = measured / np.asarray(part.frequency_response(jnp.asarray(frequency)) / part.static_gain)
+            response = np.asarray(part.frequency_response(jnp.asarray(frequency)))
+            measured = measured * float(part.static_gain) / response
         # The variance of the logarithm of a response is proportional to (1 - coherence) / coherence.
         weight = np.minimum(np.sqrt(coherence / (1 - coherence)), _SHARPEST)
         run = np.repeat(np.arange(len(responses)), [len(one.frequency_Hz) for one in responses])

@@ -1,0 +1,217 @@
+"""A whole stage identified from slow and fast runs of an independent bench, and runs that cannot be."""
+
+import dataclasses
+import secrets
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import data_synth
+import fits
+from fits import Record
+
+SCENARIO = """
+name = "small"
+description = "slow loops, a fast multisine, and motion to check with"
+
+[rig]
+kind = "plays"
+plays = 2000
+
+[plant]
+time_constant_s = {tau}
+natural_frequency_Hz = {frequency}
+damping_ratio = {damping}
+
+[sensor]
+noise_um = 0.03
+
+[[runs]]
+name = "slow"
+sample_rate_Hz = 100.0
+
+[[runs.program]]
+kind = "triangle"
+cycles = 1
+rate_V_per_s = 100.0
+
+[[runs.program]]
+kind = "nested"
+biases_V = [60.0]
+amplitude_V = 60.0
+loops = 10
+rate_V_per_s = 100.0
+
+[[runs]]
+name = "fast"
+sample_rate_Hz = 2500.0
+
+[[runs.program]]
+kind = "triangle"
+cycles = 1
+rate_V_per_s = 800.0
+
+[[runs.program]]
+kind = "ramp"
+to_V = 60.0
+rate_V_per_s = 800.0
+
+[[runs.program]]
+kind = "multisine"
+amplitude_V = 20.0
+low_Hz = 2.0
+high_Hz = 300.0
+period_s = 0.5
+periods = 2
+
+[[runs]]
+name = "check"
+sample_rate_Hz = 2500.0
+
+[[runs.program]]
+kind = "random_reversals"
+reversals = 20
+rate_V_per_s = 2000.0
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rig:
+    truth: dict[str, float]
+    records: dict[str, Record]
+    true_um: dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def rig():
+    seed = secrets.randbelow(2**31)
+    print(f"rig of seed {seed}")
+    rng = np.random.default_rng(seed)
+    tau, frequency, damping = 10 ** rng.uniform(-3.7, -2.8), rng.uniform(80, 150), rng.uniform(0.02, 0.1)
+    bench = data_synth.simulate(
+        data_synth.parse_scenario(SCENARIO.format(tau=tau, frequency=frequency, damping=damping)), seed
+    )
+    truth = {
+        "driver.time_constant_s": tau,
+        "mechanics.natural_frequency_Hz": frequency,
+        "mechanics.damping_ratio": damping,
+    }
+    records = {r.name: Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in bench.records}
+    return Rig(truth, records, {r.name: r.true_displacement_um for r in bench.records})
+
+
+@pytest.fixture(scope="module")
+def fitted(rig):
+    told: list[str] = []
+    result = fits.fit_stage(
+        [rig.records["slow"], rig.records["fast"]],
+        holdout=[rig.records["check"]],
+        initial="negative",
+        levels=16,
+        progress=told.append,
+    )
+    assert any("poles" in sentence for sentence in told)
+    return result
+
+
+def test_poles_are_found_without_a_guess(rig, fitted):
+    for name, value in rig.truth.items():
+        print(name, fitted[name], "truth", value)
+        # A twentieth of a per cent is what the grid's own error may be worth beside the noise.
+        assert abs(fitted[name].value - value) < 4 * fitted[name].sd + 2e-3 * value
+        assert fitted[name].sd < 0.01 * value
+        assert fitted[name].lower < fitted[name].value < fitted[name].upper
+
+
+def test_motion_that_was_not_fitted_is_predicted(rig, fitted):
+    assert fitted.held_out is not None
+    assert fitted.held_out.rms_um < 1.25 * 0.03
+    assert fitted.in_sample.rms_um < 1.1 * 0.03
+    prediction = fitted.predict(rig.records["check"])
+    off = prediction.displacement_um - rig.true_um["check"]
+    assert np.std(off) < 0.02
+    inside = np.mean(np.abs(off - np.mean(off)) < 1.96 * prediction.displacement_sd_um)
+    print("inside the 95 % band", inside)
+    assert inside > 0.7
+
+
+def test_the_joint_fit_beats_the_hysteresis_alone(rig, fitted):
+    alone = fits.fit([rig.records["slow"]], levels=16, holdout=0.0, initial="negative")
+    off = alone.predict(rig.records["check"]).displacement_um - rig.true_um["check"]
+    assert np.std(off) > 5 * np.std(fitted.predict(rig.records["check"]).displacement_um - rig.true_um["check"])
+
+
+def test_gains_stay_in_the_operator(fitted):
+    assert {"driver.gain", "mechanics.gain"} <= set(fitted.model.frozen)
+    assert float(fitted.model["driver"].gain) == 1.0
+    assert [parameter.name for parameter in fitted.parameters] == list(
+        ("driver.time_constant_s", "mechanics.natural_frequency_Hz", "mechanics.damping_ratio")
+    )
+    with pytest.raises(KeyError, match="choose one of driver"):
+        fitted["driver.gain"]
+
+
+def test_a_voltage_beyond_the_fitted_range_is_refused(fitted):
+    time = np.arange(100) / 1000
+    with pytest.raises(fits.DataError, match=r"prog.csv: sample 51 .* fitted between 0 and 120 V"):
+        fitted.predict(Record(time, np.where(time < 0.05, 0.0, 130.0), None, source="prog.csv"))
+
+
+def test_slow_runs_alone_do_not_show_the_dynamics(rng):
+    time = np.arange(2400) / 100.0
+    voltage = 60 - 60 * np.cos(2 * np.pi * 0.25 * time)
+    displacement = 0.3 * voltage + 0.03 * rng.standard_normal(len(time))
+    record = Record(time, voltage, displacement, source="slow.csv")
+    with pytest.raises(fits.DataError, match=r"slow.csv: .*no(thing|t).*") as refusal:
+        fits.fit_stage([record], levels=8, initial="negative")
+    assert "chirp" in str(refusal.value) or "sample" in str(refusal.value)
+
+
+def test_a_run_sampled_too_slowly_for_its_mode_is_refused(rig, rng):
+    fast = rig.records["fast"]
+    # Its rate falls to 1.5 times the resonance.
+    keep = max(1, round(2500 / (1.5 * rig.truth["mechanics.natural_frequency_Hz"])))
+    thinned = Record(
+        fast.time_s[::keep], fast.voltage_V[::keep], fast.displacement_um[::keep], source="thinned.csv"
+    )
+    with pytest.raises(fits.DataError, match=r"thinned.csv: sampled at .* Hz"):
+        fits.fit_stage([rig.records["slow"], thinned], levels=8, initial="negative", holdout=0.0)
+
+
+def test_runs_of_different_rigs_are_refused(rig):
+    fast = rig.records["fast"]
+    other = Record(fast.time_s, fast.voltage_V, 1.4 * fast.displacement_um, source="other.csv")
+    with pytest.raises(fits.DataError, match=r"other.csv and slow.csv: .* times as far .* not of one rig"):
+        fits.fit_stage([rig.records["slow"], other], levels=8, initial="negative", holdout=0.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"loss": "absolute"}, "unknown loss 'absolute': choose one of squares, huber"),
+        ({"initial": ["negative"]}, "1 initial states were given for 2 runs"),
+        ({"initial": "positve"}, "unknown initial state 'positve'"),
+        ({"holdout": 0.95}, "fraction held out is 0.95"),
+    ],
+)
+def test_settings_that_cannot_be_honoured_are_refused(rig, settings, sentence):
+    with pytest.raises(fits.DataError, match=sentence):
+        fits.fit_stage([rig.records["slow"], rig.records["fast"]], **settings)
+    with pytest.raises(fits.DataError, match="no record"):
+        fits.fit_stage([])
+
+
+def test_new_data_of_the_same_shape_compile_nothing(rig, fitted):
+    import jax
+
+    again = {name: Record(r.time_s, r.voltage_V, r.displacement_um + 1.0, source=r.source) for name, r in rig.records.items()}
+    with jax.log_compiles(False):
+        compiled: list[str] = []
+        jax.monitoring.register_event_duration_secs_listener(
+            lambda event, duration, **_: compiled.append(event) if "backend_compile" in event else None
+        )
+        result = fits.fit_stage([again["slow"], again["fast"]], holdout=[again["check"]], initial="negative", levels=16)
+    assert compiled == []
+    assert result["driver.time_constant_s"].value == pytest.approx(fitted["driver.time_constant_s"].value, rel=1e-3)
+    assert jnp.isfinite(result.uncertainty.coordinates).all()

@@ -1,0 +1,141 @@
+"""Whole stages and their uncertainty in model files."""
+
+import json
+
+import jax.numpy as jnp
+import pytest
+from _models import random_model
+from test_model_file import REPORT, bits, hashed, refusal
+
+import microid
+from fits import DataError, StageUncertainty, Uncertainty, load_model, save_model
+from fits._design import Grid
+
+PARAMETERS, LEVELS, PERTURBATIONS = 3, 5, 6
+
+
+def draw(rng, grid=True):
+    """A stage whose gains are frozen, and perturbations of all sizes."""
+    piezo = random_model(rng) if grid else microid.Piezo(rng.uniform(0.1, 1), rng.normal())
+    stage = microid.Stage.of(
+        driver=microid.Driver(rng.uniform(1e-4, 1e-2)),
+        piezo=piezo,
+        mechanics=microid.Mechanics(rng.uniform(50, 500), rng.uniform(0.01, 0.5)),
+        substeps=int(rng.integers(1, 9)),
+    )
+    stage = stage.freeze("driver.gain", "mechanics.gain")
+    mesh = Grid(jnp.asarray(0.0), jnp.asarray(rng.uniform(10, 100)), LEVELS) if grid else None
+
+    def numbers(*shape):
+        return jnp.asarray(rng.normal(size=shape) * 10.0 ** rng.integers(-300, 300, shape))
+
+    return stage, StageUncertainty(
+        numbers(PERTURBATIONS, PARAMETERS if grid else PARAMETERS + 1),
+        numbers(PERTURBATIONS, mesh.columns if mesh else 0),
+        numbers(PERTURBATIONS),
+        jnp.asarray(rng.uniform()),
+        mesh,
+    )
+
+
+@pytest.mark.parametrize("grid", [True, False])
+def test_a_stage_comes_back_bit_by_bit(tmp_path, rng, grid):
+    stage, uncertainty = draw(rng, grid)
+    save_model(tmp_path / "a.json", stage, uncertainty, REPORT)
+    back = load_model(tmp_path / "a.json")
+    assert bits(back.model) == bits(stage)
+    assert bits(back.uncertainty) == bits(uncertainty)
+    assert isinstance(back.uncertainty, StageUncertainty)
+    for name in ("names", "hold", "substeps", "frozen"):
+        assert getattr(back.model, name) == getattr(stage, name)
+    assert (back.uncertainty.grid is None) == (not grid)
+    assert [type(part) for part in back.model.parts] == [type(part) for part in stage.parts]
+    save_model(tmp_path / "b.json", back.model, back.uncertainty, back.report)
+    assert (tmp_path / "b.json").read_bytes() == (tmp_path / "a.json").read_bytes()
+
+
+@pytest.fixture
+def written(tmp_path, rng):
+    stage, uncertainty = draw(rng)
+    path = tmp_path / "stage.json"
+    save_model(path, stage, uncertainty, REPORT)
+    return path, stage, uncertainty
+
+
+def test_matrices_are_packed(written):
+    path, _, uncertainty = written
+    content = json.loads(path.read_text(encoding="utf-8"))
+    for name in ("coordinates", "columns_um", "mean_um"):
+        assert set(content["uncertainty"][name]) == {"unit", "shape", "float64_base64"}
+        assert content["uncertainty"][name]["shape"] == list(getattr(uncertainty, name).shape)
+    assert content["uncertainty"]["mean_um"]["unit"] == "um"
+    assert content["model"]["parts"][0]["time_constant_s"]["unit"] == "s"
+
+
+def test_tampering_is_refused(written, rng):
+    path, _, _ = written
+    content = json.loads(path.read_text(encoding="utf-8"))
+    frequency = content["model"]["parts"][2]["natural_frequency_Hz"]
+    frequency["value"] *= 1 + rng.uniform(1e-9, 1e-3)
+    path.write_text(json.dumps(content), encoding="utf-8")
+    assert "sha256" in refusal(path)
+
+
+def wrong(rng, stage, uncertainty):
+    """Uncertainties that are not of this stage, each with a word from its refusal."""
+    u = uncertainty
+    more = jnp.asarray(rng.normal(size=(PERTURBATIONS, PARAMETERS + 1)))
+    short = u.columns_um[:, 1:]
+    finer = Grid(u.grid.lower_V, u.grid.upper_V, LEVELS + 1)
+    return {
+        "another parameter": StageUncertainty(more, u.columns_um, u.mean_um, u.discrepancy_um, u.grid),
+        "a column less": StageUncertainty(u.coordinates, short, u.mean_um, u.discrepancy_um, u.grid),
+        "another grid": StageUncertainty(u.coordinates, u.columns_um, u.mean_um, u.discrepancy_um, finer),
+        "no grid": StageUncertainty(u.coordinates, u.columns_um, u.mean_um, u.discrepancy_um, None),
+    }
+
+
+@pytest.mark.parametrize("case", ["another parameter", "a column less", "another grid", "no grid"])
+def test_an_uncertainty_of_another_shape_is_refused(tmp_path, rng, case):
+    stage, uncertainty = draw(rng)
+    path = tmp_path / "stage.json"
+    save_model(path, stage, wrong(rng, stage, uncertainty)[case], REPORT)
+    assert "does not fit" in refusal(path)
+
+
+def test_perturbations_of_different_number_are_refused(written):
+    path, _, _ = written
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["uncertainty"]["mean_um"] |= {"shape": [2], "float64_base64": "AAAAAAAA8D8AAAAAAAAAQA=="}
+    path.write_text(json.dumps(hashed(content)), encoding="utf-8")
+    refusal(path)
+
+
+def test_something_else_for_a_grid_is_refused(written):
+    path, _, _ = written
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["uncertainty"]["grid"] = "fine"
+    path.write_text(json.dumps(hashed(content)), encoding="utf-8")
+    assert "does not fit" in refusal(path)
+
+
+def test_a_stage_uncertainty_needs_a_stage(tmp_path, rng):
+    _, uncertainty = draw(rng)
+    save_model(tmp_path / "m.json", random_model(rng), uncertainty, REPORT)
+    assert "does not fit the stage" in refusal(tmp_path / "m.json")
+
+
+def test_a_stage_with_the_uncertainty_of_its_hysteresis_is_still_read(tmp_path, rng):
+    stage, uncertainty = draw(rng)
+    grid = uncertainty.grid
+    plain = Uncertainty(uncertainty.columns_um, uncertainty.mean_um, uncertainty.discrepancy_um, grid)
+    save_model(tmp_path / "m.json", stage, plain, REPORT)
+    assert bits(load_model(tmp_path / "m.json").uncertainty) == bits(plain)
+
+
+def test_what_is_not_finite_is_not_written(tmp_path, rng):
+    stage, u = draw(rng)
+    endless = StageUncertainty(u.coordinates.at[0, 0].set(jnp.nan), u.columns_um, u.mean_um, u.discrepancy_um, u.grid)
+    with pytest.raises(DataError, match="finite"):
+        save_model(tmp_path / "m.json", stage, endless, REPORT)
+    assert not (tmp_path / "m.json").exists()

@@ -1,0 +1,122 @@
+"""What a fit says of its own uncertainty, against SciPy and against fresh noise."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _stage_records import linear_displacement, linear_record
+from scipy import stats
+from scipy.optimize import curve_fit
+
+import fits
+from microid import Driver, Mechanics, Piezo, Stage
+
+TRUTH = {
+    "time_constant_s": 6e-4,
+    "natural_frequency_Hz": 210.0,
+    "damping_ratio": 0.03,
+    "gain_um_per_V": 0.31,
+}
+NAMES = ("driver.time_constant_s", "mechanics.natural_frequency_Hz", "mechanics.damping_ratio", "piezo.gain_um_per_V")
+
+
+def linear_stage():
+    stage = Stage.of(
+        driver=Driver(jnp.asarray(1e-2)),
+        piezo=Piezo(jnp.asarray(1.0)),
+        mechanics=Mechanics(jnp.asarray(10.0), jnp.asarray(0.5)),
+    )
+    return stage.freeze("driver.gain", "mechanics.gain")
+
+
+def fit_linear(record, **settings):
+    return fits.fit_stage([record], stage=linear_stage(), holdout=0.0, **settings)
+
+
+def test_estimates_and_standard_deviations_are_those_of_curve_fit(rng):
+    record = linear_record(rng, TRUTH)
+
+    def model(time, *values):
+        return linear_displacement(time, record.voltage_V, *values[:4]) + values[4]
+
+    start = [value * 1.02 for value in TRUTH.values()] + [2.9]
+    scale = np.array([1e-4, 1.0, 1e-2, 0.1, 1.0])
+    best, covariance = curve_fit(
+        lambda t, *x: model(t, *(np.array(x) * scale)), record.time_s, record.displacement_um, np.array(start) / scale
+    )
+    result = fit_linear(record, initial="negative")
+    for name, value, sd in zip(NAMES, best * scale, np.sqrt(np.diag(covariance)) * scale, strict=False):
+        assert result[name].value == pytest.approx(value, abs=0.02 * sd)
+        assert result[name].sd == pytest.approx(sd, rel=0.1)
+        assert result[name].lower == pytest.approx(value - 1.96 * sd, abs=0.25 * sd)
+        assert result[name].upper == pytest.approx(value + 1.96 * sd, abs=0.25 * sd)
+    correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    order = [NAMES.index(parameter.name) for parameter in result.parameters]
+    np.testing.assert_allclose(result.correlation, correlation[np.ix_(order, order)], atol=0.1)
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.8], ids=["white", "coloured"])
+def test_intervals_hold_the_truth_as_often_as_they_say(rng, pole):
+    fits_made, z = 40, []
+    for _ in range(fits_made):
+        result = fit_linear(linear_record(rng, TRUTH, pole=pole), initial="unknown")
+        z.append([(result[n].value - v) / result[n].sd for n, v in zip(NAMES, TRUTH.values(), strict=True)])
+    z = np.array(z)
+    print("rms of (estimate - truth) / sd", np.sqrt(np.mean(z**2, axis=0)), "inside 95 %", np.mean(np.abs(z) < 1.96))
+    # Each parameter's mean square is a chi-square, wrong by chance once in ten thousand studies.
+    low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], fits_made) / fits_made
+    assert np.all(np.mean(z**2, axis=0) < high * 1.25)
+    assert np.all(np.mean(z**2, axis=0) > low / 1.25)
+
+
+def test_the_state_before_a_run_is_not_assumed(rng):
+    record = linear_record(rng, TRUTH)
+    # Cut in the middle of its motion.
+    later = record[777:]
+    result = fit_linear(later, initial="unknown")
+    for name, value in zip(NAMES, TRUTH.values(), strict=True):
+        assert abs(result[name].value - value) < 5 * result[name].sd
+    assert result.noise_um[0] == pytest.approx(0.02, rel=0.1)
+
+
+def test_outliers_count_less_under_the_huber_loss(rng):
+    record = linear_record(rng, TRUTH)
+    spikes = np.where(rng.random(len(record)) < 0.03, rng.choice([-1.0, 1.0], len(record)) * 2.0, 0.0)
+    spoiled = fits.Record(record.time_s, record.voltage_V, record.displacement_um + spikes, source="spikes.csv")
+    plain, robust = fit_linear(spoiled), fit_linear(spoiled, loss="huber")
+    for name, value in zip(NAMES, TRUTH.values(), strict=True):
+        assert abs(robust[name].value - value) < 5 * robust[name].sd
+        assert robust[name].sd < 0.5 * plain[name].sd
+
+
+def test_combinations_that_are_not_seen_are_named(rng):
+    record = linear_record(rng, TRUTH)
+    result = fits.fit_stage([record], stage=linear_stage().thaw("mechanics.gain"), holdout=0.0)
+    assert any(
+        "mechanics.gain" in sentence and "piezo.gain_um_per_V" in sentence and " * " in sentence and "not each" in sentence
+        for sentence in result.unseen
+    ), result.unseen
+    assert set(result.unseen) <= set(result.remarks)
+    # What is seen is not spoiled by what is not.
+    frequency = result["mechanics.natural_frequency_Hz"]
+    assert abs(frequency.value - TRUTH["natural_frequency_Hz"]) < 5 * frequency.sd < 1.0
+    # The product is as certain as if there were one gain.
+    product = result["mechanics.gain"].value * result["piezo.gain_um_per_V"].value
+    assert product == pytest.approx(TRUTH["gain_um_per_V"], rel=1e-2)
+    assert fit_linear(record).unseen == ()
+
+
+@pytest.mark.parametrize("damping_ratio", [0.01, 0.2, 1.4])
+def test_no_guess_is_needed(rng, damping_ratio):
+    truth = TRUTH | {
+        "natural_frequency_Hz": float(rng.uniform(60, 600)),
+        "damping_ratio": damping_ratio,
+        "time_constant_s": float(10 ** rng.uniform(-4, -2.7)),
+    }
+    record = linear_record(rng, truth, rate_Hz=12 * truth["natural_frequency_Hz"], noise_um=0.005)
+    result = fit_linear(record)
+    clean = linear_displacement(record.time_s, record.voltage_V, **truth)
+    predicted = np.asarray(result.model(jnp.asarray(record.time_s), jnp.asarray(record.voltage_V)))
+    assert np.std(predicted - clean) < 0.005
+    if damping_ratio < 1:
+        # Beyond it three real poles can change places.
+        assert abs(result[NAMES[1]].value - truth["natural_frequency_Hz"]) < 6 * result[NAMES[1]].sd
