@@ -12,8 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _frequency_rows import frequency as frequency_rows
 from _inputs import BENCH, Case, SLOPE_um_per_V, model_of, random_path, shared_case, smooth_density, synthetic_case
+from _inverse_rows import inverse as inverse_rows
 from _peers import fit_lsq_linear, fit_nnls, numpy_relays, relay_design, scan_relays, thresholds
+from _plant_fit_rows import fit_own, plant_fit
 from _plant_rows import plant as plant_rows
 from _timing import Line, Table, cpu_seconds, seconds, side_by_side
 
@@ -246,8 +249,19 @@ def cold(settings: Settings, table: Table) -> None:
 
 
 def plant(settings: Settings, table: Table) -> None:
-    """The linear plant, against SciPy's simulation."""
+    """The linear plant, against SciPy's simulation, and its fit, against SciPy's least squares."""
     plant_rows(settings.samples, settings.repeats, settings.seed, table)
+    plant_fit(1 if settings.quick else 3, table, fit_own)
+
+
+def inverse(settings: Settings, table: Table) -> None:
+    """The exact inverse, in JAX and in C, beside a network trained for it."""
+    inverse_rows(10_000, settings.repeats, settings.seed, table)
+
+
+def frequency(_: Settings, table: Table) -> None:
+    """Modes of a measured mirror, with and without hysteresis."""
+    frequency_rows(table)
 
 
 ROWS = {
@@ -257,5 +271,7 @@ ROWS = {
     "fit": fit,
     "record": record,
     "plant": plant,
+    "inverse": inverse,
+    "frequency": frequency,
     "cold": cold,
 }

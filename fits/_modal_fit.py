@@ -133,9 +133,9 @@ def fit_hysteresis(
     wanted = np.mean(y, axis=2)[band]
     spectra = _spectra(frequency[band], drive, wanted, variance, coupled)
     # Solved for first of all, so what they start from does not matter.
-    zero = np.zeros((len(modes.damping_ratio), y.shape[3], drive.shape[2]))
+    zero = jnp.zeros((len(modes.damping_ratio), y.shape[3], drive.shape[2]))
     modes = Modes(modes.natural_frequency_Hz, modes.damping_ratio, zero, zero, zero[0], modes.delay_s)
-    return _fit(HystereticModes(modes, threshold), spectra, True)
+    return _fit(HystereticModes(modes, jnp.asarray(threshold)), spectra, True)
 
 
 def relative_error(model: Modes | HystereticModes, record: Multisine, band_Hz: _Band = None) -> float:
@@ -304,8 +304,8 @@ def _start(spectra: _Spectra, response: NDArray[Any], count: int) -> Modes:
         if len(at) < count and all(abs(natural - other) > 0.02 * natural for other, _ in at):
             at.append((natural, float(np.clip(damping, 1e-3, 0.2))))
     while True:
-        naturals, dampings = np.array(at).reshape(-1, 2).T
-        zero = np.zeros((len(at), spectra.wanted.shape[2], 1))
+        naturals, dampings = jnp.asarray(np.array(at).reshape(-1, 2).T)
+        zero = jnp.zeros((len(at), spectra.wanted.shape[2], 1))
         model = Modes(naturals, dampings, zero, zero, zero.sum(axis=0))
         if len(at) == count:
             return model

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits._errors import DataError
+from fits._noise import correlation_samples
+from fits._record import Record
 from fits._stage_run import StageRun, residual_of, simulate_stage
 from fits._stage_solve import Solved, marginal_information
 from microid import Coordinates, Mechanics, Stage
@@ -17,10 +19,44 @@ _REFUSED, _REMARKED = 0.1, 0.05
 _HIGHEST = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
 _UNSEEN = 0.5
+# Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
+_WORTH = 40.0
+# Ranges of voltage that differ by less than this, as a fraction, are alike.
+_ALIKE = 0.05
 _POLES = ("time_constant_s", "natural_frequency_Hz")
 
 
-def refuse_unseen(stage: Stage, coordinates: Coordinates[Stage], solved: Solved) -> None:
+def refuse_slopes(records: Sequence[Record]) -> None:
+    """Refuse slow runs over one range of voltage that move differently far.
+
+    Raises
+    ------
+    DataError
+        If they cannot be of one rig.
+    """
+    spans = [
+        (float(np.ptp(record.voltage_V)), float(np.ptp(record.displacement_um)), record.source)
+        for record in records
+        if record.displacement_um is not None
+    ]
+    widest = max(span for span, _, _ in spans)
+    full = [(moved / span, source) for span, moved, source in spans if span > (1 - _ALIKE) * widest]
+    (low, other), (high, one) = min(full), max(full)
+    if high > (1 + _REFUSED) * low:
+        raise DataError(_not_one_rig(one, other, high / low))
+
+
+def _not_one_rig(one: str, other: str, ratio: float) -> str:
+    return (
+        f"{one} and {other}: under the same voltage the first moves {ratio:.3g} times as far as the second, so "
+        "they are not of one rig in one setting; check the units, the amplifier's gain and the sensor's range, "
+        "or fit them apart"
+    )
+
+
+def refuse_unseen(
+    stage: Stage, coordinates: Coordinates[Stage], solved: Solved, drives: Sequence[np.ndarray]
+) -> None:
     """Refuse runs that do not show the dynamics they are fitted with.
 
     Parameters
@@ -29,20 +65,14 @@ def refuse_unseen(stage: Stage, coordinates: Coordinates[Stage], solved: Solved)
         With the poles that explain the runs best.
     coordinates, solved
         Of these poles, the hysteresis being given.
+    drives
+        What the hysteresis alone would give, for each run, shape `(n,)`.
 
     Raises
     ------
     DataError
         If no run moves fast enough, or none is sampled fast enough.
     """
-    fastest = max(solved.runs, key=lambda run: run.rate_Hz)
-    for part in stage.parts:
-        if isinstance(part, Mechanics) and float(part.natural_frequency_Hz) > _HIGHEST * fastest.rate_Hz:
-            raise DataError(
-                f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, expected a rate well above twice the "
-                f"resonance, which seems to lie near {float(part.natural_frequency_Hz):.3g} Hz or beyond: sample at "
-                "5 times the resonance or more, or fit the hysteresis alone with --model loop"
-            )
     information = marginal_information(
         solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
     )
@@ -51,13 +81,31 @@ def refuse_unseen(stage: Stage, coordinates: Coordinates[Stage], solved: Solved)
     if not poles:
         return
     sd = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300)) * slope
-    if all(sd[k] > _UNSEEN for k in poles):
+    if all(sd[k] > _UNSEEN for k in poles) or _gained(solved, drives) < _WORTH:
         names = ", ".join(run.record.source for run in solved.runs)
         raise DataError(
             f"{names}: the displacement follows the voltage without delay or ringing, so these runs hold nothing of "
             "the driver and the mechanics; add a run with steps, a chirp or a multisine that goes beyond the "
             "resonance, or fit the hysteresis alone with --model loop"
         )
+    fastest = max(solved.runs, key=lambda run: run.rate_Hz)
+    for part in stage.parts:
+        if isinstance(part, Mechanics) and float(part.natural_frequency_Hz) > _HIGHEST * fastest.rate_Hz:
+            raise DataError(
+                f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, expected a rate well above twice the "
+                f"resonance, which seems to lie near {float(part.natural_frequency_Hz):.3g} Hz or beyond: sample at "
+                "5 times the resonance or more, or fit the hysteresis alone with --model loop"
+            )
+
+
+def _gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:
+    """Twice the logarithm of how much likelier the poles make the runs."""
+    gained = 0.0
+    for run, drive, noise in zip(solved.runs, drives, solved.weighing.noise_um, strict=True):
+        x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
+        left = y - y.mean() - x * (x @ y / (x @ x))
+        gained += 2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise))
+    return gained
 
 
 def _names(stage: Stage, coordinates: Coordinates[Stage]) -> list[str]:
@@ -114,11 +162,7 @@ def compare_gains(stage: Stage, runs: Sequence[StageRun], refuse: bool = False) 
     ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
     one, other = runs[high].record.source, runs[low].record.source
     if refuse and ratio > 1 + _REFUSED:
-        raise DataError(
-            f"{one} and {other}: under the same voltage the first moves {ratio:.3g} times as far as the second, so "
-            "they are not of one rig in one setting; check the units, the amplifier's gain and the sensor's range, "
-            "or fit them apart"
-        )
+        raise DataError(_not_one_rig(one, other, ratio))
     if ratio > 1 + _REMARKED:
         return [
             f"under the same voltage {one} moves {ratio:.3g} times as far as {other}: "

@@ -118,7 +118,8 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
     candidates = problem.candidates()
     found: list[tuple[float, np.ndarray]] = []
     for x in _distinct(candidates[:_LEADING], _COARSE)[:_REFINED]:
-        end: Any = least_squares(problem.misfit, x, method="trf", x_scale=1.0, max_nfev=200)
+        low, high = problem.bounds()
+        end: Any = least_squares(problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200)
         found.append((float(end.cost), end.x))
     found.sort(key=lambda item: item[0])
     ends = _distinct([x for _, x in found], _SAME)[:_KEPT]
@@ -188,6 +189,14 @@ class _LogResponse:
             # Gains are positive: only their size is free.
             off[..., which] -= (off[..., which].real @ share / np.sum(share))[..., None]
         return off * self.weight
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Poles beyond these leave nothing in the band, and those within their ends something."""
+        low, high = np.log(self.frequency_Hz.min() / 30), np.log(self.frequency_Hz.max() * 30)
+        radian = np.log(2 * np.pi)
+        driver, mechanics = [(-radian - high, -radian - low)], [(low, high), (np.log(1e-4), np.log(1e2))]
+        pairs = [pair for one in self.drivers for pair in (driver if one else mechanics)]
+        return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
 
     def candidates(self) -> list[np.ndarray]:
         """All combinations of some poles for each part, the best first."""

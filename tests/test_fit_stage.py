@@ -3,6 +3,7 @@
 import dataclasses
 import secrets
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -97,7 +98,9 @@ def rig():
         "mechanics.natural_frequency_Hz": frequency,
         "mechanics.damping_ratio": damping,
     }
-    records = {r.name: Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in bench.records}
+    records = {
+        r.name: Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in bench.records
+    }
     return Rig(truth, records, {r.name: r.true_displacement_um for r in bench.records})
 
 
@@ -172,9 +175,7 @@ def test_a_run_sampled_too_slowly_for_its_mode_is_refused(rig, rng):
     fast = rig.records["fast"]
     # Its rate falls to 1.5 times the resonance.
     keep = max(1, round(2500 / (1.5 * rig.truth["mechanics.natural_frequency_Hz"])))
-    thinned = Record(
-        fast.time_s[::keep], fast.voltage_V[::keep], fast.displacement_um[::keep], source="thinned.csv"
-    )
+    thinned = Record(fast.time_s[::keep], fast.voltage_V[::keep], fast.displacement_um[::keep], source="thinned.csv")
     with pytest.raises(fits.DataError, match=r"thinned.csv: sampled at .* Hz"):
         fits.fit_stage([rig.records["slow"], thinned], levels=8, initial="negative", holdout=0.0)
 
@@ -203,15 +204,15 @@ def test_settings_that_cannot_be_honoured_are_refused(rig, settings, sentence):
 
 
 def test_new_data_of_the_same_shape_compile_nothing(rig, fitted):
-    import jax
-
-    again = {name: Record(r.time_s, r.voltage_V, r.displacement_um + 1.0, source=r.source) for name, r in rig.records.items()}
-    with jax.log_compiles(False):
-        compiled: list[str] = []
-        jax.monitoring.register_event_duration_secs_listener(
-            lambda event, duration, **_: compiled.append(event) if "backend_compile" in event else None
-        )
-        result = fits.fit_stage([again["slow"], again["fast"]], holdout=[again["check"]], initial="negative", levels=16)
+    again = [
+        Record(r.time_s, r.voltage_V, r.displacement_um + 1.0, source=r.source)
+        for r in (rig.records[name] for name in ("slow", "fast", "check"))
+    ]
+    compiled: list[str] = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, duration, **_: compiled.append(event) if "backend_compile" in event else None
+    )
+    result = fits.fit_stage(again[:2], holdout=again[2:], initial="negative", levels=16)
     assert compiled == []
     assert result["driver.time_constant_s"].value == pytest.approx(fitted["driver.time_constant_s"].value, rel=1e-3)
     assert jnp.isfinite(result.uncertainty.coordinates).all()
