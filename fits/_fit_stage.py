@@ -114,6 +114,10 @@ def fit_stage(
     voltages = [record.voltage_V for record in (*records, *aside)]
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     stage = default_stage() if stage is None else stage
+    if stage.hold != "first":
+        raise DataError(
+            f"the stage holds its command in steps (hold={stage.hold!r}), which is not fitted: use 'first'"
+        )
     remembers = place_of_hysteresis(stage) is not None
     plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, remembers)
     problem = _start(plan, stage, levels)

@@ -21,6 +21,8 @@ _HIGHEST = 0.45
 _UNSEEN = 0.5
 # Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
 _WORTH = 40.0
+# A run that leaves so many times what the quietest leaves moves in ways that its samples do not show.
+_LOUD = 3.0
 # Ranges of voltage that differ by less than this, as a fraction, are alike.
 _ALIKE = 0.05
 _POLES = ("time_constant_s", "natural_frequency_Hz")
@@ -82,6 +84,16 @@ def refuse_unseen(
         return
     sd = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300)) * slope
     if all(sd[k] > _UNSEEN for k in poles) or _gained(solved, drives) < _WORTH:
+        noise = solved.weighing.noise_um
+        loudest = int(np.argmax(noise))
+        if noise[loudest] > _LOUD * min(noise):
+            loud = solved.runs[loudest]
+            raise DataError(
+                f"{loud.record.source}: sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it: "
+                f"{noise[loudest]:.3g} um of it stay unexplained, {noise[loudest] / min(noise):.3g} times as much as "
+                "of the quietest run; sample at 5 times the resonance or more, or fit the hysteresis alone with "
+                "--model loop"
+            )
         names = ", ".join(run.record.source for run in solved.runs)
         raise DataError(
             f"{names}: the displacement follows the voltage without delay or ringing, so these runs hold nothing of "

@@ -107,7 +107,10 @@ def _run_linear(system: LinearSystem, time_s: Times, signal: Signal) -> Signal:
     """Pass a signal through a linear system that was at rest."""
     values = system.respond(time_s, signal.values, signal.before, signal.hold)
     before = system.offset + system.gain * signal.before
-    return Signal(values, before, "smooth" if system.order else signal.hold)
+    if system.order == 0:
+        return Signal(values, before, signal.hold)
+    # Behind a step even what comes out of an inertia may have a corner.
+    return Signal(values, before, "first" if signal.hold == "zero" else "smooth")
 
 
 def _imaginary(frequency_Hz: Float[Array, "..."]) -> Complex[Array, "..."]:

@@ -52,6 +52,15 @@ def states(a, b, time_s, signal, hold, before=None, interval=van_loan):
     return np.array(out)
 
 
+def smoothed(time_s, signal):
+    """Samples whose joining lines have, on average, the height of the parabolas through three samples each."""
+    out = np.array(signal, dtype=float)
+    for k in range(1, len(out) - 1):
+        bend = np.polyfit(time_s[k - 1 : k + 2] - time_s[k], signal[k - 1 : k + 2], 2)[0]
+        out[k] -= bend * (time_s[k] - time_s[k - 1]) * (time_s[k + 1] - time_s[k]) / 6
+    return out
+
+
 def play_positions(signal, slack, start):
     """Positions of plays, one sample and one play after the other."""
     position, out = np.array(start, dtype=float), []

@@ -261,5 +261,5 @@ def test_whole_volts_are_no_integers():
 
 
 def test_an_unknown_hold_is_refused():
-    with pytest.raises(ValueError, match="hold must be 'first' or 'zero'"):
+    with pytest.raises(ValueError, match="hold must be 'first', 'zero' or 'smooth'"):
         m.Driver(1e-3).system().respond(np.arange(2.0), np.arange(2.0), jnp.asarray(0.0), "second")

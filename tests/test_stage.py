@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _models import compiled, random_model
-from _plant_reference import driver_and_mechanics, mechanics_alone, play_positions, states
+from _plant_reference import driver_and_mechanics, mechanics_alone, play_positions, smoothed, states
 from _reference import central_differences
 
 import microid as m
@@ -53,7 +53,8 @@ def test_chain_is_the_composition_of_its_parts(hold, rested, rng):
     plays = play_positions(u, np.asarray(law.threshold_V), memory_V)
     w = float(law.offset_um) + float(law.slope_um_per_V) * u + plays @ np.asarray(law.weight_um_per_V)
     a, b = mechanics_alone(float(mechanics.natural_frequency_Hz), float(mechanics.damping_ratio))
-    out = float(mechanics.gain) * states(a, b, time_s, w[1:], "first", w[0])[:, 0]
+    seen = smoothed(time_s, w[1:]) if hold == "first" else w[1:]
+    out = float(mechanics.gain) * states(a, b, time_s, seen, "first", w[0])[:, 0]
     expected = float(sensor.offset_um) + float(sensor.gain) * out
     start = m.Start(np.asarray(rest_V) if rested else None, memory_V)
     np.testing.assert_allclose(respond(stage, time_s, voltage_V, start), expected, rtol=0, atol=1e-12 * 200)
@@ -70,7 +71,7 @@ def test_a_stage_at_rest_stays_there(rng):
 
 
 def test_neighbouring_linear_parts_are_exact_and_substeps_converge(rng):
-    """Without a hysteresis nothing is approximated. With a linear one between, it is, to second order."""
+    """Without a hysteresis nothing is approximated. With a linear one between it is, to the third order at corners."""
     driver, mechanics = m.Driver(2e-3), m.Mechanics(60.0, 0.1, 2.0)
     time_s, voltage_V = interval(rng), rng.uniform(-40, 40, SAMPLES)
     plant = driver_and_mechanics(2e-3, 60.0, 0.1)
@@ -82,7 +83,7 @@ def test_neighbouring_linear_parts_are_exact_and_substeps_converge(rng):
     for substeps in (2, 8):
         parted = m.Stage.of(driver=driver, law=law, mechanics=mechanics, substeps=substeps)
         errors.append(np.abs(respond(parted, time_s, voltage_V) - exact).max())
-    assert 1.8 < np.log(errors[0] / errors[1]) / np.log(4) < 2.2
+    assert 2.7 < np.log(errors[0] / errors[1]) / np.log(4) < 4.2
 
 
 def test_steps_are_held_through_substeps(rng):
