@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from fits._plot_compensation import plot_compensation as plot_compensation
     from fits._plot_stage import plot_stage as plot_stage
     from fits._plots import plot_fit as plot_fit
+    from fits._posterior import Draws as Draws
+    from fits._posterior import sample_posterior as sample_posterior
+    from fits._profile import Profile as Profile
+    from fits._profile import profile_stage as profile_stage
     from fits._read_csv import read_csv as read_csv
     from fits._read_csv import read_reference as read_reference
     from fits._read_csv import read_runs as read_runs
@@ -57,6 +61,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "Compensation": "_compensate",
     "DataError": "_errors",
+    "Draws": "_posterior",
     "Errors": "_metrics",
     "FitError": "_result",
     "FitResult": "_result",
@@ -69,6 +74,7 @@ _HOMES = {
     "NetworkInverse": "_network_inverse",
     "ParameterEstimate": "_stage_result",
     "Prediction": "_result",
+    "Profile": "_profile",
     "Record": "_record",
     "Reference": "_record",
     "ResponseData": "_frequency",
@@ -95,12 +101,14 @@ _HOMES = {
     "plot_fit": "_plots",
     "plot_stage": "_plot_stage",
     "predict": "_result",
+    "profile_stage": "_profile",
     "predict_stage": "_stage_result",
     "read_csv": "_read_csv",
     "read_multisine": "_frequency",
     "read_reference": "_read_csv",
     "read_runs": "_read_csv",
     "relative_error": "_modal_fit",
+    "sample_posterior": "_posterior",
     "save_model": "_model_file",
     "stage_report": "_stage_report",
 }

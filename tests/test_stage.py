@@ -71,7 +71,7 @@ def test_a_stage_at_rest_stays_there(rng):
 
 
 def test_neighbouring_linear_parts_are_exact_and_substeps_converge(rng):
-    """Without a hysteresis nothing is approximated. With a linear one between it is, to the third order at corners."""
+    """Without a hysteresis nothing is approximated. With a linear one between it is, to third order at corners."""
     driver, mechanics = m.Driver(2e-3), m.Mechanics(60.0, 0.1, 2.0)
     time_s, voltage_V = interval(rng), rng.uniform(-40, 40, SAMPLES)
     plant = driver_and_mechanics(2e-3, 60.0, 0.1)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from _stage_records import linear_displacement, linear_record
 from scipy import stats
-from scipy.optimize import curve_fit
+from scipy.optimize import curve_fit, least_squares
 
 import fits
 from microid import Driver, Mechanics, Piezo, Stage
@@ -119,3 +119,42 @@ def test_no_guess_is_needed(rng, damping_ratio):
     if damping_ratio < 1:
         # Beyond it three real poles can change places.
         assert abs(result[NAMES[1]].value - truth["natural_frequency_Hz"]) < 6 * result[NAMES[1]].sd
+
+
+def test_a_profile_is_that_of_scipy_with_one_parameter_held(rng):
+    # Hardly seen beside the delay of the mechanics, so that its profile is no parabola.
+    truth = TRUTH | {"time_constant_s": 2e-5}
+    record = linear_record(rng, truth, n=1500, noise_um=0.3)
+    result = fit_linear(record, initial="negative")
+    profile = fits.profile_stage(result, [record], NAMES[0], points=5, holdout=0.0, initial="negative")
+    scale = np.array([1.0, 1e-2, 0.1, 1.0])
+
+    def least(tau):
+        def residual(x):
+            frequency, damping, gain, offset = x * scale
+            model = linear_displacement(record.time_s, record.voltage_V, tau, frequency, damping, gain) + offset
+            return model - record.displacement_um
+
+        start = np.array([truth["natural_frequency_Hz"], truth["damping_ratio"], truth["gain_um_per_V"], 3.0])
+        return 2 * least_squares(residual, start / scale, xtol=1e-12, ftol=1e-12).cost
+
+    costs = np.array([least(tau) for tau in profile.values])
+    best = least(result[NAMES[0]].value)
+    expected = (costs - best) / result.noise_um[0] ** 2 / result.correlation_samples[0]
+    np.testing.assert_allclose(profile.deviance, expected, rtol=0.02, atol=0.02)
+    assert profile.values[0] > 0
+    assert profile.lower <= result[NAMES[0]].value <= profile.upper
+    with pytest.raises(fits.DataError, match=r"no single parameter 'driver.gain' .* choose one of driver"):
+        fits.profile_stage(result, [record], "driver.gain")
+
+
+def test_the_posterior_is_as_wide_as_the_standard_deviations_say(rng, seed):
+    pytest.importorskip("numpyro", reason="numpyro is not installed: pip install '.[posterior]'")
+    record = linear_record(rng, TRUTH, n=800)
+    result = fit_linear(record, initial="negative")
+    drawn = fits.sample_posterior(result, [record], draws=600, seed=seed, holdout=0.0, initial="negative")
+    assert drawn.divergences < 15
+    for name, values in zip(drawn.names, drawn.values.T, strict=True):
+        # Hundreds of draws that hardly depend on each other: 3 % of the deviation, five times over.
+        assert np.std(values) == pytest.approx(result[name].sd, rel=0.15)
+        assert np.mean(values) == pytest.approx(result[name].value, abs=0.2 * result[name].sd)
