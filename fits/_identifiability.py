@@ -12,7 +12,9 @@ _FAINT = 0.15
 _WHOLE = 0.1
 
 
-def unseen_directions(information: np.ndarray, names: Sequence[str], relative: np.ndarray) -> tuple[str, ...]:
+def unseen_directions(
+    information: np.ndarray, names: Sequence[str], relative: np.ndarray, grid: str | None = None
+) -> tuple[str, ...]:
     """Name the combinations of parameters that the data leave open.
 
     Parameters
@@ -23,6 +25,8 @@ def unseen_directions(information: np.ndarray, names: Sequence[str], relative: n
         Of the parameters, one per coordinate.
     relative
         Change of each parameter's logarithm per coordinate, shape `(p,)`.
+    grid
+        Name of the hysteresis whose weights were fitted too; it takes up any gain.
 
     Returns
     -------
@@ -34,13 +38,15 @@ def unseen_directions(information: np.ndarray, names: Sequence[str], relative: n
     for value, vector in zip(values, vectors.T, strict=True):
         if value * _UNKNOWN**2 > 1:
             break
-        sentences.append(_sentence(vector * relative, names))
+        sentences.append(_sentence(vector * relative, names, grid))
     return tuple(sentences)
 
 
-def _sentence(direction: np.ndarray, names: Sequence[str]) -> str:
+def _sentence(direction: np.ndarray, names: Sequence[str], grid: str | None) -> str:
     size = np.abs(direction)
     moved = [k for k in np.argsort(-size, kind="stable") if size[k] > _FAINT * size.max()]
+    if grid is not None and all(".gain" in names[k] for k in moved):
+        return f"only {' * '.join(names[k] for k in moved)} * {grid} is seen, not each"
     if len(moved) == 1:
         return f"{names[moved[0]]} is not seen in these runs"
     exponents = direction[moved] / direction[moved[0]]

@@ -304,9 +304,9 @@ def _start(spectra: _Spectra, response: NDArray[Any], count: int) -> Modes:
         if len(at) < count and all(abs(natural - other) > 0.02 * natural for other, _ in at):
             at.append((natural, float(np.clip(damping, 1e-3, 0.2))))
     while True:
-        naturals, dampings = jnp.asarray(np.array(at).reshape(-1, 2).T)
+        naturals, dampings = np.array(at).reshape(-1, 2).T
         zero = jnp.zeros((len(at), spectra.wanted.shape[2], 1))
-        model = Modes(naturals, dampings, zero, zero, zero.sum(axis=0))
+        model = Modes(jnp.asarray(naturals), jnp.asarray(dampings), zero, zero, zero.sum(axis=0))
         if len(at) == count:
             return model
         squares = np.asarray(_squares(model, spectra))

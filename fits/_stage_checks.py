@@ -87,6 +87,7 @@ def refuse_unseen(
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
         if noise[loudest] > _LOUD * min(noise):
+            compare_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
             raise DataError(
                 f"{loud.record.source}: sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it: "

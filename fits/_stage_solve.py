@@ -144,6 +144,15 @@ def prior_precision(chain: Chain, hyper: Hyper | None, stroke_um: float) -> np.n
     return np.asarray(roughness(chain.levels).precision(hyper)) / stroke_um**2
 
 
+def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
+    """Take off what a prior says of the scale of all columns together, shape `(D, D)`.
+
+    That is for the data alone to say: a gain beside the grid is not seen, however smooth the grid is.
+    """
+    pull = prior @ columns_um
+    return prior - np.outer(pull, pull) / max(float(columns_um @ pull), 1e-300)
+
+
 def _gather(
     chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun], loss: str, free: bool
 ) -> tuple[Sequence[StageRun], list[RunSums], Weighing]:
@@ -190,7 +199,7 @@ def _step(
     columns = np.asarray(solution.columns) * stroke_um
     step = answer - follow @ columns
     variance = float(jnp.exp(solution.hyper.log_variance)) * stroke_um**2
-    prior = prior_precision(chain, solution.hyper, stroke_um)
+    prior = scale_free(prior_precision(chain, solution.hyper, stroke_um), columns)
     information = marginal_information(total, chain.size, prior, variance)
     return step, columns, solution.hyper, variance, float(step @ information @ step / len(step)) ** 0.5
 

@@ -10,10 +10,10 @@ from scipy import fft
 
 from fits._design import Grid
 from fits._noise import correlation_samples, shared_square
-from fits._prior import interpolation, roughness
+from fits._prior import interpolation
 from fits._stage_moments import Chain, RunSums, along
 from fits._stage_run import StageRun, place_of_hysteresis
-from fits._stage_solve import Solved
+from fits._stage_solve import Solved, prior_precision, scale_free
 from microid import Coordinates, ParameterInfo, Stage
 
 # Levels on which predictions are perturbed; finer ones move no displacement.
@@ -105,8 +105,8 @@ class Precision:
         self.gram = np.asarray(total.gram) / self.variance
         self.prior = np.zeros_like(self.gram)
         if solved.hyper is not None:
-            form = roughness(chain.levels).precision(solved.hyper)
-            self.prior[:size, :size] = np.asarray(form) / stroke_um**2
+            prior = prior_precision(chain, solved.hyper, stroke_um)
+            self.prior[:size, :size] = scale_free(prior, solved.columns_um)
         rest = np.arange(size), np.arange(size, size + count)
         self.information = self._marginal(*rest)
 
@@ -148,7 +148,8 @@ class Precision:
         autocovariances (the sandwich of Newey & West 1987), to which comes what is not known of the columns.
         """
         size, answer = self.chain.size, self.answer()
-        held = answer[:size].T @ self.prior[:size, :size] @ answer[:size]
+        # What nothing is known of stays unknown, whatever the residual.
+        held = answer[:size].T @ self.prior[:size, :size] @ answer[:size] + _FAINT * answer[size:].T @ answer[size:]
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
             weight = np.asarray(run.samples.weight)[: len(run.record)]
             held = held + _sandwich(own, np.sqrt(weight) * one.residual_um, run.fitted)

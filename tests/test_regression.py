@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from scipy.integrate import quad
 from scipy.optimize import nnls
 from scipy.stats import multivariate_normal
 
@@ -106,16 +107,18 @@ def test_posterior_is_that_of_dense_bayesian_regression(problem):
     np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-5, atol=1e-9 * covariance.max())
 
 
-def test_roughness_is_the_integral_of_squared_curvature():
+def test_roughness_is_the_weighted_integral_of_squared_curvature():
     # A quadratic has constant second derivatives: 2a, 2c and b along the two axes and mixed.
     n, (a, b, c) = 40, (1.3, -0.7, 0.4)
     v = np.linspace(0, 1, n)
     alpha, beta = (w[np.tril_indices(n)] for w in np.meshgrid(v, v, indexing="ij"))
     columns = np.concatenate([a * alpha**2 + b * alpha * beta + c * beta**2, 2 * v**2])
     rough = roughness(n)
-    curvature = ((2 * a) ** 2 + 2 * b**2 + (2 * c) ** 2) / 2
+    # Lines of equal distance from the diagonal get shorter with it; curvature counts by its square.
+    area = quad(lambda x: (1 - x) * ((x + 0.05) / 0.35) ** 2, 0, 1)[0]
+    curvature = ((2 * a) ** 2 + 2 * b**2 + (2 * c) ** 2) * area
     np.testing.assert_allclose(columns @ rough.density @ columns, curvature, rtol=0.15)
-    np.testing.assert_allclose(columns @ rough.along @ columns, (2 * a + 2 * b + 2 * c) ** 2 / 2, rtol=0.15)
+    np.testing.assert_allclose(columns @ rough.along @ columns, (2 * a + 2 * b + 2 * c) ** 2 * area, rtol=0.15)
     np.testing.assert_allclose(columns @ rough.reversible @ columns, 16.0, rtol=0.1)
     straight = np.concatenate([3 + 2 * alpha - beta, 1 - v])
     for form in (rough.density, rough.along, rough.reversible):

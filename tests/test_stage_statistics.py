@@ -95,6 +95,8 @@ def test_combinations_that_are_not_seen_are_named(rng):
     assert len(result.unseen) == 1
     assert result.unseen[0] in [f"only {pair} is seen, not each" for pair in pairs]
     assert set(result.unseen) <= set(result.remarks)
+    # Each by itself is unknown, and says so.
+    assert all(result[name].sd > result[name].value for name in ("mechanics.gain", "piezo.gain_um_per_V"))
     # What is seen is not spoiled by what is not.
     frequency = result["mechanics.natural_frequency_Hz"]
     assert abs(frequency.value - TRUTH["natural_frequency_Hz"]) < 5 * frequency.sd < 1.0
