@@ -177,6 +177,12 @@ def _start(plan: _Plan, stage: Stage, levels: int | None) -> _Problem:
     name = stage.names[place or 0]
     if isinstance(law, Preisach) and isinstance(law.density, GridDensity) and name not in stage.frozen:
         refuse_slopes([plan.records[k] for k in slow])
+        loose = [stage.named(row.path) for row in offsets_out(stage, True).table if row.path.endswith(".gain")]
+        if loose:
+            raise DataError(
+                f"{', '.join(loose)} and the weights of {name} are both free, but only their product is seen, not each: "
+                f"freeze {loose[0]}, or the {name}"
+            )
         runs = [
             prepare_run(record, *plan.range_V, state, plan.fraction)
             for record, state in zip(plan.records, plan.states, strict=True)

@@ -12,9 +12,7 @@ _FAINT = 0.15
 _WHOLE = 0.1
 
 
-def unseen_directions(
-    information: np.ndarray, names: Sequence[str], relative: np.ndarray, grid: str | None = None
-) -> tuple[str, ...]:
+def unseen_directions(information: np.ndarray, names: Sequence[str], relative: np.ndarray) -> tuple[str, ...]:
     """Name the combinations of parameters that the data leave open.
 
     Parameters
@@ -25,8 +23,6 @@ def unseen_directions(
         Of the parameters, one per coordinate.
     relative
         Change of each parameter's logarithm per coordinate, shape `(p,)`.
-    grid
-        Name of the hysteresis whose weights were fitted too; it takes up any gain.
 
     Returns
     -------
@@ -38,15 +34,13 @@ def unseen_directions(
     for value, vector in zip(values, vectors.T, strict=True):
         if value * _UNKNOWN**2 > 1:
             break
-        sentences.append(_sentence(vector * relative, names, grid))
+        sentences.append(_sentence(vector * relative, names))
     return tuple(sentences)
 
 
-def _sentence(direction: np.ndarray, names: Sequence[str], grid: str | None) -> str:
+def _sentence(direction: np.ndarray, names: Sequence[str]) -> str:
     size = np.abs(direction)
     moved = [k for k in np.argsort(-size, kind="stable") if size[k] > _FAINT * size.max()]
-    if grid is not None and all(".gain" in names[k] for k in moved):
-        return f"only {' * '.join(names[k] for k in moved)} * {grid} is seen, not each"
     if len(moved) == 1:
         return f"{names[moved[0]]} is not seen in these runs"
     exponents = direction[moved] / direction[moved[0]]

@@ -12,7 +12,7 @@ from fits._metrics import Errors, errors, loop_width_pct
 from fits._result import FitStatus, RunReport
 from fits._stage_checks import compare_gains, coordinates_slope
 from fits._stage_result import ParameterEstimate, StageFit
-from fits._stage_run import StageRun, place_of_hysteresis, residual_of, simulate_stage
+from fits._stage_run import StageRun, residual_of, simulate_stage
 from fits._stage_solve import Solved
 from fits._stage_uncertainty import Precision
 from microid import Coordinates, Stage, Staircase
@@ -65,9 +65,7 @@ def summarise(
         ParameterEstimate(name, unit, *map(float, figures))
         for (name, unit), *figures in zip(names, value, np.abs(slope) * sd, *ends, strict=True)
     )
-    place = place_of_hysteresis(stage)
-    grid = None if place is None or solved.hyper is None else stage.names[place]
-    unseen = unseen_directions(precision.information, [name for name, _ in names], slope / value, grid)
+    unseen = unseen_directions(precision.information, [name for name, _ in names], slope / value)
     for run, correlation in zip(solved.runs, solved.weighing.correlation, strict=True):
         if correlation > _WHITE:
             remarks.append(
