@@ -180,8 +180,8 @@ def _start(plan: _Plan, stage: Stage, levels: int | None) -> _Problem:
         loose = [stage.named(row.path) for row in offsets_out(stage, True).table if row.path.endswith(".gain")]
         if loose:
             raise DataError(
-                f"{', '.join(loose)} and the weights of {name} are both free, but only their product is seen, not each: "
-                f"freeze {loose[0]}, or the {name}"
+                f"{', '.join(loose)} and the weights of {name} are both free, but only their product is seen, "
+                f"not each: freeze {loose[0]}, or the {name}"
             )
         runs = [
             prepare_run(record, *plan.range_V, state, plan.fraction)
