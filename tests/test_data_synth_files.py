@@ -74,7 +74,8 @@ def test_a_csv_holds_what_was_measured_and_nothing_else(scenario, seed, tmp_path
         columns = np.array([[float(cell) for cell in row.split(",")] for row in rows]).T
         for column, measured in zip(columns, (record.time_s, record.voltage_V, record.displacement_um), strict=True):
             np.testing.assert_array_equal(column, measured)
-        assert np.all(record.displacement_um != record.true_displacement_um)
+        # Single readings may equal the truth (a stage at rest at exactly zero); the noise as a whole is there.
+        assert np.std(record.displacement_um - record.true_displacement_um) == pytest.approx(0.03, rel=0.2)
         # The history before the record stays unknown: only its end, where the record starts, can be seen.
         assert not set(np.round(record.history_V[2:-1], 6)) & set(columns[1])
 
