@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from fits._read_csv import read_csv as read_csv
     from fits._read_csv import read_reference as read_reference
     from fits._read_csv import read_runs as read_runs
+    from fits._read_response import read_response as read_response
     from fits._record import Record as Record
     from fits._record import Reference as Reference
     from fits._report import describe as describe
@@ -106,6 +107,7 @@ _HOMES = {
     "read_csv": "_read_csv",
     "read_multisine": "_frequency",
     "read_reference": "_read_csv",
+    "read_response": "_read_response",
     "read_runs": "_read_csv",
     "relative_error": "_modal_fit",
     "sample_posterior": "_posterior",

@@ -1,7 +1,7 @@
 """The `microid` command: what can be asked of it.
 
-Only the standard library and click are imported here; the work, and what it imports, is in `_cli_work` and other
-modules named `_cli_...`.
+Only the standard library and click are imported here; the work, and what it imports, is in other modules named
+`_cli_...`.
 """
 
 import functools
@@ -120,14 +120,9 @@ def fit(**options: Any) -> None:
     The files are runs of one rig, with the columns time_s, voltage_V and displacement_um. A stage needs a slow run
     over the whole range, and one with steps, a chirp or a multisine beyond the resonance.
     """
-    if options.pop("model") == "stage":
-        from fits._cli_stage import run_fit_stage
+    from fits._cli_fit import run_fit
 
-        run_fit_stage(**options)
-    else:
-        from fits._cli_work import run_fit
-
-        run_fit(**options)
+    run_fit(**options)
 
 
 @cli.command()

@@ -7,8 +7,9 @@ import click
 import numpy as np
 
 from fits._atomic import atomic_path, write_csv
+from fits._cli_files import keep_inputs, new_folder
 from fits._cli_jax import start_jax
-from fits._cli_work import _folder, _keep_inputs, _preisach
+from fits._cli_work import preisach_of
 from fits._compensate import compensate
 from fits._compensate_stage import static_equivalent
 from fits._errors import DataError
@@ -42,7 +43,7 @@ def run_compensate(
 ) -> None:
     """Do `microid compensate`; the options are the command's."""
     start_jax()
-    _keep_inputs(out, [model, reference])
+    keep_inputs(out, [model, reference])
     loaded = load_model(model)
     stage = _compensable(model, loaded)
     if way == "dynamic" and isinstance(stage, Preisach):
@@ -52,7 +53,7 @@ def run_compensate(
         )
     wanted = read_reference(reference, parse_columns(columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
-    with atomic_path(out) as unfinished, _folder(plots) as drawings:
+    with atomic_path(out) as unfinished, new_folder(plots) as drawings:
         found = compensate(stage, wanted, initial, clip, _limits(limits), "dynamic" if way == "dynamic" else "static")
         program = Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
         sd_um = _displacement_sd_um(loaded, program, initial)
@@ -113,7 +114,7 @@ def run_export(*, model: str, out: str, name: str, memory: int, limits: str | No
 
 
 def _compensable(path: str, loaded: ModelFile) -> Preisach | Stage:
-    return loaded.model if isinstance(loaded.model, Stage) else _preisach(path, loaded)
+    return loaded.model if isinstance(loaded.model, Stage) else preisach_of(path, loaded)
 
 
 def _displacement_sd_um(loaded: ModelFile, program: Record, initial: str) -> np.ndarray | None:

@@ -17,7 +17,7 @@ from fits._run import prepare_run, simulate_run
 from fits._stage_checks import compare_gains, refuse_slopes, refuse_unseen
 from fits._stage_moments import Chain
 from fits._stage_result import StageFit
-from fits._stage_run import StageRun, place_of_hysteresis, prepare_stage_run, simulate_stage
+from fits._stage_run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, simulate_stage
 from fits._stage_solve import LOSSES, Solved, solve_chain
 from fits._stage_start import measure_response, start_stages
 from fits._stage_summary import summarise
@@ -78,7 +78,8 @@ def fit_stage(
     holdout
         Fraction at the end of every run that is only predicted, or records that are.
     initial
-        Memory before each run, or one for all: `unknown`, `negative`, `positive` or `demagnetised`.
+        Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. One for all holds for records
+        that are held out, too; theirs is unknown where each fitted run has its own.
     loss
         `squares`, or `huber`, to which outliers count less.
     progress
@@ -118,12 +119,12 @@ def fit_stage(
         raise DataError(
             f"the stage holds its command in steps (hold={stage.hold!r}), which is not fitted: use 'first'"
         )
-    remembers = place_of_hysteresis(stage) is not None
-    plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, remembers)
+    plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage))
     problem = _start(plan, stage, levels)
     problem, solved, precision = _refine(plan, problem)
     progress("comparing with the measurement")
-    held = [prepare_stage_run(r, range_V, "unknown", 1.0, solved.runs[-1].samples.stride, remembers) for r in aside]
+    before = initial if isinstance(initial, str) else "unknown"
+    held = [prepare_stage_run(r, range_V, before, 1.0, solved.runs[-1].samples.stride, plan.gain) for r in aside]
     found = summarise(problem.at(solved), problem.chain.coordinates, solved, precision, held)
     notes = [warning for record in (*records, *aside) for warning in record.warnings]
     return replace(found, remarks=(*notes, *problem.remarks, *found.remarks))
@@ -139,12 +140,12 @@ class _Plan:
     range_V: tuple[float, float]
     loss: str
     progress: Callable[[str], None]
-    remembers: bool
+    gain: float | None
 
     def runs(self, stride: int) -> list[StageRun]:
         """The records, each interval divided into so many steps."""
         return [
-            prepare_stage_run(record, self.range_V, state, self.fraction, stride, self.remembers)
+            prepare_stage_run(record, self.range_V, state, self.fraction, stride, self.gain)
             for record, state in zip(self.records, self.states, strict=True)
         ]
 
@@ -183,8 +184,10 @@ def _start(plan: _Plan, stage: Stage, levels: int | None) -> _Problem:
                 f"{', '.join(loose)} and the weights of {name} are both free, but only their product is seen, "
                 f"not each: freeze {loose[0]}, or the {name}"
             )
+        assert plan.gain is not None
+        lower, upper = plan.gain * plan.range_V[0], plan.gain * plan.range_V[1]
         runs = [
-            prepare_run(record, *plan.range_V, state, plan.fraction)
+            prepare_run(replace(record, voltage_V=plan.gain * record.voltage_V), lower, upper, state, plan.fraction)
             for record, state in zip(plan.records, plan.states, strict=True)
         ]
         plan.progress(f"hysteresis from {', '.join(plan.records[k].source for k in slow)}")
@@ -242,7 +245,7 @@ def _refine(plan: _Plan, problem: _Problem) -> tuple[_Problem, Solved, Precision
         solved = solve_chain(problem.chain, *start, plan.loss, plan.progress)
         problem = replace(problem, z=solved.z, columns_um=solved.columns_um, hyper=solved.hyper)
         precision = Precision(problem.chain, solved, problem.stroke_um)
-        if not plan.remembers or stride > 1:
+        if plan.gain is None or stride > 1:
             return problem, solved, precision
         influence, stage = precision.influence(), problem.at(solved)
         sd = np.sqrt(np.diagonal(precision.covariance(influence)))

@@ -19,7 +19,7 @@ from fits._record import Record
 from fits._result import RunReport
 from fits._run import prepare_run, simulate_run
 from fits._stage_result import StageFit
-from fits._stage_run import StageRun, place_of_hysteresis, prepare_stage_run, residual_of
+from fits._stage_run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, residual_of
 from fits._stage_start import MeasuredResponse, measure_response
 from microid import AbstractLinear, Preisach, Stage
 
@@ -86,13 +86,14 @@ def plot_stage(
     # The runs are refined already.
     stage = result.model.with_substeps(1)
     range_V = _range_V([*records, *aside])
-    remembers = place_of_hysteresis(stage) is not None
+    gain = gain_ahead(stage)
+    before_aside = initial if isinstance(initial, str) else "unknown"
     runs = [
-        prepare_stage_run(record, range_V, state, fraction, stride, remembers)
+        prepare_stage_run(record, range_V, state, fraction, stride, gain)
         for record, state, stride in zip(records, states, result.substeps, strict=True)
     ]
     for record in aside:
-        run = prepare_stage_run(record, range_V, "unknown", 1.0, result.substeps[-1], remembers)
+        run = prepare_stage_run(record, range_V, before_aside, 1.0, result.substeps[-1], gain)
         runs.append(replace(run, fitted=run.known).weighted(run.known))
     noises = [*result.noise_um, *([max(result.noise_um)] * len(aside))]
     drawn = [

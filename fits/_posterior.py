@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from fits._errors import DataError
 from fits._record import Record
-from fits._stage_result import StageFit, range_of
-from fits._stage_run import Samples, lead_ins, place_of_hysteresis, prepare_stage_run, residual_of, respond, without
+from fits._stage_result import StageFit, prepare_again
+from fits._stage_run import Samples, lead_ins, residual_of, respond, without
 from fits._stage_solve import Weighing
 from fits._stage_uncertainty import offsets_out
 from microid import Coordinates, Stage
@@ -81,11 +81,8 @@ def sample_posterior(
         from numpyro.infer import MCMC, NUTS
     except ImportError:
         raise DataError('the posterior needs numpyro: pip install -c constraints.txt ".[posterior]"') from None
-    stage, range_V = result.model.with_substeps(1), range_of(result.model)
-    if not np.isfinite(range_V[0]):
-        range_V = (min(float(r.voltage_V.min()) for r in records), max(float(r.voltage_V.max()) for r in records))
-    remembers = place_of_hysteresis(stage) is not None
-    runs = [prepare_stage_run(r, range_V, initial, holdout, result.model.substeps, remembers) for r in records]
+    stage = result.model.with_substeps(1)
+    runs = prepare_again(result.model, records, initial, holdout)
     weighing = Weighing.of(runs, [residual_of(stage, run) for run in runs])
     precision = [
         jnp.asarray(1 / (noise**2 * correlation))

@@ -13,8 +13,8 @@ from fits._errors import DataError
 from fits._prior import Hyper
 from fits._record import Record
 from fits._stage_moments import Chain
-from fits._stage_result import StageFit, range_of
-from fits._stage_run import StageRun, place_of_hysteresis, prepare_stage_run, residual_of
+from fits._stage_result import StageFit, prepare_again
+from fits._stage_run import StageRun, place_of_hysteresis, residual_of
 from fits._stage_solve import Solved, prior_precision, solve_chain
 from fits._stage_uncertainty import offsets_out
 from microid import GridDensity, Preisach, Stage, parameter_table
@@ -91,11 +91,7 @@ def profile_stage(
     if high >= spec.upper:
         high = spec.upper - 0.01 * (spec.upper - at.value)
     values = np.linspace(low, high, points)
-    range_V = range_of(result.model)
-    if not np.isfinite(range_V[0]):
-        range_V = (min(float(r.voltage_V.min()) for r in records), max(float(r.voltage_V.max()) for r in records))
-    remembers = place_of_hysteresis(result.model) is not None
-    runs = [prepare_stage_run(r, range_V, initial, holdout, result.model.substeps, remembers) for r in records]
+    runs = prepare_again(result.model, records, initial, holdout)
     problem = _Held.of(result.model.with_substeps(1), runs, initial_hyper=Hyper.start())
 
     def deviance(value: float) -> float:

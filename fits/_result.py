@@ -18,9 +18,9 @@ class FitStatus(enum.Enum):
     """How a fit ended; the value says what to do."""
 
     CONVERGED = "the optimality conditions hold"
-    MAX_STEPS = "the solver ran out of steps: try fewer levels or another --family"
+    MAX_STEPS = "the solver ran out of steps: fit a simpler model (fewer levels, parameters or modes)"
     NONFINITE = "the solver met a number that is not finite: look for absurd values in the data"
-    NOT_STATIONARY = "the solver stopped where the cost still falls: try more --starts or another --family"
+    NOT_STATIONARY = "the solver stopped where the cost still falls: try another model, or other values to start from"
 
 
 class FitError(RuntimeError):
@@ -192,14 +192,19 @@ def predict(model: Preisach, uncertainty: Uncertainty, record: Record, initial: 
         If the voltage leaves the range that the model was fitted on.
     """
     lower, upper = float(model.density.lower_V), float(model.density.upper_V)
-    slack = 1e-9 * (upper - lower)
-    outside = np.flatnonzero((record.voltage_V < lower - slack) | (record.voltage_V > upper + slack))
+    refuse_outside(record, lower, upper)
+    run = prepare_run(record, lower, upper, initial, holdout=1.0)
+    return Prediction(simulate_run(model, run), sd_run(uncertainty, run))
+
+
+def refuse_outside(record: Record, lower_V: float, upper_V: float) -> None:
+    """Refuse, in a `DataError`, a program that leaves the range that a model was fitted on."""
+    slack = 1e-9 * (upper_V - lower_V) if np.isfinite(upper_V - lower_V) else 0.0
+    outside = np.flatnonzero((record.voltage_V < lower_V - slack) | (record.voltage_V > upper_V + slack))
     if len(outside):
         first = int(outside[0])
         raise DataError(
             f"{record.source}: sample {first + 1} (time {record.time_s[first]:g} s) asks for "
-            f"{record.voltage_V[first]:g} V, but the model was fitted between {lower:g} and {upper:g} V: "
-            "clip the program or fit a record that covers it"
+            f"{record.voltage_V[first]:g} V, but the model was fitted between {lower_V:g} and {upper_V:g} V: "
+            "clip the program or fit runs that cover it"
         )
-    run = prepare_run(record, lower, upper, initial, holdout=1.0)
-    return Prediction(simulate_run(model, run), sd_run(uncertainty, run))

@@ -1,14 +1,14 @@
 """What the fit of a stage gives back."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fits._errors import DataError
 from fits._metrics import Errors
 from fits._record import Record
-from fits._result import FitStatus, Prediction, RunReport, pool
-from fits._stage_run import place_of_hysteresis, prepare_stage_run, simulate_stage
+from fits._result import FitStatus, Prediction, RunReport, pool, refuse_outside
+from fits._stage_run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, simulate_stage
 from fits._stage_uncertainty import StageUncertainty
 from microid import Preisach, Stage
 
@@ -108,12 +108,23 @@ class StageFit:
 
 
 def range_of(stage: Stage) -> tuple[float, float]:
-    """Voltages that a stage was fitted on; unlimited without a Preisach operator."""
+    """Commands that a stage was fitted on, in V; unlimited without a Preisach operator."""
     place = place_of_hysteresis(stage)
     law = None if place is None else stage.parts[place]
     if isinstance(law, Preisach):
-        return float(law.density.lower_V), float(law.density.upper_V)
+        gain = gain_ahead(stage)
+        assert gain is not None
+        return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
     return -np.inf, np.inf
+
+
+def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout: float) -> list[StageRun]:
+    """Make the records ready on which a stage was fitted; without a Preisach operator they give the range."""
+    range_V = range_of(stage)
+    if not np.isfinite(range_V[0]):
+        range_V = (min(float(r.voltage_V.min()) for r in records), max(float(r.voltage_V.max()) for r in records))
+    gain = gain_ahead(stage)
+    return [prepare_stage_run(record, range_V, initial, holdout, stage.substeps, gain) for record in records]
 
 
 def predict_stage(
@@ -136,17 +147,9 @@ def predict_stage(
         If the voltage leaves the range that the stage was fitted on.
     """
     lower, upper = range_of(stage)
-    slack = 1e-9 * (upper - lower) if np.isfinite(upper - lower) else 0.0
-    outside = np.flatnonzero((record.voltage_V < lower - slack) | (record.voltage_V > upper + slack))
-    if len(outside):
-        first = int(outside[0])
-        raise DataError(
-            f"{record.source}: sample {first + 1} (time {record.time_s[first]:g} s) asks for "
-            f"{record.voltage_V[first]:g} V, but the stage was fitted between {lower:g} and {upper:g} V: "
-            "clip the program or fit runs that cover it"
-        )
+    refuse_outside(record, lower, upper)
     program = Record(record.time_s, record.voltage_V, np.zeros(len(record)), source=record.source)
-    run = prepare_stage_run(program, (lower, upper), initial, 1.0, stage.substeps)
+    run = prepare_stage_run(program, (lower, upper), initial, 1.0, stage.substeps, gain_ahead(stage))
     # The program is refined already.
     stage = stage.with_substeps(1)
     sd = np.full(len(record), np.nan)

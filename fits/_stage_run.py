@@ -1,5 +1,6 @@
 """A record made ready for fitting a whole stage: padded, refined in time, and weighed."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -105,7 +106,7 @@ def prepare_stage_run(
     initial: str,
     holdout: float,
     stride: int = 1,
-    remembers: bool = True,
+    gain: float | None = 1.0,
 ) -> StageRun:
     """Make a record ready.
 
@@ -114,15 +115,16 @@ def prepare_stage_run(
     record
         Measured voltage and displacement.
     range_V
-        Range of the switching voltages.
+        Range of the command.
     initial
         Memory before the first sample, one of `INITIAL_STATES`.
     holdout
         Fraction at the end that is kept out of the fit.
     stride
         Steps into which each interval is divided.
-    remembers
-        Whether there is a hysteresis, whose unknown past lasts until the voltage has been at both ends.
+    gain
+        Static gain ahead of the hysteresis, see `gain_ahead`. None where there is no hysteresis, whose unknown past
+        lasts until the voltage has been at both ends.
 
     Raises
     ------
@@ -133,7 +135,7 @@ def prepare_stage_run(
         raise DataError(f"{record.source}: a displacement column is needed here")
     lower, upper = range_V
     n, unknown = len(record), initial == "unknown"
-    known = known_samples(record.voltage_V, lower, upper) if unknown and remembers else np.ones(n, dtype=bool)
+    known = known_samples(record.voltage_V, lower, upper) if unknown and gain is not None else np.ones(n, dtype=bool)
     fitted = known.copy()
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False
@@ -144,7 +146,8 @@ def prepare_stage_run(
             "out; state the initial state with --initial, hold out less, or start each run with a full loop"
         )
     samples = refine(record.time_s, record.voltage_V, record.displacement_um, fitted, stride, unknown)
-    memory = _roomy(initial_state(initial, lower, upper))
+    ahead = 1.0 if gain is None else gain
+    memory = _roomy(initial_state(initial, ahead * lower, ahead * upper))
     return StageRun(record, eqx.tree_at(lambda s: s.start.memory, samples, memory, is_leaf=_none), known, fitted)
 
 
@@ -245,6 +248,26 @@ def place_of_hysteresis(stage: Stage) -> int | None:
     """Where in the chain the hysteresis stands; None where there is none."""
     places = [place for place, part in enumerate(stage.parts) if isinstance(part, AbstractHysteresis)]
     return places[0] if places else None
+
+
+def gain_ahead(stage: Stage) -> float | None:
+    """Voltage at the hysteresis per command, at rest; None where there is no hysteresis.
+
+    Raises
+    ------
+    DataError
+        If it is not positive.
+    """
+    place = place_of_hysteresis(stage)
+    if place is None:
+        return None
+    gain = math.prod(float(part.static_gain) for part in stage.parts[:place] if isinstance(part, AbstractLinear))
+    if not (math.isfinite(gain) and gain > 0):
+        raise DataError(
+            f"the static gain ahead of {stage.names[place]!r} is {gain:g}, expected a positive one: turn the sign of "
+            "the voltage column instead"
+        )
+    return gain
 
 
 def joined(parts: Sequence[Any]) -> LinearSystem | None:

@@ -74,9 +74,9 @@ def invert_stage(
     Notes
     -----
     Derivatives are those of the cubic splines through the samples. Played in lines, the command leaves an error that
-    falls with the square of the interval, since neither the lines nor the samples meet the extremes between them. No
-    way of differentiating does better. Solving the driver's response to lines for the command, sample by sample, is
-    stable but rings for as long as its time constant after every wiped-out loop, where the command must jump.
+    falls with the square of the interval, since neither the lines nor the samples meet the extremes between them.
+    Solving the driver's response to lines for the command, sample by sample, is stable but rings for as long as its
+    time constant after every wiped-out loop, where the command must jump.
     """
     place = _piezo(stage)
     displacement = piezo_demand(stage, time_s, reference_um)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from _command import OFF, files, refused, run
 
-import fits._cli_work
+import fits._cli_fit
 from fits._cli import cli
 from fits._cli_jax import _cache_folder
 from fits._run import INITIAL_STATES
@@ -143,7 +143,7 @@ def test_an_interruption_leaves_nothing(bench, tmp_path, monkeypatch, step):
                 (argument / "loops.png").write_bytes(b"half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fits._cli_work, step, interrupt)
+    monkeypatch.setattr(fits._cli_fit, step, interrupt)
     csv = folder / "csv" / "train.csv"
     result = run("fit", csv, "--out", old, "--plots", tmp_path / "plots", "--levels", 8)
     assert result.exit_code == 130

@@ -10,6 +10,7 @@ import pytest
 
 import data_synth
 import fits
+import microid as m
 from fits import Record
 
 SCENARIO = """
@@ -121,7 +122,7 @@ def fitted(rig):
 def test_poles_are_found_without_a_guess(rig, fitted):
     for name, value in rig.truth.items():
         print(name, fitted[name], "truth", value)
-        # A twentieth of a per cent is what the grid's own error may be worth beside the noise.
+        # A fifth of a per cent is what the grid's own error may be worth beside the noise.
         assert abs(fitted[name].value - value) < 4 * fitted[name].sd + 2e-3 * value
         assert fitted[name].sd < 0.01 * value
         assert fitted[name].lower < fitted[name].value < fitted[name].upper
@@ -153,6 +154,27 @@ def test_gains_stay_in_the_operator(fitted):
     )
     with pytest.raises(KeyError, match="choose one of driver"):
         fitted["driver.gain"]
+
+
+def test_an_amplifier_of_known_gain_scales_the_command_and_nothing_else(rig, fitted):
+    commands = {name: dataclasses.replace(r, voltage_V=r.voltage_V / 10) for name, r in rig.records.items()}
+    amplified = fits.default_stage().swap("driver", m.Driver(jnp.asarray(1e-3), jnp.asarray(10.0)))
+    result = fits.fit_stage(
+        [commands["slow"], commands["fast"]],
+        stage=amplified,
+        holdout=[commands["check"]],
+        initial="negative",
+        levels=16,
+    )
+    for name in rig.truth:
+        assert result[name].value == pytest.approx(fitted[name].value, abs=0.1 * fitted[name].sd)
+    np.testing.assert_allclose(
+        result.predict(commands["check"]).displacement_um,
+        fitted.predict(rig.records["check"]).displacement_um,
+        atol=1e-3,
+    )
+    with pytest.raises(fits.DataError, match="fitted between 0 and 12 V"):
+        result.predict(rig.records["check"])
 
 
 def test_a_gain_beside_the_operator_is_refused(rig):
