@@ -4,7 +4,7 @@ Units inside: mm, N, MPa, rad. Every rigid part is one body with three coordinat
 """
 
 import numpy as np
-from scipy.linalg import block_diag, null_space
+from scipy.linalg import null_space
 
 X, Y, TURN = np.eye(3)
 
@@ -50,9 +50,11 @@ class Frame:
 
     def stiffness(self):
         """The assembled matrix of all coordinates, before anything is held."""
-        total = np.zeros(2 * (3 * len(self.places),))
+        size = 3 * len(self.places)
+        total = np.zeros((size, size))
         for first, start, second, end, thickness in self.beams:
-            ends = block_diag(self.lever(first, start), self.lever(second, end))
+            ends = np.zeros((6, 6))
+            ends[:3, :3], ends[3:, 3:] = self.lever(first, start), self.lever(second, end)
             at = [3 * body + k for body in (first, second) for k in range(3)]
             matrix = beam(start, end, thickness, self.modulus, self.width, self.shear)
             total[np.ix_(at, at)] += ends.T @ matrix @ ends
@@ -94,7 +96,8 @@ def beam(start, end, thickness, modulus, width, shear):
             [0, b, far * k, 0, -b, near * k],
         ]
     )
-    turn = np.kron(np.eye(2), [[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = [[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]
     return turn.T @ local @ turn
 
 

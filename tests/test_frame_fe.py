@@ -177,10 +177,11 @@ def both(rng, shear):
         for b, modulus, n in zip(*draw[1:], strict=True)
     ]
     ours = compared(*stage(draw), jnp.asarray(shear))
-    for axis in m.AXES:
+    for alike in (("x", "y"), ("z",), ("alpha", "beta"), ("gamma",)):
         pairs = zip(draw[0], options, strict=True)
-        wanted = np.array([fe.gain_and_input_stiffness(axis, d, **o) for d, o in pairs])
-        yield axis, wanted.T, np.array(ours[axis])
+        wanted = np.array([fe.gain_and_input_stiffness(alike[0], d, **o) for d, o in pairs]).T
+        for axis in alike:
+            yield axis, wanted, np.array(ours[axis])
 
 
 def test_six_axes_at_level_0_are_those_of_the_frames(rng):
