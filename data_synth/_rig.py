@@ -69,6 +69,7 @@ def random_rig(
     loop_width: float | None = None,
     relays: int = 2000,
     plays: int = 400,
+    roughness: float = 1.0,
 ) -> Rig:
     """Draw a rig. What is None is drawn too.
 
@@ -90,6 +91,9 @@ def random_rig(
         The number of relays along one side of their grid.
     plays
         The number of play operators.
+    roughness
+        How irregular the play operators are: 1 for radii and weights at random, 0 for radii evenly apart and weights
+        on a smooth curve, as close to a continuous density as their number allows.
 
     Raises
     ------
@@ -115,7 +119,7 @@ def random_rig(
     if kind == "relays":
         irreversible = _random_density(rng, lower_V, upper_V, mass_um, gap_um)
     else:
-        irreversible = _random_plays(rng, lower_V, upper_V, mass_um, gap_um, plays)
+        irreversible = _random_plays(rng, lower_V, upper_V, mass_um, gap_um, plays, roughness)
     return Rig(
         kind=kind,
         lower_V=lower_V,
@@ -184,16 +188,22 @@ def _random_density(
 
 
 def _random_plays(
-    rng: np.random.Generator, lower_V: float, upper_V: float, mass_um: float, gap_um: float, plays: int
+    rng: np.random.Generator,
+    lower_V: float,
+    upper_V: float,
+    mass_um: float,
+    gap_um: float,
+    plays: int,
+    roughness: float,
 ) -> PlayShape:
     """Random radii, and random weights that fall (rarely: rise) with them as fast as the loop asks for."""
     half_V = (upper_V - lower_V) / 2
     # One radius somewhere in each of equal cells: random, but without the big holes that pure chance leaves.
-    radii_V = half_V * 0.98 * (np.arange(plays) + rng.random(plays)) / plays
-    roughness = rng.gamma(4.0, size=plays)
+    radii_V = half_V * 0.98 * (np.arange(plays) + 0.5 + roughness * (rng.random(plays) - 0.5)) / plays
+    factors = 1 + roughness * (rng.gamma(4.0, size=plays) / 4 - 1)
 
     def tilted(growth: float) -> PlayShape:
-        weights = roughness * np.exp(growth * radii_V / half_V)
+        weights = factors * np.exp(growth * radii_V / half_V)
         shape = PlayShape(lower_V, upper_V, tuple(radii_V.tolist()), tuple(weights.tolist()))
         scaled = weights * (mass_um / shape.stroke_um)
         return replace(shape, weights_um_per_V=tuple(scaled.tolist()))

@@ -50,6 +50,8 @@ class RigSettings:
         The number of relays along one side of their grid.
     plays
         The number of play operators.
+    roughness
+        How irregular they are: 1 for radii and weights at random, 0 for those of a smooth curve.
     """
 
     random: bool = False
@@ -61,6 +63,7 @@ class RigSettings:
     loop_width: float | None = None
     relays: int = 2000
     plays: int = 400
+    roughness: float = 1.0
 
     def __post_init__(self) -> None:
         """Raise ValueError for a rig that cannot be."""
@@ -77,6 +80,7 @@ class RigSettings:
             _require(share is None or 0 < share < 1, f"{name} must be between 0 and 1, got {share}")
         _require(2 <= self.relays <= 10_000, f"relays must be 2 to 10000, got {self.relays}")
         _require(20 <= self.plays <= 100_000, f"plays must be 20 to 100000, got {self.plays}")
+        _require(0 <= self.roughness <= 1, f"roughness must be 0 to 1, got {self.roughness}")
 
     def draw(self, rng: np.random.Generator) -> Rig:
         """Draw the rig. Raises ValueError where no hysteresis has so wide a loop."""
@@ -85,7 +89,13 @@ class RigSettings:
         if not self.random:
             stated = {name: usual[name] if value is None else value for name, value in stated.items()}
         return random_rig(
-            rng, **stated, lower_V=self.lower_V, upper_V=self.upper_V, relays=self.relays, plays=self.plays
+            rng,
+            **stated,
+            lower_V=self.lower_V,
+            upper_V=self.upper_V,
+            relays=self.relays,
+            plays=self.plays,
+            roughness=self.roughness,
         )
 
 

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from fits._model_file import save_model as save_model
     from fits._network_inverse import NetworkInverse as NetworkInverse
     from fits._network_inverse import fit_network_inverse as fit_network_inverse
+    from fits._paper_claims import Claim as Claim
+    from fits._paper_claims import describe_claims as describe_claims
+    from fits._paper_claims import paper_claims as paper_claims
+    from fits._paper_claims import sign_change_guides as sign_change_guides
     from fits._plot_compensation import plot_compensation as plot_compensation
     from fits._plot_stage import plot_stage as plot_stage
     from fits._plots import plot_fit as plot_fit
@@ -50,18 +54,33 @@ if TYPE_CHECKING:
     from fits._result import Prediction as Prediction
     from fits._result import RunReport as RunReport
     from fits._result import predict as predict
+    from fits._sensitivity import AxisSensitivity as AxisSensitivity
+    from fits._sensitivity import DimensionEffect as DimensionEffect
+    from fits._sensitivity import SensitivityReport as SensitivityReport
+    from fits._sensitivity import sensitivities as sensitivities
+    from fits._sensitivity_report import describe_sensitivity as describe_sensitivity
+    from fits._sensitivity_report import sensitivity_json as sensitivity_json
+    from fits._stage_design import Design as Design
+    from fits._stage_design import Together as Together
+    from fits._stage_design import paper_design as paper_design
     from fits._stage_report import describe_stage as describe_stage
     from fits._stage_report import stage_report as stage_report
     from fits._stage_result import ParameterEstimate as ParameterEstimate
     from fits._stage_result import StageFit as StageFit
     from fits._stage_result import predict_stage as predict_stage
+    from fits._stage_toml import read_design as read_design
+    from fits._stage_toml import write_design as write_design
     from fits._stage_uncertainty import StageUncertainty as StageUncertainty
     from fits._uncertainty import Uncertainty as Uncertainty
 
 # Names are looked up when first used, so that the command's help does not wait for JAX and pandas.
 _HOMES = {
+    "AxisSensitivity": "_sensitivity",
+    "Claim": "_paper_claims",
     "Compensation": "_compensate",
     "DataError": "_errors",
+    "Design": "_stage_design",
+    "DimensionEffect": "_sensitivity",
     "Draws": "_posterior",
     "Errors": "_metrics",
     "FitError": "_result",
@@ -80,12 +99,16 @@ _HOMES = {
     "Reference": "_record",
     "ResponseData": "_frequency",
     "RunReport": "_result",
+    "SensitivityReport": "_sensitivity",
     "StageFit": "_stage_result",
     "StageUncertainty": "_stage_uncertainty",
+    "Together": "_stage_design",
     "Uncertainty": "_uncertainty",
     "compensate": "_compensate",
     "default_stage": "_fit_stage",
     "describe": "_report",
+    "describe_claims": "_paper_claims",
+    "describe_sensitivity": "_sensitivity_report",
     "describe_stage": "_stage_report",
     "errors": "_metrics",
     "estimate_response": "_frequency",
@@ -98,6 +121,8 @@ _HOMES = {
     "fit_stage": "_fit_stage",
     "load_model": "_model_file",
     "loop_width_pct": "_metrics",
+    "paper_claims": "_paper_claims",
+    "paper_design": "_stage_design",
     "plot_compensation": "_plot_compensation",
     "plot_fit": "_plots",
     "plot_stage": "_plot_stage",
@@ -105,6 +130,7 @@ _HOMES = {
     "profile_stage": "_profile",
     "predict_stage": "_stage_result",
     "read_csv": "_read_csv",
+    "read_design": "_stage_toml",
     "read_multisine": "_frequency",
     "read_reference": "_read_csv",
     "read_response": "_read_response",
@@ -112,7 +138,11 @@ _HOMES = {
     "relative_error": "_modal_fit",
     "sample_posterior": "_posterior",
     "save_model": "_model_file",
+    "sensitivities": "_sensitivity",
+    "sensitivity_json": "_sensitivity_report",
+    "sign_change_guides": "_paper_claims",
     "stage_report": "_stage_report",
+    "write_design": "_stage_toml",
 }
 
 

@@ -109,6 +109,11 @@ def cli() -> None:
     type=click.Choice(["squares", "huber"]),
     help="What the fit of a stage minimises (default squares); outliers count less in huber.",
 )
+@click.option(
+    "--hold",
+    type=click.Choice(["lines", "steps"]),
+    help="How the command of a stage runs between samples (default lines); a converter that holds it makes steps.",
+)
 @click.option("--starts", type=click.IntRange(min=1), help="Starts for families whose fit is not convex (default 8).")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the starts (default 0).")
 @_json
@@ -233,6 +238,37 @@ def info(**options: Any) -> None:
     from fits._cli_work import run_info
 
     run_info(**options)
+
+
+@cli.command()
+@click.argument("stage", metavar="[STAGE.toml]", required=False)
+@click.option(
+    "--axis",
+    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
+    default="all",
+    show_default=True,
+    help="Which motion.",
+)
+@click.option(
+    "--tolerance", metavar="LENGTH", help="Of all lengths instead of the stage's own, such as 0.02mm or 20um."
+)
+@click.option(
+    "--level", type=click.IntRange(0, 1), help="0: slender leaves and rigid blocks; 1: the stage's default."
+)
+@click.option("--voltage", is_flag=True, help="Also at a fixed voltage, where a stiffer stage compresses its piezo.")
+@click.option("--json", "json_file", metavar="FILE", help="JSON file to write; - prints it instead of the tables.")
+@click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
+@click.option("--write-stage", metavar="FILE", help="TOML file of the stage to write, to change and come back with.")
+@_in_sentences
+def sensitivity(**options: Any) -> None:
+    """Rank what machining errors of the dimensions do to each motion of a stage.
+
+    STAGE.toml holds the dimensions with their tolerances; without it, the stage is the paper's, and the tables are
+    followed by what the paper reads in its Fig. 7. --write-stage writes one to begin with.
+    """
+    from fits._cli_sensitivity import run_sensitivity
+
+    run_sensitivity(**options)
 
 
 def main() -> None:

@@ -93,7 +93,7 @@ def run_compensate(
     if sd_um is not None:
         lines.insert(2, f"expected       standard deviation {np.median(sd_um):.3g} um in the median")
     if summary["clipped"]:
-        lines.append(f"clipped        {summary['clipped']} samples out of reach, off by at most {off.max():.3g} um")
+        lines.append(f"clipped        at {summary['clipped']} of the samples, off by at most {off.max():.3g} um")
     lines += [f"Note: {remark}" for remark in remarks]
     click.echo("\n".join([*lines, f"voltage        {out}", *(f"plot           {place}" for place in places)]))
 

@@ -13,7 +13,7 @@ from fits._cli_files import fraction_or_files, keep_inputs, new_folder, progress
 from fits._cli_jax import start_jax
 from fits._errors import DataError
 from fits._fit import fit
-from fits._fit_stage import fit_stage
+from fits._fit_stage import default_stage, fit_stage
 from fits._model_file import model_text
 from fits._plot_stage import plot_stage
 from fits._plots import plot_fit
@@ -43,6 +43,7 @@ def run_fit(
     family: str | None,
     levels: int | None,
     loss: str | None,
+    hold: str | None,
     holdout: Sequence[str],
     columns: str,
     initial: Sequence[str],
@@ -57,10 +58,10 @@ def run_fit(
     options: dict[str, Any]
     if model == "stage":
         kind = _Kind(fit_stage, stage_report, describe_stage, plot_stage)
-        states, options = _stage_options(family, starts, seed, loss, initial, len(runs))
+        states, options = _stage_options(family, starts, seed, loss, hold, initial, len(runs))
     else:
         kind = _Kind(fit, fit_report, describe, plot_fit)
-        states, options = _loop_options(family, starts, seed, loss, initial)
+        states, options = _loop_options(family, starts, seed, loss, hold, initial)
     progress = progress_to_stderr(quiet)
     mapping = parse_columns(columns)
     fraction, files = fraction_or_files(holdout)
@@ -88,13 +89,19 @@ def run_fit(
 
 
 def _loop_options(
-    family: str | None, starts: int | None, seed: int | None, loss: str | None, initial: Sequence[str]
+    family: str | None,
+    starts: int | None,
+    seed: int | None,
+    loss: str | None,
+    hold: str | None,
+    initial: Sequence[str],
 ) -> tuple[str, dict[str, Any]]:
     """Memory before all runs, and the options of `fit`; what it cannot honour is refused."""
-    if loss is not None:
-        raise DataError(
-            f"--loss {loss}: only the fit of a stage has a choice; leave out --loss, or use --model stage."
-        )
+    for name, value in (("loss", loss), ("hold", hold)):
+        if value is not None:
+            raise DataError(
+                f"--{name} {value}: only the fit of a stage has a choice; leave out --{name}, or use --model stage."
+            )
     if len(initial) > 1:
         raise DataError(
             f"--initial: expected one state for all runs, found {len(initial)}; give one, or use --model stage."
@@ -111,6 +118,7 @@ def _stage_options(
     starts: int | None,
     seed: int | None,
     loss: str | None,
+    hold: str | None,
     initial: Sequence[str],
     count: int,
 ) -> tuple[str | list[str], dict[str, Any]]:
@@ -132,4 +140,5 @@ def _stage_options(
             "their order."
         )
     states = (initial[0] if initial else "unknown") if len(initial) < 2 else list(initial)
-    return states, {"loss": loss or "squares"}
+    stage = default_stage("zero" if hold == "steps" else "first")
+    return states, {"loss": loss or "squares", "stage": stage}

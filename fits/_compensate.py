@@ -146,6 +146,9 @@ def _led(
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Lead the driver, within the limits; which samples were cut, and what to say of that."""
     asked_V = command(stage, reference.time_s, static_V)
+    if stage.hold == "zero":
+        # A step stands for the line across its interval.
+        asked_V = np.append((asked_V[:-1] + asked_V[1:]) / 2, asked_V[-1])
     voltage_V = np.clip(asked_V, *limits)
     excess_V, width_V = np.abs(asked_V - voltage_V), limits[1] - limits[0]
     if excess_V.max() > _TOLERABLE * width_V and not clip:
@@ -156,7 +159,9 @@ def _led(
             "from the ends of the range, or cut the command there with --clip."
         )
     cut = excess_V > _WORTH_SAYING * width_V
-    said = [f"{int(cut.sum())} samples of the command were cut to the limits, by at most {excess_V.max():.3g} V."]
+    said = [
+        f"the command was cut to the limits at {int(cut.sum())} of its samples, by at most {excess_V.max():.3g} V."
+    ]
     return voltage_V, cut, said if cut.any() else []
 
 

@@ -18,7 +18,7 @@ from fits._metrics import Errors, errors, loop_width_pct
 from fits._moments import Data, gather
 from fits._noise import correlation_samples
 from fits._prior import Hyper, interpolation
-from fits._record import Record
+from fits._record import Record, refuse_repeats
 from fits._result import FitError, FitResult, FitStatus, LevelTrial, RunReport
 from fits._run import Run, prepare_run, simulate_run
 from fits._shapes import solve_shape
@@ -110,7 +110,7 @@ def fit(
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
     if not records:
         raise DataError("there is no record to fit")
-
+    refuse_repeats([*records, *aside])
     voltages = [record.voltage_V for record in (*records, *aside)]
     lower, upper = min(v.min() for v in voltages), max(v.max() for v in voltages)
     runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]

@@ -11,7 +11,7 @@ import numpy as np
 from fits._errors import DataError
 from fits._fit import choose_grid
 from fits._prior import Hyper
-from fits._record import Record
+from fits._record import Record, refuse_repeats
 from fits._result import FitError, FitStatus
 from fits._run import prepare_run, simulate_run
 from fits._stage_checks import compare_gains, refuse_slopes, refuse_unseen
@@ -22,7 +22,7 @@ from fits._stage_solve import LOSSES, Solved, solve_chain
 from fits._stage_start import measure_response, start_stages
 from fits._stage_summary import summarise
 from fits._stage_uncertainty import Precision, offsets_out
-from microid import Driver, GridDensity, Mechanics, Preisach, Reversible, Stage
+from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
 
 # Runs whose voltage moves less than this many times faster than that of the slowest are slow.
 _SLOW = 4.0
@@ -31,10 +31,16 @@ _BIAS = 0.15
 _FINEST = 16
 
 
-def default_stage() -> Stage:
+def default_stage(hold: Hold = "first") -> Stage:
     """The stage of Section 3.1: driver, Preisach operator and mechanics, with all gain in the operator.
 
     A gain anywhere else would only be seen together with it.
+
+    Parameters
+    ----------
+    hold
+        How the command runs between samples: `first` for lines, `zero` for steps that each begin at a sample and are
+        not seen by it yet.
     """
     flat = Preisach(
         GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
@@ -42,6 +48,7 @@ def default_stage() -> Stage:
         jnp.asarray(0.0),
     )
     stage = Stage.of(
+        hold=hold,
         driver=Driver(jnp.asarray(1e-3)),
         hysteresis=flat,
         mechanics=Mechanics(jnp.asarray(100.0), jnp.asarray(0.1)),
@@ -105,26 +112,30 @@ def fit_stage(
         raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
     if not records:
         raise DataError("there is no record to fit")
+    aside = () if isinstance(holdout, int | float) else tuple(holdout)
+    refuse_repeats([*records, *aside])
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
     if len(states) != len(records):
         raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
     fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
     if not 0 <= fraction <= 0.9:
         raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
-    aside = () if isinstance(holdout, int | float) else tuple(holdout)
     voltages = [record.voltage_V for record in (*records, *aside)]
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     stage = default_stage() if stage is None else stage
-    if stage.hold != "first":
+    ahead = stage.parts[: place_of_hysteresis(stage)]
+    if stage.hold == "zero" and not any(isinstance(part, Driver) for part in ahead):
         raise DataError(
-            f"the stage holds its command in steps (hold={stage.hold!r}), which is not fitted: use 'first'"
+            "the stage holds its command in steps, which is fitted only with a driver ahead of the hysteresis: "
+            "insert one, or use hold='first'"
         )
-    plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage))
+    plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold)
     problem = _start(plan, stage, levels)
     problem, solved, precision = _refine(plan, problem)
     progress("comparing with the measurement")
     before = initial if isinstance(initial, str) else "unknown"
-    held = [prepare_stage_run(r, range_V, before, 1.0, solved.runs[-1].samples.stride, plan.gain) for r in aside]
+    settings = before, 1.0, solved.runs[-1].samples.stride, plan.gain, stage.hold
+    held = [prepare_stage_run(record, range_V, *settings) for record in aside]
     found = summarise(problem.at(solved), problem.chain.coordinates, solved, precision, held)
     notes = [warning for record in (*records, *aside) for warning in record.warnings]
     return replace(found, remarks=(*notes, *problem.remarks, *found.remarks))
@@ -141,11 +152,12 @@ class _Plan:
     loss: str
     progress: Callable[[str], None]
     gain: float | None
+    hold: Hold
 
     def runs(self, stride: int) -> list[StageRun]:
         """The records, each interval divided into so many steps."""
         return [
-            prepare_stage_run(record, self.range_V, state, self.fraction, stride, self.gain)
+            prepare_stage_run(record, self.range_V, state, self.fraction, stride, self.gain, self.hold)
             for record, state in zip(self.records, self.states, strict=True)
         ]
 
@@ -222,7 +234,7 @@ def _start(plan: _Plan, stage: Stage, levels: int | None) -> _Problem:
         raise failure
     _, stage, chain, solved = best
     found = chain.stage(jnp.asarray(solved.z), jnp.asarray(columns))
-    refuse_unseen(found, chain.coordinates, solved, drives)
+    refuse_unseen(found, chain.coordinates, solved, drives, fast=lively != slow)
     remarks = compare_gains(found, runs_at_rate)
     return _Problem(stage, chain, solved.z, columns, hyper, stroke, tuple(remarks))
 

@@ -89,11 +89,11 @@ def plot_stage(
     gain = gain_ahead(stage)
     before_aside = initial if isinstance(initial, str) else "unknown"
     runs = [
-        prepare_stage_run(record, range_V, state, fraction, stride, gain)
+        prepare_stage_run(record, range_V, state, fraction, stride, gain, stage.hold)
         for record, state, stride in zip(records, states, result.substeps, strict=True)
     ]
     for record in aside:
-        run = prepare_stage_run(record, range_V, before_aside, 1.0, result.substeps[-1], gain)
+        run = prepare_stage_run(record, range_V, before_aside, 1.0, result.substeps[-1], gain, stage.hold)
         runs.append(replace(run, fitted=run.known).weighted(run.known))
     noises = [*result.noise_um, *([max(result.noise_um)] * len(aside))]
     drawn = [

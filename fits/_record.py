@@ -1,12 +1,14 @@
 """One measured run, or a reference to follow: read-only arrays in s, V and um."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from fits._errors import DataError
 
 FloatArray = NDArray[np.float64]
 
@@ -128,3 +130,15 @@ class Reference:
 
     def __len__(self) -> int:
         return self.time_s.size
+
+
+def refuse_repeats(records: Sequence[Record]) -> None:
+    """Refuse, in a `DataError`, records that are given twice: they would count twice, or be held out in vain."""
+    for k, one in enumerate(records):
+        for other in records[:k]:
+            if _same(one.voltage_V, other.voltage_V) and _same(one.displacement_um, other.displacement_um):
+                raise DataError(f"{other.source} and {one.source} hold the same samples: give each run once")
+
+
+def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
+    return one is not None and other is not None and np.array_equal(one, other)

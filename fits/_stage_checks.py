@@ -57,7 +57,7 @@ def _not_one_rig(one: str, other: str, ratio: float) -> str:
 
 
 def refuse_unseen(
-    stage: Stage, coordinates: Coordinates[Stage], solved: Solved, drives: Sequence[np.ndarray]
+    stage: Stage, coordinates: Coordinates[Stage], solved: Solved, drives: Sequence[np.ndarray], fast: bool
 ) -> None:
     """Refuse runs that do not show the dynamics they are fitted with.
 
@@ -69,6 +69,8 @@ def refuse_unseen(
         Of these poles, the hysteresis being given.
     drives
         What the hysteresis alone would give, for each run, shape `(n,)`.
+    fast
+        Whether a run is faster than the others.
 
     Raises
     ------
@@ -79,11 +81,19 @@ def refuse_unseen(
         solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
     )
     slope = np.abs(_relative(coordinates, solved.z))
-    poles = [k for k, name in enumerate(_names(stage, coordinates)) if name.rpartition(".")[2] in _POLES]
+    names = _names(stage, coordinates)
+    poles = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _POLES]
     if not poles:
         return
     sd = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300)) * slope
-    if all(sd[k] > _UNSEEN for k in poles) or _gained(solved, drives) < _WORTH:
+    blurred = [names[k] for k in poles if sd[k] > _UNSEEN]
+    sources = ", ".join(run.record.source for run in solved.runs)
+    if blurred and not fast and len(blurred) < len(poles):
+        raise DataError(
+            f"{sources}: these runs are all about as slow, and do not show {', '.join(blurred)}; add a run with "
+            "steps, a chirp or a multisine that goes beyond the resonance"
+        )
+    if len(blurred) == len(poles) or _gained(solved, drives) < _WORTH:
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
         if noise[loudest] > _LOUD * min(noise):
@@ -95,11 +105,11 @@ def refuse_unseen(
                 "of the quietest run; sample at 5 times the resonance or more, or fit the hysteresis alone with "
                 "--model loop"
             )
-        names = ", ".join(run.record.source for run in solved.runs)
         raise DataError(
-            f"{names}: the displacement follows the voltage without delay or ringing, so these runs hold nothing of "
-            "the driver and the mechanics; add a run with steps, a chirp or a multisine that goes beyond the "
-            "resonance, or fit the hysteresis alone with --model loop"
+            f"{sources}: the displacement follows the voltage without delay or ringing, so these runs hold nothing "
+            "of the driver and the mechanics; add a run with steps, a chirp or a multisine that goes beyond the "
+            "resonance, check that voltage and displacement are not exchanged, or fit the hysteresis alone with "
+            "--model loop"
         )
     fastest = max(solved.runs, key=lambda run: run.rate_Hz)
     for part in stage.parts:
@@ -112,13 +122,17 @@ def refuse_unseen(
 
 
 def _gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:
-    """Twice the logarithm of how much likelier the poles make the runs."""
-    gained = 0.0
+    """Twice the logarithm of how much likelier the poles make the run that shows them best.
+
+    Slow runs may become less likely: the hysteresis read off them has taken in the driver's lag, which now counts
+    twice.
+    """
+    gained = []
     for run, drive, noise in zip(solved.runs, drives, solved.weighing.noise_um, strict=True):
         x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
         left = y - y.mean() - x * (x @ y / (x @ x))
-        gained += 2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise))
-    return gained
+        gained.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
+    return max(gained)
 
 
 def _names(stage: Stage, coordinates: Coordinates[Stage]) -> list[str]:

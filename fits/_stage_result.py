@@ -123,8 +123,8 @@ def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout
     range_V = range_of(stage)
     if not np.isfinite(range_V[0]):
         range_V = (min(float(r.voltage_V.min()) for r in records), max(float(r.voltage_V.max()) for r in records))
-    gain = gain_ahead(stage)
-    return [prepare_stage_run(record, range_V, initial, holdout, stage.substeps, gain) for record in records]
+    settings = initial, holdout, stage.substeps, gain_ahead(stage), stage.hold
+    return [prepare_stage_run(record, range_V, *settings) for record in records]
 
 
 def predict_stage(
@@ -149,7 +149,7 @@ def predict_stage(
     lower, upper = range_of(stage)
     refuse_outside(record, lower, upper)
     program = Record(record.time_s, record.voltage_V, np.zeros(len(record)), source=record.source)
-    run = prepare_stage_run(program, (lower, upper), initial, 1.0, stage.substeps, gain_ahead(stage))
+    run = prepare_stage_run(program, (lower, upper), initial, 1.0, stage.substeps, gain_ahead(stage), stage.hold)
     # The program is refined already.
     stage = stage.with_substeps(1)
     sd = np.full(len(record), np.nan)

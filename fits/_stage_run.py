@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fits._errors import DataError
 from fits._record import Record
 from fits._run import initial_state, known_samples
-from microid import AbstractHysteresis, AbstractLinear, LinearSystem, Preisach, Signal, Stage, Staircase, Start
+from microid import AbstractHysteresis, AbstractLinear, Hold, LinearSystem, Preisach, Signal, Stage, Staircase, Start
 
 # Records are filled up to a power of two, so that those of like length share what was compiled.
 _SHORTEST = 1024
@@ -107,6 +107,7 @@ def prepare_stage_run(
     holdout: float,
     stride: int = 1,
     gain: float | None = 1.0,
+    hold: Hold = "first",
 ) -> StageRun:
     """Make a record ready.
 
@@ -125,6 +126,8 @@ def prepare_stage_run(
     gain
         Static gain ahead of the hysteresis, see `gain_ahead`. None where there is no hysteresis, whose unknown past
         lasts until the voltage has been at both ends.
+    hold
+        How the command runs between samples, as in `Stage`.
 
     Raises
     ------
@@ -145,7 +148,7 @@ def prepare_stage_run(
             "the voltage has been at both ends of its range, where its unknown history still counts, or are held "
             "out; state the initial state with --initial, hold out less, or start each run with a full loop"
         )
-    samples = refine(record.time_s, record.voltage_V, record.displacement_um, fitted, stride, unknown)
+    samples = refine(record.time_s, record.voltage_V, record.displacement_um, fitted, stride, unknown, hold)
     ahead = 1.0 if gain is None else gain
     memory = _roomy(initial_state(initial, ahead * lower, ahead * upper))
     return StageRun(record, eqx.tree_at(lambda s: s.start.memory, samples, memory, is_leaf=_none), known, fitted)
@@ -162,14 +165,16 @@ def refine(
     fitted: np.ndarray,
     stride: int,
     moving: bool,
+    hold: Hold,
 ) -> Samples:
-    """Fill up and refine the arrays of a record whose command runs in lines from sample to sample."""
+    """Fill up and refine the arrays of a record."""
     n = len(time_s)
     pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
     step = (time_s[-1] - time_s[0]) / (n - 1)
     voltage, weight = np.pad(voltage_V, pad, mode="edge"), np.pad(fitted.astype(float), pad)
     share = np.arange((n + pad[1] - 1) * stride + 1) / stride
-    fine_V = np.interp(share, np.arange(n + pad[1]), voltage)
+    lines = np.interp(share, np.arange(n + pad[1]), voltage)
+    fine_V = lines if hold == "first" else voltage[np.arange(len(share)) // stride]
     if np.max(np.abs(np.diff(time_s) - step)) <= _EVEN * step:
         time: Any = np.asarray(step / stride)
     else:

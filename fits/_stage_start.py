@@ -123,7 +123,8 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
         found.append((float(end.cost), end.x))
     found.sort(key=lambda item: item[0])
     ends = _distinct([x for _, x in found], _SAME)[:_KEPT]
-    return [problem.applied(stage, moved, x) for x in ends]
+    best = [other for x in ends[:1] for other in problem.exchanged(x)]
+    return [problem.applied(stage, moved, x) for x in [*ends, *best]]
 
 
 def _distinct(points: Sequence[np.ndarray], apart: float) -> list[np.ndarray]:
@@ -214,6 +215,21 @@ class _LogResponse:
             points = np.concatenate([np.repeat(points, len(more), axis=0), np.tile(more, (len(points), 1))], axis=1)
         cost = np.sum(np.abs(self._off(inverse)) ** 2, axis=1)
         return list(points[np.argsort(cost)])
+
+    def exchanged(self, x: np.ndarray) -> list[np.ndarray]:
+        """The same poles in other places: a response does not tell which real pole lies ahead of the hysteresis."""
+        parts = self._split(x)
+        if self.drivers != [True, False] or parts[1][1] <= 0:
+            return []
+        rate, damping = 2 * np.pi * np.exp(parts[1][0]), np.exp(parts[1][1])
+        spread = rate * np.sqrt(damping**2 - 1)
+        poles = [np.exp(-parts[0][0]), rate * damping - spread, rate * damping + spread]
+        others = []
+        for k in (1, 2):
+            one, two = poles[:k] + poles[k + 1 :]
+            natural = np.log(np.sqrt(one * two) / (2 * np.pi)), np.log((one + two) / (2 * np.sqrt(one * two)))
+            others.append(np.array([-np.log(poles[k]), *natural]))
+        return others
 
     def applied(self, stage: Stage, names: Sequence[str], x: np.ndarray) -> Stage:
         for name, pole in zip(names, self._split(np.exp(x)), strict=True):

@@ -21,6 +21,8 @@ from microid import Coordinates, Stage, Staircase
 _NORMAL = 1.959964
 # A residual less correlated than this counts as white.
 _WHITE = 1.2
+# A coordinate, of the order of 1, that is known no better than this is hardly seen.
+_UNSEEN = 0.5
 
 
 def summarise(
@@ -61,9 +63,11 @@ def summarise(
     ]
     value, slope = coordinates_slope(coordinates, solved.z)
     ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * _NORMAL * sd))) for sign in (-1, 1)]
+    # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
+    width = np.where(sd > _UNSEEN, np.abs(ends[1] - ends[0]) / (2 * _NORMAL), np.abs(slope) * sd)
     parameters = tuple(
         ParameterEstimate(name, unit, *map(float, figures))
-        for (name, unit), *figures in zip(names, value, np.abs(slope) * sd, *ends, strict=True)
+        for (name, unit), *figures in zip(names, value, width, *ends, strict=True)
     )
     unseen = unseen_directions(precision.information, [name for name, _ in names], slope / value)
     for run, correlation in zip(solved.runs, solved.weighing.correlation, strict=True):

@@ -9,6 +9,7 @@ from microid._inverse_stage import StageInversion as StageInversion
 from microid._inverse_stage import driver_command as driver_command
 from microid._inverse_stage import invert_stage as invert_stage
 from microid._inverse_stage import piezo_demand as piezo_demand
+from microid._linear import Hold as Hold
 from microid._linear import LinearSystem as LinearSystem
 from microid._linear import recur as recur
 from microid._memory import Memory as Memory

@@ -6,11 +6,11 @@ co-rotational finite elements at 40 um.
 """
 
 import math
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
+from jax import lax
 from jaxtyping import Array, Float
 
 from microid.kinetostatics._compliance import Constants, guide_stiffness_N_per_um
@@ -182,14 +182,7 @@ def _beam_column(p: _Residual, shape: _Shape) -> tuple[_Residual, _Residual]:
     insert = leg * jnp.cos(inclination) - length
     half = insert / 2
     inertia = thickness**3 / 12
-    # With x = sqrt(p): cosh x, sinh x / x, and the rests over p of cosh x after 1 and after sinh x / x, and of
-    # sinh x / x after 1 at 4 p, there also less the same at p.
-    cosh = _series(p, [1 / math.factorial(2 * n) for n in range(_TERMS)])
-    sinhc = _series(p, [1 / math.factorial(2 * n + 1) for n in range(_TERMS)])
-    cosh_rest = _series(p, [1 / math.factorial(2 * n + 2) for n in range(_TERMS)])
-    difference = _series(p, [(2 * n + 2) / math.factorial(2 * n + 3) for n in range(_TERMS)])
-    sinhc_rest = _series(p, [4**n / math.factorial(2 * n + 3) for n in range(_TERMS)])
-    rest_difference = _series(p, [(4 ** (n + 1) - 1) / math.factorial(2 * n + 5) for n in range(_TERMS)])
+    cosh, sinhc, cosh_rest, difference, sinhc_rest, rest_difference = _entire(p)
     bend = cosh + half * p * sinhc / length
     give = length**2 / inertia * (length * difference + half * (length + half) * sinhc / length) / bend
     # Output of a half, over p.
@@ -204,8 +197,21 @@ def _beam_column(p: _Residual, shape: _Shape) -> tuple[_Residual, _Residual]:
     return 2 * (stretch - shortening + rise * jnp.sin(turn) - insert * (1 - jnp.cos(turn))), 2 * p * lift
 
 
-def _series(p: _Residual, coefficients: Sequence[float]) -> _Residual:
-    total = jnp.zeros_like(p)
-    for coefficient in reversed(coefficients):
-        total = total * p + coefficient
-    return total
+def _entire(p: _Residual) -> Float[Array, "6"]:
+    """Entire functions of `p = x^2`: cosh x, sinh x / x, and what is left of them beyond the first terms.
+
+    These are, over `p`: cosh x less 1, cosh x less sinh x / x, sinh x / x less 1 at 4 p, and the last less the same
+    at p, over `p` again.
+    """
+    rows = [
+        (
+            1 / math.factorial(2 * n),
+            1 / math.factorial(2 * n + 1),
+            1 / math.factorial(2 * n + 2),
+            (2 * n + 2) / math.factorial(2 * n + 3),
+            4**n / math.factorial(2 * n + 3),
+            (4 ** (n + 1) - 1) / math.factorial(2 * n + 5),
+        )
+        for n in reversed(range(_TERMS))
+    ]
+    return lax.scan(lambda total, row: (total * p + row, None), jnp.zeros(6, p.dtype), jnp.asarray(rows, p.dtype))[0]
