@@ -18,6 +18,7 @@ from _inverse_rows import inverse as inverse_rows
 from _peers import fit_lsq_linear, fit_nnls, numpy_relays, relay_design, scan_relays, thresholds
 from _plant_fit_rows import fit_own, plant_fit
 from _plant_rows import plant as plant_rows
+from _sensitivity_rows import sensitivity as sensitivity_rows
 from _timing import Line, Table, cpu_seconds, seconds, side_by_side
 
 import fits
@@ -264,6 +265,11 @@ def frequency(_: Settings, table: Table) -> None:
     frequency_rows(table)
 
 
+def sensitivity(settings: Settings, table: Table) -> None:
+    """Spread of all axes within the tolerances, against NumPy."""
+    sensitivity_rows(10 * settings.samples, settings.repeats, settings.seed, table)
+
+
 ROWS = {
     "forward": forward,
     "gradient": gradient,
@@ -273,5 +279,6 @@ ROWS = {
     "plant": plant,
     "inverse": inverse,
     "frequency": frequency,
+    "sensitivity": sensitivity,
     "cold": cold,
 }

@@ -4,6 +4,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fits._allocate import Allocation as Allocation
+    from fits._allocate import AllocationError as AllocationError
+    from fits._allocate import allocate as allocate
     from fits._compensate import Compensation as Compensation
     from fits._compensate import compensate as compensate
     from fits._errors import DataError as DataError
@@ -16,6 +19,9 @@ if TYPE_CHECKING:
     from fits._frequency import ResponseData as ResponseData
     from fits._frequency import estimate_response as estimate_response
     from fits._frequency import read_multisine as read_multisine
+    from fits._idle import IdleNoise as IdleNoise
+    from fits._idle import idle_noise as idle_noise
+    from fits._idle import read_idle as read_idle
     from fits._metrics import Errors as Errors
     from fits._metrics import errors as errors
     from fits._metrics import loop_width_pct as loop_width_pct
@@ -26,13 +32,19 @@ if TYPE_CHECKING:
     from fits._model_file import ModelFile as ModelFile
     from fits._model_file import load_model as load_model
     from fits._model_file import save_model as save_model
+    from fits._monte_carlo import AxisSpread as AxisSpread
+    from fits._monte_carlo import MonteCarlo as MonteCarlo
+    from fits._monte_carlo import monte_carlo as monte_carlo
     from fits._network_inverse import NetworkInverse as NetworkInverse
     from fits._network_inverse import fit_network_inverse as fit_network_inverse
+    from fits._noise_spectrum import NoiseBand as NoiseBand
+    from fits._noise_spectrum import NoiseLine as NoiseLine
     from fits._paper_claims import Claim as Claim
     from fits._paper_claims import describe_claims as describe_claims
     from fits._paper_claims import paper_claims as paper_claims
     from fits._paper_claims import sign_change_guides as sign_change_guides
     from fits._plot_compensation import plot_compensation as plot_compensation
+    from fits._plot_idle import plot_idle as plot_idle
     from fits._plot_stage import plot_stage as plot_stage
     from fits._plots import plot_fit as plot_fit
     from fits._posterior import Draws as Draws
@@ -54,12 +66,16 @@ if TYPE_CHECKING:
     from fits._result import Prediction as Prediction
     from fits._result import RunReport as RunReport
     from fits._result import predict as predict
+    from fits._second_order import SecondOrder as SecondOrder
+    from fits._second_order import second_order as second_order
     from fits._sensitivity import AxisSensitivity as AxisSensitivity
     from fits._sensitivity import DimensionEffect as DimensionEffect
     from fits._sensitivity import SensitivityReport as SensitivityReport
     from fits._sensitivity import sensitivities as sensitivities
     from fits._sensitivity_report import describe_sensitivity as describe_sensitivity
     from fits._sensitivity_report import sensitivity_json as sensitivity_json
+    from fits._sobol import SobolIndices as SobolIndices
+    from fits._sobol import sobol as sobol
     from fits._stage_design import Design as Design
     from fits._stage_design import Together as Together
     from fits._stage_design import paper_design as paper_design
@@ -75,7 +91,10 @@ if TYPE_CHECKING:
 
 # Names are looked up when first used, so that the command's help does not wait for JAX and pandas.
 _HOMES = {
+    "Allocation": "_allocate",
+    "AllocationError": "_allocate",
     "AxisSensitivity": "_sensitivity",
+    "AxisSpread": "_monte_carlo",
     "Claim": "_paper_claims",
     "Compensation": "_compensate",
     "DataError": "_errors",
@@ -86,12 +105,16 @@ _HOMES = {
     "FitError": "_result",
     "FitResult": "_result",
     "FitStatus": "_result",
+    "IdleNoise": "_idle",
     "LADDER": "_fit",
     "LevelTrial": "_result",
     "ModalFit": "_modal_fit",
     "ModelFile": "_model_file",
+    "MonteCarlo": "_monte_carlo",
     "Multisine": "_frequency",
     "NetworkInverse": "_network_inverse",
+    "NoiseBand": "_noise_spectrum",
+    "NoiseLine": "_noise_spectrum",
     "ParameterEstimate": "_stage_result",
     "Prediction": "_result",
     "Profile": "_profile",
@@ -99,11 +122,14 @@ _HOMES = {
     "Reference": "_record",
     "ResponseData": "_frequency",
     "RunReport": "_result",
+    "SecondOrder": "_second_order",
     "SensitivityReport": "_sensitivity",
+    "SobolIndices": "_sobol",
     "StageFit": "_stage_result",
     "StageUncertainty": "_stage_uncertainty",
     "Together": "_stage_design",
     "Uncertainty": "_uncertainty",
+    "allocate": "_allocate",
     "compensate": "_compensate",
     "default_stage": "_fit_stage",
     "describe": "_report",
@@ -119,18 +145,22 @@ _HOMES = {
     "fit_report": "_report",
     "fit_response": "_modal_fit",
     "fit_stage": "_fit_stage",
+    "idle_noise": "_idle",
     "load_model": "_model_file",
     "loop_width_pct": "_metrics",
+    "monte_carlo": "_monte_carlo",
     "paper_claims": "_paper_claims",
     "paper_design": "_stage_design",
     "plot_compensation": "_plot_compensation",
     "plot_fit": "_plots",
+    "plot_idle": "_plot_idle",
     "plot_stage": "_plot_stage",
     "predict": "_result",
-    "profile_stage": "_profile",
     "predict_stage": "_stage_result",
+    "profile_stage": "_profile",
     "read_csv": "_read_csv",
     "read_design": "_stage_toml",
+    "read_idle": "_idle",
     "read_multisine": "_frequency",
     "read_reference": "_read_csv",
     "read_response": "_read_response",
@@ -138,9 +168,11 @@ _HOMES = {
     "relative_error": "_modal_fit",
     "sample_posterior": "_posterior",
     "save_model": "_model_file",
+    "second_order": "_second_order",
     "sensitivities": "_sensitivity",
     "sensitivity_json": "_sensitivity_report",
     "sign_change_guides": "_paper_claims",
+    "sobol": "_sobol",
     "stage_report": "_stage_report",
     "write_design": "_stage_toml",
 }

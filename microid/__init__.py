@@ -57,6 +57,7 @@ from microid.kinetostatics._axes import Axis as Axis
 from microid.kinetostatics._axes import Form as Form
 from microid.kinetostatics._axes import Motion as Motion
 from microid.kinetostatics._axes import Sensitivity as Sensitivity
+from microid.kinetostatics._axes import drive_of as drive_of
 from microid.kinetostatics._axes import gain as gain
 from microid.kinetostatics._axes import input_stiffness_N_per_um as input_stiffness_N_per_um
 from microid.kinetostatics._axes import loaded_um as loaded_um
@@ -68,6 +69,7 @@ from microid.kinetostatics._compliance import TwoPort as TwoPort
 from microid.kinetostatics._compliance import bridge as bridge
 from microid.kinetostatics._compliance import constants_of as constants_of
 from microid.kinetostatics._compliance import guide_stiffness_N_per_um as guide_stiffness_N_per_um
+from microid.kinetostatics._compliance import leaf_compliance as leaf_compliance
 from microid.kinetostatics._errors import DrivingError as DrivingError
 from microid.kinetostatics._errors import TotalError as TotalError
 from microid.kinetostatics._errors import driving_error as driving_error
@@ -75,12 +77,20 @@ from microid.kinetostatics._errors import total_error as total_error
 from microid.kinetostatics._geometry import DIMENSIONS as DIMENSIONS
 from microid.kinetostatics._geometry import Dimension as Dimension
 from microid.kinetostatics._geometry import Geometry as Geometry
+from microid.kinetostatics._large_stroke import beam_alpha as beam_alpha
+from microid.kinetostatics._large_stroke import beam_gamma as beam_gamma
+from microid.kinetostatics._large_stroke import beam_x as beam_x
+from microid.kinetostatics._large_stroke import beam_z as beam_z
+from microid.kinetostatics._large_stroke import pseudo_rigid_alpha as pseudo_rigid_alpha
+from microid.kinetostatics._large_stroke import pseudo_rigid_z as pseudo_rigid_z
 from microid.kinetostatics._motion import f_alpha as f_alpha
 from microid.kinetostatics._motion import f_beta as f_beta
 from microid.kinetostatics._motion import f_gamma as f_gamma
 from microid.kinetostatics._motion import f_x as f_x
 from microid.kinetostatics._motion import f_y as f_y
 from microid.kinetostatics._motion import f_z as f_z
+from microid.kinetostatics._motion import link_leaf as link_leaf
+from microid.kinetostatics._motion import middle_bridge as middle_bridge
 from microid.kinetostatics._motion import tilt_arm_mm as tilt_arm_mm
 from microid.kinetostatics._stage_constants import Actuation as Actuation
 from microid.kinetostatics._stage_constants import StageConstants as StageConstants

@@ -7,6 +7,7 @@ import os
 import pkgutil
 import subprocess
 import sys
+import typing
 from pathlib import Path
 
 import pytest
@@ -96,6 +97,11 @@ def listed(package):
     return names
 
 
+def is_defined(value):
+    """Whether a name stands for a class or a function of its module, not for a constant or the name of a type."""
+    return callable(value) and typing.get_origin(value) is None
+
+
 @pytest.mark.parametrize("package", [*PACKAGES, "microid.densities", "microid.hysteresis"])
 def test_public_names_are_the_listed_ones(package):
     module, names = importlib.import_module(package), listed(package)
@@ -103,7 +109,7 @@ def test_public_names_are_the_listed_ones(package):
     for name, home in names.items():
         value = getattr(module, name)
         assert value is getattr(importlib.import_module(home), name)
-        if callable(value):
+        if is_defined(value):
             assert value.__module__.startswith(home), f"{package} lists {name} from where it is not defined"
     submodules = {found.name for found in pkgutil.iter_modules(module.__path__)}
     public = {name for name in dir(module) if not name.startswith("_")} - submodules
@@ -153,7 +159,7 @@ def documented(owner, value):
 def test_public_names_have_docstrings(package):
     module = importlib.import_module(package)
     values = {name: getattr(module, name) for name in listed(package)}
-    callables = {name: value for name, value in values.items() if callable(value)}
+    callables = {name: value for name, value in values.items() if is_defined(value)}
     missing = [name for key, value in callables.items() for name, has in documented(key, value) if not has]
     assert missing == []
 

@@ -1,6 +1,7 @@
 """The dimensions of the stage (Table 1), each with its unit, bounds and meaning."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -10,14 +11,12 @@ from microid._param import param
 Scalar = float | Float[Array, ""]
 
 
-def _length(default: float) -> Float[Array, ""]:
-    value: Float[Array, ""] = param(unit="mm", scale=1.0, lower=0.0, default=default)
-    return value
+def _length(default: float) -> Any:
+    return param(unit="mm", scale=1.0, lower=0.0, default=default)
 
 
-def _angle(default: float) -> Float[Array, ""]:
-    value: Float[Array, ""] = param(unit="rad", scale=0.1, lower=0.0, upper=1.5, default=default)
-    return value
+def _angle(default: float) -> Any:
+    return param(unit="rad", scale=0.1, lower=0.0, upper=1.5, default=default)
 
 
 class Geometry(eqx.Module):

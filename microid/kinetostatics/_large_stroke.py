@@ -68,14 +68,14 @@ def beam_x(
 ) -> _Residual:
     """Translation in x or y, in um, with leaves as beam-columns."""
     load = guide_stiffness_N_per_um(l2_mm, t2_mm, l3_mm, constants)
-    return x_out_um - flattened_um(l1_mm, t1_mm, la1_mm, alpha1_rad, load, x_pzt_um, constants)
+    return x_out_um - _flattened_um(l1_mm, t1_mm, la1_mm, alpha1_rad, load, x_pzt_um, constants)
 
 
 def beam_z(
     z_out_um: Scalar, la2_mm: Scalar, alpha2_rad: Scalar, t4_mm: Scalar, z_pzt_um: Scalar, *, constants: Constants
 ) -> _Residual:
     """Translation in z, in um, with leaves as beam-columns."""
-    return z_out_um - flattened_um(constants.middle_hinge_mm, t4_mm, la2_mm, alpha2_rad, 0.0, z_pzt_um, constants)
+    return z_out_um - _flattened_um(constants.middle_hinge_mm, t4_mm, la2_mm, alpha2_rad, 0.0, z_pzt_um, constants)
 
 
 def beam_alpha(
@@ -110,11 +110,11 @@ def beam_gamma(
 ) -> _Residual:
     """Rotation about z, in rad, with the bridge's leaves as beam-columns."""
     load, give = link_leaf(l7_mm, t7_mm, R_mm + J_mm, constants)
-    tip_um = flattened_um(l6_mm, t6_mm, la3_mm, alpha3_rad, load, gamma_pzt_um, constants) / give
+    tip_um = _flattened_um(l6_mm, t6_mm, la3_mm, alpha3_rad, load, gamma_pzt_um, constants) / give
     return gamma_out_rad - jnp.arcsin(1e-3 * tip_um / (R_mm + J_mm))
 
 
-def flattened_um(
+def _flattened_um(
     length_mm: Scalar,
     thickness_mm: Scalar,
     leg_mm: Scalar,

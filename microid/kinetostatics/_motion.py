@@ -110,7 +110,9 @@ def f_gamma(
 ) -> _Residual:
     """Rotation about z, in rad: two bridges of the top platform turn the rotor as a couple, each through a leaf.
 
-    The paper counts six arguments where Eq. (4) sums eight (erratum 5).
+    Each bridge's output block is taken as guided: it neither turns nor moves sideways. Held by its own legs alone it
+    would let the rotor turn further, by 17 % for the paper's dimensions. The paper counts six arguments where Eq. (4)
+    sums eight (erratum 5).
     """
     drive = bridge(l6_mm, t6_mm, la3_mm, alpha3_rad, constants)
     load, give = link_leaf(l7_mm, t7_mm, R_mm + J_mm, constants)

@@ -1,0 +1,241 @@
+"""Pictures of what machining errors do: tornado plots, and the curves of the paper's Fig. 7."""
+
+import dataclasses
+import os
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+
+import microid as m
+from fits._paper_claims import Claim, paper_claims
+from fits._plot_style import DARK, LIGHT, WIDE_in, figure, label, legend, save
+from fits._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at
+from fits._stage_design import Design, paper_design
+
+AXIS_SIGNS: dict[m.Axis, str] = {"alpha": "α", "beta": "β", "gamma": "γ"}
+UNIT_SIGNS = {"um": "µm", "urad": "µrad"}
+# Odd, so that the nominal dimensions are among the steps.
+_STEPS = 41
+_COLUMNS = 2
+# Of the height of a panel: the least distance of two labels.
+_LABEL_GAP = 0.085
+_CLAIM_CHARACTERS = 66
+_SMALL_pt = 6
+_QUANTITY = {"": "ratio {:.3g}", "%": "{:.3g} %", "guiding legs": "vanishes at {:.3g} guiding legs"}
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """One motion, or two that are alike.
+
+    Attributes
+    ----------
+    axis
+        Sensitivities of the first.
+    title
+        Names of all.
+    curves
+        Relative change of the output by dimension over the steps of its error, from minus to plus one tolerance,
+        each of shape `(s,)`.
+    """
+
+    axis: AxisSensitivity
+    title: str
+    curves: dict[str, NDArray[np.float64]]
+
+
+def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os.PathLike[str]) -> list[Path]:
+    """Draw which dimensions matter, and the output error over the machining error of each (Fig. 7).
+
+    Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel.
+
+    Parameters
+    ----------
+    design, report
+        What `sensitivities` was given, and what it found.
+    folder
+        Existing folder for `tornado.png` and `machining_error.png`; 200 dots per inch.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be written.
+    """
+    panels = _panels(design, report)
+    claims = paper_claims(design) if _is_the_papers(design) else ()
+    return [
+        save(_tornado(panels), Path(folder) / "tornado.png"),
+        save(_machining_error(design, panels, claims), Path(folder) / "machining_error.png"),
+    ]
+
+
+def _panels(design: Design, report: SensitivityReport) -> list[_Panel]:
+    panels: list[_Panel] = []
+    left = list(report.axes.values())
+    while left:
+        first = left[0]
+        names = [each.axis for each in left if dataclasses.replace(each, axis=first.axis) == first]
+        left = [each for each in left if each.axis not in names]
+        title = ", ".join(AXIS_SIGNS.get(name, name) for name in names)
+        panels.append(_Panel(first, title, _curves(design, first.axis)))
+    return panels
+
+
+def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
+    names = m.MOTIONS[axis].dimensions
+    shares = np.linspace(-1, 1, _STEPS)
+    errors = np.concatenate([np.outer(shares, row) for row in np.diag([design.tolerance[name] for name in names])])
+    gains = gains_at(design, axis, errors).reshape(len(names), _STEPS)
+    nominal = gains[0, _STEPS // 2]
+    return {name: gains[i] / nominal - 1 for i, name in enumerate(names)}
+
+
+def _is_the_papers(design: Design) -> bool:
+    paper = paper_design()
+    same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
+    return same and design.guides == paper.guides
+
+
+def _tornado(panels: Sequence[_Panel]) -> Figure:
+    rows = [len(panel.axis.dimensions) for panel in panels]
+    picture = figure(WIDE_in, 0.75 + 0.17 * sum(rows) + 0.3 * len(rows))
+    column = np.atleast_1d(picture.subplots(len(panels), 1, sharex=True, height_ratios=[n + 0.6 for n in rows]))
+    for axes, panel in zip(column, panels, strict=True):
+        _draw_bars(axes, panel)
+    reach = 1.06 * max(np.abs(panel.axis.dimensions[0].relative_change_pct) for panel in panels) or 1.0
+    column[-1].set_xlim(-reach, reach)
+    label(column[-1], x="change of the output at a fixed elongation of the piezo (%)")
+    legend(picture, column[:1])
+    return picture
+
+
+def _draw_bars(axes: Axes, panel: _Panel) -> None:
+    effects = panel.axis.dimensions
+    places = np.arange(len(effects))
+    changes = np.array([effect.relative_change_pct for effect in effects])
+    exact = 100 * np.array([panel.curves[effect.name][[0, -1]] for effect in effects])
+    plain = {"height": 0.72, "linewidth": 0.4, "edgecolor": DARK}
+    axes.barh(places, changes, color="0.45", label="plus one tolerance, first order", **plain)
+    axes.barh(places, -changes, color="0.9", label="minus one tolerance", **plain)
+    marks = {"linestyle": "none", "markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
+    axes.plot(exact[:, 1], places, marker="D", label="exact", markerfacecolor="0.0", **marks)
+    axes.plot(exact[:, 0], places, marker="D", label="exact, minus", markerfacecolor="1.0", **marks)
+    axes.axvline(0, color=DARK, linewidth=0.6)
+    axes.set_ylim(len(effects) - 0.4, -0.6)
+    axes.set_yticks(places, [f"{symbol(effect.name)} ± {_tolerance(effect)}" for effect in effects])
+    for place, effect in zip(places, effects, strict=True):
+        words = f"{effect.relative_change_pct:+.3f} %".replace("-", "−")
+        axes.text(1.10, place, words, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
+        share = f"{100 * effect.share_of_variance:.1f} %".replace("-", "−")
+        axes.text(1.20, place, share, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
+    for x, words in ((1.10, "change"), (1.20, "share of\nvariance")):
+        axes.text(x, 1.0, words, transform=axes.transAxes, ha="right", va="bottom", fontsize=_SMALL_pt)
+    axis = panel.axis
+    title = f"{panel.title}: root sum of squares {axis.rss_pct:.2f} %, worst case {axis.worst_case_pct:.2f} %"
+    axes.set_title(title, loc="left", fontsize=8)
+    label(axes)
+    axes.tick_params(axis="y", length=0)
+    axes.tick_params(axis="x", labelbottom=axes.get_subplotspec().is_last_row())
+
+
+def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[Claim]) -> Figure:
+    """Fig. 7: panels of two columns, each with its claims below."""
+    words = [_claim_lines(panel, claims) for panel in panels]
+    columns = min(_COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    heights: list[float] = []
+    for row in range(rows):
+        lines = max(len(each) for each in words[row * columns : (row + 1) * columns])
+        heights += [2.5, 0.125 * lines + 0.02]
+    picture = figure(WIDE_in * (1 if columns > 1 else 0.6), sum(heights) + 0.5 * rows, gap=0.04)
+    grid = picture.add_gridspec(2 * rows, columns, height_ratios=heights)
+    for k, (panel, lines) in enumerate(zip(panels, words, strict=True)):
+        row, column = divmod(k, columns)
+        axes = picture.add_subplot(grid[2 * row, column])
+        _draw_curves(axes, design, panel)
+        axes.set_title(f"({'abcdef'[k]}) {panel.title}", loc="left", fontsize=8)
+        below = picture.add_subplot(grid[2 * row + 1, column])
+        below.set_axis_off()
+        below.text(0, 1, "\n".join(lines), transform=below.transAxes, va="top", fontsize=_SMALL_pt, linespacing=1.35)
+    return picture
+
+
+def _draw_curves(axes: Axes, design: Design, panel: _Panel) -> None:
+    unit = UNIT_SIGNS[panel.axis.output_unit]
+    effects = sorted(panel.axis.dimensions, key=lambda effect: panel.curves[effect.name][-1])
+    curves = {effect.name: panel.axis.stroke * panel.curves[effect.name] for effect in effects}
+    ends_mm = {effect.name: _length_mm(design, effect) for effect in effects}
+    widest_mm = max(ends_mm.values()) or 1.0
+    reach = 1.08 * max(float(np.abs(curve).max()) for curve in curves.values()) or 1.0
+    axes.set_xlim(-widest_mm, widest_mm)
+    axes.set_ylim(-reach, reach)
+    axes.axhline(0, color=LIGHT, linewidth=0.6)
+    axes.axvline(0, color=LIGHT, linewidth=0.6)
+    gap = _LABEL_GAP * 2 * reach
+    heights = _apart(np.array([curve[-1] for curve in curves.values()]), gap)
+    for effect, height in zip(effects, heights, strict=True):
+        curve, end_mm = curves[effect.name], ends_mm[effect.name]
+        style = "-" if effect.unit == "mm" else "--"
+        leads = effect.name == panel.axis.dimensions[0].name
+        axes.plot(end_mm * np.linspace(-1, 1, _STEPS), curve, style, color="0.0", linewidth=1.4 if leads else 0.8)
+        axes.annotate(
+            f"{symbol(effect.name)}  {curve[-1]:+.3g}".replace("-", "−"),
+            (end_mm, curve[-1]),
+            (1.07, height),
+            textcoords=axes.get_yaxis_transform(),
+            va="center",
+            fontsize=7,
+            arrowprops={"arrowstyle": "-", "color": "0.5", "linewidth": 0.4, "shrinkA": 0, "shrinkB": 0},
+        )
+    label(axes, "machining error (mm)", f"output error at {panel.axis.stroke:.4g} {unit} ({unit})")
+
+
+def _apart(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
+    """Places nearest to increasing ones, at least a gap from each other."""
+    steps = gap * np.arange(len(wanted))
+    return np.asarray(isotonic_regression(wanted - steps).x) + steps
+
+
+def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[str]:
+    """What the paper says of a motion, each with our verdict and its number; of several motions, with the last."""
+    own = [claim for claim in claims if panel.axis.axis in claim.axes and claim.axes[0] in (panel.axis.axis, "z")]
+    own = [claim for claim in own if len(claim.axes) < 3 or panel.axis.axis != "z"]
+    lines = [f"The paper's Fig. 7 read, and what this stage says:"] if own else []
+    for claim in own:
+        number = _QUANTITY[claim.unit].format(claim.number)
+        lines += textwrap.wrap(
+            f"{claim.verdict}: {claim.statement} ({number})", _CLAIM_CHARACTERS, subsequent_indent="   "
+        )
+    return lines
+
+
+def symbol(name: str) -> str:
+    """Symbol of a dimension as the paper prints it."""
+    stem = name.rstrip("0123456789")
+    index = name[len(stem) :]
+    stem, index = ("l", f"a{index}") if stem == "la" else (stem, index)
+    stem = rf"\{stem}" if stem == "alpha" else stem
+    return f"${stem}_{{{index}}}$" if index else f"${stem}$"
+
+
+def _tolerance(effect: DimensionEffect) -> str:
+    unit, scale = ("mrad", 1e3) if effect.unit == "rad" else ("µm", 1e3)
+    return f"{scale * effect.tolerance:.3g} {unit}"
+
+
+def _length_mm(design: Design, effect: DimensionEffect) -> float:
+    """Tolerance as a length: of an angle, that of the end of its leg."""
+    leg = m.DIMENSIONS[effect.name].leg
+    return effect.tolerance * (1.0 if leg is None else float(design.geometry[leg]))

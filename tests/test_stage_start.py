@@ -1,0 +1,41 @@
+"""Poles read off a response, and where they stand: ahead of the hysteresis or behind it."""
+
+import numpy as np
+
+import fits
+from fits._stage_start import MeasuredResponse, start_stages
+
+
+def poles_of(stage):
+    """Time constant, and the rates of the mechanics, in order."""
+    rate = 2 * np.pi * float(stage["mechanics"].natural_frequency_Hz)
+    damping = complex(stage["mechanics"].damping_ratio)
+    spread = np.sqrt(damping**2 - 1)
+    return float(stage["driver"].time_constant_s), np.sort(
+        np.real(rate * np.array([damping - spread, damping + spread]))
+    )
+
+
+def test_real_poles_are_tried_on_either_side(rng):
+    rates = np.sort(2 * np.pi * rng.uniform(10, 20, 3) * np.array([1, 6, 36]))
+    frequency_Hz = np.geomspace(1, 2000, 200)
+    s = 2j * np.pi * frequency_Hz
+    response = np.prod([rate / (s + rate) for rate in rates], axis=0)
+    measured = MeasuredResponse(frequency_Hz, response, np.full(len(s), 0.999))
+    found = [poles_of(stage) for stage in start_stages(fits.default_stage(), [measured])]
+    for k in range(3):
+        others = np.delete(rates, k)
+        assert any(
+            abs(time * rates[k] - 1) < 1e-3 and np.all(np.abs(pair / others - 1) < 1e-3) for time, pair in found
+        )
+
+
+def test_poles_that_ring_have_one_place(rng):
+    frequency_Hz = np.geomspace(1, 2000, 200)
+    s = 2j * np.pi * frequency_Hz
+    natural = 2 * np.pi * rng.uniform(50, 200)
+    response = natural**2 / (s**2 + 0.1 * natural * s + natural**2) / (1 + 1e-3 * s)
+    measured = MeasuredResponse(frequency_Hz, response, np.full(len(s), 0.999))
+    best = start_stages(fits.default_stage(), [measured])[0]
+    assert abs(float(best["driver"].time_constant_s) / 1e-3 - 1) < 1e-3
+    assert abs(2 * np.pi * float(best["mechanics"].natural_frequency_Hz) / natural - 1) < 1e-4
