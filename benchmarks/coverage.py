@@ -1,7 +1,7 @@
 """How often the intervals of a fitted stage hold the truth, over random rigs of the bench.
 
 Each rig has a hysteresis, a driver and a mechanics of its own; slow loops and a fast multisine are fitted jointly
-without a guess. Prints a line per rig and the coverage of 95 % intervals. About 40 s per rig on one core, the first longer.
+without a guess. Prints a line per rig and the coverage of 95 % intervals. About 40 s per rig on one core.
 
     python benchmarks/coverage.py --rigs 50 [--seed 600] [--roughness 0]
 """

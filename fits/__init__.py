@@ -7,6 +7,12 @@ if TYPE_CHECKING:
     from fits._allocate import Allocation as Allocation
     from fits._allocate import AllocationError as AllocationError
     from fits._allocate import allocate as allocate
+    from fits._budget import AxisBudget as AxisBudget
+    from fits._budget import Budget as Budget
+    from fits._budget import Driving as Driving
+    from fits._budget import budget as budget
+    from fits._budget_report import budget_json as budget_json
+    from fits._budget_report import describe_budget as describe_budget
     from fits._compensate import Compensation as Compensation
     from fits._compensate import compensate as compensate
     from fits._errors import DataError as DataError
@@ -43,8 +49,10 @@ if TYPE_CHECKING:
     from fits._paper_claims import describe_claims as describe_claims
     from fits._paper_claims import paper_claims as paper_claims
     from fits._paper_claims import sign_change_guides as sign_change_guides
+    from fits._plot_budget import plot_budget as plot_budget
     from fits._plot_compensation import plot_compensation as plot_compensation
     from fits._plot_idle import plot_idle as plot_idle
+    from fits._plot_sensitivity import plot_sensitivity as plot_sensitivity
     from fits._plot_stage import plot_stage as plot_stage
     from fits._plots import plot_fit as plot_fit
     from fits._posterior import Draws as Draws
@@ -93,14 +101,17 @@ if TYPE_CHECKING:
 _HOMES = {
     "Allocation": "_allocate",
     "AllocationError": "_allocate",
+    "AxisBudget": "_budget",
     "AxisSensitivity": "_sensitivity",
     "AxisSpread": "_monte_carlo",
+    "Budget": "_budget",
     "Claim": "_paper_claims",
     "Compensation": "_compensate",
     "DataError": "_errors",
     "Design": "_stage_design",
     "DimensionEffect": "_sensitivity",
     "Draws": "_posterior",
+    "Driving": "_budget",
     "Errors": "_metrics",
     "FitError": "_result",
     "FitResult": "_result",
@@ -130,9 +141,12 @@ _HOMES = {
     "Together": "_stage_design",
     "Uncertainty": "_uncertainty",
     "allocate": "_allocate",
+    "budget": "_budget",
+    "budget_json": "_budget_report",
     "compensate": "_compensate",
     "default_stage": "_fit_stage",
     "describe": "_report",
+    "describe_budget": "_budget_report",
     "describe_claims": "_paper_claims",
     "describe_sensitivity": "_sensitivity_report",
     "describe_stage": "_stage_report",
@@ -151,9 +165,11 @@ _HOMES = {
     "monte_carlo": "_monte_carlo",
     "paper_claims": "_paper_claims",
     "paper_design": "_stage_design",
+    "plot_budget": "_plot_budget",
     "plot_compensation": "_plot_compensation",
     "plot_fit": "_plots",
     "plot_idle": "_plot_idle",
+    "plot_sensitivity": "_plot_sensitivity",
     "plot_stage": "_plot_stage",
     "predict": "_result",
     "predict_stage": "_stage_result",

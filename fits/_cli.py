@@ -271,6 +271,44 @@ def sensitivity(**options: Any) -> None:
     run_sensitivity(**options)
 
 
+@cli.command()
+@click.argument("stage", metavar="STAGE.toml|paper")
+@click.argument("model", metavar="MODEL.json")
+@click.argument("idle", metavar="IDLE.csv")
+@click.option(
+    "--axis",
+    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
+    default="all",
+    show_default=True,
+    help="Which motion.",
+)
+@click.option(
+    "--model-measures",
+    type=click.Choice(["pzt", "x", "y", "z", "alpha", "beta", "gamma"]),
+    default="pzt",
+    show_default=True,
+    help="What the displacement of MODEL.json is: the piezo's elongation, or the output of a motion.",
+)
+@click.option(
+    "--arm", metavar="LENGTH", help="Where the sensor reads a rotation: its distance from the axis, as 50mm."
+)
+@click.option("--not-zeroed", "zeroed", flag_value=False, default=True, help="Count the offset of IDLE.csv too.")
+@_columns
+@click.option("--json", "json_file", metavar="FILE", help="JSON file to write; - prints it instead of the table.")
+@click.option("--plots", metavar="DIR", help="Folder for a plot; it is made if need be.")
+@_in_sentences
+def budget(**options: Any) -> None:
+    """Add up what driving, machining and measuring do to each motion of a stage.
+
+    The driving error is the hysteresis of MODEL.json, from `microid fit`, over its whole range; the machining error
+    is that of the tolerances in STAGE.toml, or of the paper's stage; the measuring error is what the sensor shows at
+    rest in IDLE.csv, with the columns time_s and displacement_um.
+    """
+    from fits._cli_budget import run_budget
+
+    run_budget(**options)
+
+
 def main() -> None:
     """Run the command."""
     cli(prog_name="microid")

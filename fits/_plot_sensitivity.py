@@ -2,10 +2,12 @@
 
 import dataclasses
 import os
+import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,16 +21,28 @@ from fits._plot_style import DARK, LIGHT, WIDE_in, figure, label, legend, save
 from fits._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at
 from fits._stage_design import Design, paper_design
 
-AXIS_SIGNS: dict[m.Axis, str] = {"alpha": "α", "beta": "β", "gamma": "γ"}
+AXIS_SIGNS: dict[m.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamma": r"$\gamma$"}
 UNIT_SIGNS = {"um": "µm", "urad": "µrad"}
 # Odd, so that the nominal dimensions are among the steps.
 _STEPS = 41
 _COLUMNS = 2
 # Of the height of a panel: the least distance of two labels.
 _LABEL_GAP = 0.085
-_CLAIM_CHARACTERS = 66
+_PANEL_in, _LINE_in = 2.3, 0.125
 _SMALL_pt = 6
-_QUANTITY = {"": "ratio {:.3g}", "%": "{:.3g} %", "guiding legs": "vanishes at {:.3g} guiding legs"}
+_CHARACTERS = 64
+_DIMENSION = re.compile(rf"\b(?:{'|'.join({name for motion in m.MOTIONS.values() for name in motion.dimensions})})\b")
+
+
+_LEADER: dict[str, Any] = {
+    "arrowstyle": "-",
+    "color": "0.5",
+    "linewidth": 0.4,
+    "shrinkA": 1.5,
+    "shrinkB": 0,
+    "relpos": (0, 0.5),
+    "patchA": None,
+}
 
 
 @dataclass(frozen=True)
@@ -114,6 +128,7 @@ def _tornado(panels: Sequence[_Panel]) -> Figure:
     column = np.atleast_1d(picture.subplots(len(panels), 1, sharex=True, height_ratios=[n + 0.6 for n in rows]))
     for axes, panel in zip(column, panels, strict=True):
         _draw_bars(axes, panel)
+        axes.tick_params(axis="x", labelbottom=axes is column[-1])
     reach = 1.06 * max(np.abs(panel.axis.dimensions[0].relative_change_pct) for panel in panels) or 1.0
     column[-1].set_xlim(-reach, reach)
     label(column[-1], x="change of the output at a fixed elongation of the piezo (%)")
@@ -123,22 +138,22 @@ def _tornado(panels: Sequence[_Panel]) -> Figure:
 
 def _draw_bars(axes: Axes, panel: _Panel) -> None:
     effects = panel.axis.dimensions
-    places = np.arange(len(effects))
+    places = range(len(effects))
     changes = np.array([effect.relative_change_pct for effect in effects])
     exact = 100 * np.array([panel.curves[effect.name][[0, -1]] for effect in effects])
-    plain = {"height": 0.72, "linewidth": 0.4, "edgecolor": DARK}
+    plain: dict[str, Any] = {"height": 0.72, "linewidth": 0.4, "edgecolor": DARK}
     axes.barh(places, changes, color="0.45", label="plus one tolerance, first order", **plain)
-    axes.barh(places, -changes, color="0.9", label="minus one tolerance", **plain)
-    marks = {"linestyle": "none", "markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
-    axes.plot(exact[:, 1], places, marker="D", label="exact", markerfacecolor="0.0", **marks)
-    axes.plot(exact[:, 0], places, marker="D", label="exact, minus", markerfacecolor="1.0", **marks)
+    axes.barh(places, -changes, color="0.9", label="minus one tolerance, first order", **plain)
+    marks: dict[str, Any] = {"linestyle": "none", "markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
+    axes.plot(exact[:, 1], places, marker="D", label="plus, exact", markerfacecolor="0.0", **marks)
+    axes.plot(exact[:, 0], places, marker="D", label="minus, exact", markerfacecolor="1.0", **marks)
     axes.axvline(0, color=DARK, linewidth=0.6)
     axes.set_ylim(len(effects) - 0.4, -0.6)
     axes.set_yticks(places, [f"{symbol(effect.name)} ± {_tolerance(effect)}" for effect in effects])
     for place, effect in zip(places, effects, strict=True):
-        words = f"{effect.relative_change_pct:+.3f} %".replace("-", "−")
+        words = _signed(f"{effect.relative_change_pct:+.3f} %")
         axes.text(1.10, place, words, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
-        share = f"{100 * effect.share_of_variance:.1f} %".replace("-", "−")
+        share = _signed(f"{100 * effect.share_of_variance:.1f} %")
         axes.text(1.20, place, share, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
     for x, words in ((1.10, "change"), (1.20, "share of\nvariance")):
         axes.text(x, 1.0, words, transform=axes.transAxes, ha="right", va="bottom", fontsize=_SMALL_pt)
@@ -147,28 +162,33 @@ def _draw_bars(axes: Axes, panel: _Panel) -> None:
     axes.set_title(title, loc="left", fontsize=8)
     label(axes)
     axes.tick_params(axis="y", length=0)
-    axes.tick_params(axis="x", labelbottom=axes.get_subplotspec().is_last_row())
 
 
 def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[Claim]) -> Figure:
-    """Fig. 7: panels of two columns, each with its claims below."""
-    words = [_claim_lines(panel, claims) for panel in panels]
+    """Fig. 7: panels in two columns, each with its claims below."""
     columns = min(_COLUMNS, len(panels))
-    rows = -(-len(panels) // columns)
-    heights: list[float] = []
-    for row in range(rows):
-        lines = max(len(each) for each in words[row * columns : (row + 1) * columns])
-        heights += [2.5, 0.125 * lines + 0.02]
-    picture = figure(WIDE_in * (1 if columns > 1 else 0.6), sum(heights) + 0.5 * rows, gap=0.04)
-    grid = picture.add_gridspec(2 * rows, columns, height_ratios=heights)
-    for k, (panel, lines) in enumerate(zip(panels, words, strict=True)):
+    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    words = {panel.title: _claim_lines(panel, claims) for panel in panels}
+    heights = [
+        height
+        for row in rows
+        for height in (_PANEL_in, _LINE_in * max(1, *(len(words[panel.title]) for panel in row)))
+    ]
+    picture = figure(WIDE_in * (1 if columns > 1 else 0.55), sum(heights) + 0.55 * len(rows) + 0.25, gap=0.06)
+    grid = picture.add_gridspec(2 * len(rows), columns, height_ratios=heights)
+    for k, panel in enumerate(panels):
         row, column = divmod(k, columns)
         axes = picture.add_subplot(grid[2 * row, column])
         _draw_curves(axes, design, panel)
-        axes.set_title(f"({'abcdef'[k]}) {panel.title}", loc="left", fontsize=8)
+        unit = UNIT_SIGNS[panel.axis.output_unit]
+        axes.set_title(f"({'abcdef'[k]}) {panel.title}: full stroke {plain(panel.axis.stroke)} {unit}", loc="left")
+        axes.title.set_fontsize(8)
         below = picture.add_subplot(grid[2 * row + 1, column])
         below.set_axis_off()
-        below.text(0, 1, "\n".join(lines), transform=below.transAxes, va="top", fontsize=_SMALL_pt, linespacing=1.35)
+        _write(below, words[panel.title])
+    kinds = [picture.axes[0].plot([], [], style, color="0.0", linewidth=0.8)[0] for style in ("-", "--")]
+    names = ["length", "angle, by the error across its leg"]
+    picture.legend(kinds, names, loc="outside upper center", ncols=2, frameon=False)
     return picture
 
 
@@ -191,15 +211,15 @@ def _draw_curves(axes: Axes, design: Design, panel: _Panel) -> None:
         leads = effect.name == panel.axis.dimensions[0].name
         axes.plot(end_mm * np.linspace(-1, 1, _STEPS), curve, style, color="0.0", linewidth=1.4 if leads else 0.8)
         axes.annotate(
-            f"{symbol(effect.name)}  {curve[-1]:+.3g}".replace("-", "−"),
+            f"{symbol(effect.name)}  {_signed(f'{curve[-1]:+#.3g}'.rstrip('.'))}",
             (end_mm, curve[-1]),
             (1.07, height),
             textcoords=axes.get_yaxis_transform(),
             va="center",
             fontsize=7,
-            arrowprops={"arrowstyle": "-", "color": "0.5", "linewidth": 0.4, "shrinkA": 0, "shrinkB": 0},
+            arrowprops=_LEADER,
         )
-    label(axes, "machining error (mm)", f"output error at {panel.axis.stroke:.4g} {unit} ({unit})")
+    label(axes, "machining error (mm)", f"output error ({unit})")
 
 
 def _apart(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
@@ -208,17 +228,39 @@ def _apart(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
     return np.asarray(isotonic_regression(wanted - steps).x) + steps
 
 
-def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[str]:
-    """What the paper says of a motion, each with our verdict and its number; of several motions, with the last."""
-    own = [claim for claim in claims if panel.axis.axis in claim.axes and claim.axes[0] in (panel.axis.axis, "z")]
-    own = [claim for claim in own if len(claim.axes) < 3 or panel.axis.axis != "z"]
-    lines = [f"The paper's Fig. 7 read, and what this stage says:"] if own else []
-    for claim in own:
-        number = _QUANTITY[claim.unit].format(claim.number)
-        lines += textwrap.wrap(
-            f"{claim.verdict}: {claim.statement} ({number})", _CLAIM_CHARACTERS, subsequent_indent="   "
-        )
-    return lines
+def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[tuple[str, str]]:
+    """What the paper says of a motion, each with our verdict and the figures for it: lines with their colours."""
+    lines: list[tuple[str, str]] = []
+    for claim in claims:
+        # One on several motions stands below the last of them.
+        if panel.axis.axis in claim.axes and (panel.axis.axis == claim.axes[0]) == (len(claim.axes) < 3):
+            reason = claim.reason.partition(". ")[0].rstrip(".")
+            said = f"{claim.verdict}: {claim.statement}"
+            lines += [(line, DARK) for line in textwrap.wrap(said, _CHARACTERS, subsequent_indent="   ")]
+            lines += [(f"   {line}", "0.4") for line in textwrap.wrap(reason, _CHARACTERS - 3)]
+    return [("The paper's reading of its Fig. 7, and this stage:", DARK), *lines] if lines else []
+
+
+def _write(axes: Axes, lines: Sequence[tuple[str, str]]) -> None:
+    for k, (words, color) in enumerate(lines):
+        verdict, colon, rest = words.partition(": ")
+        if color == DARK and colon:
+            words = rf"$\bf{{{verdict}}}${colon}{_with_symbols(rest)}"
+        else:
+            words = _with_symbols(words)
+        place: dict[str, Any] = {"xy": (0, 1), "xytext": (0, -72 * _LINE_in * k), "textcoords": "offset points"}
+        axes.annotate(words, **place, xycoords="axes fraction", va="top", fontsize=_SMALL_pt, color=color)
+
+
+def _with_symbols(words: str) -> str:
+    """Words with the symbols of dimensions and axes."""
+    found = _DIMENSION.sub(lambda name: symbol(name[0]), _signed(words))
+    return re.sub(r"\balpha\b", r"$\\alpha$", found)
+
+
+def _signed(words: str) -> str:
+    """Words with minus signs before numbers, where there were hyphens."""
+    return re.sub(r"-(?=\d)", "\N{MINUS SIGN}", words)
 
 
 def symbol(name: str) -> str:
@@ -228,6 +270,11 @@ def symbol(name: str) -> str:
     stem, index = ("l", f"a{index}") if stem == "la" else (stem, index)
     stem = rf"\{stem}" if stem == "alpha" else stem
     return f"${stem}_{{{index}}}$" if index else f"${stem}$"
+
+
+def plain(number: float, digits: int = 4) -> str:
+    """Significant digits, or whole numbers where these are more, without an exponent for large ones."""
+    return f"{number:.{digits}g}" if abs(number) < 10**digits else f"{number:.0f}"
 
 
 def _tolerance(effect: DimensionEffect) -> str:

@@ -18,7 +18,7 @@ _REFUSED, _REMARKED = 0.1, 0.05
 # A resonance above this fraction of the sampling rate is hardly told from its mirror image.
 _HIGHEST = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
-_UNSEEN = 0.5
+_UNSEEN, _LOST = 0.5, 5.0
 # Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
 _WORTH = 40.0
 # A run that leaves so many times what the quietest leaves moves in ways that its samples do not show.
@@ -85,8 +85,9 @@ def refuse_unseen(
     poles = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _POLES]
     if not poles:
         return
-    sd = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300)) * slope
-    blurred = [names[k] for k in poles if sd[k] > _UNSEEN]
+    spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    # At a bound the slope vanishes, however far the coordinate may run.
+    blurred = [names[k] for k in poles if spread[k] * slope[k] > _UNSEEN or spread[k] > _LOST]
     sources = ", ".join(run.record.source for run in solved.runs)
     if blurred and not fast and len(blurred) < len(poles):
         raise DataError(

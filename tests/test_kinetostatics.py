@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _models import compiled
 
 import microid as m
 
@@ -33,12 +34,12 @@ TWO_PORTS = {
 FUNCTIONS = {"x": m.f_x, "y": m.f_y, "z": m.f_z, "alpha": m.f_alpha, "beta": m.f_beta, "gamma": m.f_gamma}
 
 
-@eqx.filter_jit
+@compiled
 def moved(axis, geometry, piezo_um, constants, form="linear"):
     return m.output(axis, geometry, piezo_um, constants, form)
 
 
-@eqx.filter_jit
+@compiled
 def sensitivity(axis, geometry, piezo_um, constants, form="linear"):
     return m.sensitivity(axis, geometry, piezo_um, constants, form)
 
@@ -157,9 +158,9 @@ def test_derivatives_of_implicit_forms_too(axis, form, rng):
 @pytest.mark.parametrize("axis", ["x", "z", "alpha", "gamma"])
 def test_fixed_voltage_adds_what_stiffness_does(axis, rng):
     geometry, free_um, piezo_N_per_um = randomised(rng), 40.0, rng.uniform(25, 120)
-    found = eqx.filter_jit(m.voltage_sensitivity)(axis, geometry, free_um, m.constants_of(geometry), piezo_N_per_um)
+    found = compiled(m.voltage_sensitivity)(axis, geometry, free_um, m.constants_of(geometry), piezo_N_per_um)
 
-    @eqx.filter_jit
+    @compiled
     def loaded(geometry):
         constants = m.constants_of(geometry)
         stiffness = m.input_stiffness_N_per_um(axis, geometry, constants)
@@ -220,7 +221,7 @@ def test_constants_of_the_stage_are_those_derived_elsewhere():
         "gamma": (0.50085e-3, 35.0, 23.5, 11.8e-3, 319, 6.980e4, 1390),
     }
     for axis, row in table.items():
-        found = eqx.filter_jit(m.stage_constants)(axis, geometry, constants, m.Actuation())
+        found = compiled(m.stage_constants)(axis, geometry, constants, m.Actuation())
         shown = (
             found.gain,
             found.input_stiffness_N_per_um,

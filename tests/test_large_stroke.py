@@ -1,15 +1,15 @@
 """Large strokes: against the beam-column equation integrated numerically, and against SciPy's root finder."""
 
-import equinox as eqx
 import numpy as np
 import pytest
+from _models import compiled
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import microid as m
 
 
-@eqx.filter_jit
+@compiled
 def moved(axis, geometry, piezo_um, constants, form):
     return m.output(axis, geometry, piezo_um, constants, form)
 
@@ -99,7 +99,7 @@ def test_small_strokes_are_those_of_the_linear_form(axis, rng):
     constants = m.constants_of(g, 0)
     for form in m.MOTIONS[axis].functions:
         assert abs(moved(axis, g, 0.0, constants, form)) < 1e-9
-        slope = eqx.filter_jit(m.sensitivity)(axis, g, 0.0, constants, form).piezo
+        slope = compiled(m.sensitivity)(axis, g, 0.0, constants, form).piezo
         assert slope == pytest.approx(float(m.gain(axis, g, constants)), rel=1e-9)
 
 
