@@ -121,11 +121,14 @@ def _bounded(belief: Posterior, which: Int[Array, " k"]) -> tuple[Float[Array, "
 def _marginal(
     belief: Posterior, which: Int[Array, " k"]
 ) -> tuple[Float[Array, "D k"], Float[Array, "k k"], Float[Array, " k"], Float[Array, " k"]]:
-    """Covariance of all columns with the chosen ones, and the belief about those alone, scaled."""
+    """Covariance of all columns with the chosen ones, which ascend, and the belief about those alone, scaled."""
     rows = jax.nn.one_hot(which, belief.mean.shape[0], dtype=belief.mean.dtype)
     spread = jax.scipy.linalg.cho_solve((belief.root, True), rows.T)
-    covariance = spread[which]
-    precision = jnp.linalg.inv((covariance + covariance.T) / 2)
+    # With the chosen ones last, the end of the Cholesky factor is that of their marginal precision. The inverse of
+    # their covariance would be the same, but for rounding, which may leave it indefinite.
+    last = jnp.argsort(jnp.sum(rows, axis=0), stable=True)
+    root = jnp.linalg.cholesky(belief.precision[last][:, last])[-which.shape[0] :, -which.shape[0] :]
+    precision = root @ root.T
     # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
     scale = jnp.sqrt(jnp.diagonal(precision))
     return spread, precision / (scale[:, None] * scale[None, :]), belief.mean[which] * scale, scale

@@ -111,9 +111,17 @@ def solve_chain(
         total = weighing.total(sums)
         here = weighing.cost_um2(runs, [one.residual_um for one in sums])
         while True:
-            step, columns, hyper, variance, distance = _step(
-                chain, total, columns_um, hyper, weighing, stroke_um, damping
-            )
+            try:
+                step, columns, better, variance, distance = _step(
+                    chain, total, columns_um, hyper, weighing, stroke_um, damping
+                )
+            except FitError:
+                # The columns of a step too far may be out of their solver's reach.
+                damping *= _FACTOR
+                if damping > _HIGHEST:
+                    raise
+                continue
+            hyper = better
             prior = prior_precision(chain, hyper, stroke_um)
             there = weighing.cost_um2(runs, _residuals(chain, z + step, columns, runs))
             old = here / variance + columns_um @ prior @ columns_um

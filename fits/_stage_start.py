@@ -16,8 +16,9 @@ from microid import AbstractLinear, Driver, Mechanics, Stage
 # Segments whose spectra are averaged.
 _SEGMENTS = 8
 _LEAST = 64
-# Lines at which less than this of the displacement's power follows the input say nothing.
-_COHERENT = 0.3
+# Lines at which less than this of the displacement's power follows the input say nothing; noise alone seems to follow
+# by a third at many of them, so that less than the first counts only where there is nothing better.
+_COHERENT, _HARDLY = 0.7, 0.3
 _LINES = 6
 # However coherent a line is, the estimate leaks from its neighbours.
 _SHARPEST = 30.0
@@ -71,7 +72,10 @@ def measure_response(run: StageRun, drive: np.ndarray) -> MeasuredResponse:
     with np.errstate(invalid="ignore", divide="ignore"):
         response, coherence = cross / power, np.abs(cross) ** 2 / (power * out)
     # The lines next to zero hold what the trend leaves.
-    seen = (np.arange(len(frequency)) >= 2) & (coherence > _COHERENT) & np.isfinite(coherence) & (response != 0)
+    usable = (np.arange(len(frequency)) >= 2) & np.isfinite(coherence) & (response != 0)
+    seen = usable & (coherence > _COHERENT)
+    if seen.sum() < _LINES:
+        seen = usable & (coherence > _HARDLY)
     kept = _thinned(frequency, np.abs(response), np.flatnonzero(seen))
     return MeasuredResponse(frequency[kept], response[kept], np.minimum(coherence[kept], 1 - 1e-9))
 
