@@ -2,11 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +16,7 @@ import microid as m
 from fits._compensate_stage import static_equivalent
 from fits._errors import DataError
 from fits._idle import IdleNoise
-from fits._sensitivity import quick_jit
+from fits._sensitivity import _ALIKE, _derive, quick_jit
 from fits._stage_design import Design
 
 Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
@@ -210,18 +209,16 @@ def budget(
     noise_um = idle.error_um(zeroed)
     found: dict[m.Axis, AxisBudget] = {}
     for axis in axes:
-        # By symmetry the second of a pair is as the first.
-        alike: m.Axis = "x" if axis == "y" else "alpha" if axis == "beta" else axis
-        known = next((each for each in found.values() if _pair(each.axis) == _pair(axis)), None)
-        found[axis] = dataclasses.replace(
-            known or _of_axis(design, alike, driving, _reading(axis, noise_um, arm_mm)), axis=axis
-        )
+        known = next((each for name, each in found.items() if _alike(name) == _alike(axis)), None)
+        measuring = _reading(axis, noise_um, arm_mm)
+        found[axis] = dataclasses.replace(known or _of_axis(design, _alike(axis), driving, measuring), axis=axis)
     remarks = tuple(_remarks(design, found, driving, arm_mm))
     return Budget(found, driving, measures, noise_um, zeroed, arm_mm, design.level, remarks)
 
 
-def _pair(axis: m.Axis) -> str:
-    return {"y": "x", "beta": "alpha"}.get(axis, axis)
+def _alike(axis: m.Axis) -> m.Axis:
+    """The axis itself, or the one with the same motion function."""
+    return _ALIKE.get(axis, axis)
 
 
 def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, arm_mm: float | None) -> Driving:
@@ -241,7 +238,8 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
                     f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
                 )
             per_rad = 1e3 * arm_mm
-        scale = 1 / (per_rad * float(_gain(measures, design.geometry, design.constants)))
+        found = _derive(_alike(measures), design.geometry, design.constants, design.actuation)
+        scale = 1 / (per_rad * float(found.gain))
     stroke_um = scale * float(highest_um)
     if not stroke_um > 0:
         raise DataError(
@@ -256,7 +254,7 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
     )
 
 
-@eqx.filter_jit
+@quick_jit
 def _loop(law: m.Preisach, voltage_V: Float[Array, " n"]) -> tuple[m.DrivingError, Float[Array, ""]]:
     """Driving error over a loop, and what the model moves up to its middle, which is the turn."""
     error = m.driving_error(law, voltage_V)
@@ -264,31 +262,17 @@ def _loop(law: m.Preisach, voltage_V: Float[Array, " n"]) -> tuple[m.DrivingErro
     return error, error.signed_um[turn] + error.slope_um_per_V * (voltage_V[turn] - voltage_V[0])
 
 
-@quick_jit
-def _gain(axis: m.Axis, geometry: m.Geometry, constants: m.Constants) -> Float[Array, ""]:
-    return m.gain(axis, geometry, constants)
-
-
-@quick_jit
-def _derive(
-    axis: m.Axis, geometry: m.Geometry, constants: m.Constants, piezo_um: Array, piezo_N_per_um: Array
-) -> tuple[m.Sensitivity, m.Sensitivity]:
-    """Sensitivities with the elongation imposed, and with the voltage that gives this elongation."""
-    loaded = m.loaded_um(axis, geometry, 1.0, constants, piezo_N_per_um)
-    return (
-        m.sensitivity(axis, geometry, piezo_um, constants),
-        m.voltage_sensitivity(axis, geometry, piezo_um / loaded, constants, piezo_N_per_um),
-    )
-
-
 def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | None) -> AxisBudget:
     scale, unit = (1e6, "urad") if m.MOTIONS[axis].unit == "rad" else (1.0, "um")
-    piezo_um = jnp.asarray(driving.stroke_um)
-    imposed = (design.geometry, design.constants, piezo_um, jnp.asarray(design.actuation.piezo_N_per_um))
-    by_stroke, by_voltage = _derive(axis, *imposed)
-    stroke, slope = scale * float(by_stroke.output), scale * float(by_stroke.piezo)
-    signed, worst, squares = _sums(design, by_stroke, scale)
-    _, voltage_worst, voltage_squares = _sums(design, by_voltage, scale)
+    # The load takes a fixed part of any free elongation.
+    usual = _derive(axis, design.geometry, design.constants, design.actuation)
+    free_um = driving.stroke_um * float(design.actuation.free_stroke_um / usual.loaded_stroke_um)
+    actuation = dataclasses.replace(design.actuation, free_stroke_um=jnp.asarray(free_um))
+    derived = _derive(axis, design.geometry, design.constants, actuation)
+    stroke = scale * float(derived.stroke)
+    slope = scale * float(derived.by_voltage.piezo) * free_um / driving.stroke_um
+    signed, worst, squares = _sums(design, derived.slopes_at_full_stroke, scale)
+    _, voltage_worst, voltage_squares = _sums(design, derived.by_voltage.dimensions, scale)
     if not np.all(np.isfinite([stroke, slope, worst, voltage_worst])):
         raise DataError(
             f"{axis}: expected dimensions of a stage that moves, found some that are so small or so large that no "
@@ -310,13 +294,10 @@ def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | 
     )
 
 
-def _sums(design: Design, found: m.Sensitivity, scale: float) -> tuple[float, float, float]:
+def _sums(design: Design, slopes: Mapping[str, Array], scale: float) -> tuple[float, float, float]:
     """Sum of the errors at plus one tolerance, of their sizes, and the root of their squares with correlations."""
-    names = [*found.dimensions]
-    changes: NDArray[np.float64] = scale * np.array(
-        [float(found.dimensions[name]) * design.tolerance[name] for name in names]
-    )
-    variance = float(changes @ design.correlation(names) @ changes)
+    changes: NDArray[np.float64] = scale * np.array([float(slopes[name]) * design.tolerance[name] for name in slopes])
+    variance = float(changes @ design.correlation([*slopes]) @ changes)
     return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
 
 

@@ -56,9 +56,8 @@ def _axis_json(axis: AxisBudget) -> dict[str, Any]:
 def describe_budget(found: Budget) -> str:
     """Put error budgets into a table and sentences, without a newline at the end."""
     driving = found.driving
-    rows: list[tuple[str, ...]] = [
-        ("", "stroke", "driving", "machining", "at fixed V", "measuring", "signed", "worst case", "", "rss", "")
-    ]
+    parts = ("stroke", "driving", "machining", "at fixed V", "measuring")
+    rows: list[tuple[str, ...]] = [("", *parts, "signed", "worst case", "%", "rss", "%")]
     rows += [_row(axis) for axis in found.axes.values()]
     source = "its displacement" if found.measures == "pzt" else f"its displacement, {found.measures}, over the gain"
     lines = [

@@ -51,9 +51,9 @@ def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
     for place, axis in enumerate(axes):
         unit = UNIT_SIGNS[axis.output_unit]
         words = f"{plain(axis.worst_case, 3)} {unit} of {plain(axis.stroke)} {unit}"
-        words += "" if axis.measuring is not None else ", no sensor"
+        words += "" if axis.measuring is not None else ", sensor unknown"
         bars.annotate(words, (ends[place], place), (4, 0), textcoords="offset points", va="center", fontsize=7)
-    bars.set_xlim(0, 1.3 * max(ends))
+    bars.set_xlim(0, 1.35 * max(ends))
     bars.set_ylim(len(axes) - 0.4, -0.6)
     bars.set_yticks(places, [AXIS_SIGNS.get(axis.axis, axis.axis) for axis in axes])
     bars.tick_params(axis="y", length=0)

@@ -220,11 +220,11 @@ def test_a_command_held_in_steps_behind_a_slow_driver_is_fitted():
     """The slow loops lag by what the driver takes, and the first hysteresis has that in it."""
     seed = secrets.randbelow(2**31)
     print(f"rig of seed {seed}")
-    text = SCENARIO.format(tau=8e-3, frequency=120.0, damping=0.05).replace("[plant]", '[plant]\nhold = "zero"')
+    text = SCENARIO.format(tau=4e-3, frequency=120.0, damping=0.05).replace("[plant]", '[plant]\nhold = "zero"')
     bench = data_synth.simulate(data_synth.parse_scenario(text), seed)
     runs = [Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in bench.records[:2]]
     result = fits.fit_stage(runs, stage=fits.default_stage("zero"), initial="negative", levels=16, holdout=0.0)
-    truth = {"driver.time_constant_s": 8e-3, "mechanics.natural_frequency_Hz": 120.0, "mechanics.damping_ratio": 0.05}
+    truth = {"driver.time_constant_s": 4e-3, "mechanics.natural_frequency_Hz": 120.0, "mechanics.damping_ratio": 0.05}
     for name, value in truth.items():
         print(result[name])
         assert abs(result[name].value - value) < 5 * result[name].sd + 2e-3 * value
