@@ -27,7 +27,8 @@ def _in_sentences(command: _Command) -> _Command:
             click.echo("Interrupted: no unfinished file was left.", err=True)
             sys.exit(130)
         except DataError as error:
-            click.echo(" ".join(str(error).split()), err=True)
+            sentence = " ".join(str(error).split())
+            click.echo(sentence if sentence.endswith(".") else f"{sentence}.", err=True)
             sys.exit(2)
 
     return run  # type: ignore[return-value]
