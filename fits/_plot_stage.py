@@ -193,7 +193,9 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
         "linewidths": 0.0,
         "zorder": 3,
     }
-    size.scatter(measured.frequency_Hz, np.abs(measured.response), label="measured (Welch: peaks are rounded)", **grey)
+    size.scatter(
+        measured.frequency_Hz, np.abs(measured.response), label="measured (Welch: peaks are rounded)", **grey
+    )
     size.loglog(frequency, np.abs(model), label="driver and mechanics", color="0.5", linewidth=1.2)
     turn.scatter(measured.frequency_Hz, np.degrees(near), **grey)
     turn.semilogx(frequency, np.degrees(phase), color="0.5", linewidth=1.2)
