@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import NonlinearConstraint, minimize, nnls
 
 from fits._errors import DataError
-from fits._second_order import check, first_order, inputs_of, nominal, setting, twin
+from fits._second_order import check, first_order, inputs_of, nominal, second_order, setting, twin
 from fits._stage_design import Design
 from microid import DIMENSIONS, Axis
 
@@ -67,12 +67,14 @@ def allocate(
     limit: Limit = "three_sigma",
     bounds_mm: tuple[float, float] = _LENGTHS_MM,
     voltage: bool = False,
+    curvature_share: float = 0.05,
 ) -> Allocation:
     r"""Choose the tolerances that cost least and keep the error of each axis within its budget.
 
     The cost of a dimension is in inverse proportion to its tolerance. In the logarithms of the tolerances both the
     cost :math:`\sum c_i T_{0i} / T_i` and the errors, :math:`\sum |s_i| T_i` or :math:`\sqrt{\sum s_i^2 T_i^2}` with
-    relative derivatives s, are convex, so that the minimum is the only one.
+    relative derivatives s, are convex, so that the minimum is the only one. Where a slope nearly vanishes the first
+    order would let a tolerance grow without a price; `curvature_share` stops it.
 
     Parameters
     ----------
@@ -89,6 +91,9 @@ def allocate(
         Smallest and largest tolerance of a length; of an angle, at the end of its leg.
     voltage
         Impose the voltage of the piezos instead of their elongation.
+    curvature_share
+        No tolerance goes beyond where the second order of its dimension alone takes this share of a budget; infinite
+        for the first order however far.
 
     Raises
     ------
@@ -108,6 +113,9 @@ def allocate(
     price = np.array([(cost or {}).get(name, 1.0) for name in names])
     leg = np.array([float(design.geometry[DIMENSIONS[n].leg or ""]) if DIMENSIONS[n].leg else 1.0 for n in names])
     lower, upper = (np.log(bound / leg / tolerance) for bound in bounds_mm)
+    for axis in axes:
+        straight = np.log(_straight(design, axis, names, voltage, curvature_share * budget_pct[axis]) / tolerance)
+        upper = np.maximum(lower, np.minimum(upper, straight))
     effect = np.array([_effect_pct(design, axis, names, voltage) for axis in axes]) * tolerance
     wanted = np.array([budget_pct[axis] for axis in axes])
     problem = _Problem(price, effect / wanted[:, None], lower, upper, _POWERS[limit])
@@ -198,6 +206,16 @@ def _effect_pct(design: Design, axis: Axis, names: tuple[str, ...], voltage: boo
     value, slopes = first_order(nominal(design, own), twin(axis), own, *setting(design, voltage))
     by_name = dict(zip(own, np.asarray(slopes).tolist(), strict=True))
     return np.array([100 * by_name.get(name, 0.0) / float(value) for name in names])
+
+
+def _straight(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool, share_pct: float) -> _Vector:
+    """Tolerances at which the second order of each dimension alone comes to so much."""
+    if not np.isfinite(share_pct):
+        return np.full(len(names), np.inf)
+    expanded = second_order(design, twin(axis), voltage=voltage)
+    bend = np.abs(np.diagonal(expanded.hessian)) / abs(expanded.gain) / 2
+    allowed = dict(zip(expanded.names, np.sqrt(share_pct / 100 / np.maximum(bend, 1e-300)), strict=True))
+    return np.array([allowed.get(name, np.inf) for name in names])
 
 
 def _tightest(budget_pct: Mapping[Axis, float]) -> tuple[Axis, ...]:

@@ -212,7 +212,7 @@ def budget(
         known = next((each for name, each in found.items() if _alike(name) == _alike(axis)), None)
         measuring = _reading(axis, noise_um, arm_mm)
         found[axis] = dataclasses.replace(known or _of_axis(design, _alike(axis), driving, measuring), axis=axis)
-    remarks = tuple(_remarks(design, found, driving, arm_mm))
+    remarks = (*_remarks(design, found, driving, arm_mm), *(f"Idle record: {remark}" for remark in idle.remarks))
     return Budget(found, driving, measures, noise_um, zeroed, arm_mm, design.level, remarks)
 
 
@@ -316,10 +316,18 @@ def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, a
             f"The measuring error of {', '.join(turning)} is left out: a displacement sensor reads a rotation at an "
             "arm; give it."
         )
-    free_um = float(design.actuation.free_stroke_um)
-    if driving.stroke_um > free_um:
+    loaded_um = max(
+        float(_derive(_alike(axis), design.geometry, design.constants, design.actuation).loaded_stroke_um)
+        for axis in axes
+    )
+    if driving.stroke_um > 1.05 * loaded_um:
         remarks.append(
-            f"The model elongates its piezo by {driving.stroke_um:.4g} um, more than the {free_um:.4g} um that the "
-            "stage's piezos do without a load; check what it measures."
+            f"The model elongates its piezo by {driving.stroke_um:.4g} um, but against the stage the piezos of this "
+            f"design reach {loaded_um:.4g} um: if it was measured without the stage, scale its displacement or say "
+            "what it measures."
         )
+    remarks.append(
+        "The totals take machining at a fixed elongation of the piezo (Eq. 4); open loop the voltage is fixed, and "
+        "the column beside it counts."
+    )
     return remarks

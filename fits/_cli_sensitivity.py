@@ -76,7 +76,7 @@ def run_sensitivity(
 
 def _design(stage: str | None, tolerance: str | None, level: int | None) -> Design:
     """The stage that is asked about."""
-    design = paper_design() if stage is None else read_design(stage)
+    design = paper_design() if stage in (None, "paper") else read_design(stage)
     if tolerance is not None:
         length_mm = _length_mm(tolerance)
         try:

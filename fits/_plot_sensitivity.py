@@ -119,7 +119,7 @@ def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
 def _is_the_papers(design: Design) -> bool:
     paper = paper_design()
     same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
-    return same and design.guides == paper.guides
+    return same and design.guides == paper.guides and design.tolerance == paper.tolerance
 
 
 def _tornado(panels: Sequence[_Panel]) -> Figure:

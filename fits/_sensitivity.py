@@ -109,7 +109,13 @@ class AxisSensitivity:
 
     def __getitem__(self, name: str) -> DimensionEffect:
         """Effect of a dimension by its name."""
-        return next(effect for effect in self.dimensions if effect.name == name)
+        for effect in self.dimensions:
+            if effect.name == name:
+                return effect
+        raise KeyError(
+            f"{self.axis} does not depend on {name!r}: choose one of "
+            f"{', '.join(effect.name for effect in self.dimensions)}"
+        )
 
 
 @dataclass(frozen=True)
@@ -147,7 +153,9 @@ def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> Sensitivit
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('sensitivities need float64: jax.config.update("jax_enable_x64", True)')
     found: dict[m.Axis, AxisSensitivity] = {}
-    for axis in axes:
+    for axis in (axes,) if isinstance(axes, str) else axes:
+        if axis not in m.AXES:
+            raise DataError(f"there is no axis {axis!r}: choose some of {', '.join(m.AXES)}.")
         alike = _ALIKE.get(axis, axis)
         known = next((each for name, each in found.items() if _ALIKE.get(name, name) == alike), None)
         found[axis] = _of_axis(design, alike, axis) if known is None else dataclasses.replace(known, axis=axis)

@@ -16,7 +16,10 @@ from fits._errors import DataError
 TOLERANCE_MM = 0.02
 LARGEST_ANGLE_RAD = 1.5
 # Hinges and the distance between the centres of the two of a leg, which they cannot exceed.
-_HINGES = (("l1", "la1"), ("l2", "l3"), ("l4", "la2"), ("l6", "la3"))
+_HINGES = (("l1", "la1", "alpha1"), ("l2", "l3", ""), ("l4", "la2", "alpha2"), ("l6", "la3", "alpha3"))
+# The paper's middle platform has hinges that are longer than their leg's run by 0.2 %.
+_OVERLAP = 0.01
+_MOST_GUIDES = 1000
 # What rounding may take from the smallest eigenvalue of a correlation matrix.
 _ROUNDING = 1e-9
 
@@ -134,8 +137,8 @@ def _faults(design: Design) -> Iterator[str]:
     yield from _faults_of_sizes(design)
     if isinstance(design.level, bool) or not isinstance(design.level, int) or design.level not in (0, 1):
         yield f"level: expected 0 or 1, found {design.level!r}; give one of them."
-    if not (math.isfinite(design.guides) and design.guides >= 0):
-        yield f"material.guides: expected a number of legs of at least 0, found {design.guides:g}; correct it."
+    if not 0 <= design.guides <= _MOST_GUIDES:
+        yield f"material.guides: expected 0 to {_MOST_GUIDES} legs, found {design.guides:g}; correct it."
     if not (math.isfinite(design.youngs_modulus_GPa) and design.youngs_modulus_GPa > 0):
         yield (
             f"material.youngs_modulus: expected more than 0 GPa, found {design.youngs_modulus_GPa:g}; give the "
@@ -171,11 +174,12 @@ def _faults_of_sizes(design: Design) -> Iterator[str]:
                 f"{place}: expected a tolerance below the dimension, {size:g} {unit}, found {tolerance:g} {unit}; "
                 "give a smaller one."
             )
-    for hinge, leg in _HINGES:
-        if sizes[hinge] > sizes[leg]:
+    for hinge, leg, angle in _HINGES:
+        run = sizes[leg] * math.cos(sizes[angle]) if angle else sizes[leg]
+        if sizes[hinge] > (1 + _OVERLAP) * run:
             yield (
-                f"geometry.{hinge}: expected a hinge no longer than its leg, {leg} = {sizes[leg]:g} mm, found "
-                f"{sizes[hinge]:g} mm; shorten the hinge or lengthen the leg."
+                f"geometry.{hinge}: expected a hinge no longer than its leg, which runs {run:.4g} mm along it "
+                f"({leg} = {sizes[leg]:g} mm), found {sizes[hinge]:g} mm; shorten the hinge or lengthen the leg."
             )
 
 
