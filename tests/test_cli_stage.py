@@ -237,10 +237,11 @@ def test_bad_records_leave_the_old_model(tmp_path, kind):
 
 def test_slow_runs_alone_show_no_dynamics(bench, tmp_path):
     _, (slow, _), _, _ = bench
-    (tmp_path / "again.csv").write_bytes(slow.read_bytes())
+    head, *rows = slow.read_text().splitlines()
+    (tmp_path / "again.csv").write_text("\n".join([head, *rows[:-20]]))
     (tmp_path / "m.json").write_text("old")
     options = ["--model", "stage", "--levels", LEVELS, "--initial", "negative", "--out", tmp_path / "m.json"]
-    refused(run("fit", slow, tmp_path / "again.csv", *options), "--model loop")
+    refused(run("fit", slow, tmp_path / "again.csv", *options), "add a run with steps")
     assert files(tmp_path) == ["again.csv", "m.json"]
     assert (tmp_path / "m.json").read_text() == "old"
 

@@ -193,7 +193,9 @@ def test_after_a_rest_the_dynamics_are_forgotten_but_not_the_way(kind, rng):
     hysteresis = rig.hysteresis()
     hysteresis.play(history_V)
     expected_um = rig.reversible(levels_V) + hysteresis.play(levels_V)
-    np.testing.assert_allclose(displacement_um, expected_um, rtol=0, atol=1e-9 * rig.stroke_um)
+    # A relay on whose edge the voltage comes to rest has switched or has not, by rounding: a row of them may differ.
+    share = 1e-9 if kind == "plays" else 1e-2
+    np.testing.assert_allclose(displacement_um, expected_um, rtol=0, atol=share * rig.stroke_um)
 
 
 def test_relays_glide_through_what_they_play(rng):
