@@ -10,7 +10,10 @@ held from sample to sample with `hold = "zero"`, and is at rest before the first
 from data_synth._bench import Bench as Bench
 from data_synth._bench import Record as Record
 from data_synth._bench import simulate as simulate
+from data_synth._environment import OtherAxisSettings as OtherAxisSettings
+from data_synth._environment import TemperatureSettings as TemperatureSettings
 from data_synth._errors import ScenarioError as ScenarioError
+from data_synth._hidden import hidden as hidden
 from data_synth._history import initial_history as initial_history
 from data_synth._plant import Plant as Plant
 from data_synth._plant import random_plant as random_plant
@@ -39,16 +42,25 @@ from data_synth._scenario import load_scenario as load_scenario
 from data_synth._scenario import parse_scenario as parse_scenario
 from data_synth._scenario import scenario_names as scenario_names
 from data_synth._sensor import Sensor as Sensor
+from data_synth._strength import EffectSettings as EffectSettings
+from data_synth._strength import HiddenEffect as HiddenEffect
 from data_synth._truth_density import Bump as Bump
 from data_synth._truth_density import Density as Density
 from data_synth._truth_density import Reversible as Reversible
 from data_synth._truth_density import Ridge as Ridge
 from data_synth._write import write as write
+from data_synth.effects import EFFECTS as EFFECTS
+from data_synth.effects import OUTSIDE as OUTSIDE
 
 __all__ = [
+    "EFFECTS",
+    "OUTSIDE",
     "Bench",
     "Bump",
     "Density",
+    "EffectSettings",
+    "HiddenEffect",
+    "OtherAxisSettings",
     "Plant",
     "PlantSettings",
     "PlayShape",
@@ -64,8 +76,10 @@ __all__ = [
     "ScenarioError",
     "Segment",
     "Sensor",
+    "TemperatureSettings",
     "chirp",
     "forc",
+    "hidden",
     "hold",
     "initial_history",
     "load_scenario",

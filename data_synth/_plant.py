@@ -102,7 +102,7 @@ class Plant:
             )
             voltage_V[:, -1] = end_V[part]
             path_V = np.insert(voltage_V.ravel(), turn_at, turn_V)
-            path_um = np.concatenate([static(run_V) for run_V in _monotone_runs(path_V, last_V)])
+            path_um = np.concatenate([static(run_V) for run_V in monotone_runs(path_V, last_V)])
             last_V = float(path_V[-1])
             static_um = np.delete(path_um, turn_at + np.arange(len(turn_at))).reshape(voltage_V.shape)
             if self.natural_frequency_Hz is None:
@@ -185,7 +185,7 @@ class Plant:
         return nodes_s, expm(matrix * period_s), omega_rad_per_s * weights_s[:, None] * carried
 
 
-def _monotone_runs(voltage_V: FloatArray, before_V: float) -> list[FloatArray]:
+def monotone_runs(voltage_V: FloatArray, before_V: float) -> list[FloatArray]:
     """Cut voltages (V) that follow `before_V` where they turn, and where a piece becomes long for the memory."""
     moves = np.diff(voltage_V, prepend=before_V)
     moving = np.flatnonzero(moves)

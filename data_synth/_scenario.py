@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from data_synth._environment import OtherAxisSettings, TemperatureSettings
 from data_synth._errors import ScenarioError
 from data_synth._plant import Hold, Plant, random_plant
 from data_synth._programs import PROGRAMS
 from data_synth._rig import Kind, Rig, random_rig
 from data_synth._sensor import Sensor
+from data_synth._strength import EffectSettings
 from data_synth._table import build, nearest, read_arguments
 from data_synth._types import FloatArray, Initial
 
@@ -191,12 +193,15 @@ class Run:
         What is played, one program after another.
     initial
         What the stage remembers at the start.
+    start_V
+        Where the record starts, in V, if it is not where `initial` ends: the voltage goes straight there from that.
     """
 
     name: str
     sample_rate_Hz: float
     program: tuple[Segment, ...]
     initial: Initial = "negative"
+    start_V: float | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for a run that cannot be played or written."""
@@ -236,6 +241,13 @@ class Scenario:
         What the sensor adds.
     plant
         Its dynamics; None for a quasi-static stage.
+    effects
+        What the stage hides.
+    temperature, other_axis
+        The room and a second axis; None where nobody looks at them.
+    fine_steps
+        Whether a stage that hides nothing goes through the fine-step chain too, as one does that hides something:
+        otherwise it is solved in closed form.
     seed
         Where all randomness starts; a fresh one for each simulation if it is None.
     file
@@ -250,6 +262,10 @@ class Scenario:
     runs: tuple[Run, ...]
     sensor: Sensor = field(default_factory=Sensor)
     plant: PlantSettings | None = None
+    effects: tuple[EffectSettings, ...] = ()
+    temperature: TemperatureSettings | None = None
+    other_axis: OtherAxisSettings | None = None
+    fine_steps: bool = False
     seed: int | None = None
     file: str = "scenario"
     text: str = ""
@@ -258,12 +274,20 @@ class Scenario:
         """Raise ValueError for runs that cannot be played."""
         _require(self.seed is None or self.seed >= 0, f"seed must be zero or positive, got {self.seed}")
         _require(len(self.runs) > 0, "runs must hold at least one table")
+        hidden = [effect.name for effect in self.effects]
+        for k, name in enumerate(hidden):
+            _require(hidden.count(name) == 1, f"effects[{k}]: {name} stands twice")
         names = [run.name.casefold() for run in self.runs]  # not every file system tells Train from train
         for k, run in enumerate(self.runs):
             _require(names.count(names[k]) == 1, f"runs[{k}]: name {run.name!r} is taken by another run")
             # Programs are tried once, so that a bad number is refused before anything is simulated.
+            start_V = self.rig.lower_V if run.start_V is None else run.start_V
+            _require(
+                self.rig.lower_V <= start_V <= self.rig.upper_V,
+                f"runs[{k}]: start_V must lie in {self.rig.lower_V:g} to {self.rig.upper_V:g} V, got {start_V:g}",
+            )
             try:
-                run.voltage_V(self.rig.lower_V, self.rig.lower_V, self.rig.upper_V, np.random.default_rng(0))
+                run.voltage_V(start_V, self.rig.lower_V, self.rig.upper_V, np.random.default_rng(0))
             except ValueError as error:
                 raise ValueError(f"runs[{k}]: {error}") from error
 

@@ -15,8 +15,9 @@ SCHEMA = "data_synth.truth/1"
 def write(bench: Bench, folder: str | Path) -> list[Path]:
     """Write `<run>.csv` for each run, and `truth.json`, into a folder that is made if need be.
 
-    A CSV has the columns `time_s,voltage_V,displacement_um` and nothing else: what is true stands in `truth.json`
-    only. Each file is written under a temporary name and renamed. The same seed gives the same bytes.
+    A CSV has the columns `time_s,voltage_V,displacement_um`, and `temperature_C` and `other_um` where these are
+    measured, and nothing else: what is true stands in `truth.json` only. Each file is written under a temporary name
+    and renamed. The same seed gives the same bytes.
 
     Returns
     -------
@@ -49,9 +50,9 @@ def _replace(path: Path, text: str) -> None:
 
 
 def _csv(record: Record) -> str:
-    columns = (record.time_s.tolist(), record.voltage_V.tolist(), record.displacement_um.tolist())
-    rows = [f"{time_s!r},{voltage_V!r},{um!r}" for time_s, voltage_V, um in zip(*columns, strict=True)]
-    return "\n".join(["time_s,voltage_V,displacement_um", *rows, ""])
+    columns = {name: values.tolist() for name, values in record.columns().items()}
+    rows = [",".join(map(repr, row)) for row in zip(*columns.values(), strict=True)]
+    return "\n".join([",".join(columns), *rows, ""])
 
 
 def _truth(bench: Bench) -> str:
@@ -61,6 +62,7 @@ def _truth(bench: Bench) -> str:
         "seed": bench.seed,
         "rig": asdict(bench.rig),
         **({} if bench.plant is None else {"plant": asdict(bench.plant)}),
+        **({"effects": [asdict(effect) for effect in bench.effects]} if bench.effects else {}),
         "sensor": asdict(bench.scenario.sensor),
         "runs": {
             record.name: {

@@ -106,6 +106,60 @@ def fit_stage(
     RuntimeError
         If JAX computes in single precision.
     """
+    asked = stage, levels, holdout, initial, loss, progress
+    found = solve_stage(records, *asked)
+    progress("comparing with the measurement")
+    aside = () if isinstance(holdout, int | float) else tuple(holdout)
+    before = initial if isinstance(initial, str) else "unknown"
+    chain = found.chain
+    settings = before, 1.0, found.solved.runs[-1].samples.stride, gain_ahead(found.stage), found.stage.hold
+    held = [prepare_stage_run(record, found.range_V, *settings) for record in aside]
+    summary = summarise(found.stage, chain.coordinates, found.solved, found.precision, held)
+    notes = [warning for record in (*records, *aside) for warning in record.warnings]
+    return replace(summary, remarks=(*notes, *found.remarks, *summary.remarks))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the fit of a stage found, before it is compared with anything.
+
+    Attributes
+    ----------
+    stage
+        The fitted stage, without an offset.
+    chain
+        The same in the coordinates of its fit.
+    solved
+        Where the fit ended.
+    precision
+        How sure it is.
+    stroke_um
+        Unit of the columns of the grid.
+    range_V
+        Range of the commands.
+    remarks
+        What the user should know, one sentence each.
+    """
+
+    stage: Stage
+    chain: Chain
+    solved: Solved
+    precision: Precision
+    stroke_um: float
+    range_V: tuple[float, float]
+    remarks: tuple[str, ...]
+
+
+def solve_stage(
+    records: Sequence[Record],
+    stage: Stage | None,
+    levels: int | None,
+    holdout: float | Sequence[Record],
+    initial: str | Sequence[str],
+    loss: str,
+    progress: Callable[[str], None],
+) -> Solution:
+    """Fit a stage; arguments and errors are those of `fit_stage`."""
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
     if loss not in LOSSES:
@@ -132,13 +186,8 @@ def fit_stage(
     plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold)
     problem = _start(plan, stage, levels)
     problem, solved, precision = _refine(plan, problem)
-    progress("comparing with the measurement")
-    before = initial if isinstance(initial, str) else "unknown"
-    settings = before, 1.0, solved.runs[-1].samples.stride, plan.gain, stage.hold
-    held = [prepare_stage_run(record, range_V, *settings) for record in aside]
-    found = summarise(problem.at(solved), problem.chain.coordinates, solved, precision, held)
-    notes = [warning for record in (*records, *aside) for warning in record.warnings]
-    return replace(found, remarks=(*notes, *problem.remarks, *found.remarks))
+    fitted = problem.at(solved)
+    return Solution(fitted, problem.chain, solved, precision, problem.stroke_um, range_V, problem.remarks)
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,7 @@ def run_sums(
     known = size + slope.shape[1]
     rows = np.empty((min(len(weight), _PIECE), known + own.shape[1]))
     sums = Moments(np.zeros((rows.shape[1],) * 2), np.zeros(rows.shape[1]), np.zeros(()), np.zeros(()))
-    for first, columns in _pieces(chain, z, run, free):
+    for first, columns in pieces(chain, z, run, free):
         piece = slice(first, first + columns.shape[0])
         used = rows[: columns.shape[0]]
         used[:, :size], used[:, size:known], used[:, known:] = columns, slope[piece], own[piece]
@@ -221,12 +221,12 @@ def along(
     _, slope, _ = linearise(chain, z, columns_um, run)
     moved = [
         reduce(columns @ directions[0] + slope[first : first + len(columns)] @ directions[1])
-        for first, columns in _pieces(chain, z, run, True)
+        for first, columns in pieces(chain, z, run, True)
     ]
     return np.concatenate(moved)
 
 
-def _pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> Iterator[tuple[int, np.ndarray]]:
+def pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the rows of the columns, piece by piece, with the sample that each piece begins at.
 
     They are not refined: as directions to move in they are good enough, and only the residual decides where the fit

@@ -31,6 +31,7 @@ from microid._param import static as static
 from microid._part import AbstractHysteresis as AbstractHysteresis
 from microid._part import AbstractLinear as AbstractLinear
 from microid._part import AbstractPart as AbstractPart
+from microid._part import Scene as Scene
 from microid._part import Signal as Signal
 from microid._plant import Driver as Driver
 from microid._plant import Mechanics as Mechanics
@@ -46,6 +47,12 @@ from microid.densities._base import node_areas as node_areas
 from microid.densities.grid import GridDensity as GridDensity
 from microid.densities.mixture import MixtureDensity as MixtureDensity
 from microid.densities.network import NetworkDensity as NetworkDensity
+from microid.effects import EFFECTS as EFFECTS
+from microid.effects import PLACES as PLACES
+from microid.effects import AbstractEffect as AbstractEffect
+from microid.effects import Scales as Scales
+from microid.effects import extend as extend
+from microid.effects import host as host
 from microid.hysteresis import BoucWen as BoucWen
 from microid.hysteresis import Dahl as Dahl
 from microid.hysteresis import Duhem as Duhem

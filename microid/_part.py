@@ -30,6 +30,24 @@ class Signal(eqx.Module):
     hold: Hold = eqx.field(static=True)
 
 
+class Scene(eqx.Module):
+    """What a part may look at beside the signal that comes in.
+
+    Attributes
+    ----------
+    command
+        What went into the first part.
+    columns
+        Further columns of the record by name, such as `temperature_degC`, each of shape `(t,)`.
+    memory
+        State of the hysteresis before it came to rest under the command before the first sample.
+    """
+
+    command: Signal
+    columns: dict[str, Float[Array, " t"]]
+    memory: Any = None
+
+
 class AbstractPart(eqx.Module):
     """One link of the chain that a `Stage` is.
 
@@ -53,7 +71,7 @@ class AbstractPart(eqx.Module):
         signal
             What goes in.
         start
-            State before the first sample, for parts that need to be told.
+            The `Scene` of the record.
         """
 
 
@@ -98,8 +116,9 @@ class AbstractHysteresis(AbstractPart):
         """Displacement in um under a voltage, shape `(t,)`; `start` is the state before the first sample."""
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
-        """Pass a voltage on, which has come from `start` to its value before the first sample."""
-        displacement_um = self(jnp.concatenate([signal.before[None], signal.values]), start)
+        """Pass a voltage on, which has come from the scene's memory to its value before the first sample."""
+        memory = start.memory if isinstance(start, Scene) else start
+        displacement_um = self(jnp.concatenate([signal.before[None], signal.values]), memory)
         return Signal(displacement_um[1:], displacement_um[0], signal.hold)
 
 

@@ -1,6 +1,7 @@
 """The whole stage: a chain of parts from command voltage to measured displacement (Section 3.1)."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, Self
 
 import equinox as eqx
@@ -9,7 +10,7 @@ from jaxtyping import Array, Complex, Float
 
 from microid._linear import Hold, LinearSystem, Times
 from microid._param import ParameterInfo, _as_inexact, parameter_table, static
-from microid._part import AbstractHysteresis, AbstractLinear, AbstractPart, Signal, _imaginary, _run_linear
+from microid._part import AbstractHysteresis, AbstractLinear, AbstractPart, Scene, Signal, _imaginary, _run_linear
 
 
 def _maybe_inexact(value: Any) -> Any:
@@ -93,7 +94,11 @@ class Stage(eqx.Module):
                 raise ValueError(f"there is nothing called {name!r} to freeze: choose some of {', '.join(paths)}")
 
     def __call__(
-        self, time_s: Times, voltage_V: Float[Array, " t"], start: Start | None = None
+        self,
+        time_s: Times,
+        voltage_V: Float[Array, " t"],
+        start: Start | None = None,
+        columns: Mapping[str, Float[Array, " t"]] | None = None,
     ) -> Float[Array, " t"]:
         """Respond to a command.
 
@@ -106,6 +111,8 @@ class Stage(eqx.Module):
             Command, shape `(t,)`.
         start
             How the stage stood before; by default at rest under the first sample.
+        columns
+            What else was recorded, by name, each of shape `(t,)`: some effects need a `temperature_degC`.
 
         Returns
         -------
@@ -116,11 +123,13 @@ class Stage(eqx.Module):
         time, voltage = _refined(_as_inexact(time_s), _as_inexact(voltage_V), self.substeps, self.hold)
         before = voltage[0] if start.rest_V is None else start.rest_V.astype(voltage.dtype)
         signal = Signal(voltage, before, self.hold)
+        beside = {name: _lines(_as_inexact(values), self.substeps) for name, values in (columns or {}).items()}
+        scene = Scene(signal, beside, start.memory)
         for link in self._links():
             if isinstance(link, LinearSystem):
                 signal = _run_linear(link, time, signal)
             else:
-                signal = link.run(time, signal, start.memory)
+                signal = link.run(time, signal, scene)
         return signal.values[:: self.substeps]
 
     def _links(self) -> list[LinearSystem | AbstractPart]:
@@ -247,11 +256,14 @@ def _refined(
 ) -> tuple[Times, Float[Array, " r"]]:
     if substeps == 1:
         return time_s, voltage_V
+    voltage = _lines(voltage_V, substeps) if hold == "first" else jnp.repeat(voltage_V, substeps)[: 1 - substeps]
+    return time_s / substeps if time_s.ndim == 0 else _lines(time_s, substeps), voltage
 
-    def lines(values: Array) -> Array:
-        share = jnp.arange(substeps, dtype=values.dtype) / substeps
-        inner = values[:-1, None] + jnp.diff(values)[:, None] * share[None, :]
-        return jnp.append(inner.ravel(), values[-1])
 
-    voltage = lines(voltage_V) if hold == "first" else jnp.repeat(voltage_V, substeps)[: 1 - substeps]
-    return time_s / substeps if time_s.ndim == 0 else lines(time_s), voltage
+def _lines(values: Float[Array, " t"], substeps: int) -> Float[Array, " r"]:
+    """Divide the lines between samples."""
+    if substeps == 1:
+        return values
+    share = jnp.arange(substeps, dtype=values.dtype) / substeps
+    inner = values[:-1, None] + jnp.diff(values)[:, None] * share[None, :]
+    return jnp.append(inner.ravel(), values[-1])

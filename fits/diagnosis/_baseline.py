@@ -1,0 +1,161 @@
+"""The plain stage that a diagnosis starts from, fitted to all runs, and its regression."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from fits._design import columns_of
+from fits._errors import DataError
+from fits._fit import choose_grid
+from fits._fit_stage import solve_stage
+from fits._prior import roughness
+from fits._record import Record
+from fits._result import FitError
+from fits._run import prepare_run
+from fits._stage_moments import Chain
+from fits._stage_run import StageRun, prepare_stage_run
+from fits._stage_solve import prior_precision
+from microid import Preisach, Stage
+
+# Fewer levels than these would leave structure of the density to be taken for an effect; more are slow.
+_LEVELS = 32
+
+
+class Fixed(eqx.Module):
+    """Coordinates of a stage of which nothing but the grid moves."""
+
+    stage: Stage
+    size: int = eqx.field(static=True, default=0)
+
+    def __call__(self, _: object) -> Stage:
+        """The stage."""
+        return self.stage
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A fitted plain stage.
+
+    Attributes
+    ----------
+    chain
+        The stage in the coordinates of its fit.
+    z, columns_um
+        Where that ended.
+    prior
+        Precision of the columns before the data, in 1/um^2, shape `(D, D)`.
+    stroke_um
+        Range of the displacement.
+    range_V
+        Range of the commands.
+    runs
+        Prepared; what is held out of each is not fitted.
+    aside
+        Whole runs that are held out.
+    dynamic
+        Whether driver and mechanics were fitted.
+    remarks
+        What the user should know, one sentence each.
+    """
+
+    chain: Chain
+    z: np.ndarray
+    columns_um: np.ndarray
+    prior: np.ndarray
+    stroke_um: float
+    range_V: tuple[float, float]
+    runs: tuple[StageRun, ...]
+    aside: tuple[StageRun, ...]
+    dynamic: bool
+    remarks: tuple[str, ...]
+
+    @property
+    def stage(self) -> Stage:
+        """The fitted stage, without an offset."""
+        return self.chain.stage(jnp.asarray(self.z), jnp.asarray(self.columns_um))
+
+    def moved(self, dz: np.ndarray, dcolumns_um: np.ndarray) -> "Baseline":
+        """The same at other coordinates and columns."""
+        return replace(self, z=self.z + dz, columns_um=self.columns_um + dcolumns_um)
+
+
+def fit_baseline(
+    records: Sequence[Record],
+    aside: Sequence[Record],
+    holdout: float,
+    initial: str,
+    progress: Callable[[str], None],
+) -> Baseline:
+    """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
+
+    Raises
+    ------
+    DataError, FitError
+        If neither can be fitted.
+    """
+    voltages = [record.voltage_V for record in (*records, *aside)]
+    range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
+    remarks: tuple[str, ...] = ()
+    try:
+        found = solve_stage(records, None, None, holdout, initial, "squares", progress)
+    except (DataError, FitError) as error:
+        remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
+        return _static(records, aside, range_V, holdout, initial, remarks, progress)
+    prior = prior_precision(found.chain, found.solved.hyper, found.stroke_um)
+    settings = found.solved.runs[0].samples.stride, 1.0, "first"
+    runs = _prepared(records, range_V, initial, holdout, *settings)
+    held = _prepared(aside, range_V, initial, 0.0, *settings)
+    return Baseline(
+        found.chain,
+        found.solved.z,
+        found.solved.columns_um,
+        prior,
+        found.stroke_um,
+        range_V,
+        runs,
+        held,
+        True,
+        found.remarks,
+    )
+
+
+def _prepared(
+    records: Sequence[Record],
+    range_V: tuple[float, float],
+    initial: str,
+    holdout: float,
+    stride: int,
+    gain: float,
+    hold,
+) -> tuple[StageRun, ...]:
+    return tuple(prepare_stage_run(record, range_V, initial, holdout, stride, gain, hold) for record in records)
+
+
+def _static(
+    records: Sequence[Record],
+    aside: Sequence[Record],
+    range_V: tuple[float, float],
+    holdout: float,
+    initial: str,
+    remarks: tuple[str, ...],
+    progress: Callable[[str], None],
+) -> Baseline:
+    runs = [prepare_run(record, *range_V, initial, holdout) for record in records]
+    stroke, tried, _ = choose_grid(runs, None, progress)
+    grid = tried.data.grid
+    columns = np.asarray(tried.solution.columns) * stroke
+    stage = Stage.of(hysteresis=grid.model(columns, np.zeros(())))
+    chain = Chain(Fixed(stage), 0, grid)  # type: ignore[arg-type]
+    prior = np.asarray(roughness(grid.levels).precision(tried.solution.hyper)) / stroke**2
+    ready = _prepared(records, range_V, initial, holdout, 1, 1.0, "first")
+    held = _prepared(aside, range_V, initial, 0.0, 1, 1.0, "first")
+    return Baseline(chain, np.zeros(0), columns, prior, stroke, range_V, ready, held, False, remarks)
+
+
+def columns_in(stage: Stage) -> np.ndarray:
+    """Columns of the grid of a stage, in um."""
+    law = next(part for part in stage.parts if isinstance(part, Preisach))
+    return np.asarray(columns_of(law))

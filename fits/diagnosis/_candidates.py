@@ -1,0 +1,145 @@
+"""The effects that records can be asked about, and what each would change in them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._evaluate import Prepared, prepare, respond_again, signals, with_effects
+from microid import EFFECTS, AbstractEffect, Mechanics, Scales, Signal, Stage, host
+
+# Strength at which an effect's derivative is taken, as a share of that of its probe.
+_STEP = 1e-2
+
+
+class Bench:
+    """A fitted stage and the runs, ready to be simulated with effects.
+
+    Parameters
+    ----------
+    baseline
+        The plain stage.
+    effects
+        What is in the stage already: per run, effects by their class.
+    """
+
+    def __init__(self, baseline: Baseline, aside: bool = False):
+        self.baseline = baseline
+        self.stage = baseline.stage.with_substeps(1)
+        runs = baseline.aside if aside else baseline.runs
+        self.prepared = [prepare(self.stage, run) for run in runs]
+        self.known = [signals(self.stage, one) for one in self.prepared]
+        self.plain = [self._out(known[-1], one) for known, one in zip(self.known, self.prepared, strict=True)]
+
+    @staticmethod
+    def _out(signal: Signal, prepared: Prepared) -> np.ndarray:
+        return np.asarray(signal.values)[:: prepared.run.samples.stride][: len(prepared.run.record)]
+
+    def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
+        """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
+        return [
+            respond_again(with_effects(self.stage, own), self.stage, known, one)
+            for own, known, one in zip(effects, self.known, self.prepared, strict=True)
+        ]
+
+    def change(
+        self, effects: Sequence[AbstractEffect], before: Sequence[np.ndarray] | None = None
+    ) -> list[np.ndarray]:
+        """What effects that all runs share change in them, in um."""
+        out = self.respond([list(effects)] * len(self.prepared))
+        return [a - b for a, b in zip(out, self.plain if before is None else before, strict=True)]
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A group of effects that the data are asked about together.
+
+    Attributes
+    ----------
+    effects
+        Of the size probed.
+    signatures
+        What each changes in all runs, in um: per column, a list over runs. Where an effect differs from run to run
+        there is one column per run.
+    positive
+        Whether its strength cannot be negative.
+    """
+
+    effects: tuple[AbstractEffect, ...]
+    signatures: tuple[tuple[np.ndarray, ...], ...]
+    positive: bool
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.effects[0].name
+
+
+def scales_of(baseline: Baseline, noise_um: float) -> Scales:
+    """Measure how large things are in the runs."""
+    records = [run.record for run in baseline.runs]
+    stage = baseline.stage
+    mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
+    fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
+    columns = {}
+    for run in baseline.runs:
+        from fits.diagnosis._evaluate import columns_of_record
+
+        for name, values in columns_of_record(run).items():
+            columns.setdefault(name, (float(np.mean(values)), float(np.ptp(values))))
+    return Scales(
+        lower_V=baseline.range_V[0],
+        upper_V=baseline.range_V[1],
+        fastest_V_per_s=fastest,
+        stroke_um=baseline.stroke_um,
+        interval_s=min(float(np.median(np.diff(r.time_s))) for r in records),
+        duration_s=max(r.duration_s for r in records),
+        noise_um=noise_um,
+        resonance_Hz=float(mechanics[0].natural_frequency_Hz) if mechanics else None,
+        columns=tuple((name, *value) for name, value in columns.items()),
+    )
+
+
+def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
+    """Why an effect cannot be asked about, as the end of a sentence; None where it can."""
+    stage: Stage = baseline.stage
+    if form.fast and not baseline.dynamic:
+        return "the runs do not show the dynamics"
+    for name in form.needs:
+        from fits.diagnosis._evaluate import columns_of_record
+
+        if not all(name in columns_of_record(run) for run in baseline.runs):
+            return f"the runs lack a column {name} that varies"
+    try:
+        host(form, stage)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Iterator[Probe]:
+    """Simulate all probes of an effect."""
+    stage = bench.stage
+    place = host(form, stage)
+    inner = None if place is None else stage.parts[place]
+    for group in form.probes(scales, inner):
+        columns: list[tuple[np.ndarray, ...]] = []
+        for effect in group:
+            change = bench.change([effect])
+            if form.per_run and len(change) > 1:
+                for k in range(len(change)):
+                    columns.append(tuple(c if i == k else np.zeros_like(c) for i, c in enumerate(change)))
+            else:
+                columns.append(tuple(change))
+        if all(np.all(np.isfinite(c)) for column in columns for c in column):
+            yield Probe(tuple(group), tuple(columns), one_sided(form))
+
+
+def one_sided(form: type[AbstractEffect]) -> bool:
+    """Whether the strength of an effect cannot be negative."""
+    from fits._encode import _spec
+
+    fields = form.__dataclass_fields__
+    specs = [_spec(fields[name]) for name in form.strength]
+    return not specs or all(spec is not None and spec.lower >= 0 for spec in specs)

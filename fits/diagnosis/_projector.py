@@ -1,0 +1,208 @@
+"""What a re-fitted baseline leaves of a signal: projection off its whole tangent, in units of the noise."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import qr, solve_triangular
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+
+from fits.diagnosis._regression import Regression
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one run: its innovations' standard deviation, and how it depends on its past.
+
+    Attributes
+    ----------
+    innovation_um
+        Standard deviation of what is new in every sample.
+    past
+        Coefficients of the autoregression, shape `(order,)`; empty for white noise.
+    """
+
+    innovation_um: float
+    past: np.ndarray
+
+    @property
+    def total_um(self) -> float:
+        """Standard deviation of the noise itself."""
+        if len(self.past) == 0:
+            return self.innovation_um
+        impulse = np.zeros(4096)
+        impulse[0] = 1.0
+        return self.innovation_um * float(np.linalg.norm(lfilter([1.0], np.r_[1.0, -self.past], impulse)))
+
+    def whiten(self, values: np.ndarray) -> np.ndarray:
+        """Turn noise into independent numbers of variance one, along the first axis."""
+        if len(self.past):
+            values = lfilter(np.r_[1.0, -self.past], [1.0], values, axis=0)
+        return values / self.innovation_um
+
+
+class Projector:
+    """Takes off signals what the baseline can follow.
+
+    Signals are given per run, for all samples; inside they are whitened, joined, and followed by one entry for each
+    unknown that has a prior, by which that counts.
+
+    Parameters
+    ----------
+    regression
+        Of the baseline on all runs.
+    noise
+        Of each run.
+    roughness
+        Standard deviation of the relative roughness of the density that its grid cannot follow, of each kind in
+        `Regression.finer`.
+    more
+        Further signals that count as part of the baseline: per column, a list over runs.
+    """
+
+    def __init__(
+        self,
+        regression: Regression,
+        noise: Sequence[Noise],
+        roughness: Sequence[float] = (),
+        more: Sequence[Sequence[np.ndarray]] = (),
+    ):
+        self.regression, self.noise = regression, tuple(noise)
+        self.masks = regression.masks
+        self.count = sum(int(mask.sum()) for mask in self.masks)
+        grid = regression.baseline.chain.size
+        rough = [kind for kind, size in zip(regression.finer, roughness, strict=False) if size > 0]
+        sizes = [size for size in roughness if size > 0]
+        priors = grid + sum(kind[0].shape[1] for kind in rough)
+        self._priors = priors
+        shared = self._joined_rows(
+            [np.concatenate([rows, *(k[i] for k in rough)], axis=1) for i, rows in enumerate(regression.rows)]
+        )
+        blocks = [shared, self._own_rows(regression.own)]
+        if more:
+            blocks.append(np.stack([self.join(column) for column in more], axis=1))
+        matrix = np.concatenate(blocks, axis=1)
+        root = regression.root
+        matrix[self.count : self.count + grid, :grid] = root
+        at, row = regression.size, self.count + grid
+        for kind, size in zip(rough, sizes, strict=True):
+            k = kind[0].shape[1]
+            matrix[row : row + k, at : at + k] = np.eye(k) / size
+            at, row = at + k, row + k
+        self._scale = np.linalg.norm(matrix, axis=0) + 1e-300
+        self._q, self._r = qr(matrix / self._scale, mode="economic", overwrite_a=True, check_finite=False)
+        # Directions that the runs do not show have nothing to be projected on.
+        self._weak = np.abs(np.diagonal(self._r)) < 1e-9
+        self._q[:, self._weak] = 0.0
+        self.residual = self.join(regression.residuals)
+        self.residual[self.count : self.count + grid] = -root @ regression.baseline.columns_um
+
+    @property
+    def freedom(self) -> float:
+        """Samples that are worth one of the unknowns: what is fitted takes so many degrees of freedom off."""
+        return float(np.sum(self._q[: self.count] ** 2))
+
+    def _joined_rows(self, signals: Sequence[np.ndarray]) -> np.ndarray:
+        return self.join(signals)
+
+    def _own_rows(self, own: Sequence[np.ndarray]) -> np.ndarray:
+        out = np.zeros((self.count + self._priors, sum(o.shape[1] for o in own)))
+        row = at = 0
+        for o, noise, mask in zip(own, self.noise, self.masks, strict=True):
+            stop = row + int(mask.sum())
+            out[row:stop, at : at + o.shape[1]] = noise.whiten(o)[mask]
+            row, at = stop, at + o.shape[1]
+        return out
+
+    def join(self, signals: Sequence[np.ndarray]) -> np.ndarray:
+        """Whiten signals of all runs, each of shape `(n, ...)`, and join them; shape `(count + priors, ...)`."""
+        out = np.zeros((self.count + self._priors, *signals[0].shape[1:]))
+        row = 0
+        for signal, noise, mask in zip(signals, self.noise, self.masks, strict=True):
+            stop = row + int(mask.sum())
+            out[row:stop] = noise.whiten(signal)[mask]
+            row = stop
+        return out
+
+    def off(self, joined: np.ndarray) -> np.ndarray:
+        """Project joined signals off the tangent."""
+        return joined - self._q @ (self._q.T @ joined)
+
+    def split(self, joined: np.ndarray) -> list[np.ndarray]:
+        """Cut a joined signal into those of the runs, whitened, at the samples that count."""
+        stops = np.cumsum([int(mask.sum()) for mask in self.masks])
+        return np.split(joined[: self.count], stops[:-1])
+
+    def step(self, joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Steps of coordinates and columns by which the baseline follows a joined signal best."""
+        right = self._q.T @ joined
+        r = self._r.copy()
+        r[np.diag_indices_from(r)] = np.where(self._weak, 1.0, np.diagonal(r))
+        answer = solve_triangular(r, np.where(self._weak, 0.0, right)) / self._scale
+        columns = self.regression.baseline.chain.size
+        return answer[columns : self.regression.size], answer[:columns]
+
+
+def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Noise:
+    """Learn the noise of a run from what nothing explains.
+
+    Parameters
+    ----------
+    residual_um
+        Shape `(n,)`.
+    freedom
+        Unknowns that were fitted to it.
+    order
+        Largest order of the autoregression; the Bayesian information criterion chooses.
+    """
+    n = len(residual_um)
+    inflate = (n / max(n - freedom, n / 2)) ** 0.5
+    lags = np.array([residual_um[: n - k] @ residual_um[k:] / n for k in range(order + 1)])
+    best, past, variance = np.inf, np.zeros(0), lags[0]
+    coefficients, error = np.zeros(0), lags[0]
+    for k in range(order + 1):
+        if k:
+            # Levinson and Durbin's recursion.
+            reflection = (lags[k] - coefficients @ lags[k - 1 : 0 : -1]) / error if k > 1 else lags[1] / error
+            coefficients = np.append(coefficients - reflection * coefficients[::-1], reflection)
+            error = error * (1 - reflection**2)
+        score = n * np.log(error) + k * np.log(n)
+        # A correlation too small to matter is not worth a filter.
+        if score < best - 6:
+            best, past, variance = score, coefficients.copy(), error
+    return Noise(float(np.sqrt(variance)) * inflate, past)
+
+
+def learn_roughness(projector: Projector, candidates: Sequence[Sequence[np.ndarray]]) -> tuple[float, ...]:
+    """Find how rough the density is beyond its grid, from what neither the baseline nor any candidate explains.
+
+    Maximises the probability of the residual (the evidence) over the standard deviations of the relative roughness
+    of all kinds; a kind without which the residual is as probable is left out.
+    """
+    finer = projector.regression.finer
+    joined = [projector.join(kind) for kind in finer]
+    sizes = [kind.shape[1] for kind in joined]
+    off = projector.off(np.concatenate([*joined, projector.residual[:, None]], axis=1))
+    if candidates:
+        fixed, _ = qr(projector.off(np.stack([projector.join(c) for c in candidates], axis=1)), mode="economic")
+        off = off - fixed @ (fixed.T @ off)
+    columns, left = off[:, :-1], off[:, -1]
+    gram, cross, energy = columns.T @ columns, columns.T @ left, float(left @ left)
+    count = projector.count - projector.freedom - len(candidates)
+
+    def unlikely(logs: np.ndarray) -> float:
+        scale = np.repeat(np.exp(logs), sizes)
+        inner = np.eye(len(scale)) + scale[:, None] * gram * scale[None, :]
+        root = np.linalg.cholesky(inner)
+        half = solve_triangular(root, scale * cross, lower=True)
+        # The noise may be a little more or less than what was taken off.
+        return float(count * np.log(max(energy - half @ half, 1e-300)) + 2 * np.sum(np.log(np.diagonal(root)))) / 2
+
+    none = unlikely(np.full(len(sizes), -30.0))
+    best, at = none, np.full(len(sizes), -30.0)
+    for start in ([-2.0, -2.0], [-2.0, -30.0], [-30.0, -2.0]):
+        found = minimize(unlikely, start, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 0.05, "maxiter": 80})
+        if found.fun < best - 0.5:
+            best, at = float(found.fun), found.x
+    return tuple(float(np.exp(a)) if a > -12 else 0.0 for a in at)

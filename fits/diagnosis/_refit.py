@@ -1,0 +1,186 @@
+"""Effects fitted to what the baseline leaves, the baseline following along its tangent."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import qr
+from scipy.optimize import least_squares
+
+from fits.diagnosis._candidates import Bench
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._score import Scored
+from microid import AbstractEffect, Coordinates, ParameterInfo
+
+_STEP = 1e-3
+_EVALUATIONS = 25
+
+
+def _own(info: ParameterInfo) -> bool:
+    return not info.path.startswith("inner")
+
+
+class Law:
+    """The coordinates of one effect in all runs.
+
+    Those of an effect that differs from run to run are what the runs share, then its strengths in each.
+    """
+
+    def __init__(self, effects: Sequence[AbstractEffect]):
+        self.form = type(effects[0])
+        self.maps = [Coordinates(effect, _own) for effect in effects]
+        vectors = [np.asarray(one.of(effect)) for one, effect in zip(self.maps, effects, strict=True)]
+        names = [info.path for info in self.maps[0].table]
+        strength = np.array([name in self.form.strength for name in names], dtype=bool)
+        self.each = strength if self.form.per_run and len(effects) > 1 else np.zeros(len(names), dtype=bool)
+        self.names = tuple(names)
+        self.start = np.concatenate([vectors[0][~self.each], *(v[self.each] for v in vectors if self.each.any())])
+        if not self.each.any():
+            self.start = vectors[0]
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.start)
+
+    def vector(self, x: np.ndarray, run: int) -> np.ndarray:
+        """Coordinates of the effect in one run."""
+        if not self.each.any():
+            return x
+        shared, own = int(np.sum(~self.each)), int(np.sum(self.each))
+        full = np.empty(len(self.each))
+        full[~self.each] = x[:shared]
+        full[self.each] = x[shared + run * own : shared + (run + 1) * own]
+        return full
+
+    def effect(self, x: np.ndarray, run: int) -> AbstractEffect:
+        """The effect in one run."""
+        return self.maps[run](jnp.asarray(self.vector(x, run)))
+
+
+def law_of(scored: Scored, runs: int) -> Law:
+    """Start from a probe and the multiples of its signatures that the data ask for."""
+    form = type(scored.probe.effects[0])
+    effects: list[AbstractEffect] = []
+    per_run = form.per_run and runs > 1
+    for run in range(runs):
+        first = scored.probe.effects[0]
+        values = {}
+        for name in form.strength:
+            spec = next(i.spec for i in Coordinates(first, _own).table if i.path == name)
+            total = 0.0
+            for k, effect in enumerate(scored.probe.effects):
+                share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]
+                total += float(share) * float(getattr(effect, name))
+            values[name] = jnp.asarray(float(np.clip(total, spec.lower, spec.upper)))
+        effects.append(replace(first, **values) if values else first)
+    return Law(effects)
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A set of effects, fitted together.
+
+    Attributes
+    ----------
+    laws, x
+        The effects, and their coordinates.
+    change_um
+        What they change in the plain stage's response, shape `(n,)` per run.
+    residual
+        What is left, whitened and joined, off the baseline's tangent.
+    tangent
+        Derivatives of the response along all coordinates, off the baseline's tangent, shape `(rows, k)`.
+    cost
+        Sum of squares of the residual, in noise variances.
+    """
+
+    laws: tuple[Law, ...]
+    x: tuple[np.ndarray, ...]
+    change_um: tuple[np.ndarray, ...]
+    residual: np.ndarray
+    tangent: np.ndarray
+    cost: float
+
+    @property
+    def freedom(self) -> int:
+        """Number of coordinates that the data determine."""
+        if self.tangent.shape[1] == 0:
+            return 0
+        size = np.linalg.svd(self.tangent, compute_uv=False)
+        return int(np.sum(size > 1e-6 * size[0])) if size[0] > 0 else 0
+
+    def criterion(self, count: int) -> float:
+        """Bayesian information criterion: the smaller, the better."""
+        return self.cost + self.freedom * float(np.log(count))
+
+    def effects(self, run: int) -> list[AbstractEffect]:
+        """The effects in one run."""
+        return [law.effect(x, run) for law, x in zip(self.laws, self.x, strict=True)]
+
+    def covariance(self) -> np.ndarray:
+        """Of all coordinates together."""
+        return np.linalg.pinv(self.tangent.T @ self.tangent, rcond=1e-12, hermitian=True)
+
+    def basis(self) -> np.ndarray:
+        """Orthonormal columns that span the tangent."""
+        if self.tangent.shape[1] == 0:
+            return self.tangent
+        scaled = self.tangent / (np.linalg.norm(self.tangent, axis=0) + 1e-300)
+        q, r, _ = qr(scaled, mode="economic", pivoting=True)
+        return q[:, np.abs(np.diagonal(r)) > 1e-6]
+
+
+def nothing(bench: Bench, projector: Projector) -> Refit:
+    """The baseline without any effect."""
+    residual = projector.off(projector.residual)
+    return Refit(
+        (),
+        (),
+        tuple(np.zeros_like(plain) for plain in bench.plain),
+        residual,
+        np.zeros((len(residual), 0)),
+        float(residual @ residual),
+    )
+
+
+def refit(bench: Bench, projector: Projector, laws: Sequence[Law], x: Sequence[np.ndarray] | None = None) -> Refit:
+    """Fit effects together: Levenberg and Marquardt's steps, the baseline projected out (variable projection)."""
+    runs = len(bench.prepared)
+    sizes = [law.size for law in laws]
+    target = projector.off(projector.residual)
+
+    def parts(flat: np.ndarray) -> list[np.ndarray]:
+        return np.split(flat, np.cumsum(sizes)[:-1])
+
+    def change(flat: np.ndarray) -> list[np.ndarray]:
+        cut = parts(flat)
+        effects = [[law.effect(own, run) for law, own in zip(laws, cut, strict=True)] for run in range(runs)]
+        return [a - b for a, b in zip(bench.respond(effects), bench.plain, strict=True)]
+
+    def left(flat: np.ndarray) -> np.ndarray:
+        moved = projector.off(projector.join(change(flat)))
+        return np.where(np.isfinite(moved), target - moved, 1e6)
+
+    def slope(flat: np.ndarray) -> np.ndarray:
+        at = left(flat)
+        steps = []
+        for k in range(len(flat)):
+            ahead = flat.copy()
+            ahead[k] += _STEP
+            steps.append((left(ahead) - at) / _STEP)
+        return np.stack(steps, axis=1)
+
+    start = np.concatenate([law.start for law in laws] if x is None else list(x))
+    found = least_squares(
+        left, start, jac=slope, method="trf", x_scale="jac", max_nfev=_EVALUATIONS, ftol=1e-7, xtol=1e-6, gtol=1e-9
+    )
+    return Refit(
+        tuple(laws),
+        tuple(parts(found.x)),
+        tuple(change(found.x)),
+        found.fun,
+        -found.jac,
+        float(found.fun @ found.fun),
+    )

@@ -1,0 +1,113 @@
+"""All runs as one regression: derivatives of the baseline, and finer structure of the density than its grid has."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import cholesky
+
+from fits._design import Grid
+from fits._prior import interpolation
+from fits._stage_moments import Chain, linearise, pieces
+from fits._stage_run import StageRun
+from fits.diagnosis._baseline import Baseline
+
+# Levels of the grid of the finer structure, and how many random examples of it stand for all.
+_FINE = 64
+_EXAMPLES = 120
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Derivatives of a baseline in all runs, for all samples.
+
+    Attributes
+    ----------
+    baseline
+        Where it is linearised.
+    masks
+        Samples of each run that are fitted, shape `(n,)`.
+    rows
+        Derivatives along columns and coordinates, shape `(n, D + p)` per run.
+    own
+        Each run's own unknowns, shape `(n, k)`.
+    finer
+        By kind, per run, what relative roughness of the density changes that the grid cannot follow, shape `(n, k)`:
+        of loops of one width at all biases, as play operators are, and at single places of the half-plane.
+    residuals
+        Measurement less simulation, in um, shape `(n,)` per run.
+    root
+        Root of the prior precision of the columns, shape `(D, D)`.
+    """
+
+    baseline: Baseline
+    masks: tuple[np.ndarray, ...]
+    rows: tuple[np.ndarray, ...]
+    own: tuple[np.ndarray, ...]
+    finer: tuple[tuple[np.ndarray, ...], ...]
+    residuals: tuple[np.ndarray, ...]
+    root: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of columns and coordinates."""
+        return self.rows[0].shape[1]
+
+
+def regress(baseline: Baseline, masks: Sequence[np.ndarray] | None = None) -> Regression:
+    """Linearise a baseline in all its runs."""
+    chain, runs = baseline.chain, baseline.runs
+    assert chain.grid is not None
+    fine = Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE)
+    finer = Chain(chain.coordinates, chain.place, fine)
+    bases = _bases(baseline)
+    rows, own, residuals = [], [], []
+    kinds: list[list[np.ndarray]] = [[] for _ in bases]
+    for run in runs:
+        out, slope, free = linearise(chain, jnp.asarray(baseline.z), jnp.asarray(baseline.columns_um), run)
+        n = len(run.record)
+        both = np.empty((n, chain.size + slope.shape[1]))
+        both[:, chain.size :] = slope[:n]
+        for first, columns in pieces(chain, jnp.asarray(baseline.z), run, True):
+            both[first : first + len(columns), : chain.size] = columns[: n - first]
+        rows.append(both)
+        own.append(free[:n])
+        residuals.append(run.displacement_um - out[:n])
+        for kind, part in zip(kinds, _along(finer, baseline, run, bases), strict=True):
+            kind.append(part)
+    trace = np.trace(baseline.prior) / len(baseline.prior)
+    return Regression(
+        baseline,
+        tuple(run.fitted for run in runs) if masks is None else tuple(masks),
+        tuple(rows),
+        tuple(own),
+        tuple(tuple(kind) for kind in kinds),
+        tuple(residuals),
+        cholesky(baseline.prior + 1e-12 * trace * np.eye(len(baseline.prior))),
+    )
+
+
+def _bases(baseline: Baseline) -> list[np.ndarray]:
+    """Relative roughness of the density, in columns of the finer grid, in um, shape `(D, k)` by kind."""
+    grid = baseline.chain.grid
+    assert grid is not None
+    smooth = interpolation(grid.levels, _FINE) @ baseline.columns_um
+    weights = _FINE * (_FINE + 1) // 2
+    density, slope = np.maximum(smooth[:weights], 0), smooth[weights:]
+    i, j = np.tril_indices(_FINE)
+    loops = np.zeros((len(smooth), _FINE))
+    loops[np.arange(weights), i - j] = density
+    # Relays without width are the reversible part.
+    loops[weights:, 0] = slope
+    rng = np.random.default_rng(0)
+    places = np.zeros((len(smooth), _EXAMPLES))
+    places[:weights] = density[:, None] * rng.standard_normal((weights, _EXAMPLES)) / _EXAMPLES**0.5
+    return [loops, places]
+
+
+def _along(finer: Chain, baseline: Baseline, run: StageRun, bases: list[np.ndarray]) -> list[np.ndarray]:
+    joined = np.concatenate(bases, axis=1)
+    parts = [columns @ joined for _, columns in pieces(finer, jnp.asarray(baseline.z), run, True)]
+    moved = np.concatenate(parts)[: len(run.record)]
+    return np.split(moved, np.cumsum([base.shape[1] for base in bases])[:-1], axis=1)

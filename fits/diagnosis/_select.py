@@ -1,0 +1,181 @@
+"""Which effects the records need: forward selection with refits, a backward check, and what cannot be told apart."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fits.diagnosis._candidates import Bench, Probe
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import Law, Refit, law_of, nothing, refit
+from fits.diagnosis._score import Family, Scored, rescore, score
+
+# Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
+_LEADERS, _FORMS = 6, 2
+_MOST = 4
+# Differences of the criterion, and standard deviations after projecting one effect off another, within which two
+# effects are not told apart.
+_SAME, _APART = 10.0, 4.0
+# Scores below this share of the best are not worth a fit.
+_WORTH = 0.3
+
+
+@dataclass(frozen=True)
+class Rival:
+    """An effect fitted in place of a cause."""
+
+    name: str
+    refit: Refit
+    criterion: float
+    apart: float
+
+
+@dataclass(frozen=True)
+class Cause:
+    """An effect that the records need.
+
+    Attributes
+    ----------
+    name
+        Name of the effect.
+    z
+        Evidence for it when it was found, in standard deviations.
+    p_family
+        Probability of as much evidence for any effect by chance.
+    rivals
+        Effects that explain the same about as well, the best first.
+    drop
+        Decrease of the sum of squares, in noise variances, when it was found.
+    """
+
+    name: str
+    z: float
+    p_family: float
+    rivals: tuple[Rival, ...]
+    drop: float
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What forward selection found.
+
+    Attributes
+    ----------
+    causes
+        In the order found.
+    model
+        All of them fitted together.
+    plain
+        The baseline without them.
+    scores
+        Of all probes, at the baseline.
+    left
+        Of all probes, beside the causes.
+    family
+        Chance of the largest score.
+    """
+
+    causes: tuple[Cause, ...]
+    model: Refit
+    plain: Refit
+    scores: tuple[Scored, ...]
+    left: tuple[Scored, ...]
+    family: Family
+
+
+def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
+    """The highest score of each effect, the highest first."""
+    found: dict[str, Scored] = {}
+    for one in sorted(scores, key=lambda s: -s.z):
+        found.setdefault(one.name, one)
+    return found
+
+
+def select(
+    bench: Bench,
+    projector: Projector,
+    probes: Sequence[Probe],
+    false_alarm: float,
+    rng: np.random.Generator,
+    progress: Callable[[str], None],
+) -> Selection:
+    """Add effects one at a time until chance explains the rest."""
+    plain = model = nothing(bench, projector)
+    scores = left = tuple(score(projector, probe, plain.residual) for probe in probes)
+    family = Family(scores, rng)
+    causes: list[Cause] = []
+    laws: list[Law] = []
+    while len(causes) < _MOST:
+        taken = {cause.name for cause in causes}
+        open_ = [one for one in left if one.name not in taken]
+        if not open_:
+            break
+        top = max(one.z for one in open_)
+        p = family.p(top)
+        if p >= false_alarm:
+            break
+        progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
+        rivals = _contest(bench, projector, model, laws, open_, top)
+        if not rivals:
+            break
+        first = rivals[0]
+        drop = model.cost - first.refit.cost
+        causes.append(
+            Cause(first.name, max(drop, 0.0) ** 0.5, family.p(max(drop, 0.0) ** 0.5), tuple(rivals[1:]), drop)
+        )
+        model, laws = first.refit, list(first.refit.laws)
+        basis = model.basis()
+        left = tuple(rescore(one, basis, model.residual) for one in scores)
+        family = Family(left, rng)
+    causes, model = _backward(bench, projector, causes, model)
+    return Selection(tuple(causes), model, plain, scores, left, family)
+
+
+def _contest(
+    bench: Bench, projector: Projector, model: Refit, laws: Sequence[Law], scores: Sequence[Scored], top: float
+) -> list[Rival]:
+    """Fit the leaders beside what is there already: the best, then those not told apart from it."""
+    runs = len(bench.prepared)
+    names = [name for name, one in best_of(scores).items() if one.z > _WORTH * top][:_LEADERS]
+    fitted: dict[str, Refit] = {}
+    for name in names:
+        own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
+        tried: dict[type, int] = {}
+        for one in own:
+            form = type(one.probe.effects[0])
+            if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < _WORTH * own[0].z:
+                continue
+            tried[form] = tried.get(form, 0) + 1
+            law = law_of(one, runs)
+            found = refit(bench, projector, [*laws, law], [*model.x, law.start])
+            if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
+                fitted[name] = found
+    order = sorted(fitted, key=lambda name: fitted[name].criterion(projector.count))
+    if not order:
+        return []
+    best = fitted[order[0]]
+    rivals = [Rival(order[0], best, best.criterion(projector.count), 0.0)]
+    for name in order[1:]:
+        other = fitted[name]
+        worse = other.criterion(projector.count) - rivals[0].criterion
+        # What the best explains beyond the other, and the other's change that the best cannot follow.
+        apart = max(other.cost - best.cost, 0.0) ** 0.5
+        if worse < _SAME or apart < _APART:
+            rivals.append(Rival(name, other, other.criterion(projector.count), apart))
+    return rivals
+
+
+def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Refit) -> tuple[list[Cause], Refit]:
+    """Take out what later additions made unnecessary."""
+    while len(causes) > 1:
+        trials = []
+        for k in range(len(causes)):
+            laws = [law for i, law in enumerate(model.laws) if i != k]
+            without = refit(bench, projector, laws, [x for i, x in enumerate(model.x) if i != k])
+            trials.append((without.criterion(projector.count), k, without))
+        criterion, k, without = min(trials, key=lambda t: t[0])
+        if criterion > model.criterion(projector.count) + _SAME:
+            break
+        causes = [cause for i, cause in enumerate(causes) if i != k]
+        model = without
+    return causes, model

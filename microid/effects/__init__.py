@@ -1,0 +1,20 @@
+"""Physical effects that the plain stage lacks, one file each.
+
+Importing the package imports every sibling whose name does not start with an underscore; each registers itself.
+"""
+
+import importlib
+import pkgutil
+
+from microid.effects._base import EFFECTS as EFFECTS
+from microid.effects._base import PLACES as PLACES
+from microid.effects._base import AbstractEffect as AbstractEffect
+from microid.effects._base import Place as Place
+from microid.effects._base import Scales as Scales
+from microid.effects._base import extend as extend
+from microid.effects._base import host as host
+from microid.effects._base import register as register
+
+for _module in pkgutil.iter_modules(__path__):
+    if not _module.name.startswith("_"):
+        importlib.import_module(f"{__name__}.{_module.name}")

@@ -1,0 +1,213 @@
+"""What a physical effect is to the rest of the package: one more part of a stage, and what is known of it."""
+
+import abc
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Self, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from microid._linear import Times
+from microid._part import AbstractHysteresis, AbstractPart, Signal
+from microid._plant import Driver, Mechanics
+from microid._stage import Stage
+
+Place = Literal["driver", "hysteresis", "mechanics", "environment", "sensor", "time", "noise"]
+# In the order of the signal.
+PLACES: tuple[Place, ...] = ("driver", "hysteresis", "mechanics", "environment", "sensor", "time", "noise")
+
+
+@dataclass(frozen=True)
+class Scales:
+    """How large things are in the records at hand, from which an effect chooses where to be probed.
+
+    Attributes
+    ----------
+    lower_V, upper_V
+        Range of the command.
+    fastest_V_per_s
+        Largest rate of the command.
+    stroke_um
+        Range of the displacement.
+    interval_s
+        Shortest time between two samples.
+    duration_s
+        Duration of the longest record.
+    noise_um
+        What the plain stage leaves, standard deviation.
+    resonance_Hz
+        Of the plain stage; None without dynamics.
+    columns
+        Mean and range of each further column by name, such as `temperature_degC`.
+    """
+
+    lower_V: float
+    upper_V: float
+    fastest_V_per_s: float
+    stroke_um: float
+    interval_s: float
+    duration_s: float
+    noise_um: float
+    resonance_Hz: float | None = None
+    columns: tuple[tuple[str, float, float], ...] = ()
+
+
+class AbstractEffect(AbstractPart):
+    """One physical effect: a part of a stage that does nothing where its strength is zero.
+
+    To add an effect, put one file with one final, registered subclass into `microid/effects/`.
+
+    Attributes
+    ----------
+    name
+        Name of the effect, that of its file.
+    form
+        Which of several models of that effect this is; empty where there is one.
+    place
+        Where in the chain it acts, one of `PLACES`.
+    strength
+        Names of the fields that are zero where there is no effect; all else says what it would be like.
+    needs
+        Columns beside time, command and displacement without which there is nothing to see.
+    fast
+        Whether it is only seen in records that show the dynamics.
+    per_run
+        Whether it differs from record to record, as a drift does.
+    fingerprint
+        What it leaves in the residual of the plain stage, one sentence.
+    confusions
+        Names of the effects that it is mistaken for.
+    experiment
+        What tells it from those, one sentence.
+    source
+        Where the model comes from.
+    """
+
+    name: eqx.AbstractClassVar[str]
+    place: eqx.AbstractClassVar[Place]
+    strength: eqx.AbstractClassVar[tuple[str, ...]]
+    fingerprint: eqx.AbstractClassVar[str]
+    confusions: eqx.AbstractClassVar[tuple[str, ...]]
+    experiment: eqx.AbstractClassVar[str]
+    source: eqx.AbstractClassVar[str]
+    form: ClassVar[str] = ""
+    needs: ClassVar[tuple[str, ...]] = ()
+    fast: ClassVar[bool] = False
+    per_run: ClassVar[bool] = False
+
+    @classmethod
+    @abc.abstractmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Effects of a size that would be seen, with which the data are asked whether there is one.
+
+        Parameters
+        ----------
+        scales
+            Of the records.
+        inner
+            The part that this effect is put around; None for one that stands by itself.
+
+        Returns
+        -------
+        tuple of tuples
+            Alternatives; each is a group of effects that are tried together, such as the cosine and sine of a line.
+            Empty where the records cannot show it.
+        """
+
+    @abc.abstractmethod
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Pass a signal on; `start` is the `Scene` of the record."""
+
+
+# Every form of every effect, in the order of the files.
+EFFECTS: list[type[AbstractEffect]] = []
+
+_Effect = TypeVar("_Effect", bound=type[AbstractEffect])
+
+
+def register(effect: _Effect) -> _Effect:
+    """Make a form of an effect known."""
+    EFFECTS.append(effect)
+    return effect
+
+
+def host(effect: type[AbstractEffect], stage: Stage) -> int | None:
+    """Place of the part that an effect is put around.
+
+    That is one of the kind that its field `inner` is declared as; None for an effect that stands by itself.
+
+    Raises
+    ------
+    ValueError
+        If the stage has no such part.
+    """
+    field = effect.__dataclass_fields__.get("inner")
+    if field is None:
+        return None
+    kinds = {"driver": Driver, "hysteresis": AbstractHysteresis, "mechanics": Mechanics}
+    for place, part in enumerate(stage.parts):
+        if isinstance(_innermost(part), kinds[effect.place]):
+            return place
+    raise ValueError(f"{effect.name!r} acts on a {effect.place}, and this stage has none")
+
+
+def _innermost(part: Any) -> Any:
+    return _innermost(part.inner) if isinstance(part, AbstractEffect) and hasattr(part, "inner") else part
+
+
+def extend(stage: Stage, effect: AbstractEffect) -> Stage:
+    """Put an effect into a stage, where it belongs in the chain.
+
+    Raises
+    ------
+    ValueError
+        If the stage has it already, or lacks the part that it acts on.
+    """
+    if effect.name in stage.names:
+        raise ValueError(f"the stage has the effect {effect.name!r} already")
+    place = host(type(effect), stage)
+    if place is not None:
+        name = stage.names[place]
+        # What was frozen of the part lies one level deeper now.
+        deeper = tuple(
+            path.replace(f"{name}.", f"{name}.inner.", 1) for path in stage.frozen if path.startswith(f"{name}.")
+        )
+        kept = stage.thaw(*(path for path in stage.frozen if path.startswith(f"{name}.")))
+        return kept.swap(name, effect).freeze(*deeper)
+    rank = PLACES.index(effect.place)
+    for index, part in enumerate(stage.parts):
+        if _rank(part) > rank or (effect.place == "driver" and isinstance(_innermost(part), Driver)):
+            return stage.insert(index, effect.name, effect)
+    return stage.append(effect.name, effect)
+
+
+def _rank(part: AbstractPart) -> float:
+    """Place of a part among those of the effects: an effect comes behind what its place is named after."""
+    inner = _innermost(part)
+    if isinstance(inner, AbstractHysteresis):
+        return PLACES.index("hysteresis") - 0.5
+    if isinstance(inner, Mechanics):
+        # What acts on the mechanics from before is ahead of them.
+        return PLACES.index("mechanics") + 0.5
+    return PLACES.index(part.place) if isinstance(part, AbstractEffect) else -1 if part.gives == "V" else 3.5
+
+
+def times_of(time_s: Times, count: int) -> Float[Array, " t"]:
+    """Times of the samples from the first on, shape `(t,)`, be it given or only the interval."""
+    if time_s.ndim == 0:
+        return time_s * jnp.arange(count, dtype=time_s.dtype)
+    return time_s - time_s[0]
+
+
+def rate_of(time_s: Times, values: Float[Array, " t"]) -> Float[Array, " t"]:
+    """Rate of change at the samples, by central differences, shape `(t,)`."""
+    time = times_of(time_s, values.shape[0])
+    inner = (values[2:] - values[:-2]) / (time[2:] - time[:-2])
+    ends = (values[1] - values[0]) / (time[1] - time[0]), (values[-1] - values[-2]) / (time[-1] - time[-2])
+    return jnp.concatenate([ends[0][None], inner, ends[1][None]])
+
+
+def lowpass(time_s: Times, values: Float[Array, " t"], time_constant_s: Float[Array, ""]) -> Float[Array, " t"]:
+    """Follow values with a lag of the first order, from rest at the first, shape `(t,)`."""
+    return Driver(time_constant_s).system().respond(time_s, values, values[0], "first")

@@ -1,0 +1,30 @@
+"""What of a hysteresis depends on the voltage alone, and what on its past."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from microid._part import AbstractPart, Signal
+
+# Levels of the sweep, and its interval: so slow that no effect of the rate is left.
+_LEVELS, _SLOW_S = 65, 1e4
+
+
+def anhysteretic(inner: AbstractPart, signal: Signal, start: Any) -> Signal:
+    """Mean of the two branches of the loop over the range of a voltage, in um, at the voltages of the signal."""
+    low = jnp.minimum(jnp.min(signal.values), signal.before)
+    step = (jnp.maximum(jnp.max(signal.values), signal.before) - low) / (_LEVELS - 1)
+    up = low + step * jnp.asarray(np.arange(_LEVELS), dtype=low.dtype)
+    sweep = Signal(jnp.concatenate([up, up[::-1], up]), low, "first")
+    branches = inner.run(jnp.asarray(_SLOW_S, dtype=low.dtype), sweep, start).values.reshape(3, _LEVELS)
+    mean = (branches[1][::-1] + branches[2]) / 2
+
+    def at(voltage_V: Float[Array, "..."]) -> Float[Array, "..."]:
+        place = (voltage_V - low) / jnp.maximum(step, jnp.finfo(low.dtype).tiny)
+        left = jnp.clip(jnp.floor(place), 0, _LEVELS - 2).astype(jnp.int32)
+        share = place - left.astype(low.dtype)
+        return mean[left] * (1 - share) + mean[left + 1] * share
+
+    return Signal(at(signal.values), at(signal.before), signal.hold)

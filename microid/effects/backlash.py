@@ -1,0 +1,52 @@
+"""Backlash: clearance in a joint between the piezo and the mechanics."""
+
+from typing import Any, ClassVar, Self
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from microid._linear import Times
+from microid._modes import _plays
+from microid._param import param
+from microid._part import AbstractPart, Signal
+from microid.effects._base import AbstractEffect, Place, Scales, register
+
+
+@register
+class Backlash(AbstractEffect):
+    r"""A play: an output that stays until one side of the clearance pushes it.
+
+    .. math:: y_k = \min(\max(y_{k-1}, w_k - b), w_k + b)
+
+    At rest before the first sample it stands in the middle of its clearance.
+
+    Attributes
+    ----------
+    half_gap_um
+        `b`.
+    """
+
+    name: ClassVar[str] = "backlash"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "mechanics"
+    strength: ClassVar[tuple[str, ...]] = ("half_gap_um",)
+    fingerprint: ClassVar[str] = (
+        "The displacement stays for a while after every reversal, however small the loop, and small oscillations are "
+        "lost."
+    )
+    confusions: ClassVar[tuple[str, ...]] = ("friction", "slew_limit", "quantisation")
+    experiment: ClassVar[str] = "Fast downward steps of several heights, and chirps at a low and a high bias."
+    source: ClassVar[str] = "play operator; Micromachines 16 (2025) 1024 on preload; 0.05 to 2 um (estimate)"
+    half_gap_um: Float[Array, ""] = param(unit="um", scale=0.1, lower=0.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """A thousandth of the stroke, three and ten."""
+        return tuple((cls(jnp.asarray(share * scales.stroke_um)),) for share in (0.001, 0.003, 0.01))
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Drag the output along."""
+        return Signal(
+            _plays(signal.values, self.half_gap_um[None], signal.before[None])[:, 0], signal.before, signal.hold
+        )

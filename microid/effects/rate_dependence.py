@@ -1,0 +1,125 @@
+"""Rate-dependent hysteresis: loops that widen with the speed at which they are run through."""
+
+from typing import Any, ClassVar, Self
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from microid._linear import Times
+from microid._param import param
+from microid._part import AbstractPart, Signal
+from microid.effects._base import AbstractEffect, Place, Scales, lowpass, rate_of, register
+from microid.effects._grids import decades
+from microid.effects._irreversible import anhysteretic
+
+# By which the widening lags behind the rate: a width that jumped at reversals would be a step in the displacement.
+_LAG_S = 2e-3
+
+
+@register
+class RateDependence(AbstractEffect):
+    r"""A loop that widens along the logarithm of the rate.
+
+    .. math:: w + b \, \mathrm{LP}_{2 ms}[\log_{10}(1 + |\dot u| / v_0)] \, w_{irr}
+
+    The irreversible part is the displacement less the mean of the two branches of the loop over the record's range.
+
+    Attributes
+    ----------
+    inner
+        The hysteresis.
+    gain_per_decade
+        `b`: widening over the loop's width, per decade of the rate.
+    onset_V_per_s
+        `v0`, where it begins.
+    """
+
+    name: ClassVar[str] = "rate_dependence"
+    takes: ClassVar[str] = "V"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
+    fingerprint: ClassVar[str] = (
+        "Over the voltage the residual is a thin loop whose area grows along the logarithm of the rate, in "
+        "proportion to the width of the hysteresis and not to the stroke; it is gone in slow loops."
+    )
+    confusions: ClassVar[tuple[str, ...]] = (
+        "transport_delay",
+        "sensor_lowpass",
+        "slew_limit",
+        "creep",
+        "voltage_dependent_capacitance",
+    )
+    experiment: ClassVar[str] = (
+        "The same levels at three rates or more over two decades, and small and large amplitudes at the same speed."
+    )
+    source: ClassVar[str] = (
+        "Robert, Damjanovic & Setter, J. Appl. Phys. 90 (2001) 2459; Wolf, Sutor, Rupitsch & Lerch, Sens. Actuators "
+        "A 172 (2011) 245; 2 to 10 % of the width per decade (estimate)"
+    )
+    inner: AbstractPart
+    gain_per_decade: Float[Array, ""] = param(unit="1", scale=0.05, lower=0.0)
+    onset_V_per_s: Float[Array, ""] = param(unit="V/s", scale=100.0, lower=1e-3, upper=1e7)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Onsets in steps of a decade, down to a thousandth of the fastest rate."""
+        if inner is None:
+            return ()
+        grid = decades(max(scales.fastest_V_per_s / 1000, 1e-2), scales.fastest_V_per_s)
+        return tuple((cls(inner, jnp.asarray(0.05), jnp.asarray(onset)),) for onset in grid)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Widen the loop."""
+        given = self.inner.run(time_s, signal, start)
+        if signal.values.shape[0] < 2:
+            return given
+        beside = given.values - anhysteretic(self.inner, signal, start).values
+        speed = jnp.log1p(jnp.abs(rate_of(time_s, signal.values)) / self.onset_V_per_s) / jnp.log(10.0)
+        wider = lowpass(time_s, speed, jnp.asarray(_LAG_S, dtype=speed.dtype))
+        return Signal(given.values + self.gain_per_decade * wider * beside, given.before, given.hold)
+
+
+@register
+class RelaxingHysteresis(AbstractEffect):
+    r"""A share of the irreversible part that lags: `w + g (LP_tau[w_irr] - w_irr)`.
+
+    Attributes
+    ----------
+    inner
+        The hysteresis.
+    share
+        `g`.
+    time_constant_s
+        `tau`.
+    """
+
+    name: ClassVar[str] = "rate_dependence"
+    form: ClassVar[str] = "relaxation"
+    takes: ClassVar[str] = "V"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("share",)
+    fingerprint: ClassVar[str] = RateDependence.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = RateDependence.confusions
+    experiment: ClassVar[str] = RateDependence.experiment
+    source: ClassVar[str] = RateDependence.source
+    inner: AbstractPart
+    share: Float[Array, ""] = param(unit="1", scale=0.1, lower=0.0)
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=0.01, lower=1e-6, upper=1e3)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Time constants in steps of a decade, from some samples to a tenth of a second or three samples more."""
+        if inner is None:
+            return ()
+        first = max(3 * scales.interval_s, 3e-4)
+        grid = decades(first, max(0.1, 10 * first))
+        return tuple((cls(inner, jnp.asarray(0.1), jnp.asarray(constant)),) for constant in grid)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Let a share of the irreversible part come late."""
+        given = self.inner.run(time_s, signal, start)
+        beside = given.values - anhysteretic(self.inner, signal, start).values
+        late = lowpass(time_s, beside, self.time_constant_s)
+        return Signal(given.values + self.share * (late - beside), given.before, given.hold)

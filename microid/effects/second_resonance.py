@@ -1,0 +1,67 @@
+"""A second resonance: a mode of the mechanism, or of what stands on it, beyond the first."""
+
+from typing import Any, ClassVar, Self
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from microid._linear import Times
+from microid._param import param
+from microid._part import AbstractPart, Signal
+from microid._plant import Mechanics
+from microid.effects._base import AbstractEffect, Place, Scales, _innermost, register
+
+
+@register
+class SecondResonance(AbstractEffect):
+    r"""A second mode beside the mechanics, without a share in the displacement at rest.
+
+    .. math:: y = G w + g \lambda (H_2 - 1) w, \qquad H_2 = \frac{\omega_2^2}{s^2 + 2 \zeta_2 \omega_2 s + \omega_2^2}
+
+    Attributes
+    ----------
+    inner
+        The mechanics `G`, of static gain `lambda`.
+    share
+        `g`: positive where both modes move the sensor alike, negative where an anti-resonance lies between them.
+    frequency_Hz
+        `omega_2 / 2 pi`.
+    damping_ratio
+        `zeta_2`.
+    """
+
+    name: ClassVar[str] = "second_resonance"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "mechanics"
+    strength: ClassVar[tuple[str, ...]] = ("share",)
+    fast: ClassVar[bool] = True
+    fingerprint: ClassVar[str] = (
+        "Ringing at a second frequency after steps, and a narrow peak or notch in the frequency response; nothing in "
+        "slow records."
+    )
+    confusions: ClassVar[tuple[str, ...]] = ("transport_delay", "sensor_lowpass", "stiffness_hardening")
+    experiment: ClassVar[str] = "Chirps of two small amplitudes to three times the first resonance or more."
+    source: ClassVar[str] = "modal superposition; shares of 0.01 to 0.3 at 1.3 to 6 times the first (estimate)"
+    inner: AbstractPart
+    share: Float[Array, ""] = param(unit="1", scale=0.01)
+    frequency_Hz: Float[Array, ""] = param(unit="Hz", scale=100.0, lower=1e-3)
+    damping_ratio: Float[Array, ""] = param(unit="1", scale=0.01, lower=1e-5, upper=1.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Eight frequencies from 1.3 to 6 times the first resonance, as far as samples can follow."""
+        if scales.resonance_Hz is None or inner is None:
+            return ()
+        first, last = 1.3 * scales.resonance_Hz, min(6 * scales.resonance_Hz, 0.2 / scales.interval_s)
+        grid = np.geomspace(first, last, 8) if last > first else np.zeros(0)
+        share, damping = jnp.asarray(0.01), jnp.asarray(0.02)
+        return tuple((cls(inner, share, jnp.asarray(float(frequency)), damping),) for frequency in grid)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Add the second mode's answer."""
+        first = self.inner.run(time_s, signal, start)
+        mode = Mechanics(self.frequency_Hz, self.damping_ratio)
+        more = _innermost(self.inner).gain * (mode.run(time_s, signal, start).values - signal.values)
+        return Signal(first.values + self.share * more, first.before, first.hold)

@@ -1,0 +1,123 @@
+"""Thermal gain: the piezo's gain changes with its temperature, measured or from its own losses."""
+
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from microid._linear import Times
+from microid._param import _as_inexact, array, param
+from microid._part import AbstractPart, Signal
+from microid.effects._base import AbstractEffect, Place, Scales, lowpass, rate_of, register
+from microid.effects._grids import decades
+
+
+@register
+class ThermalGain(AbstractEffect):
+    r"""A gain in proportion to a measured temperature.
+
+    .. math:: w_0 + (w - w_0) (1 + \beta \, \mathrm{LP}_\tau[T - T_0])
+
+    Attributes
+    ----------
+    gain_per_K
+        `beta`.
+    time_constant_s
+        `tau`, by which the piezo lags behind the sensor of the temperature.
+    reference_degC
+        `T0`, given.
+    zero_um
+        `w0`, the displacement that stays, given.
+    """
+
+    name: ClassVar[str] = "thermal_gain"
+    form: ClassVar[str] = "temperature"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("gain_per_K",)
+    needs: ClassVar[tuple[str, ...]] = ("temperature_degC",)
+    fingerprint: ClassVar[str] = (
+        "The residual is in proportion to the position, by a factor that grows with heavy driving or with the "
+        "temperature and decays in pauses."
+    )
+    confusions: ClassVar[tuple[str, ...]] = ("aging", "accommodation", "creep", "thermal_drift")
+    experiment: ClassVar[str] = "A slow loop, a burst of heavy driving, the same loop, a pause, and the same loop."
+    source: ClassVar[str] = "PI piezo tutorial, temperature effects; 0.1 to 0.5 % per K (estimate)"
+    gain_per_K: Float[Array, ""] = param(unit="1/K", scale=1e-3)
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
+    reference_degC: Float[Array, ""] = array()
+    zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Time constants in steps of half a decade, from some samples to the length of the record."""
+        found = {name: (mean, spread) for name, mean, spread in scales.columns}
+        mean, spread = found.get("temperature_degC", (0.0, 0.0))
+        if not spread > 0:
+            return ()
+        grid = decades(max(3 * scales.interval_s, scales.duration_s / 300, 1e-3), scales.duration_s, 2)
+        return tuple((cls(jnp.asarray(1e-3), jnp.asarray(constant), jnp.asarray(mean)),) for constant in grid)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Scale the displacement."""
+        above = lowpass(time_s, start.columns["temperature_degC"] - self.reference_degC, self.time_constant_s)
+        more = self.gain_per_K * above
+        before = signal.before + more[0] * (signal.before - self.zero_um)
+        return Signal(signal.values + more * (signal.values - self.zero_um), before, signal.hold)
+
+
+@register
+class SelfHeating(AbstractEffect):
+    r"""A gain in proportion to the temperature that the piezo's own losses bring about, from cold on.
+
+    .. math:: w_0 + (w - w_0) (1 + b \, \mathrm{LP}_\tau[|u \dot u|] / p_0)
+
+    Attributes
+    ----------
+    gain
+        `b`: relative change of the gain in the end under losses of `p0`.
+    time_constant_s
+        `tau`.
+    reference_V2_per_s
+        `p0`, given.
+    zero_um
+        `w0`, the displacement that stays, given.
+    """
+
+    name: ClassVar[str] = "thermal_gain"
+    form: ClassVar[str] = "self_heating"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("gain",)
+    fingerprint: ClassVar[str] = ThermalGain.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = ThermalGain.confusions
+    experiment: ClassVar[str] = ThermalGain.experiment
+    source: ClassVar[str] = (
+        "Noliac tutorial on heat dissipation: 30 to 70 K; Actuators 10 (2021) 297: amplitude 15 % more at 10 kHz"
+    )
+    gain: Float[Array, ""] = param(unit="1", scale=0.01)
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
+    reference_V2_per_s: Float[Array, ""] = array()
+    zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Time constants in steps of half a decade, from a thirtieth of the record to ten of it."""
+        losses = max(abs(scales.lower_V), abs(scales.upper_V)) * scales.fastest_V_per_s / 2
+        if not losses > 0:
+            return ()
+        grid = decades(max(scales.duration_s / 30, 2e-3), 10 * scales.duration_s, 2)
+        return tuple((cls(jnp.asarray(0.01), jnp.asarray(constant), jnp.asarray(losses)),) for constant in grid)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Scale the displacement."""
+        command = start.command.values
+        if command.shape[0] == 1:
+            return signal
+        losses = jnp.abs(command * rate_of(time_s, command)) / self.reference_V2_per_s
+        # The part before the record was at rest, and cold.
+        heat = lowpass(time_s, losses.at[0].set(0), self.time_constant_s)
+        return Signal(signal.values + self.gain * heat * (signal.values - self.zero_um), signal.before, signal.hold)

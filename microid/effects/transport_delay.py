@@ -1,0 +1,47 @@
+"""Transport delay: the reading is of an earlier instant."""
+
+from typing import Any, ClassVar, Self
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from microid._linear import Times
+from microid._param import param
+from microid._part import AbstractPart, Signal
+from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
+from microid.effects._resample import read_at
+
+
+@register
+class TransportDelay(AbstractEffect):
+    r"""A delay of any length: `y(t - d)`, by cubics through the samples.
+
+    Attributes
+    ----------
+    delay_s
+        `d`.
+    """
+
+    name: ClassVar[str] = "transport_delay"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "time"
+    strength: ClassVar[tuple[str, ...]] = ("delay_s",)
+    fingerprint: ClassVar[str] = (
+        "The residual is minus the velocity times a constant at all amplitudes: the phase falls in a line with the "
+        "frequency, and the magnitude stays."
+    )
+    confusions: ClassVar[tuple[str, ...]] = ("sensor_lowpass", "rate_dependence", "second_resonance")
+    experiment: ClassVar[str] = "A small broadband signal up to several times the first resonance."
+    source: ClassVar[str] = "dead time exp(-s d); 0.05 to 5 ms in controllers, 1 to 20 ms in polled loops (estimate)"
+    delay_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Half the interval between samples."""
+        return ((cls(jnp.asarray(scales.interval_s / 2)),),)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Read the signal as it was before."""
+        when = times_of(time_s, signal.values.shape[0]) - self.delay_s
+        return Signal(read_at(time_s, signal, when), signal.before, signal.hold)
