@@ -310,6 +310,37 @@ def budget(**options: Any) -> None:
     run_budget(**options)
 
 
+@cli.command()
+@click.argument("runs", metavar="RUN.csv [MORE.csv ...]", nargs=-1, required=True)
+@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+@click.option(
+    "--holdout", multiple=True, metavar="FRACTION|FILE", help="What is only predicted, as for fit (default 0.2)."
+)
+@click.option(
+    "--false-alarm", type=float, default=0.01, show_default=True, help="Chance of a cause where there is none."
+)
+@click.option("--duration", type=float, metavar="SECONDS", help="Of the next experiment; as the runs by default.")
+@click.option(
+    "--initial",
+    type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
+    default="unknown",
+    show_default=True,
+    help="Memory before all runs.",
+)
+@_columns
+@_json
+@_quiet
+@_in_sentences
+def diagnose(**options: Any) -> None:
+    """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.
+
+    Writes report.html, diagnosis.json, the plain and the extended stage, and the voltages of the next experiment.
+    """
+    from fits._cli_diagnose import run_diagnose
+
+    run_diagnose(**options)
+
+
 def main() -> None:
     """Run the command."""
     cli(prog_name="microid")

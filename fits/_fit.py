@@ -161,9 +161,9 @@ def fit(
 
 
 def choose_grid(
-    runs: Sequence[Run], levels: int | None, progress: Callable[[str], None]
+    runs: Sequence[Run], levels: int | None, progress: Callable[[str], None], finest: int = LADDER[-1]
 ) -> tuple[float, GridTrial, list[LevelTrial]]:
-    """Fit grids of rising resolution, or of the one given, and keep the one that predicts best.
+    """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
 
     Returns
     -------
@@ -188,15 +188,17 @@ def choose_grid(
         progress(f"{n} levels")
         return _try(gather(Grid(lower, upper, n), runs), runs, stroke, hyper, levels is None)
 
-    tried, trials = _resolve(trial, levels)
+    tried, trials = _resolve(trial, levels, finest)
     return stroke, tried, trials
 
 
-def _resolve(trial: Callable[[int, Hyper], GridTrial], levels: int | None) -> tuple[GridTrial, list[LevelTrial]]:
+def _resolve(
+    trial: Callable[[int, Hyper], GridTrial], levels: int | None, finest: int
+) -> tuple[GridTrial, list[LevelTrial]]:
     """Refine until it no longer pays; the finest that predicts no worse is kept, as its grid is least felt."""
     best = trial(levels or LADDER[0], Hyper.start())
     trials = [LevelTrial(best.data.grid.levels, best.error_um)]
-    for n in LADDER[1:] if levels is None else ():
+    for n in [n for n in LADDER[1:] if n <= finest] if levels is None else ():
         finer = trial(n, best.solution.hyper)
         trials.append(LevelTrial(n, finer.error_um))
         pays = finer.error_um < (1 - _WORTH) * best.error_um

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits._errors import DataError
-from fits._fit import choose_grid
+from fits._fit import LADDER, choose_grid
 from fits._prior import Hyper
 from fits._record import Record, refuse_repeats
 from fits._result import FitError, FitStatus
@@ -158,8 +158,9 @@ def solve_stage(
     initial: str | Sequence[str],
     loss: str,
     progress: Callable[[str], None],
+    finest: int = LADDER[-1],
 ) -> Solution:
-    """Fit a stage; arguments and errors are those of `fit_stage`."""
+    """Fit a stage, on a grid of at most the finest levels; other arguments and errors are those of `fit_stage`."""
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
     if loss not in LOSSES:
@@ -184,7 +185,7 @@ def solve_stage(
             "insert one, or use hold='first'"
         )
     plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold)
-    problem = _start(plan, stage, levels)
+    problem = _start(plan, stage, levels, finest)
     problem, solved, precision = _refine(plan, problem)
     fitted = problem.at(solved)
     return Solution(fitted, problem.chain, solved, precision, problem.stroke_um, range_V, problem.remarks)
@@ -228,7 +229,7 @@ class _Problem:
         return self.chain.stage(jnp.asarray(solved.z), jnp.asarray(solved.columns_um))
 
 
-def _start(plan: _Plan, stage: Stage, levels: int | None) -> _Problem:
+def _start(plan: _Plan, stage: Stage, levels: int | None, finest: int) -> _Problem:
     """Read a hysteresis off the slow runs and poles off the others."""
     speed = [_speed_Hz(record) for record in plan.records]
     slow = [k for k, one in enumerate(speed) if one <= _SLOW * min(speed)]
@@ -252,7 +253,7 @@ def _start(plan: _Plan, stage: Stage, levels: int | None) -> _Problem:
             for record, state in zip(plan.records, plan.states, strict=True)
         ]
         plan.progress(f"hysteresis from {', '.join(plan.records[k].source for k in slow)}")
-        stroke, tried, _ = choose_grid([runs[k] for k in slow], levels, plan.progress)
+        stroke, tried, _ = choose_grid([runs[k] for k in slow], levels, plan.progress, finest)
         grid, hyper = tried.data.grid, tried.solution.hyper
         columns = np.asarray(tried.solution.columns) * stroke
         law = grid.model(columns, np.zeros(()))

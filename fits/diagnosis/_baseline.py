@@ -20,8 +20,8 @@ from fits._stage_run import StageRun, prepare_stage_run
 from fits._stage_solve import prior_precision
 from microid import Preisach, Stage
 
-# Fewer levels than these would leave structure of the density to be taken for an effect; more are slow.
-_LEVELS = 32
+# What a finer grid would follow has a prior of its own in the projection.
+_FINEST = 32
 
 
 class Fixed(eqx.Module):
@@ -55,6 +55,8 @@ class Baseline:
         Prepared; what is held out of each is not fitted.
     aside
         Whole runs that are held out.
+    coarse, coarse_aside
+        The same without steps between the samples: what effects change is seen well enough there.
     dynamic
         Whether driver and mechanics were fitted.
     remarks
@@ -69,6 +71,8 @@ class Baseline:
     range_V: tuple[float, float]
     runs: tuple[StageRun, ...]
     aside: tuple[StageRun, ...]
+    coarse: tuple[StageRun, ...]
+    coarse_aside: tuple[StageRun, ...]
     dynamic: bool
     remarks: tuple[str, ...]
 
@@ -100,14 +104,12 @@ def fit_baseline(
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     remarks: tuple[str, ...] = ()
     try:
-        found = solve_stage(records, None, None, holdout, initial, "squares", progress)
+        found = solve_stage(records, None, None, holdout, initial, "squares", progress, _FINEST)
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
         return _static(records, aside, range_V, holdout, initial, remarks, progress)
     prior = prior_precision(found.chain, found.solved.hyper, found.stroke_um)
-    settings = found.solved.runs[0].samples.stride, 1.0, "first"
-    runs = _prepared(records, range_V, initial, holdout, *settings)
-    held = _prepared(aside, range_V, initial, 0.0, *settings)
+    stride = found.solved.runs[0].samples.stride
     return Baseline(
         found.chain,
         found.solved.z,
@@ -115,23 +117,19 @@ def fit_baseline(
         prior,
         found.stroke_um,
         range_V,
-        runs,
-        held,
+        _prepared(records, range_V, initial, holdout, stride),
+        _prepared(aside, range_V, initial, 0.0, stride),
+        _prepared(records, range_V, initial, holdout, 1),
+        _prepared(aside, range_V, initial, 0.0, 1),
         True,
         found.remarks,
     )
 
 
 def _prepared(
-    records: Sequence[Record],
-    range_V: tuple[float, float],
-    initial: str,
-    holdout: float,
-    stride: int,
-    gain: float,
-    hold,
+    records: Sequence[Record], range_V: tuple[float, float], initial: str, holdout: float, stride: int
 ) -> tuple[StageRun, ...]:
-    return tuple(prepare_stage_run(record, range_V, initial, holdout, stride, gain, hold) for record in records)
+    return tuple(prepare_stage_run(record, range_V, initial, holdout, stride) for record in records)
 
 
 def _static(
@@ -144,15 +142,14 @@ def _static(
     progress: Callable[[str], None],
 ) -> Baseline:
     runs = [prepare_run(record, *range_V, initial, holdout) for record in records]
-    stroke, tried, _ = choose_grid(runs, None, progress)
+    stroke, tried, _ = choose_grid(runs, None, progress, _FINEST)
     grid = tried.data.grid
     columns = np.asarray(tried.solution.columns) * stroke
     stage = Stage.of(hysteresis=grid.model(columns, np.zeros(())))
     chain = Chain(Fixed(stage), 0, grid)  # type: ignore[arg-type]
     prior = np.asarray(roughness(grid.levels).precision(tried.solution.hyper)) / stroke**2
-    ready = _prepared(records, range_V, initial, holdout, 1, 1.0, "first")
-    held = _prepared(aside, range_V, initial, 0.0, 1, 1.0, "first")
-    return Baseline(chain, np.zeros(0), columns, prior, stroke, range_V, ready, held, False, remarks)
+    ready, held = _prepared(records, range_V, initial, holdout, 1), _prepared(aside, range_V, initial, 0.0, 1)
+    return Baseline(chain, np.zeros(0), columns, prior, stroke, range_V, ready, held, ready, held, False, remarks)
 
 
 def columns_in(stage: Stage) -> np.ndarray:

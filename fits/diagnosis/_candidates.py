@@ -1,13 +1,13 @@
 """The effects that records can be asked about, and what each would change in them."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._evaluate import Prepared, prepare, respond_again, signals, with_effects
-from microid import EFFECTS, AbstractEffect, Mechanics, Scales, Signal, Stage, host
+from fits.diagnosis._evaluate import Prepared, columns_of_record, prepare, respond_again, signals, with_effects
+from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host
 
 # Strength at which an effect's derivative is taken, as a share of that of its probe.
 _STEP = 1e-2
@@ -27,7 +27,7 @@ class Bench:
     def __init__(self, baseline: Baseline, aside: bool = False):
         self.baseline = baseline
         self.stage = baseline.stage.with_substeps(1)
-        runs = baseline.aside if aside else baseline.runs
+        runs = baseline.coarse_aside if aside else baseline.coarse
         self.prepared = [prepare(self.stage, run) for run in runs]
         self.known = [signals(self.stage, one) for one in self.prepared]
         self.plain = [self._out(known[-1], one) for known, one in zip(self.known, self.prepared, strict=True)]
@@ -76,25 +76,26 @@ class Probe:
         return self.effects[0].name
 
 
-def scales_of(baseline: Baseline, noise_um: float) -> Scales:
+def scales_of(bench: Bench, noise_um: float) -> Scales:
     """Measure how large things are in the runs."""
+    baseline, plain = bench.baseline, bench.plain
     records = [run.record for run in baseline.runs]
     stage = baseline.stage
     mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
     fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
     columns = {}
     for run in baseline.runs:
-        from fits.diagnosis._evaluate import columns_of_record
-
         for name, values in columns_of_record(run).items():
             columns.setdefault(name, (float(np.mean(values)), float(np.ptp(values))))
     return Scales(
         lower_V=baseline.range_V[0],
         upper_V=baseline.range_V[1],
         fastest_V_per_s=fastest,
-        stroke_um=baseline.stroke_um,
+        stroke_um=float(max(p.max() for p in plain) - min(p.min() for p in plain)),
+        middle_um=float(max(p.max() for p in plain) + min(p.min() for p in plain)) / 2,
         interval_s=min(float(np.median(np.diff(r.time_s))) for r in records),
         duration_s=max(r.duration_s for r in records),
+        shortest_s=min(r.duration_s for r in records),
         noise_um=noise_um,
         resonance_Hz=float(mechanics[0].natural_frequency_Hz) if mechanics else None,
         columns=tuple((name, *value) for name, value in columns.items()),
@@ -107,8 +108,6 @@ def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
     if form.fast and not baseline.dynamic:
         return "the runs do not show the dynamics"
     for name in form.needs:
-        from fits.diagnosis._evaluate import columns_of_record
-
         if not all(name in columns_of_record(run) for run in baseline.runs):
             return f"the runs lack a column {name} that varies"
     try:
@@ -126,7 +125,8 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
     for group in form.probes(scales, inner):
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
-            change = bench.change([effect])
+            share = 1.0 if form.finite else _STEP
+            change = [c / share for c in bench.change([_scaled(effect, share)])]
             if form.per_run and len(change) > 1:
                 for k in range(len(change)):
                     columns.append(tuple(c if i == k else np.zeros_like(c) for i, c in enumerate(change)))
@@ -134,6 +134,12 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
                 columns.append(tuple(change))
         if all(np.all(np.isfinite(c)) for column in columns for c in column):
             yield Probe(tuple(group), tuple(columns), one_sided(form))
+
+
+def _scaled(effect: AbstractEffect, share: float) -> AbstractEffect:
+    if share == 1.0 or not effect.strength:
+        return effect
+    return replace(effect, **{name: share * getattr(effect, name) for name in effect.strength})
 
 
 def one_sided(form: type[AbstractEffect]) -> bool:

@@ -21,10 +21,13 @@ class Noise:
         Standard deviation of what is new in every sample.
     past
         Coefficients of the autoregression, shape `(order,)`; empty for white noise.
+    spread
+        Factor by which a sample is noisier than that, shape `(n,)`; None where all are alike.
     """
 
     innovation_um: float
     past: np.ndarray
+    spread: np.ndarray | None = None
 
     @property
     def total_um(self) -> float:
@@ -39,6 +42,8 @@ class Noise:
         """Turn noise into independent numbers of variance one, along the first axis."""
         if len(self.past):
             values = lfilter(np.r_[1.0, -self.past], [1.0], values, axis=0)
+        if self.spread is not None:
+            values = values / self.spread.reshape(-1, *(1,) * (values.ndim - 1))
         return values / self.innovation_um
 
 

@@ -1,5 +1,6 @@
 """Effects fitted to what the baseline leaves, the baseline following along its tangent."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -32,8 +33,10 @@ class Law:
         self.maps = [Coordinates(effect, _own) for effect in effects]
         vectors = [np.asarray(one.of(effect)) for one, effect in zip(self.maps, effects, strict=True)]
         names = [info.path for info in self.maps[0].table]
-        strength = np.array([name in self.form.strength for name in names], dtype=bool)
-        self.each = strength if self.form.per_run and len(effects) > 1 else np.zeros(len(names), dtype=bool)
+        strength = np.concatenate(
+            [np.full(math.prod(info.shape), info.path in self.form.strength) for info in self.maps[0].table]
+        )
+        self.each = strength if self.form.per_run and len(effects) > 1 else np.zeros(len(strength), dtype=bool)
         self.names = tuple(names)
         self.start = np.concatenate([vectors[0][~self.each], *(v[self.each] for v in vectors if self.each.any())])
         if not self.each.any():
@@ -69,11 +72,11 @@ def law_of(scored: Scored, runs: int) -> Law:
         values = {}
         for name in form.strength:
             spec = next(i.spec for i in Coordinates(first, _own).table if i.path == name)
-            total = 0.0
+            total = np.zeros(np.shape(getattr(first, name)))
             for k, effect in enumerate(scored.probe.effects):
                 share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]
-                total += float(share) * float(getattr(effect, name))
-            values[name] = jnp.asarray(float(np.clip(total, spec.lower, spec.upper)))
+                total = total + float(share) * np.asarray(getattr(effect, name))
+            values[name] = jnp.asarray(np.clip(total, spec.lower, spec.upper))
         effects.append(replace(first, **values) if values else first)
     return Law(effects)
 

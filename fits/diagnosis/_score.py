@@ -10,6 +10,8 @@ from fits.diagnosis._candidates import Probe
 from fits.diagnosis._projector import Projector
 
 _DRAWS = 2000
+# Share of a signature that must be left for the records to show it at all.
+_BLIND = 0.003
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,9 @@ def score(projector: Projector, probe: Probe, residual: np.ndarray) -> Scored:
     columns = projector.off(joined)
     z, coefficients, drop = evidence(columns, residual, probe.positive)
     left = float(np.linalg.norm(columns) / raw) if raw > 0 else 0.0
+    if left < _BLIND:
+        # What the baseline follows but for rounding cannot be asked about.
+        return Scored(probe, np.zeros_like(columns), 0.0, np.zeros_like(coefficients), 0.0, left)
     return Scored(probe, columns, z, coefficients, drop, left)
 
 
@@ -60,7 +65,8 @@ def rescore(scored: Scored, basis: np.ndarray, residual: np.ndarray) -> Scored:
     columns = scored.columns - basis @ (basis.T @ scored.columns)
     z, coefficients, drop = evidence(columns, residual, scored.probe.positive)
     raw = np.linalg.norm(scored.columns) / max(scored.share_left, 1e-300)
-    return Scored(scored.probe, columns, z, coefficients, drop, float(np.linalg.norm(columns) / raw))
+    left = float(np.linalg.norm(columns) / raw) if raw > 0 else 0.0
+    return Scored(scored.probe, columns, z, coefficients, drop, left)
 
 
 def evidence(columns: np.ndarray, residual: np.ndarray, positive: bool) -> tuple[float, np.ndarray, float]:

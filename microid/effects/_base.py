@@ -28,12 +28,14 @@ class Scales:
         Range of the command.
     fastest_V_per_s
         Largest rate of the command.
-    stroke_um
-        Range of the displacement.
+    stroke_um, middle_um
+        Range of the displacement of the plain stage, and its middle.
     interval_s
         Shortest time between two samples.
     duration_s
         Duration of the longest record.
+    shortest_s
+        Duration of the shortest, which shows the dynamics if any does.
     noise_um
         What the plain stage leaves, standard deviation.
     resonance_Hz
@@ -46,8 +48,10 @@ class Scales:
     upper_V: float
     fastest_V_per_s: float
     stroke_um: float
+    middle_um: float
     interval_s: float
     duration_s: float
+    shortest_s: float
     noise_um: float
     resonance_Hz: float | None = None
     columns: tuple[tuple[str, float, float], ...] = ()
@@ -74,6 +78,8 @@ class AbstractEffect(AbstractPart):
         Whether it is only seen in records that show the dynamics.
     per_run
         Whether it differs from record to record, as a drift does.
+    finite
+        Whether it must be tried at its full size, because at zero it has no derivative, or none that says much.
     fingerprint
         What it leaves in the residual of the plain stage, one sentence.
     confusions
@@ -95,6 +101,7 @@ class AbstractEffect(AbstractPart):
     needs: ClassVar[tuple[str, ...]] = ()
     fast: ClassVar[bool] = False
     per_run: ClassVar[bool] = False
+    finite: ClassVar[bool] = False
 
     @classmethod
     @abc.abstractmethod

@@ -31,6 +31,7 @@ class Backlash(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "mechanics"
     strength: ClassVar[tuple[str, ...]] = ("half_gap_um",)
+    finite: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "The displacement stays for a while after every reversal, however small the loop, and small oscillations are "
         "lost."

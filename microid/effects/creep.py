@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,6 +14,8 @@ from microid.effects._base import AbstractEffect, Place, Scales, lowpass, regist
 
 # Relaxations per decade, and the decades that they cover.
 _PER_DECADE, _DECADES = 2, 6
+# Relaxations whose time constants begin at t0 run ahead of log10(1 + t / t0) by Euler's constant.
+_AHEAD = float(np.exp(np.euler_gamma))
 
 
 @register
@@ -58,9 +61,9 @@ class Creep(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a displacement that was at rest."""
         moved = signal.values - signal.before
-        total = jnp.zeros_like(moved)
-        for step in range(_DECADES * _PER_DECADE):
-            total = total + lowpass(time_s, moved, self.onset_s * 10 ** ((step + 0.5) / _PER_DECADE))
+        steps = (np.arange(_DECADES * _PER_DECADE) + 0.5) / _PER_DECADE
+        constants = _AHEAD * self.onset_s * jnp.asarray(10**steps, dtype=moved.dtype)
+        total = jnp.sum(jax.vmap(lambda constant: lowpass(time_s, moved, constant))(constants), axis=0)
         return Signal(signal.values + self.gain_per_decade / _PER_DECADE * total, signal.before, signal.hold)
 
 

@@ -35,6 +35,7 @@ class DriverSaturation(AbstractEffect):
     gives: ClassVar[str] = "V"
     place: ClassVar[Place] = "driver"
     strength: ClassVar[tuple[str, ...]] = ()
+    finite: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "The displacement is flat beyond a level of the command, and after it as though it had turned at that level."
     )
@@ -76,6 +77,7 @@ class LowerDriverSaturation(AbstractEffect):
     gives: ClassVar[str] = "V"
     place: ClassVar[Place] = "driver"
     strength: ClassVar[tuple[str, ...]] = ()
+    finite: ClassVar[bool] = True
     fingerprint: ClassVar[str] = DriverSaturation.fingerprint
     confusions: ClassVar[tuple[str, ...]] = DriverSaturation.confusions
     experiment: ClassVar[str] = DriverSaturation.experiment

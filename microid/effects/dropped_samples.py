@@ -33,6 +33,7 @@ class DroppedSamples(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "time"
     strength: ClassVar[tuple[str, ...]] = ("dropped_s",)
+    finite: ClassVar[bool] = True
     per_run: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "The residual is the velocity times a factor that jumps by whole intervals between samples."

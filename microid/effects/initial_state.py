@@ -30,6 +30,7 @@ class InitialState(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("excess_V",)
+    finite: ClassVar[bool] = True
     per_run: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "The residual lasts until the voltage first exceeds all before, and is gone from there on."

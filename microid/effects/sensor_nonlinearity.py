@@ -46,10 +46,10 @@ class SensorNonlinearity(AbstractEffect):
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
-        """One group: a parabola and a cubic, with the centre at half the stroke."""
-        half = jnp.asarray(scales.stroke_um / 2)
+        """One group: a parabola and a cubic, about the middle of the stroke."""
+        half, middle = jnp.asarray(scales.stroke_um / 2), jnp.asarray(scales.middle_um)
         none, some = jnp.asarray(0.0), jnp.asarray(1e-3)
-        return ((cls(some, none, half, half), cls(none, some, half, half)),)
+        return ((cls(some, none, middle, half), cls(none, some, middle, half)),)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Bend the reading."""

@@ -32,6 +32,7 @@ class SlewLimit(AbstractEffect):
     gives: ClassVar[str] = "V"
     place: ClassVar[Place] = "driver"
     strength: ClassVar[tuple[str, ...]] = ()
+    finite: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "The residual appears only in large fast moves, as triangles in time that last in proportion to the height "
         "of the step."

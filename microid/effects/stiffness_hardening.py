@@ -62,7 +62,10 @@ class StiffnessHardening(AbstractEffect):
         if scales.resonance_Hz is None or inner is None:
             return ()
         half, size = scales.stroke_um / 2, jnp.asarray(0.002)
-        return tuple((cls(inner, size, jnp.asarray(share * half), jnp.asarray(half)),) for share in (0.0, 1.0, 2.0))
+        return tuple(
+            (cls(inner, size, jnp.asarray(scales.middle_um + share * half), jnp.asarray(half)),)
+            for share in (-1.0, 0.0, 1.0)
+        )
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Let the mechanics answer to what the cubic leaves of the piezo's displacement."""

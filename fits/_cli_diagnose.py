@@ -1,0 +1,157 @@
+"""The command `microid diagnose`: the work."""
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fits._atomic import atomic_path, write_csv
+from fits._cli_files import fraction_or_files, keep_inputs, progress_to_stderr
+from fits._cli_jax import start_jax
+from fits._errors import DataError
+from fits._read_csv import read_csv, read_runs
+from fits._result import FitError
+from fits._units import parse_columns
+
+if TYPE_CHECKING:
+    from fits.diagnosis._result import Diagnosis, EffectParameter
+
+_REPORT, _JSON, _BASELINE, _EXTENDED = "report.html", "diagnosis.json", "baseline.json", "extended.json"
+_PROGRAM = "next_experiment.csv"
+_FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
+
+
+def run_diagnose(
+    *,
+    runs: Sequence[str],
+    out: str,
+    holdout: Sequence[str],
+    false_alarm: float,
+    duration: float | None,
+    initial: str,
+    columns: str,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Do `microid diagnose`; the options are the command's."""
+    if not 0 < false_alarm <= 0.5:
+        raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {false_alarm:g}.")
+    if duration is not None and not (math.isfinite(duration) and duration > 0):
+        raise DataError(f"--duration: expected a time above 0 in s, found {duration:g}.")
+    mapping = parse_columns(columns)
+    fraction, files = fraction_or_files(holdout)
+    for name in _FILES:
+        keep_inputs(os.path.join(out, name), [*runs, *files])
+    # Before the work, so that a place that cannot be written to is refused before the wait.
+    _check_folder(out)
+    start_jax()
+    progress = progress_to_stderr(quiet)
+    records = read_runs(runs, mapping)
+    aside = [read_csv(file, mapping) for file in files]
+    # Not before the files are read: this takes as long as all that.
+    from fits.diagnosis._diagnose import diagnose
+
+    try:
+        diagnosis: Diagnosis = diagnose(
+            records,
+            holdout=aside or fraction,
+            false_alarm=false_alarm,
+            duration_s=duration,
+            initial=initial,
+            progress=progress,
+        )
+    except FitError as error:
+        raise DataError(f"{error}.") from error
+    if not aside and fraction == 0 and not any("held out" in remark for remark in diagnosis.remarks):
+        words = "Nothing was held out, so what the extension is worth on new data is not known; leave out --holdout."
+        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, words))
+    progress("writing")
+    from fits.diagnosis._json import diagnosis_json
+
+    content = diagnosis_json(diagnosis)
+    places = _write(diagnosis, content, out)
+    if as_json:
+        click.echo(json.dumps({"out": out, "files": places, **content}, indent=1, allow_nan=False))
+    else:
+        click.echo("\n".join([*_lines(diagnosis), "", *places]))
+
+
+def _check_folder(out: str) -> None:
+    """Refuse a folder that cannot be written to, or made."""
+    target = Path(os.path.realpath(out))
+    anchor = next(place for place in (target, *target.parents) if place.exists())
+    if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
+        raise DataError(f"{out}: expected a folder that can be written to; choose another for --out.")
+
+
+def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[str]:
+    """Write all files: first under temporary names, then each is renamed; their names come back."""
+    from fits._model_file import model_text
+    from fits.diagnosis._report import report_html
+
+    def model(which: str) -> str:
+        stage = diagnosis.baseline if which == "baseline" else diagnosis.extended
+        # What is not known is not in the file.
+        uncertainty: Any = diagnosis.details.get(f"{which}_uncertainty")
+        try:
+            return model_text(stage, uncertainty, {"part_of": "diagnosis", "stage": which})
+        except DataError as error:
+            raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error
+
+    # All are composed before the first is written.
+    texts = {
+        _REPORT: report_html(diagnosis),
+        _JSON: json.dumps(content, indent=1, allow_nan=False) + "\n",
+        _BASELINE: model("baseline"),
+        _EXTENDED: model("extended"),
+    }
+    ahead = diagnosis.next_experiment
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            for name, text in texts.items():
+                stack.enter_context(atomic_path(folder / name)).write_text(text, encoding="utf-8")
+            if ahead is not None:
+                unfinished = stack.enter_context(atomic_path(folder / _PROGRAM))
+                write_csv(unfinished, {"time_s": ahead.time_s, "voltage_V": ahead.voltage_V})
+        if ahead is None:
+            # One of an earlier diagnosis would pass for this one's.
+            (folder / _PROGRAM).unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(f"{out}: cannot be written ({error.strerror or error}); choose another for --out.") from error
+    return [str(folder / name) for name in (*texts, *([_PROGRAM] if ahead is not None else []))]
+
+
+def _lines(diagnosis: "Diagnosis") -> list[str]:
+    """What a terminal shows: the verdict, the causes with their parameters, and the gain."""
+    found = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
+    lines = [f"{found[diagnosis.verdict]}; noise {diagnosis.noise_um:.3g} um, {diagnosis.noise_source}"]
+    for cause in diagnosis.causes:
+        also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
+        lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {cause.p_family:.1g}")
+        if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
+            lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
+        lines += [_parameter(each) for each in cause.parameters]
+    if diagnosis.verdict == "unexplained":
+        lines.append(f"  unexplained: {diagnosis.unexplained_rms_um:.3g} um")
+    gain = diagnosis.gain
+    if math.isfinite(gain.heldout_rms_before_um):
+        line = f"error on held-out data: {gain.heldout_rms_before_um:.3g} um"
+        if diagnosis.causes and math.isfinite(gain.heldout_rms_after_um):
+            line += f" without, {gain.heldout_rms_after_um:.3g} um with what was found"
+        lines.append(line)
+    if diagnosis.next_experiment is not None:
+        lines.append(f"next experiment: {diagnosis.next_experiment.purpose}")
+    return [*lines, *(f"Note: {remark}" for remark in diagnosis.remarks)]
+
+
+def _parameter(parameter: "EffectParameter") -> str:
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    return f"    {parameter.name:24} {parameter.value:.4g} +- {parameter.sd:.2g}{unit}"

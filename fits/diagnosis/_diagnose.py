@@ -1,0 +1,287 @@
+"""From records to a diagnosis: what is wrong, why, and what is gained by adding it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from scipy import stats
+
+from fits._errors import DataError
+from fits._record import Record, refuse_repeats
+from fits._stage_run import simulate_stage
+from fits.diagnosis._baseline import Baseline, fit_baseline
+from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
+from fits.diagnosis._extend import Compared, corrected, extended_stage, feedforward, gain_of, left_of, shared_effects
+from fits.diagnosis._faults import Faults, find_faults, name_faults
+from fits.diagnosis._projector import Noise, Projector, learn_roughness
+from fits.diagnosis._refit import Refit, nothing, refit
+from fits.diagnosis._regression import Regression, regress
+from fits.diagnosis._result import Bound, Diagnosis, Gain, RunView, Test
+from fits.diagnosis._select import Selection, best_of, select
+from fits.diagnosis._structure import cycles, look, together, views
+from fits.diagnosis._tell import bounds, causes_of
+from microid import EFFECTS
+
+# A cause explains at least this part of what is reproducible, or it is none.
+_SHARE = 0.2
+# What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
+_REST, _CHANCE = 0.3, 1e-6
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All that scores and fits need: the fitted baseline, its regression, noise and probes."""
+
+    baseline: Baseline
+    regression: Regression
+    bench: Bench
+    projector: Projector
+    probes: tuple[Probe, ...]
+    faults: Faults
+    skipped: tuple[tuple[str, str], ...]
+
+
+def diagnose(
+    records: Sequence[Record],
+    *,
+    holdout: float | Sequence[Record] = 0.2,
+    false_alarm: float = 0.01,
+    duration_s: float | None = None,
+    initial: str = "unknown",
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Diagnosis:
+    """Say what the simulation of a stage gets wrong, name the cause, extend the model and measure the gain.
+
+    The plain stage is fitted to all runs. Each effect of `microid.EFFECTS` is then asked for by a score test: its
+    signature in these very runs, projected off everything that the re-fitted stage can follow. The leaders are fitted
+    jointly with the stage, one cause at a time, until chance explains the rest.
+
+    Parameters
+    ----------
+    records
+        Runs of one rig, slow and fast ones together.
+    holdout
+        Fraction at the end of every run that is only predicted, or records that are.
+    false_alarm
+        Probability of naming a cause where there is none.
+    duration_s
+        Length of the experiment that is suggested next; that of the longest run by default.
+    initial
+        Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`.
+    seed
+        Of the draws that calibrate the false alarms.
+    progress
+        Told what is being done, a sentence at a time.
+
+    Returns
+    -------
+    Diagnosis
+        Its verdict is `no_effect`, `effect_found` or `unexplained`.
+
+    Raises
+    ------
+    DataError
+        If the records cannot be diagnosed.
+    FitError
+        If the plain stage cannot be fitted: there is nothing to diagnose then.
+    RuntimeError
+        If JAX computes in single precision.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
+    if not records:
+        raise DataError("there is no record to diagnose")
+    if not 0 < false_alarm <= 0.5:
+        raise DataError(f"the probability of a false alarm is {false_alarm:g}: choose it above 0 and up to 0.5")
+    aside = () if isinstance(holdout, int | float) else tuple(holdout)
+    fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
+    if not 0 <= fraction <= 0.9:
+        raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
+    refuse_repeats([*records, *aside])
+    rng = np.random.default_rng(seed)
+    ready = prepare_diagnosis(records, aside, fraction, initial, progress)
+    progress("asking for every effect")
+    found = select(ready.bench, ready.projector, ready.probes, false_alarm, rng, progress)
+    return _conclude(ready, found, records, false_alarm, initial, fraction, progress, duration_s)
+
+
+def prepare_diagnosis(
+    records: Sequence[Record],
+    aside: Sequence[Record],
+    fraction: float,
+    initial: str,
+    progress: Callable[[str], None],
+) -> Prepared:
+    """Fit the plain stage, learn the noise, and simulate every probe of every effect."""
+    progress("fitting the plain stage")
+    baseline = fit_baseline(records, aside, fraction, initial, progress)
+    progress("reading the noise")
+    regression = regress(baseline)
+    faults = find_faults(regression)
+    if faults.repaired:
+        progress("fitting the plain stage again, without single bad samples")
+        baseline = fit_baseline(faults.clean(records), aside, fraction, initial, progress)
+        regression = regress(baseline)
+        faults = replace(find_faults(regression), spikes=faults.spikes, heights_um=faults.heights_um)
+    progress("simulating every effect")
+    bench = Bench(baseline)
+    probes: list[Probe] = []
+    skipped = []
+    scales = scales_of(bench, min(noise.total_um for noise in faults.noise))
+    for form in EFFECTS:
+        reason = applicable(baseline, form)
+        if reason is not None:
+            skipped.append((form.name, reason))
+            continue
+        own = list(probes_of(bench, form, scales))
+        if not own:
+            skipped.append((form.name, "the runs are too short or too plain to show it"))
+        probes += own
+    progress("learning how rough the density is")
+    signatures = [column for probe in probes for column in probe.signatures]
+    rough = learn_roughness(Projector(regression, faults.noise), signatures)
+    projector = Projector(regression, faults.noise, rough)
+    return Prepared(baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
+
+
+def _conclude(
+    ready: Prepared,
+    found: Selection,
+    records: Sequence[Record],
+    false_alarm: float,
+    initial: str,
+    fraction: float,
+    progress: Callable[[str], None],
+    duration_s: float | None,
+) -> Diagnosis:
+    projector, bench, baseline = ready.projector, ready.bench, ready.baseline
+    ways = views(baseline.runs, bench.plain)
+    none = np.zeros((len(found.plain.residual), 0))
+    seen = look(projector, none, found.plain.residual, ways)
+    # What all ways of looking and the causes explain together is what there is to be explained.
+    reproducible, freedom = together(projector, none, found.plain.residual, ways)
+    explained = found.plain.cost - found.model.cost
+    rest, rest_freedom = together(projector, found.model.basis(), found.model.residual, ways)
+    period_um, cycle_z, cycle_drop = cycles(projector, found.model.residual, bench.plain)
+    rest = max(rest, cycle_drop)
+    misfit = max(explained + max(rest - rest_freedom, 0.0), explained, 1e-300)
+    rest_share = (max(rest - rest_freedom, 0.0) / projector.count) ** 0.5
+    noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in ready.faults.noise])))
+    chance = stats.chi2.sf(rest, rest_freedom)
+    left_over = rest_share > _REST and chance < _CHANCE
+    share = explained / misfit
+    model = found.model
+    kept = found.causes if share >= _SHARE else ()
+    if not kept:
+        model = found.plain
+    faults = name_faults(ready.faults, projector, model, false_alarm)
+    causes = causes_of(kept, model, projector, bench, misfit, faults, ready.faults)
+    verdict = "effect_found" if causes else "unexplained" if left_over else "no_effect"
+    progress("extending the stage")
+    extended, compared, effects = _extended(ready, model if kept else None, records, initial, fraction, progress)
+    source = "the last part of each run" if not baseline.aside else "whole runs"
+    gain = gain_of(compared, noise_um, source)
+    if effects:
+        before, after = feedforward(bench, effects)
+        gain = replace(gain, feedforward_before_um=before, feedforward_after_um=after)
+    names = {cause.name for cause in causes} | {n for cause in causes for n in cause.also_consistent}
+    tests = tuple(
+        Test(
+            one.view.name,
+            one.z,
+            one.p,
+            max(one.drop - one.freedom, 0.0) / max(found.plain.cost, 1e-300),
+            one.view.sentence,
+        )
+        for one in seen
+    )
+    substeps = baseline.runs[0].samples.stride
+    return Diagnosis(
+        verdict=verdict,  # type: ignore[arg-type]
+        noise_um=noise_um,
+        noise_source=ready.faults.source,
+        noise_samples=1.0,
+        causes=causes,
+        unexplained_rms_um=rest_share * noise_um if left_over else 0.0,
+        upper_bounds=bounds(found, ready, names),
+        tests=tests,
+        gain=gain,
+        next_experiment=None,
+        remarks=(*baseline.remarks, *ready.faults.remarks),
+        baseline=baseline.stage.with_substeps(substeps),
+        extended=extended,
+        runs=tuple(
+            RunView(
+                one.run.record.source,
+                np.asarray(one.run.record.time_s),
+                np.asarray(one.run.record.voltage_V),
+                one.run.displacement_um,
+                one.before_um,
+                one.after_um,
+                ~one.held_out & one.run.known,
+            )
+            for one in compared
+        ),
+        false_alarm=false_alarm,
+        details={
+            "selection": found,
+            "ready": ready,
+            "cycles": (period_um, cycle_z),
+            "rest": rest_share,
+            "share": share,
+        },
+    )
+
+
+def _extended(
+    ready: Prepared,
+    model: Refit | None,
+    records: Sequence[Record],
+    initial: str,
+    fraction: float,
+    progress: Callable[[str], None],
+) -> tuple:
+    """Fit the plain stage again to what the effects leave, and the effects again beside it."""
+    baseline = ready.baseline
+    substeps = baseline.runs[0].samples.stride
+    runs = len(baseline.runs)
+    if model is None or not model.laws:
+        return baseline.stage.with_substeps(substeps), _compare(ready, ready.bench, None, ready.regression), []
+    clean = ready.faults.clean(records)
+    again = fit_baseline(
+        corrected(clean, model.change_um), [r.record for r in baseline.aside], fraction, initial, progress
+    )
+    # Measured again, not corrected: only the stage is new.
+    again = replace(
+        again,
+        runs=tuple(replace(run, record=old.record) for run, old in zip(again.runs, baseline.runs, strict=True)),
+        coarse=tuple(replace(run, record=old.record) for run, old in zip(again.coarse, baseline.coarse, strict=True)),
+    )
+    regression, bench = regress(again), Bench(again)
+    better = refit(bench, Projector(regression, ready.projector.noise), model.laws, model.x)
+    effects = shared_effects(better, runs)
+    substeps = again.runs[0].samples.stride
+    return extended_stage(again, effects, substeps), _compare(ready, bench, better, regression), effects
+
+
+def _compare(ready: Prepared, bench: Bench, model: Refit | None, regression: Regression) -> list[Compared]:
+    """Residuals of the plain stage and of the extended one in all runs, those held out whole last."""
+    runs = len(bench.prepared)
+    change = [np.zeros_like(plain) for plain in bench.plain] if model is None else model.change_um
+    found = []
+    for k, run in enumerate(ready.baseline.runs):
+        plain = run.displacement_um - ready.regression.residuals[k]
+        better = run.displacement_um - regression.residuals[k] + change[k]
+        own, using = ready.regression.own[k], run.fitted
+        found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), run.held_out))
+    if ready.baseline.aside:
+        shared = shared_effects(model, runs) if model is not None else []
+        behind = Bench(bench.baseline, aside=True)
+        for k, (run, change_um) in enumerate(zip(ready.baseline.aside, behind.change(shared), strict=True)):
+            plain = simulate_stage(ready.baseline.stage, run)
+            better = simulate_stage(bench.baseline.stage, bench.baseline.aside[k]) + change_um
+            own, using = np.ones((len(run.record), 1)), run.known
+            found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), using))
+    return found

@@ -1,0 +1,155 @@
+"""Faults of samples and noise: spikes, last digits, jitter and narrow bands, which no change of the mean explains."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fits._record import Record
+from fits.diagnosis._floor import floor_of, jitter_s, line_of, quantum_um, rough_noise_um, spikes
+from fits.diagnosis._projector import Noise, Projector
+from fits.diagnosis._refit import Refit
+from fits.diagnosis._regression import Regression
+
+# So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
+_SPIKES, _PART = 3, 0.3
+_JITTER_Z, _LINE_Z = 8.0, 60.0
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What is wrong with samples, and what the noise is.
+
+    Attributes
+    ----------
+    noise
+        Of each run.
+    source
+        What it was learnt from, in words.
+    spikes
+        Bad samples of each run, shape `(n,)`.
+    heights_um
+        How far off they are, shape `(n,)`.
+    quantum_um
+        Last digit of the sensor, the largest of all runs; 0 for none.
+    jitter_s, jitter_z
+        Jitter of the instants of sampling, and its evidence.
+    line_Hz, line_um, line_z
+        Strongest narrow band, its size, and its evidence.
+    remarks
+        What the user should know, one sentence each.
+    """
+
+    noise: tuple[Noise, ...]
+    source: str
+    spikes: tuple[np.ndarray, ...]
+    heights_um: tuple[np.ndarray, ...]
+    quantum_um: float
+    jitter_s: float
+    jitter_z: float
+    line_Hz: float
+    line_um: float
+    line_z: float
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def repaired(self) -> bool:
+        """Whether there are enough spikes to be taken out."""
+        return sum(int(s.sum()) for s in self.spikes) >= _SPIKES
+
+    def clean(self, records: Sequence[Record]) -> list[Record]:
+        """Take the spikes out of records."""
+        if not self.repaired:
+            return list(records)
+        out = []
+        for record, height in zip(records, self.heights_um, strict=True):
+            assert record.displacement_um is not None
+            out.append(replace(record, displacement_um=record.displacement_um - height, extra=dict(record.extra)))
+        return out
+
+
+def find_faults(regression: Regression) -> Faults:
+    """Look at what a fitted plain stage leaves of each run, sample by sample."""
+    baseline = regression.baseline
+    guess = [
+        Noise(max(rough_noise_um(r[m]), 1e-9 * baseline.stroke_um), np.zeros(0))
+        for r, m in zip(regression.residuals, regression.masks, strict=True)
+    ]
+    projector = Projector(regression, guess)
+    dz, dw = projector.step(projector.residual)
+    noise, found, heights, idle, jitters, lines = [], [], [], [], [], []
+    for run, rows, own, residual in zip(
+        baseline.runs, regression.rows, regression.own, regression.residuals, strict=True
+    ):
+        moved = residual - rows @ np.concatenate([dw, dz])
+        mask = run.fitted
+        free = np.linalg.lstsq(own[mask], moved[mask], rcond=None)[0]
+        left = moved - own @ free
+        bad = spikes(run, left)
+        smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
+        found.append(bad)
+        heights.append(np.where(bad, left - smooth, 0.0))
+        floor = floor_of(run, smooth)
+        noise.append(floor.noise)
+        idle.append(floor.idle)
+        rate = np.gradient(run.displacement_um - left, run.record.time_s)
+        size, z = jitter_s(smooth[mask], rate[mask])
+        jitters.append((z, size, np.abs(rate)))
+        interval = float(np.median(np.diff(run.record.time_s)))
+        lines.append(line_of(smooth[mask], interval))
+    z, size, _ = max(jitters, key=lambda j: j[0])
+    if z > _JITTER_Z:
+        noise = [
+            replace(n, spread=np.sqrt(1 + (size * rate / n.innovation_um) ** 2))
+            for n, (_, _, rate) in zip(noise, jitters, strict=True)
+        ]
+    quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
+    line = max(lines, key=lambda one: one[2])
+    source = (
+        "idle stretches of the runs"
+        if all(idle)
+        else "the fastest changes of the residual, as if it were white"
+        if not any(idle)
+        else "idle stretches where there are any, and the fastest changes of the residual elsewhere"
+    )
+    return Faults(
+        tuple(noise), source, tuple(found), tuple(heights), quantum, size if z > _JITTER_Z else 0.0, z, *line
+    )
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of samples or noise that is a cause of its own."""
+
+    name: str
+    z: float
+    parameters: tuple[tuple[str, float, float, str], ...]
+    variance_um2: float
+
+
+def name_faults(faults: Faults, projector: Projector, model: Refit, false_alarm: float) -> list[Fault]:
+    """Which of them explain enough of what is left to be named."""
+    found = []
+    total = float(np.mean([n.total_um**2 for n in faults.noise]))
+    count = sum(int(s.sum()) for s in faults.spikes)
+    samples = sum(len(s) for s in faults.spikes)
+    if count >= _SPIKES:
+        heights = np.concatenate([h[s] for h, s in zip(faults.heights_um, faults.spikes, strict=True)])
+        size = float(np.sqrt(np.mean(heights**2)))
+        share = count / samples
+        found.append(
+            Fault(
+                "outliers",
+                float(np.max(np.abs(heights)) / total**0.5),
+                (("fraction", share, count**0.5 / samples, "1"), ("size_um", size, size / (2 * count) ** 0.5, "um")),
+                share * size**2,
+            )
+        )
+    step = faults.quantum_um
+    if step**2 / 12 > _PART * total:
+        z = (samples * step**2 / 12 / total) ** 0.5
+        found.append(Fault("quantisation", z, (("step_um", step, 1e-6 * step, "um"),), step**2 / 12))
+    if faults.jitter_s > 0:
+        sd = faults.jitter_s / (2 * max(faults.jitter_z, 1e-9))
+        found.append(Fault("timestamp_jitter", faults.jitter_z, (("jitter_s", faults.jitter_s, sd, "s"),), 0.0))
+    return found

@@ -1,0 +1,153 @@
+"""Noise floors, and faults of single samples: what is asked of the data before any physics."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from fits._stage_run import StageRun
+from fits.diagnosis._projector import Noise, learn_noise
+
+# A command that rests for this many samples is idle from a third of the rest on; so many idle samples are a floor.
+_REST, _IDLE = 24, 150
+# Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
+_COLOURED = 4.0
+# A sample is a spike beyond this many standard deviations, where at most this many stand together.
+_SPIKE, _TOGETHER = 7.0, 3
+# A command that moves by more than this part of its range within some samples may cause what looks like a spike.
+_EDGE, _NEAR = 0.02, 6
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What a run's noise is, whatever a model leaves.
+
+    Attributes
+    ----------
+    noise
+        Its standard deviation and colour.
+    idle
+        Whether it was read off idle stretches, or else off the residual.
+    """
+
+    noise: Noise
+    idle: bool
+
+
+def rough_noise_um(residual_um: np.ndarray) -> float:
+    """Standard deviation of white noise in a residual, by its second differences, whatever slowly changes."""
+    second = np.diff(residual_um, 2)
+    return float(1.4826 * np.median(np.abs(second - np.median(second))) / 6**0.5)
+
+
+def idle_stretches(voltage_V: np.ndarray) -> list[slice]:
+    """Stretches in which the command has rested for a while."""
+    still = np.concatenate([[False], np.diff(voltage_V) == 0, [False]])
+    edges = np.flatnonzero(np.diff(still.astype(int)))
+    found = []
+    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+        if stop - first >= _REST:
+            found.append(slice(int(first + (stop - first) // 3), int(stop)))
+    return found
+
+
+def floor_of(run: StageRun, residual_um: np.ndarray) -> Floor:
+    """Read the noise of a run off its idle stretches, or off the fastest changes of the residual."""
+    pieces = []
+    for stretch in idle_stretches(run.record.voltage_V):
+        piece = residual_um[stretch]
+        time = np.linspace(-1, 1, len(piece))
+        order = min(3, len(piece) // 12)
+        # What settles is no noise.
+        pieces.append(piece - np.polyval(np.polyfit(time, piece, order), time))
+    count = sum(len(piece) for piece in pieces)
+    if count >= _IDLE:
+        joined = np.concatenate(pieces)
+        joined = (
+            joined[np.abs(joined) < 8 * rough_noise_um(joined) + 1e-300] if rough_noise_um(joined) > 0 else joined
+        )
+        freedom = 4.0 * len(pieces)
+        level = float(np.std(joined)) * (len(joined) / max(len(joined) - freedom, 1)) ** 0.5
+        correlation = float(np.mean(joined[1:] * joined[:-1]) / max(np.mean(joined**2), 1e-300))
+        if abs(correlation) * len(joined) ** 0.5 > _COLOURED and level > 0:
+            return Floor(learn_noise(joined, freedom), True)
+        if level > 0:
+            return Floor(Noise(level, np.zeros(0)), True)
+    used = residual_um[run.fitted]
+    return Floor(Noise(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um))), np.zeros(0)), False)
+
+
+def spikes(run: StageRun, residual_um: np.ndarray) -> np.ndarray:
+    """Samples that stand alone, far off their neighbours, where the command gives no reason; shape `(n,)`."""
+    off = residual_um - median_filter(residual_um, 7, mode="nearest")
+    spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")
+    spread = np.maximum(spread, 1.4826 * float(np.median(np.abs(off))))
+    far = np.abs(off) > _SPIKE * np.maximum(spread, 1e-300)
+    voltage = run.record.voltage_V
+    moved = np.abs(np.diff(voltage, prepend=voltage[0])) > _EDGE * float(np.ptp(voltage))
+    near = np.convolve(moved, np.ones(2 * _NEAR + 1), mode="same") > 0.5
+    far &= ~near
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
+    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+        if stop - first > _TOGETHER:
+            far[first:stop] = False
+    return far
+
+
+def quantum_um(values_um: np.ndarray) -> float:
+    """Last digit of a sensor: the spacing of which all readings are multiples; 0 where there is none."""
+    distinct = np.unique(values_um)
+    if len(distinct) < 3 or len(distinct) > 0.7 * len(values_um):
+        return 0.0
+    gaps = np.diff(distinct)
+    gaps = gaps[gaps > 1e-9 * float(np.ptp(distinct))]
+    smallest = float(np.quantile(gaps, 0.05))
+    spacing = float(np.median(gaps[gaps < 1.5 * smallest]))
+    turns = (distinct - distinct[0]) / spacing
+    # Refined over the whole range, where a small error of the spacing adds up.
+    whole = np.round(turns)
+    for _ in range(3):
+        spacing = float(whole @ (distinct - distinct[0]) / (whole @ whole))
+        whole = np.round((distinct - distinct[0]) / spacing)
+    off = np.abs((distinct - distinct[0]) / spacing - whole)
+    return spacing if float(np.mean(off < 0.1)) > 0.95 else 0.0
+
+
+def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray) -> tuple[float, float]:
+    """Jitter of the instants of sampling, and its evidence in standard deviations.
+
+    Noise that grows with the speed, from sample to sample: the variance of the residual about its neighbours is
+    compared with the square of the speed.
+    """
+    bent = residual_um[1:-1] - (residual_um[2:] + residual_um[:-2]) / 2
+    square = bent**2 / 1.5
+    speed = rate_um_per_s[1:-1] ** 2
+    order = np.argsort(speed)
+    slow, quick = order[: len(order) // 2], order[-len(order) // 10 :]
+    base = float(np.median(square[slow])) / 0.4549
+    more = float(np.median(square[quick])) / 0.4549 - base
+    if more <= 0 or base <= 0 or float(np.mean(speed[quick])) == 0:
+        return 0.0, 0.0
+    # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
+    error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
+    return float((more / np.median(speed[quick])) ** 0.5), float(more / error)
+
+
+def line_of(
+    residual_um: np.ndarray, interval_s: float, mains: Sequence[float] = (50.0, 60.0)
+) -> tuple[float, float, float]:
+    """Strongest narrow band of a residual from 2 to 200 Hz: frequency, amplitude (rms), evidence over the rest."""
+    n = len(residual_um)
+    power = np.abs(np.fft.rfft(residual_um * np.hanning(n))) ** 2 / (np.sum(np.hanning(n) ** 2))
+    frequency = np.fft.rfftfreq(n, interval_s)
+    inside = (frequency > 2.0) & (frequency < 200.0)
+    if inside.sum() < 20:
+        return 0.0, 0.0, 0.0
+    around = median_filter(power, 2 * (len(power) // 16) + 1, mode="nearest") / 0.693
+    ratio = np.where(inside, power / np.maximum(around, 1e-300), 0.0)
+    best = int(np.argmax(ratio))
+    low = np.searchsorted(frequency, frequency[best] * 0.85)
+    high = np.searchsorted(frequency, frequency[best] * 1.15) + 1
+    excess = float(np.sum(np.maximum(power[low:high] - around[low:high], 0))) * 2 / n
+    return float(frequency[best]), excess**0.5, float(ratio[best])

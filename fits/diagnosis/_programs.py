@@ -1,0 +1,353 @@
+"""Voltage programs that a next experiment is chosen from, within the limits of a rig."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fits._record import Record
+
+# Share of a program that its first full loop takes, unless the rig is slower.
+_LOOP = 0.12
+# Samples of the shortest period that is still seen.
+_PER_PERIOD = 12
+# A program with fewer samples than these decides nothing.
+_FEWEST = 200
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a rig can do.
+
+    Attributes
+    ----------
+    lower_V, upper_V
+        Range of the command.
+    fastest_V_per_s
+        Largest rate of the command.
+    interval_s
+        Time between two samples.
+    duration_s
+        Length of the program, at most.
+    resonance_Hz
+        Of the stage; None where it is not known.
+    """
+
+    lower_V: float
+    upper_V: float
+    fastest_V_per_s: float
+    interval_s: float
+    duration_s: float
+    resonance_Hz: float | None = None
+
+    @property
+    def span_V(self) -> float:
+        """Range of the command."""
+        return self.upper_V - self.lower_V
+
+    @property
+    def count(self) -> int:
+        """Samples of a program."""
+        return int(np.floor(self.duration_s / self.interval_s * (1 + 1e-12))) + 1
+
+    @property
+    def highest_Hz(self) -> float:
+        """The highest frequency of interest, about three times the resonance, that the samples show."""
+        seen = 1 / (_PER_PERIOD * self.interval_s)
+        return seen if self.resonance_Hz is None else min(3 * self.resonance_Hz, 3 * seen)
+
+    def inside(self, voltage_V: float) -> float:
+        """The nearest voltage within the range."""
+        return float(np.clip(voltage_V, self.lower_V, self.upper_V))
+
+
+def limits_of(
+    records: Sequence[Record], range_V: tuple[float, float], resonance_Hz: float | None, duration_s: float | None
+) -> Limits:
+    """Read off records what the rig can do; the duration is that of the longest unless it is given."""
+    fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
+    interval = min(float(np.median(np.diff(r.time_s))) for r in records)
+    longest = max(r.duration_s for r in records)
+    return Limits(*range_V, fastest, interval, longest if duration_s is None else duration_s, resonance_Hz)
+
+
+def paces(limits: Limits, most: int) -> tuple[Limits, ...]:
+    """The whole duration, as finely as so many samples allow, and the finest sampling for as long as they last."""
+    slow = replace(limits, interval_s=max(limits.interval_s, limits.duration_s / (most - 1)))
+    if slow.interval_s < 1.5 * limits.interval_s:
+        return (slow,)
+    return slow, replace(limits, duration_s=(most - 1) * limits.interval_s)
+
+
+class Path:
+    """A command drawn piece by piece, which starts at the lower voltage with a full loop.
+
+    What lies beyond the duration is cut off; where less is drawn, the last voltage is held.
+    """
+
+    def __init__(self, limits: Limits):
+        self.limits = limits
+        self._time_s, self._voltage_V = [0.0], [limits.lower_V]
+        pace = 2 * limits.span_V / (_LOOP * limits.duration_s)
+        self.to(limits.upper_V, pace)
+        self.to(limits.lower_V, pace)
+
+    @property
+    def left_s(self) -> float:
+        """What is left of the duration."""
+        return max(self.limits.duration_s - self._time_s[-1], 0.0)
+
+    @property
+    def now_V(self) -> float:
+        """Where the command is."""
+        return self._voltage_V[-1]
+
+    def to(self, voltage_V: float, rate_V_per_s: float = np.inf) -> None:
+        """Go to a voltage, at a rate or as fast as the rig can."""
+        voltage_V = self.limits.inside(voltage_V)
+        way = abs(voltage_V - self.now_V)
+        if way > 0:
+            self._time_s.append(self._time_s[-1] + way / min(rate_V_per_s, self.limits.fastest_V_per_s))
+            self._voltage_V.append(voltage_V)
+
+    def within(self, voltage_V: float, duration_s: float) -> None:
+        """Go to a voltage in a time, or as fast as the rig can."""
+        self.to(voltage_V, abs(self.limits.inside(voltage_V) - self.now_V) / max(duration_s, 1e-12))
+
+    def rest(self, duration_s: float) -> None:
+        """Stay."""
+        self._time_s.append(self._time_s[-1] + duration_s)
+        self._voltage_V.append(self.now_V)
+
+    def chirp(self, amplitude_V: float, start_Hz: float, stop_Hz: float, duration_s: float) -> None:
+        """Swing about the present voltage with a rising frequency, as far as range and rate allow, and come back."""
+        limits, bias = self.limits, self.now_V
+        time = np.arange(1, max(int(duration_s / limits.interval_s), 1)) * limits.interval_s
+        # The frequency rises exponentially.
+        growth = np.log(stop_Hz / start_Hz) / duration_s
+        phase = 2 * np.pi * start_Hz * np.expm1(growth * time) / growth
+        rate = 2 * np.pi * start_Hz * np.exp(growth * time)
+        amplitude_V = min(amplitude_V, bias - limits.lower_V, limits.upper_V - bias)
+        swing = np.minimum(amplitude_V, 0.95 * limits.fastest_V_per_s / rate) * np.sin(phase)
+        self._time_s.extend((self._time_s[-1] + time).tolist())
+        self._voltage_V.extend((bias + swing).tolist())
+        self.to(bias)
+
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times and command, shape `(n,)`, in even steps that the rig can follow."""
+        limits = self.limits
+        time = limits.interval_s * np.arange(limits.count)
+        voltage = np.interp(time, self._time_s, self._voltage_V)
+        most = limits.fastest_V_per_s * limits.interval_s
+        if np.max(np.abs(np.diff(voltage)), initial=0.0) > most:
+            voltage = _slowed(voltage, most * (1 - 1e-9))
+        return time, np.clip(voltage, limits.lower_V, limits.upper_V)
+
+
+def _slowed(voltage_V: np.ndarray, most_V: float) -> np.ndarray:
+    out, now = [], float(voltage_V[0])
+    for wanted in voltage_V.tolist():
+        now += min(max(wanted - now, -most_V), most_V)
+        out.append(now)
+    return np.asarray(out)
+
+
+Samples = tuple[np.ndarray, np.ndarray]
+
+
+def idle(limits: Limits, bias_V: float, approach_s: float) -> Samples:
+    """Rest at a voltage that is come to in some time."""
+    path = Path(limits)
+    path.within(bias_V, approach_s)
+    return path.samples()
+
+
+def staircase(limits: Limits, low_V: float, high_V: float, decades: float) -> Samples:
+    """Levels up and down, held for times that are spread over some decades, long ones among short ones."""
+    path = Path(limits)
+    levels = np.r_[np.linspace(low_V, high_V, 5), np.linspace(high_V, low_V, 5)[1:]]
+    holds = np.logspace(-decades, 0, len(levels))[[4, 0, 6, 2, 8, 1, 7, 3, 5]]
+    travel = float(np.abs(np.diff(np.r_[path.now_V, levels])).sum()) / limits.fastest_V_per_s
+    free = max(path.left_s - travel, 0.0)
+    for level, hold in zip(levels, holds / holds.sum(), strict=True):
+        path.to(float(level))
+        path.rest(free * hold)
+    return path.samples()
+
+
+def chirps(limits: Limits, bias_V: float, spread_V: float, amplitude_V: float, stop_Hz: float) -> Samples:
+    """Chirps of three amplitudes at three biases each, from a thirtieth of the highest frequency."""
+    path = Path(limits)
+    biases = [limits.inside(bias_V + shift * spread_V) for shift in (-1, 0, 1)]
+    approach = 0.03 * path.left_s
+    each = path.left_s / 9 - approach / 3 - 2 * amplitude_V / limits.fastest_V_per_s
+    for bias in biases:
+        path.within(bias, approach)
+        for share in (0.25, 1.0, 0.5):
+            path.chirp(share * amplitude_V, stop_Hz / 30, stop_Hz, max(each, 2 * limits.interval_s))
+    return path.samples()
+
+
+def multirate(limits: Limits, low_V: float, high_V: float, decades: float) -> Samples:
+    """The same loop at five rates, which are spread over some decades."""
+    path = Path(limits)
+    path.within(low_V, 0.02 * limits.duration_s)
+    ratios = np.logspace(0, -decades, 5)
+    # Quick loops are repeated, to take a tenth of the slowest one.
+    counts = [max(1, round(0.1 / ratio)) for ratio in ratios]
+    slowest = path.left_s / float(np.sum(ratios * counts))
+    for ratio, count in zip(ratios, counts, strict=True):
+        half = max(ratio * slowest / 2, _PER_PERIOD / 2 * limits.interval_s)
+        for _ in range(count):
+            path.within(high_V, half)
+            path.within(low_V, half)
+    return path.samples()
+
+
+def minor_loops(limits: Limits, bias_V: float, amplitude_V: float) -> Samples:
+    """Ten minor loops about a bias that is reached from below, and ten after it is reached from above."""
+    path = Path(limits)
+    low, high = limits.inside(bias_V - amplitude_V), limits.inside(bias_V + amplitude_V)
+    approach = limits.span_V / (0.06 * path.left_s)
+    half = 0.9 * path.left_s / 40
+    for end in (limits.lower_V, limits.upper_V):
+        path.to(end, approach)
+        for _ in range(10):
+            path.within(low if end == limits.upper_V else high, half)
+            path.within(high if end == limits.upper_V else low, half)
+    return path.samples()
+
+
+def repeat_after_wait(limits: Limits, low_V: float, high_V: float, wait_s: float) -> Samples:
+    """The same loop and hold twice, with a rest at the lower voltage between."""
+    path = Path(limits)
+    wait_s = min(wait_s, 0.8 * path.left_s)
+    each = (path.left_s - wait_s) / 2
+    for last in (False, True):
+        path.within(high_V, 0.2 * each)
+        path.rest(0.3 * each)
+        path.within(low_V, 0.15 * each)
+        path.within((low_V + high_V) / 2, 0.1 * each)
+        path.rest(0.15 * each)
+        path.within(limits.lower_V, 0.1 * each)
+        if not last:
+            path.rest(wait_s)
+    return path.samples()
+
+
+def steps(limits: Limits, base_V: float, height_V: float, dwell_s: float) -> Samples:
+    """Steps of three heights from a voltage near the bottom, over and over, with edges as fast as the rig."""
+    path = Path(limits)
+    path.within(base_V, 0.03 * limits.duration_s)
+    dwell_s = max(dwell_s, 4 * limits.interval_s)
+    heights = (height_V, height_V / 4, height_V / 2)
+    for k in range(int(path.left_s / dwell_s) + 1):
+        path.to(base_V + (heights[k // 2 % 3] if k % 2 == 0 else 0.0))
+        path.rest(dwell_s)
+    return path.samples()
+
+
+def burst(limits: Limits, amplitude_V: float, burst_s: float, period_s: float) -> Samples:
+    """A slow loop, hard driving about the middle for some time, and the same loop twice again."""
+    path = Path(limits)
+    burst_s = min(burst_s, 0.6 * path.left_s)
+    loop = (path.left_s - burst_s) / 3.2
+    middle = (limits.lower_V + limits.upper_V) / 2
+    half = max(period_s / 2, _PER_PERIOD / 2 * limits.interval_s, 2 * amplitude_V / limits.fastest_V_per_s)
+    for k in range(3):
+        path.within(limits.upper_V, loop / 2)
+        path.within(limits.lower_V, loop / 2)
+        if k == 0:
+            for _ in range(int(burst_s / (2 * half))):
+                path.within(middle + amplitude_V, half)
+                path.within(middle - amplitude_V, half)
+            path.within(limits.lower_V, 0.05 * loop)
+    return path.samples()
+
+
+@dataclass(frozen=True)
+class Program:
+    """One program of the menu, with the limits of its parameters.
+
+    Attributes
+    ----------
+    words
+        What it is made of.
+    play
+        Makes times and command from limits and parameters.
+    limits
+        Of the rig.
+    lower, upper, start
+        Of the parameters, in the order that `play` takes them, shape `(k,)`.
+    """
+
+    words: str
+    play: Callable[..., Samples]
+    limits: Limits
+    lower: np.ndarray
+    upper: np.ndarray
+    start: np.ndarray
+
+    def samples(self, parameters: np.ndarray) -> Samples:
+        """Times and command at parameters, which are brought into their limits."""
+        return self.play(self.limits, *np.clip(parameters, self.lower, self.upper).tolist())
+
+    @property
+    def name(self) -> str:
+        """Name of the function."""
+        return self.play.__name__
+
+
+def menu(limits: Limits, most: int) -> tuple[Program, ...]:
+    """All programs that fit into the limits, with so many samples at most."""
+    found = []
+    for pace in paces(limits, most):
+        if pace.count < _FEWEST or 2 * pace.span_V / pace.fastest_V_per_s > 0.5 * pace.duration_s:
+            continue
+        for words, play, table in _entries(pace):
+            lower, start, upper = np.array(table).T
+            found.append(Program(words, play, pace, lower, upper, np.clip(start, lower, upper)))
+    return tuple(found)
+
+
+def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[tuple[float, float, float]]]]:
+    """Words, function, and of each parameter the least, the first and the largest value."""
+    low, span, whole = limits.lower_V, limits.span_V, limits.duration_s
+    high = limits.upper_V
+    bottom = (low, low + 0.1 * span, low + 0.4 * span)
+    top = (low + 0.6 * span, low + 0.95 * span, high)
+    bias = (low + 0.2 * span, low + 0.5 * span, low + 0.8 * span)
+    swing = (0.05 * span, 0.15 * span, 0.5 * span)
+    period = 2 * _PER_PERIOD * limits.interval_s
+    beat = (4 / (limits.resonance_Hz or 1 / (0.05 * whole)))
+    return [
+        ("a rest after one loop", idle, [(low, low + 0.5 * span, high), (0.01 * whole, 0.03 * whole, 0.2 * whole)]),
+        ("a staircase up and down with long and short holds", staircase, [bottom, top, (0.3, 1.5, 2.5)]),
+        (
+            "chirps of three amplitudes at three biases",
+            chirps,
+            [
+                bias,
+                (0.0, 0.3 * span, 0.4 * span),
+                (0.02 * span, 0.08 * span, 0.2 * span),
+                (0.2 * limits.highest_Hz, 0.9 * limits.highest_Hz, limits.highest_Hz),
+            ],
+        ),
+        ("the same loop at five rates over two decades", multirate, [bottom, top, (1.0, 2.0, 2.3)]),
+        ("a minor loop ten times from below and ten times from above", minor_loops, [bias, swing]),
+        (
+            "the same pattern before and after a wait",
+            repeat_after_wait,
+            [bottom, top, (0.05 * whole, 0.3 * whole, 0.7 * whole)],
+        ),
+        (
+            "fast steps of three heights near the bottom",
+            steps,
+            [bottom, (0.1 * span, 0.4 * span, 0.6 * span), (0.1 * beat, beat, max(4 * beat, 0.05 * whole))],
+        ),
+        (
+            "a slow loop before and twice after a burst of hard driving",
+            burst,
+            [(0.2 * span, 0.45 * span, 0.5 * span), (0.05 * whole, 0.3 * whole, 0.5 * whole), (period, period, 20 * period)],
+        ),
+    ]

@@ -1,0 +1,237 @@
+"""Which way of looking at a residual shows which effect."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from fits.diagnosis._result import RunView
+
+_BINS = 36
+# Fewer samples than this make no mean.
+_FEWEST = 4
+# Samples whose mean is where a change begins: more would hide what happens meanwhile.
+_FIRST = 3
+# A change of the voltage below this part of its range is none.
+_STILL = 1e-6
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One curve of a view: `low` and `high` hold the middle 80 % of the samples."""
+
+    x: np.ndarray
+    y: np.ndarray
+    after: bool
+    low: np.ndarray | None = None
+    high: np.ndarray | None = None
+    downwards: bool = False
+
+
+@dataclass(frozen=True)
+class View:
+    """One way of looking at a residual.
+
+    Attributes
+    ----------
+    effects
+        Names of the effects that it shows best.
+    look
+        Makes curves from runs, with lengths times a factor; a `ValueError` where the runs do not allow it.
+    x_label, y_label, per, caption
+        In words; `per` follows the unit of the length.
+    logarithmic, spectrum
+        Whether the first axis is logarithmic, and whether both are.
+    """
+
+    effects: tuple[str, ...]
+    look: Callable[[Sequence[RunView], float], list[Curve]]
+    x_label: str
+    y_label: str
+    caption: str
+    per: str = ""
+    logarithmic: bool = False
+    spectrum: bool = False
+
+
+def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, even: bool = True) -> Curve:
+    """Means over even stretches of `x`, or over equally many samples."""
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known], y[known]
+    if x.size < _FEWEST * 3 or np.ptp(x) == 0:
+        raise ValueError("too few samples")
+    edges = np.linspace(x.min(), x.max(), _BINS + 1) if even else np.unique(np.quantile(x, np.linspace(0, 1, 37)))
+    place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
+    rows = []
+    for k in range(len(edges) - 1):
+        inside = place == k
+        if np.count_nonzero(inside) >= _FEWEST:
+            low, high = np.quantile(y[inside], [0.1, 0.9])
+            rows.append((np.mean(x[inside]), np.mean(y[inside]), low, high))
+    if len(rows) < 3:
+        raise ValueError("too few samples")
+    middle, mean, low, high = np.array(rows).T
+    return Curve(middle, mean, after, None if downwards else low, None if downwards else high, downwards)
+
+
+def _together(runs: Sequence[RunView], of: Callable[[RunView], np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.ravel(of(run)) for run in runs]) if runs else np.empty(0)
+
+
+def _velocity(run: RunView) -> np.ndarray:
+    return np.gradient(run.voltage_V, run.time_s)
+
+
+def _over_velocity(runs: Sequence[RunView], factor: float) -> list[Curve]:
+    x = _together(runs, _velocity)
+    return [
+        _binned(x, factor * _together(runs, lambda run: run.before_um), False, even=False),
+        _binned(x, factor * _together(runs, lambda run: run.after_um), True, even=False),
+    ]
+
+
+def _over_position(runs: Sequence[RunView], factor: float) -> list[Curve]:
+    x = _together(runs, lambda run: run.measured_um)
+    return [
+        _binned(x, factor * _together(runs, lambda run: run.before_um), False),
+        _binned(x, factor * _together(runs, lambda run: run.after_um), True),
+    ]
+
+
+def _over_voltage(runs: Sequence[RunView], factor: float) -> list[Curve]:
+    x = _together(runs, lambda run: run.voltage_V)
+    up = _together(runs, lambda run: _last_move(run)[0]) >= 0
+    curves = []
+    for after in (False, True):
+        y = factor * _together(runs, lambda run, after=after: run.after_um if after else run.before_um)  # type: ignore[misc]
+        curves.append(_binned(x[up], y[up], after))
+        if np.count_nonzero(~up) > _BINS:
+            curves.append(_binned(x[~up], y[~up], after, downwards=True))
+    return curves
+
+
+def _last_move(run: RunView) -> tuple[np.ndarray, np.ndarray]:
+    """Direction of the last move of the voltage, and the sample at which it last started, stopped or turned."""
+    step = np.diff(run.voltage_V, prepend=run.voltage_V[:1])
+    sign = np.sign(np.where(np.abs(step) > _STILL * (np.ptp(run.voltage_V) or 1.0), step, 0.0))
+    index = np.arange(sign.size)
+    moved = np.maximum.accumulate(np.where(sign != 0, index, 0))
+    changed = np.concatenate([[0.0], np.diff(sign)]) != 0
+    began = np.maximum.accumulate(np.where(changed, index, 0))
+    return sign[moved], began
+
+
+def _since_move(runs: Sequence[RunView], factor: float) -> list[Curve]:
+    direction = _together(runs, lambda run: _last_move(run)[0])
+    since_s = _together(runs, lambda run: run.time_s - run.time_s[_last_move(run)[1]])
+    kept = (since_s > 0) & (direction != 0)
+    if np.count_nonzero(kept) < _BINS or since_s[kept].max() < 10 * since_s[kept].min():
+        raise ValueError("the voltage never goes on for long")
+    curves = []
+    for after in (False, True):
+        change_um = _together(
+            runs,
+            lambda run, after=after: _since_event(run, run.after_um if after else run.before_um),  # type: ignore[misc]
+        )
+        found = _binned(np.log10(since_s[kept]), factor * (direction * change_um)[kept], after)
+        curves.append(Curve(10**found.x, found.y, after, found.low, found.high))
+    return curves
+
+
+def _since_event(run: RunView, residual_um: np.ndarray) -> np.ndarray:
+    """Change of a residual since the voltage last started, stopped or turned."""
+    begins = np.unique(_last_move(run)[1])
+    out = np.array(residual_um, dtype=float)
+    for begin, end in zip(begins, [*begins[1:], out.size], strict=True):
+        out[begin:end] -= np.mean(out[begin : min(begin + _FIRST, end)])
+    return out
+
+
+def _over_time(runs: Sequence[RunView], factor: float) -> list[Curve]:
+    if not runs:
+        raise ValueError("no runs")
+    longest = max(runs, key=lambda run: run.time_s[-1] - run.time_s[0] if run.time_s.size else 0.0)
+    return [
+        _binned(longest.time_s, factor * longest.before_um, False),
+        _binned(longest.time_s, factor * longest.after_um, True),
+    ]
+
+
+def _spectrum(runs: Sequence[RunView], factor: float) -> list[Curve]:
+    if not runs:
+        raise ValueError("no runs")
+    finest = max(
+        runs, key=lambda run: run.time_s.size / (np.median(np.diff(run.time_s)) if run.time_s.size > 2 else 1)
+    )
+    if finest.time_s.size < 64:
+        raise ValueError("too few samples")
+    rate_Hz = 1 / float(np.median(np.diff(finest.time_s)))
+    curves = []
+    for after in (False, True):
+        values = factor * np.nan_to_num(finest.after_um if after else finest.before_um)
+        frequency_Hz, density = signal.welch(values, rate_Hz, nperseg=min(4096, values.size // 2))
+        frequency_Hz, density = frequency_Hz[1:], density[1:]
+        # Peaks are what is looked for, so that each even stretch of the logarithm shows its largest.
+        edges = np.geomspace(frequency_Hz[0], frequency_Hz[-1] * 1.0001, 400)
+        place = np.searchsorted(edges, frequency_Hz, side="right")
+        kept = [np.flatnonzero(place == k) for k in np.unique(place)]
+        top = np.array([inside[np.argmax(density[inside])] for inside in kept])
+        curves.append(Curve(frequency_Hz[top], np.sqrt(np.maximum(density[top], 1e-30)), after))
+    return curves
+
+
+_BAND = "Lines are means, and the shaded bands hold the middle 80 % of the samples."
+
+# The last one is for all effects that no other names.
+VIEWS = (
+    View(
+        ("creep",),
+        _since_move,
+        "time since the last event (s)",
+        "change of the residual",
+        "How the residual changes after the voltage starts, stops or turns; positive in the direction of the last "
+        f"move. {_BAND}",
+        logarithmic=True,
+    ),
+    View(
+        (
+            "transport_delay",
+            "sensor_lowpass",
+            "timestamp_jitter",
+            "clock_mismatch",
+            "dropped_samples",
+            "voltage_dependent_capacitance",
+            "slew_limit",
+        ),
+        _over_velocity,
+        "rate of the voltage (V/s)",
+        "residual",
+        _BAND,
+    ),
+    View(("sensor_nonlinearity", "quantisation"), _over_position, "measured displacement (µm)", "residual", _BAND),
+    View(
+        ("mains_hum", "floor_vibration", "second_resonance", "stiffness_hardening", "load_change"),
+        _spectrum,
+        "frequency (Hz)",
+        "residual density",
+        "Spectrum of the residual of the most finely sampled run; of each narrow band the largest value is drawn.",
+        per="/√Hz",
+        logarithmic=True,
+        spectrum=True,
+    ),
+    View(
+        ("thermal_drift", "thermal_gain", "mount_relaxation", "aging", "outliers", "cross_coupling", "initial_state"),
+        _over_time,
+        "time (s)",
+        "residual",
+        f"The longest run. {_BAND}",
+    ),
+    View(
+        (),
+        _over_voltage,
+        "voltage (V)",
+        "residual",
+        f"Solid while the voltage rises or last rose, dashed while it falls or last fell. {_BAND}",
+    ),
+)

@@ -1,0 +1,200 @@
+"""A diagnosis in words and numbers with sensible digits."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from fits.diagnosis._result import Diagnosis, EffectParameter, FoundCause, RunView
+
+# Below this, probabilities are those of tails that nobody has checked.
+_SMALLEST_P = 1e-9
+_UNITS = {"um": "µm", "degC": "°C"}
+# What stands for a number that is not known.
+NONE = "\N{EN DASH}"
+SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+_MINUS = "\N{MINUS SIGN}"
+_TIMES = "\N{MULTIPLICATION SIGN}"
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def plain(name: str) -> str:
+    """Turn a name such as `thermal_drift` into words."""
+    return name.replace("_", " ")
+
+
+def listed(names: Sequence[str], last: str = "and") -> str:
+    """Join names as a sentence does."""
+    words = [plain(name) for name in names]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}" if words else ""
+
+
+def shown_unit(unit: str) -> str:
+    """Write a unit such as `um/V^2` as µm/V²; nothing for none."""
+    if unit == "1":
+        return ""
+    return "/".join(_UNITS.get(part, part) for part in unit.split("/")).replace("^2", "²")
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Write a number with so many significant digits, and an en dash where there is none."""
+    if not math.isfinite(value):
+        return NONE
+    if value == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    if not -4 <= exponent < 6:
+        mantissa = f"{value / 10.0**exponent:.{digits - 1}f}".replace("-", _MINUS)
+        return f"{mantissa} {_TIMES} 10{str(exponent).translate(_SUPERSCRIPTS)}"
+    return _decimals(value, max(digits - 1 - exponent, 0))
+
+
+def estimate(parameter: EffectParameter) -> tuple[str, str, str]:
+    """Write estimate, standard deviation and 95 % interval, rounded to two digits of the standard deviation."""
+    sd = parameter.sd
+    size = abs(parameter.value) if math.isfinite(parameter.value) else 0.0
+    if not (math.isfinite(sd) and sd > 0) or max(size, sd) >= 1e6 or sd < 1e-6:
+        ends = number(parameter.lower), number(parameter.upper)
+        return number(parameter.value, 4), number(sd, 2), f"{ends[0]} to {ends[1]}"
+    places = max(1 - math.floor(math.log10(sd)), 0)
+    lower, upper = (_decimals(end, places) for end in (parameter.lower, parameter.upper))
+    return _decimals(parameter.value, places), _decimals(sd, places), f"{lower} to {upper}"
+
+
+def _decimals(value: float, places: int) -> str:
+    if not math.isfinite(value):
+        return NONE
+    whole, _, rest = f"{value:.{places}f}".partition(".")
+    text = whole + (f".{rest}" if rest else "")
+    return text.replace("-", _MINUS) if float(text) else text.lstrip("-")
+
+
+def sigmas(z: float) -> str:
+    """Write evidence in standard deviations; a tenth of one says nothing more."""
+    return _decimals(z, 1) if abs(z) < 1e3 else number(z)
+
+
+def parameter_name(parameter: EffectParameter) -> str:
+    """Name a parameter in words, without the unit, which stands beside it."""
+    suffix = "_" + parameter.unit.replace("/", "_per_").replace("^", "")
+    return plain(parameter.name.removesuffix(suffix))
+
+
+def percent(share: float) -> str:
+    """Write a fraction as a percentage that is never rounded to all or nothing."""
+    if not math.isfinite(share):
+        return NONE
+    if 0 < share < 0.01:
+        return "< 1 %"
+    if 0.99 < share < 1:
+        return "> 99 %"
+    return f"{100 * share:.0f} %".replace("-", _MINUS)
+
+
+def chance(p: float) -> str:
+    """Write a probability."""
+    if not math.isfinite(p):
+        return NONE
+    if p < _SMALLEST_P:
+        return f"below {number(_SMALLEST_P, 1).removeprefix(f'1 {_TIMES} ')}"
+    return number(p, 2 if p >= 1e-3 else 1)
+
+
+class Lengths:
+    """Writes sizes of a residual, all in one unit: nm where they are small, um elsewhere."""
+
+    def __init__(self, diagnosis: Diagnosis):
+        sizes = [rms_um(diagnosis.runs, "before_um"), diagnosis.noise_um]
+        known = [size for size in sizes if math.isfinite(size)]
+        small = bool(known) and max(known) < 0.5
+        self.unit = "nm" if small else "µm"
+        self.per_um = 1e3 if small else 1.0
+
+    def bare(self, size_um: float) -> str:
+        """Without its unit, for tables whose heading has it."""
+        return number(self.per_um * size_um)
+
+    def __call__(self, size_um: float) -> str:
+        """With its unit."""
+        return f"{self.bare(size_um)} {self.unit}" if math.isfinite(size_um) else NONE
+
+
+def rms_um(runs: Sequence[RunView], name: str) -> float:
+    """Root mean square over all runs of a residual, `before_um` or `after_um`; NaN where there is none."""
+    values = np.concatenate([np.ravel(getattr(run, name)) for run in runs] or [np.empty(0)])
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """Say in a few words what is wrong."""
+    names = [cause.name for cause in diagnosis.causes]
+    found = listed(names)
+    if diagnosis.verdict == "no_effect":
+        return "No hidden effect was found."
+    if diagnosis.verdict == "unexplained":
+        begin = "Something is wrong that no known effect explains" if not names else f"There is {found}, and more"
+        return f"{begin}{'' if not names else ' that no known effect explains'}."
+    if any(cause.also_consistent for cause in diagnosis.causes) and len(names) == 1:
+        return f"The stage shows {either(diagnosis.causes[0])}."
+    return f"The stage shows {found}."
+
+
+def either(cause: FoundCause) -> str:
+    """Name an effect with all that cannot be told from it."""
+    return listed([cause.name, *cause.also_consistent], "or")
+
+
+def verdict_sentence(diagnosis: Diagnosis) -> str:
+    """Say in plain sentences what is wrong, why, how sure that is, and how much better the extension predicts."""
+    length = Lengths(diagnosis)
+    parts = [_found(diagnosis, length), *_told_apart(diagnosis), *_gained(diagnosis, length)]
+    return " ".join(part for part in parts if part)
+
+
+def _found(diagnosis: Diagnosis, length: Lengths) -> str:
+    noise = length(diagnosis.noise_um)
+    if not diagnosis.causes:
+        if diagnosis.verdict == "unexplained":
+            return (
+                f"The plain stage leaves a reproducible error of {length(diagnosis.unexplained_rms_um)}, root mean "
+                f"square, over a noise floor of {noise}, and no effect of the library explains it."
+            )
+        return (
+            f"The plain stage describes these records down to a noise floor of {noise}. Of records that hold "
+            f"no effect, {percent(diagnosis.false_alarm)} are given a cause by chance."
+        )
+    sentences = []
+    for cause in diagnosis.causes:
+        sentences.append(
+            f"{plain(cause.name).capitalize()} explains {percent(cause.share_of_misfit)} of the reproducible misfit "
+            f"of the plain stage ({sigmas(cause.z)} standard deviations; probability by chance "
+            f"{chance(cause.p_family)})."
+        )
+    if diagnosis.verdict == "unexplained":
+        left = length(diagnosis.unexplained_rms_um)
+        sentences.append(f"A reproducible error of {left}, root mean square, is left without an explanation.")
+    return " ".join(sentences)
+
+
+def _told_apart(diagnosis: Diagnosis) -> list[str]:
+    return [
+        f"These records cannot tell {plain(cause.name)} from {listed(cause.also_consistent, 'or')}."
+        for cause in diagnosis.causes
+        if cause.also_consistent
+    ]
+
+
+def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
+    gain = diagnosis.gain
+    if not diagnosis.causes:
+        return []
+    if not math.isfinite(gain.heldout_rms_before_um) or not math.isfinite(gain.heldout_rms_after_um):
+        return ["Nothing was held out, so what this is worth on new data is not known."]
+    before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
+    change = "falls" if after < before else "does not fall: it goes"
+    return [
+        f"With {listed([cause.name for cause in diagnosis.causes])} in the model, the error on data that were not "
+        f"used {change} from {length(before)} to {length(after)}, root mean square; the noise "
+        f"floor is {length(diagnosis.noise_um)}."
+    ]

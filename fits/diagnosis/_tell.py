@@ -1,0 +1,145 @@
+"""What was found, in the terms of its users: parameters with intervals, shares, and bounds of what was not found."""
+
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fits.diagnosis._candidates import Bench
+from fits.diagnosis._faults import Fault, Faults
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import Refit
+from fits.diagnosis._result import Bound, EffectParameter, FoundCause
+from fits.diagnosis._select import Cause, Selection, best_of
+from microid import EFFECTS
+
+if TYPE_CHECKING:
+    from fits.diagnosis._diagnose import Prepared
+
+_TWO_SIDED = 1.96
+# A class of effects that cannot be told apart names at most so many others.
+_OTHERS = 2
+
+
+def causes_of(
+    causes: Sequence[Cause],
+    model: Refit,
+    projector: Projector,
+    bench: Bench,
+    misfit: float,
+    faults: Sequence[Fault],
+    noise: Faults,
+) -> tuple[FoundCause, ...]:
+    """Describe the causes, the most important first."""
+    found = []
+    covariance, at = model.covariance(), 0
+    runs = len(bench.prepared)
+    for cause, law, x in zip(causes, model.laws, model.x, strict=True):
+        own = covariance[at : at + law.size, at : at + law.size]
+        tangent = model.tangent[:, at : at + law.size]
+        at += law.size
+        form = law.form
+        changed = [[law.effect(x, run)] for run in range(runs)]
+        alone = [a - b for a, b in zip(bench.respond(changed), bench.plain, strict=True)]
+        left = projector.off(projector.join(alone))
+        noise_um = float(np.mean([n.innovation_um for n in projector.noise]))
+        rms = float(np.linalg.norm(left) / projector.count**0.5) * noise_um
+        del tangent
+        found.append(
+            FoundCause(
+                cause.name,
+                form.form,
+                tuple(rival.name for rival in cause.rivals[:_OTHERS]),
+                cause.z,
+                cause.p_family,
+                _parameters(law, x, own),
+                float(min(1.0, cause.drop / misfit)),
+                rms,
+                form.fingerprint,
+                form.experiment,
+                form.source,
+            )
+        )
+    by_name = {form.name: form for form in EFFECTS}
+    total = float(np.mean([n.total_um**2 for n in noise.noise]))
+    for fault in faults:
+        form = by_name[fault.name]
+        parameters = tuple(
+            EffectParameter(name, value, sd, unit, value - _TWO_SIDED * sd, value + _TWO_SIDED * sd)
+            for name, value, sd, unit in fault.parameters
+        )
+        found.append(
+            FoundCause(
+                fault.name,
+                form.form,
+                (),
+                fault.z,
+                0.0,
+                parameters,
+                float(min(1.0, fault.variance_um2 / max(total, fault.variance_um2, 1e-300))),
+                fault.variance_um2**0.5,
+                form.fingerprint,
+                form.experiment,
+                form.source,
+            )
+        )
+    return tuple(sorted(found, key=lambda cause: -cause.z))
+
+
+def _parameters(law, x: np.ndarray, covariance: np.ndarray) -> tuple[EffectParameter, ...]:
+    """Values in their units: of the first run where they differ, the others by their place."""
+    runs = len(law.maps) if law.each.any() else 1
+    found = []
+    for run in range(runs):
+        slope = np.asarray(jax.jacfwd(lambda v, run=run: law.maps[run].values(_vector(law, v, run)))(jnp.asarray(x)))
+        values = np.asarray(law.maps[run].values(jnp.asarray(law.vector(x, run))))
+        sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
+        at = 0
+        for info in law.maps[run].table:
+            size = int(np.prod(info.shape)) if info.shape else 1
+            for k in range(size):
+                name = info.path if size == 1 else f"{info.path}[{k}]"
+                if runs > 1:
+                    if info.path in law.form.strength:
+                        name = f"{name} in run {run + 1}"
+                    elif run:
+                        continue
+                value, spread = float(values[at + k]), float(sd[at + k])
+                low, high = value - _TWO_SIDED * spread, value + _TWO_SIDED * spread
+                found.append(
+                    EffectParameter(
+                        name, value, spread, info.spec.unit, max(low, info.spec.lower), min(high, info.spec.upper)
+                    )
+                )
+            at += size
+    return tuple(found)
+
+
+def _vector(law, x, run: int):
+    if not law.each.any():
+        return x
+    shared, own = int(np.sum(~law.each)), int(np.sum(law.each))
+    full = jnp.zeros(len(law.each))
+    full = full.at[np.flatnonzero(~law.each)].set(x[:shared])
+    return full.at[np.flatnonzero(law.each)].set(x[shared + run * own : shared + (run + 1) * own])
+
+
+def bounds(found: Selection, ready: "Prepared", named: Collection[str]) -> tuple[Bound, ...]:
+    """How large each effect that was not named may still be."""
+    out = []
+    noise = float(np.mean([n.innovation_um for n in ready.projector.noise]))
+    for name, one in best_of(found.left).items():
+        if name in named:
+            continue
+        size = float(np.linalg.norm(one.columns))
+        raw = size / max(one.share_left, 1e-12)
+        # The largest multiple that would not have been noticed, by the size that it has in the displacement.
+        bound = (one.z + _TWO_SIDED) / max(size, 1e-300) * raw / ready.projector.count**0.5 * noise
+        out.append(Bound(name, one.z, 1.0 - one.share_left, bound))
+    asked = {bound.name for bound in out} | set(named)
+    for name, reason in dict(ready.skipped).items():
+        if name not in asked:
+            out.append(Bound(name, float("nan"), float("nan"), float("nan"), reason))
+    return tuple(sorted(out, key=lambda bound: -bound.z if np.isfinite(bound.z) else 1e9))

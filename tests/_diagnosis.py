@@ -1,0 +1,64 @@
+"""A diagnosis made by hand."""
+
+import numpy as np
+
+from fits import default_stage
+from fits.diagnosis._result import (
+    Bound,
+    Diagnosis,
+    EffectParameter,
+    Experiment,
+    FoundCause,
+    Gain,
+    RunView,
+    Test,
+)
+
+KINDS = ("no_effect", "effect_found", "unexplained")
+ODD = "a <b> & \"c\" 'd'"
+
+
+def run_view(rng, source, n):
+    time_s = 0.01 * np.arange(n)
+    voltage_V = 60 - 60 * np.cos(time_s)
+    after_um = 0.01 * rng.standard_normal(n)
+    before_um = after_um + 0.05 * np.sin(time_s)
+    return RunView(source, time_s, voltage_V, voltage_V / 5, before_um, after_um, time_s < 0.8 * time_s[-1])
+
+
+def cause(name, also=()):
+    gain = EffectParameter("gain_per_decade", 0.01542, 0.00031, "1", 0.0148, 0.016)
+    onset = EffectParameter("onset_s", 0.1, np.nan, "s", np.nan, np.inf)
+    words = f"{name} shows {ODD}"
+    return FoundCause(name, "log", also, 24.3, 3e-12, (gain, onset), 0.93, 0.045, words, "Steps.", "a book")
+
+
+def diagnosis(rng, kind="effect_found", n=3000, count=2):
+    names = {
+        "no_effect": (),
+        "effect_found": (cause("creep", ("thermal_drift",)),),
+        "unexplained": (cause("mains_hum"), cause("backlash"), cause("sensor_lowpass")),
+    }
+    stage = default_stage()
+    bounds = (Bound("friction", 0.4, 0.9, 0.02), Bound("thermal_gain", np.nan, np.nan, np.nan, f"no column {ODD}"))
+    time_s = np.arange(0.0, 5.0, 0.01)
+    ahead = Experiment(
+        time_s, 50 + 50 * np.sign(np.sin(time_s)), "steps", "It decides.", ("creep", "aging"), 9.0, 1.0
+    )
+    return Diagnosis(
+        verdict=kind,
+        noise_um=0.0101,
+        noise_source="repeated loops",
+        noise_samples=1.8,
+        causes=names[kind],
+        unexplained_rms_um=0.012,
+        upper_bounds=bounds,
+        tests=(Test("voltage", 3.1, 0.002, 0.1, f"It depends, {ODD}."),),
+        gain=Gain() if kind == "no_effect" else Gain(0.0471, 0.0123, 0.0008, noise_um=0.0101, source="slow.csv"),
+        next_experiment=None if kind == "no_effect" else ahead,
+        remarks=(f"Remark {ODD}",),
+        baseline=stage,
+        extended=stage,
+        runs=tuple(run_view(rng, f"{ODD}{k}.csv", n) for k in range(count)),
+        false_alarm=0.01,
+    )

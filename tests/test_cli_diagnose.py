@@ -1,0 +1,105 @@
+import json
+import sys
+import types
+
+import numpy as np
+import pytest
+from _command import files, refused, run
+from _diagnosis import diagnosis
+
+from fits import DataError, FitError, FitStatus
+from fits.diagnosis._report import report_html
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch, rng):
+    """A record, and what stands in for the diagnosis: its answers, and what it was asked."""
+    rows = [f"{0.01 * k},{60 - 60 * np.cos(k / 10)},{20 - 20 * np.cos(k / 10)}" for k in range(200)]
+    (tmp_path / "run.csv").write_text("\n".join(["time_s,voltage_V,displacement_um", *rows]) + "\n")
+    monkeypatch.chdir(tmp_path)
+    stand_in = types.SimpleNamespace(answer=diagnosis(rng, count=0), asked={}, folder=tmp_path)
+
+    def diagnose(records, **options):
+        stand_in.asked = {"records": records, **options}
+        options["progress"]("asking")
+        if isinstance(stand_in.answer, Exception):
+            raise stand_in.answer
+        return stand_in.answer
+
+    module = types.ModuleType("fits.diagnosis._diagnose")
+    module.diagnose = diagnose
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    return stand_in
+
+
+def test_the_command_writes_everything(bench, rng):
+    done = run("diagnose", "run.csv", "--out", "a/b", "--duration", "30", "--false-alarm", "0.05")
+    assert done.exit_code == 0, done.stderr
+    names = ["baseline.json", "diagnosis.json", "extended.json", "next_experiment.csv", "report.html"]
+    assert files(bench.folder / "a" / "b") == names
+    assert (bench.asked["duration_s"], bench.asked["false_alarm"], bench.asked["holdout"]) == (30.0, 0.05, 0.2)
+    assert [record.source for record in bench.asked["records"]] == ["run.csv"]
+    for words in ("creep", "thermal_drift", "gain_per_decade", "0.0471", "0.0123", "It decides.", "report.html"):
+        assert words in done.stdout
+    assert "asking" in done.stderr
+    folder = bench.folder / "a" / "b"
+    ahead = np.loadtxt(folder / "next_experiment.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(ahead[:, 1], bench.answer.next_experiment.voltage_V)
+    assert (folder / "report.html").read_text(encoding="utf-8") == report_html(bench.answer)
+    assert json.loads((folder / "baseline.json").read_text())["model"]["type"] == "Stage"
+    as_json = json.loads(run("diagnose", "run.csv", "--out", "a/b", "--json", "--quiet").stdout)
+    assert json.loads((folder / "diagnosis.json").read_text()).items() <= as_json.items()
+    # What an earlier diagnosis advised is not left beside a later one without advice.
+    bench.answer = diagnosis(rng, "no_effect", count=0)
+    assert run("diagnose", "run.csv", "--out", "a/b").exit_code == 0
+    assert files(folder) == [name for name in names if name != "next_experiment.csv"]
+
+
+def test_the_command_says_when_nothing_was_held_out(bench):
+    assert "held out" in run("diagnose", "run.csv", "--out", "d", "--holdout", "0").stdout
+    assert bench.asked["holdout"] == 0.0
+    assert "held out" not in run("diagnose", "run.csv", "--out", "d", "--holdout", "run.csv").stdout
+    assert [record.source for record in bench.asked["holdout"]] == ["run.csv"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--false-alarm", "0"], ["--false-alarm"]),
+        (["--false-alarm", "0.6"], ["--false-alarm", "0.6"]),
+        (["--false-alarm", "nan"], ["--false-alarm"]),
+        (["--duration", "0"], ["--duration"]),
+        (["--duration", "inf"], ["--duration"]),
+        (["--holdout", "1.5"], ["--holdout"]),
+        (["--holdout", "none.csv"], ["none.csv"]),
+        (["--columns", "voltage_V=u_V"], ["u_V"]),
+        (["--out", "run.csv"], ["run.csv", "--out"]),
+        (["--out", "run.csv/d"], ["--out"]),
+    ],
+)
+def test_bad_options_end_in_one_sentence(bench, options, words):
+    refused(run("diagnose", "run.csv", "--out", "d", *options), *words)
+    assert files(bench.folder) == ["run.csv"]
+    assert bench.asked == {}
+
+
+@pytest.mark.parametrize("error", [DataError("run.csv: no good; measure again"), FitError(FitStatus.MAX_STEPS)])
+def test_a_diagnosis_that_fails_leaves_nothing(bench, error):
+    bench.answer = error
+    refused(run("diagnose", "run.csv", "--out", "d"), str(error))
+    assert files(bench.folder) == ["run.csv"]
+
+
+def test_what_cannot_be_written_whole_is_not_written(bench, monkeypatch):
+    def full(*_):
+        raise DataError("the disk is full")
+
+    monkeypatch.setattr("fits._cli_diagnose.write_csv", full)
+    refused(run("diagnose", "run.csv", "--out", "d"), "full")
+    assert files(bench.folder / "d") == []
+
+
+def test_inputs_are_not_overwritten(bench):
+    (bench.folder / "d").mkdir()
+    (bench.folder / "run.csv").rename(bench.folder / "d" / "next_experiment.csv")
+    refused(run("diagnose", "d/next_experiment.csv", "--out", "d"), "overwrite")

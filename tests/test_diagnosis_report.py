@@ -1,0 +1,261 @@
+import html.parser
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html import unescape
+
+import numpy as np
+import pytest
+from _diagnosis import KINDS, diagnosis, run_view
+
+from fits.diagnosis._json import diagnosis_json, diagnosis_schema
+from fits.diagnosis._report import report_html
+from fits.diagnosis._report_plots import _envelope
+from fits.diagnosis._report_views import VIEWS
+from fits.diagnosis._report_words import chance, estimate, number, parameter_name, percent, shown_unit, sigmas
+from fits.diagnosis._result import EffectParameter, Gain, RunView
+
+VOID = {"meta", "link", "br", "img", "hr", "input"}
+
+
+def violations(value, schema, where="$"):
+    """What a JSON Schema of the few words that ours has finds wrong with a value."""
+    known = {"$schema", "title", "description", "type", "properties", "required", "additionalProperties"}
+    assert set(schema) <= known | {"items", "enum", "const", "minimum", "maximum", "minLength"}, where
+    kinds = {
+        "object": dict,
+        "array": list,
+        "string": str,
+        "number": (int, float),
+        "integer": int,
+        "null": type(None),
+    }
+    wanted = schema.get("type", list(kinds))
+    wanted = wanted if isinstance(wanted, list) else [wanted]
+    if isinstance(value, bool) or not isinstance(value, tuple(np.hstack([kinds[name] for name in wanted]))):
+        return [f"{where}: not {wanted}"]
+    wrong = []
+    if value not in schema.get("enum", [value]) or value != schema.get("const", value):
+        wrong.append(f"{where}: another value")
+    if isinstance(value, int | float) and not schema.get("minimum", value) <= value <= schema.get("maximum", value):
+        wrong.append(f"{where}: out of bounds")
+    if isinstance(value, str) and len(value) < schema.get("minLength", 0):
+        wrong.append(f"{where}: too short")
+    if isinstance(value, list):
+        for place, item in enumerate(value):
+            wrong += violations(item, schema.get("items", {}), f"{where}[{place}]")
+    if isinstance(value, dict):
+        wrong += [f"{where}: lacks {name}" for name in schema.get("required", ()) if name not in value]
+        for name, item in value.items():
+            inner = schema.get("properties", {}).get(name, schema.get("additionalProperties", {}))
+            wrong += (
+                [f"{where}: {name} is too much"] if inner is False else violations(item, inner, f"{where}.{name}")
+            )
+    return wrong
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_json_is_strict_and_keeps_to_its_schema(rng, kind):
+    content, schema = diagnosis_json(diagnosis(rng, kind)), diagnosis_schema()
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    assert violations(content, schema) == []
+    for broken in (
+        {"schema": "microid.diagnosis/2"},
+        {"verdict": "maybe"},
+        {"noise_um": -1.0},
+        {"noise_um": "0.1"},
+        {"causes": [{"name": "creep"}]},
+        {"remarks": [1]},
+        {"further": 1},
+    ):
+        assert violations(content | broken, schema), broken
+    jsonschema = pytest.importorskip("jsonschema")
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.Draft202012Validator(schema).validate(content)
+
+
+def test_json_says_what_the_diagnosis_says(rng):
+    content = diagnosis_json(diagnosis(rng))
+    assert content["causes"][0]["parameters"] == {
+        "gain_per_decade": {"value": 0.01542, "sd": 0.00031, "unit": "1", "lower": 0.0148, "upper": 0.016},
+        "onset_s": {"value": 0.1, "sd": None, "unit": "s", "lower": None, "upper": None},
+    }
+    assert content["causes"][0]["also_consistent"] == ["thermal_drift"]
+    assert content["upper_bounds"][1]["bound_um"] is None
+    assert content["gain"]["heldout_rms_after_um"] == 0.0123
+    assert content["gain"]["heldout_max_after_um"] is None
+    assert content["next_experiment"]["highest_V"] == 100.0
+    assert diagnosis_json(diagnosis(rng, "no_effect"))["next_experiment"] is None
+
+
+class Page(html.parser.HTMLParser):
+    """Tags that must be balanced, identifiers, links and text of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.ids, self.links, self.text = [], [], [], ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.handle_startendtag(tag, attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.ids += [value for name, value in attrs if name == "id"]
+        self.links += [value for name, value in attrs if name in ("src", "href", "xlink:href", "srcset", "action")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.text += data
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_report_is_one_whole_page(rng, kind):
+    found = diagnosis(rng, kind)
+    text = report_html(found)
+    page = Page(text)
+    words = " ".join(page.text.split())
+    for each in found.causes:
+        assert each.fingerprint in words
+        assert each.name.replace("_", " ") in words.lower()
+    for shown in (*found.remarks, *(view.source for view in found.runs), "Friction", found.upper_bounds[1].reason):
+        assert shown in words
+    if found.causes:
+        assert "0.01542" in words
+        assert "47.1 nm" in words
+        assert found.next_experiment.purpose in words
+    assert "<b>" not in text
+    for link in page.links:
+        assert link.startswith(("#", "data:"))
+    assert not re.search(r"@import|url\((?!#)|<script", text)
+    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
+    assert "nan" not in re.sub(r"[a-z]{4,}", "", words.lower()).split()
+    assert len(set(page.ids)) == len(page.ids)
+
+
+def test_the_same_diagnosis_gives_the_same_report(rng):
+    found = diagnosis(rng, "no_effect", count=1)
+    assert report_html(found) == report_html(found)
+
+
+def test_report_of_long_runs_is_small(rng):
+    text = report_html(diagnosis(rng, n=100_000, count=8))
+    assert len(text.encode()) < 1_500_000
+    assert "2 more are not" in text
+
+
+def test_report_does_without_runs_and_numbers(rng):
+    bare = replace(diagnosis(rng), runs=(), noise_um=np.nan, upper_bounds=(), tests=(), remarks=(), gain=Gain())
+    assert "not known" in Page(report_html(bare)).text
+    short = tuple(replace(run_view(rng, "short", 5), before_um=np.full(5, np.nan)) for _ in range(2))
+    Page(report_html(replace(bare, runs=short)))
+
+
+def test_an_envelope_keeps_every_spike(rng):
+    values = rng.standard_normal(100_000)
+    spikes = rng.choice(100_000, 20, replace=False)
+    values[spikes] += 50
+    kept = _envelope(values, 2000)
+    assert len(kept) <= 2002
+    assert set(np.sort(spikes)[[0, -1]]) <= set(kept)
+    assert np.isin(np.argmax(values), kept)
+    assert np.all(np.diff(kept) > 0)
+
+
+def test_the_view_of_creep_shows_its_logarithm():
+    hold = 0.01 * np.arange(1000)
+    heights = [10.0, 20.0, 5.0, 60.0, 30.0]
+    voltage = np.repeat(heights, hold.size)
+    signs = np.sign(np.diff(heights, prepend=10.0))
+    residual = np.concatenate([0.3 + sign * np.log10(1 + hold / 0.1) for sign in signs])
+    one = RunView("", 0.01 * np.arange(voltage.size), voltage, voltage, residual, 0 * residual, residual < 9)
+    before, after = VIEWS[0].look([one], 1.0)
+    expected = np.log10(1 + before.x / 0.1)
+    np.testing.assert_allclose(before.y - before.y.mean(), expected - expected.mean(), atol=0.03)
+    assert np.ptp(before.y) > 1.5
+    np.testing.assert_array_equal(after.y, 0.0)
+
+
+def test_the_view_of_hum_shows_its_line(rng):
+    time_s = 0.001 * np.arange(8192)
+    hum = np.sin(2 * np.pi * 50 * time_s) + 0.1 * rng.standard_normal(time_s.size)
+    one = RunView("", time_s, time_s, time_s, hum, 0 * hum, hum < 9)
+    view = next(view for view in VIEWS if "mains_hum" in view.effects)
+    before, _ = view.look([one], 1.0)
+    assert before.x[np.argmax(before.y)] == pytest.approx(50, rel=0.02)
+
+
+def test_numbers_have_sensible_digits():
+    shown = [number(x) for x in (0.0, 1234.5, 12.345, 0.09996, -0.000123, 2.5e-7, np.nan, 999.96)]
+    assert shown == ["0", "1234", "12.3", "0.100", "−0.000123", "2.50 × 10⁻⁷", "–", "1000"]  # noqa: RUF001
+    assert estimate(EffectParameter("a", 12.3456, 0.0234, "1", 12.29, 12.41)) == (
+        "12.346",
+        "0.023",
+        "12.290 to 12.410",
+    )
+    assert [percent(x) for x in (0.0, 0.004, 0.5, 0.999, 1.0)] == ["0 %", "< 1 %", "50 %", "> 99 %", "100 %"]
+    assert (chance(1e-12), chance(0.0123)) == ("below 10⁻⁹", "0.012")
+    assert [sigmas(z) for z in (0.04, -2.71, 24.31, 12345.0)] == ["0.0", "−2.7", "24.3", "12345"]  # noqa: RUF001
+    named = [parameter_name(EffectParameter(n, 1, 1, u, 1, 1)) for n, u in (("onset_s", "s"), ("a_um_per_s", "um/s"))]
+    assert named == ["onset", "a"]
+    assert [shown_unit(u) for u in ("1", "um", "um/K", "1/K", "um/V^2")] == ["", "µm", "µm/K", "1/K", "µm/V²"]
+
+
+def browser():
+    names = ("chromium", "chromium-browser", "google-chrome")
+    return next(filter(None, map(shutil.which, names)), None)
+
+
+def opened(text, width_px, folder):
+    """What a browser says of a page in a frame of a width; a window cannot be as narrow as a phone."""
+    watch = (
+        "<script>window.problems = []; addEventListener('error', e => problems.push(String(e.message)), true);"
+        "console.error = (...words) => problems.push(words.join(' '));</script>"
+    )
+    page = json.dumps(text.replace("<head>", f"<head>{watch}", 1)).replace("</", "<\\/")
+    outer = folder / f"outer{width_px}.html"
+    outer.write_text(
+        f"<!DOCTYPE html><body><iframe id='frame' width='{width_px}' height='800' style='border:0'></iframe>"
+        "<pre id='seen'></pre><script>const frame = document.getElementById('frame');"
+        "frame.addEventListener('load', () => { const w = frame.contentWindow, d = w.document;"
+        "document.getElementById('seen').textContent = JSON.stringify({width: w.innerWidth,"
+        "needed: d.documentElement.scrollWidth, problems: w.problems,"
+        "pictures: [...d.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().width),"
+        "broken: [...d.images].filter(i => !i.complete || !i.naturalWidth).length}); });"
+        f"frame.srcdoc = {page};</script></body>",
+        encoding="utf-8",
+    )
+    options = (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--virtual-time-budget=5000",
+        "--window-size=1400,900",
+    )
+    command = [browser(), *options, f"--user-data-dir={folder / 'profile'}", "--dump-dom", outer.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    return json.loads(unescape(re.search(r'<pre id="seen">(.*?)</pre>', done.stdout, re.DOTALL)[1]))
+
+
+@pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the report with")
+@pytest.mark.parametrize("width_px", [360, 1200])
+def test_a_browser_shows_the_report_without_scrolling_sideways(rng, tmp_path, width_px):
+    found = diagnosis(rng, "unexplained")
+    seen = opened(report_html(found), width_px, tmp_path)
+    assert seen["width"] == width_px
+    assert seen["needed"] <= width_px
+    assert seen["problems"] == []
+    assert seen["broken"] == 0
+    visible = [width for width in seen["pictures"] if width > 0]
+    assert len(visible) == len(seen["pictures"]) / 2
+    assert all(250 < width <= width_px for width in visible)
+    wide = report_html(found).replace("<main>", '<main><div style="width: 3000px">x</div>', 1)
+    assert opened(wide, width_px, tmp_path)["needed"] > width_px
