@@ -17,6 +17,7 @@ from fits._result import Prediction, predict
 from fits._stage_report import describe_stage
 from fits._stage_result import predict_stage
 from fits._stage_uncertainty import StageUncertainty
+from fits._uncertainty import Uncertainty
 from fits._units import parse_columns
 from microid import Preisach, Stage, parameter_table
 
@@ -72,15 +73,20 @@ def run_info(*, model: str, as_json: bool) -> None:
     click.echo(f"{kind}, written by {loaded.written_by}")
     for row in parameters:
         click.echo(f"  {row['path']:28} {'x'.join(map(str, row['shape'])) or '1':>8} {row['unit']}")
+    if loaded.uncertainty is None:
+        click.echo("\nwritten by 'microid diagnose', whose report says how well it predicts")
+        return
     words = describe_stage if isinstance(loaded.uncertainty, StageUncertainty) else describe
     click.echo(f"\n{words(loaded.report)}")
 
 
 def _predict(path: str, loaded: ModelFile, record: Record, initial: str) -> Prediction:
     """Predict with whatever model a file holds."""
-    if isinstance(loaded.uncertainty, StageUncertainty):
-        assert isinstance(loaded.model, Stage)
+    if isinstance(loaded.model, Stage):
+        assert not isinstance(loaded.uncertainty, Uncertainty)
         return predict_stage(loaded.model, loaded.uncertainty, record, initial)
+    if not isinstance(loaded.uncertainty, Uncertainty):
+        raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
     return predict(preisach_of(path, loaded), loaded.uncertainty, record, initial)
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits._compensate_effects import follow, has_effects, plain_of
 from fits._compensate_stage import begins_in_motion, command, demand, simulate_model, static_equivalent, turns
 from fits._errors import DataError
 from fits._record import Record, Reference
@@ -91,6 +92,18 @@ def compensate(
     if reference.displacement_um is None:
         raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
     wanted, time_s = reference.displacement_um, reference.time_s
+    if isinstance(model, Stage) and has_effects(model):
+        rounds: list[Compensation] = []
+
+        def inverse(asked: Reference) -> np.ndarray:
+            rounds.append(compensate(plain_of(model), asked, initial, clip=clip, limits_V=limits_V, way=way))
+            return rounds[-1].voltage_V
+
+        def response(stage: Stage, voltage_V: np.ndarray) -> np.ndarray:
+            return simulate_model(stage, Record(time_s, voltage_V, None, source=reference.source), initial)
+
+        voltage = follow(model, reference, inverse, response)
+        return Compensation(voltage, response(model, voltage), wanted, rounds[-1].clipped, rounds[-1].remarks)
     law = static_equivalent(model) if isinstance(model, Stage) else model
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":

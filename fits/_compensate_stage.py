@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import microid
+from fits._compensate_effects import plain_of
 from fits._errors import DataError
 from fits._record import Record
 from fits._run import initial_state, prepare_run, simulate_run
-from microid import AbstractLinear, GridDensity, Preisach, Reversible, Stage, Staircase, Start
+from microid import AbstractLinear, GridDensity, Preisach, Reversible, Stage, Staircase, Start, innermost
 
 # Doubt about the displacement needed, or a start in motion, that is worth a remark: a fraction of the span.
 _WORTH_SAYING = 0.01
@@ -40,7 +41,7 @@ class Gains:
 
 def hysteresis_of(stage: Stage) -> Preisach:
     """Find the one Preisach hysteresis of a stage."""
-    found = [part for part in stage.parts if isinstance(part, Preisach)]
+    found = [innermost(part) for part in stage.parts if isinstance(innermost(part), Preisach)]
     if not found:
         parts = ", ".join(f"{n} ({type(p).__name__})" for n, p in zip(stage.names, stage.parts, strict=True))
         raise DataError(f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.")
@@ -75,6 +76,7 @@ def static_equivalent(stage: Stage) -> Preisach:
     DataError
         If the stage has no Preisach hysteresis, or a static gain that is not positive.
     """
+    stage = plain_of(stage)
     law, gains = hysteresis_of(stage), gains_of(stage)
     lower, upper = law.density.lower_V / gains.ahead, law.density.upper_V / gains.ahead
     weights = law.weights_um[np.tril_indices(law.density.levels)]

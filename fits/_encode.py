@@ -90,11 +90,16 @@ def _classes() -> dict[str, type[eqx.Module]]:
     modules = {
         name: value for name, value in public.items() if inspect.isclass(value) and issubclass(value, eqx.Module)
     }
-    return {name: cls for name, cls in modules.items() if not inspect.isabstract(cls)} | {
-        "Grid": Grid,
-        "StageUncertainty": StageUncertainty,
-        "Uncertainty": Uncertainty,
-    }
+    effects = {effect.__name__: effect for effect in microid.EFFECTS}
+    return (
+        {name: cls for name, cls in modules.items() if not inspect.isabstract(cls)}
+        | effects
+        | {
+            "Grid": Grid,
+            "StageUncertainty": StageUncertainty,
+            "Uncertainty": Uncertainty,
+        }
+    )
 
 
 def _fields(cls: type[eqx.Module]) -> dict[str, dataclasses.Field[Any]]:

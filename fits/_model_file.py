@@ -80,7 +80,7 @@ class ModelFile:
     """
 
     model: eqx.Module
-    uncertainty: Uncertainty | StageUncertainty
+    uncertainty: Uncertainty | StageUncertainty | None
     report: dict[str, Any]
     written_by: str
 
@@ -88,7 +88,7 @@ class ModelFile:
 def save_model(
     path: str | os.PathLike[str],
     model: eqx.Module,
-    uncertainty: Uncertainty | StageUncertainty,
+    uncertainty: Uncertainty | StageUncertainty | None,
     report: Mapping[str, Any],
 ) -> None:
     """Write a model file, whole or not at all.
@@ -116,7 +116,9 @@ def save_model(
     atomic_write_text(path, text)
 
 
-def model_text(model: eqx.Module, uncertainty: Uncertainty | StageUncertainty, report: Mapping[str, Any]) -> str:
+def model_text(
+    model: eqx.Module, uncertainty: Uncertainty | StageUncertainty | None, report: Mapping[str, Any]
+) -> str:
     """Compose the text of a model file; a `DataError` says why it cannot be."""
     content: dict[str, Any] = {
         "schema": SCHEMA,
@@ -169,11 +171,13 @@ def load_model(path: str | os.PathLike[str]) -> ModelFile:
         uncertainty = decode(content["uncertainty"], "uncertainty")
     except DataError as error:
         raise DataError(f"{shown}: {error}; write the file again with 'microid fit'.") from error
-    if not isinstance(model, eqx.Module) or not isinstance(uncertainty, Uncertainty | StageUncertainty):
+    if not isinstance(model, eqx.Module) or not isinstance(uncertainty, Uncertainty | StageUncertainty | None):
         raise DataError(f"{shown}: expected a model and its uncertainty; write the file again with 'microid fit'.")
     if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
         raise DataError(f"{shown}: the uncertainty does not fit the stage; write the file again with 'microid fit'.")
-    if uncertainty.columns_um.shape[1] != (0 if uncertainty.grid is None else uncertainty.grid.columns):
+    if uncertainty is not None and uncertainty.columns_um.shape[1] != (
+        0 if uncertainty.grid is None else uncertainty.grid.columns
+    ):
         raise DataError(f"{shown}: the uncertainty does not fit its grid; write the file again with 'microid fit'.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
 

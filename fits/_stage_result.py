@@ -10,7 +10,7 @@ from fits._record import Record
 from fits._result import FitStatus, Prediction, RunReport, pool, refuse_outside
 from fits._stage_run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, simulate_stage
 from fits._stage_uncertainty import StageUncertainty
-from microid import Preisach, Stage
+from microid import Preisach, Stage, innermost
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class StageFit:
 def range_of(stage: Stage) -> tuple[float, float]:
     """Commands that a stage was fitted on, in V; unlimited without a Preisach operator."""
     place = place_of_hysteresis(stage)
-    law = None if place is None else stage.parts[place]
+    law = None if place is None else innermost(stage.parts[place])
     if isinstance(law, Preisach):
         gain = gain_ahead(stage)
         assert gain is not None
@@ -148,7 +148,7 @@ def predict_stage(
     """
     lower, upper = range_of(stage)
     refuse_outside(record, lower, upper)
-    program = Record(record.time_s, record.voltage_V, np.zeros(len(record)), source=record.source)
+    program = Record(record.time_s, record.voltage_V, np.zeros(len(record)), record.extra, source=record.source)
     run = prepare_stage_run(program, (lower, upper), initial, 1.0, stage.substeps, gain_ahead(stage), stage.hold)
     # The program is refined already.
     stage = stage.with_substeps(1)

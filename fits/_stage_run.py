@@ -14,7 +14,18 @@ from jaxtyping import Array, Float
 from fits._errors import DataError
 from fits._record import Record
 from fits._run import initial_state, known_samples
-from microid import AbstractHysteresis, AbstractLinear, Hold, LinearSystem, Preisach, Signal, Stage, Staircase, Start
+from microid import (
+    AbstractHysteresis,
+    AbstractLinear,
+    Hold,
+    LinearSystem,
+    Preisach,
+    Signal,
+    Stage,
+    Staircase,
+    Start,
+    innermost,
+)
 
 # Records are filled up to a power of two, so that those of like length share what was compiled.
 _SHORTEST = 1024
@@ -45,6 +56,8 @@ class Samples(eqx.Module):
         Refined steps per sample.
     moving
         Whether the stage may have been moving when the record began.
+    beside
+        Further columns at the refined times under the names of `columns_beside`, shape `(m,)`.
     """
 
     time_s: Float[Array, " m"] | Float[Array, ""]
@@ -54,6 +67,7 @@ class Samples(eqx.Module):
     start: Start
     stride: int = eqx.field(static=True)
     moving: bool = eqx.field(static=True)
+    beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -149,9 +163,30 @@ def prepare_stage_run(
             "out; state the initial state with --initial, hold out less, or start each run with a full loop"
         )
     samples = refine(record.time_s, record.voltage_V, record.displacement_um, fitted, stride, unknown, hold)
+    share = np.arange(samples.voltage_V.shape[0]) / stride
+    beside = {name: jnp.asarray(np.interp(share, np.arange(n), v)) for name, v in columns_beside(record).items()}
+    samples = eqx.tree_at(lambda s: s.beside, samples, beside)
     ahead = 1.0 if gain is None else gain
     memory = _roomy(initial_state(initial, ahead * lower, ahead * upper))
     return StageRun(record, eqx.tree_at(lambda s: s.start.memory, samples, memory, is_leaf=_none), known, fitted)
+
+
+def columns_beside(record: Record) -> dict[str, np.ndarray]:
+    """Further columns of a record under the names that effects know, shape `(n,)` each.
+
+    A name that speaks of temperature, or is in degrees, is `temperature_degC`; another one in a unit of length or
+    voltage is the second axis, `other_um`. A column that does not change shows nothing.
+    """
+    found: dict[str, np.ndarray] = {}
+    for name, values in record.extra.items():
+        low = name.lower()
+        if np.ptp(values) == 0 or not np.all(np.isfinite(values)):
+            continue
+        if "temp" in low or low.endswith(("_degc", "_k", "_c")):
+            found.setdefault("temperature_degC", values)
+        elif low.endswith(("_um", "_nm", "_mm", "_m", "_v", "_mv")):
+            found.setdefault("other_um", values)
+    return found
 
 
 def _none(value: Any) -> bool:
@@ -198,8 +233,8 @@ def _roomy(start: Staircase) -> Staircase:
 
 def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
     """Simulate a run, in um, shape `(n,)`."""
-    start = samples.start if any(isinstance(part, Preisach) for part in stage.parts) else Start()
-    return stage(samples.time_s, samples.voltage_V, start)[:: samples.stride]
+    start = samples.start if any(isinstance(innermost(part), Preisach) for part in stage.parts) else Start()
+    return stage(samples.time_s, samples.voltage_V, start, samples.beside)[:: samples.stride]
 
 
 def lead_ins(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
@@ -251,7 +286,7 @@ def residual_of(stage: Stage, run: StageRun) -> np.ndarray:
 
 def place_of_hysteresis(stage: Stage) -> int | None:
     """Where in the chain the hysteresis stands; None where there is none."""
-    places = [place for place, part in enumerate(stage.parts) if isinstance(part, AbstractHysteresis)]
+    places = [n for n, part in enumerate(stage.parts) if isinstance(innermost(part), AbstractHysteresis)]
     return places[0] if places else None
 
 

@@ -33,6 +33,7 @@ from microid._part import AbstractLinear as AbstractLinear
 from microid._part import AbstractPart as AbstractPart
 from microid._part import Scene as Scene
 from microid._part import Signal as Signal
+from microid._part import innermost as innermost
 from microid._plant import Driver as Driver
 from microid._plant import Mechanics as Mechanics
 from microid._plant import Piezo as Piezo

@@ -75,6 +75,13 @@ class AbstractPart(eqx.Module):
         """
 
 
+def innermost(part: Any) -> Any:
+    """The part that stands inside of all that is put around it, or the part itself."""
+    while hasattr(part, "inner"):
+        part = part.inner
+    return part
+
+
 class AbstractLinear(AbstractPart):
     """A part with a transfer function. Neighbours of this kind are solved together, exactly."""
 

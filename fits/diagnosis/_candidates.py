@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fits._stage_run import columns_beside
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._evaluate import Prepared, columns_of_record, prepare, respond_again, signals, with_effects
+from fits.diagnosis._evaluate import Prepared, prepare, respond_again, signals, with_effects
 from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host
 
 # Strength at which an effect's derivative is taken, as a share of that of its probe.
@@ -26,7 +27,9 @@ class Bench:
 
     def __init__(self, baseline: Baseline, aside: bool = False):
         self.baseline = baseline
-        self.stage = baseline.stage.with_substeps(1)
+        stage = baseline.stage.with_substeps(1)
+        # What a fit may move is looked up anew for every stage that is built.
+        self.stage = stage.thaw(*stage.frozen)
         runs = baseline.coarse_aside if aside else baseline.coarse
         self.prepared = [prepare(self.stage, run) for run in runs]
         self.known = [signals(self.stage, one) for one in self.prepared]
@@ -85,7 +88,7 @@ def scales_of(bench: Bench, noise_um: float) -> Scales:
     fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
     columns = {}
     for run in baseline.runs:
-        for name, values in columns_of_record(run).items():
+        for name, values in columns_beside(run.record).items():
             columns.setdefault(name, (float(np.mean(values)), float(np.ptp(values))))
     return Scales(
         lower_V=baseline.range_V[0],
@@ -108,7 +111,7 @@ def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
     if form.fast and not baseline.dynamic:
         return "the runs do not show the dynamics"
     for name in form.needs:
-        if not all(name in columns_of_record(run) for run in baseline.runs):
+        if not all(name in columns_beside(run.record) for run in baseline.runs):
             return f"the runs lack a column {name} that varies"
     try:
         host(form, stage)

@@ -14,11 +14,11 @@ from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
 from fits.diagnosis._extend import Compared, corrected, extended_stage, feedforward, gain_of, left_of, shared_effects
 from fits.diagnosis._faults import Faults, find_faults, name_faults
-from fits.diagnosis._projector import Noise, Projector, learn_roughness
-from fits.diagnosis._refit import Refit, nothing, refit
+from fits.diagnosis._projector import Projector, learn_roughness
+from fits.diagnosis._refit import Refit, refit
 from fits.diagnosis._regression import Regression, regress
-from fits.diagnosis._result import Bound, Diagnosis, Gain, RunView, Test
-from fits.diagnosis._select import Selection, best_of, select
+from fits.diagnosis._result import Diagnosis, RunView, Test
+from fits.diagnosis._select import Selection, select
 from fits.diagnosis._structure import cycles, look, together, views
 from fits.diagnosis._tell import bounds, causes_of
 from microid import EFFECTS
@@ -160,8 +160,7 @@ def _conclude(
     ways = views(baseline.runs, bench.plain)
     none = np.zeros((len(found.plain.residual), 0))
     seen = look(projector, none, found.plain.residual, ways)
-    # What all ways of looking and the causes explain together is what there is to be explained.
-    reproducible, freedom = together(projector, none, found.plain.residual, ways)
+    # What the causes explain and what is left to be seen in any way is what there is to be explained.
     explained = found.plain.cost - found.model.cost
     rest, rest_freedom = together(projector, found.model.basis(), found.model.residual, ways)
     period_um, cycle_z, cycle_drop = cycles(projector, found.model.residual, bench.plain)

@@ -5,31 +5,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from fits._stage_run import StageRun
 from microid import AbstractEffect, AbstractPart, Scene, Signal, Stage, extend, host
-
-TEMPERATURE, OTHER = "temperature_degC", "other_um"
-
-
-def columns_of_record(run: StageRun) -> dict[str, np.ndarray]:
-    """Further columns of a record under the names that effects know, shape `(n,)` each.
-
-    A name with `temp` in it is a temperature; another one that ends in a unit of length or voltage is the second
-    axis.
-    """
-    found: dict[str, np.ndarray] = {}
-    for name, values in run.record.extra.items():
-        low = name.lower()
-        if np.ptp(values) == 0 or not np.all(np.isfinite(values)):
-            continue
-        if "temp" in low or low.endswith(("_degc", "_k", "_c")):
-            found.setdefault(TEMPERATURE, values)
-        elif low.endswith(("_um", "_nm", "_mm", "_m", "_v", "_mv")):
-            found.setdefault(OTHER, values)
-    return found
 
 
 @dataclass(frozen=True)
@@ -45,12 +24,7 @@ def prepare(stage: Stage, run: StageRun) -> Prepared:
     """Build the scene of a run."""
     samples = run.samples
     command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
-    m, n = samples.voltage_V.shape[0], len(run.record)
-    columns = {}
-    for name, values in columns_of_record(run).items():
-        fine = np.interp(np.arange(m) / samples.stride, np.arange(n), values)
-        columns[name] = jnp.asarray(fine)
-    return Prepared(run, samples.time_s, Scene(command, columns, samples.start.memory))
+    return Prepared(run, samples.time_s, Scene(command, samples.beside, samples.start.memory))
 
 
 @eqx.filter_jit

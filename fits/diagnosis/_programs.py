@@ -319,7 +319,7 @@ def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[tup
     bias = (low + 0.2 * span, low + 0.5 * span, low + 0.8 * span)
     swing = (0.05 * span, 0.15 * span, 0.5 * span)
     period = 2 * _PER_PERIOD * limits.interval_s
-    beat = (4 / (limits.resonance_Hz or 1 / (0.05 * whole)))
+    beat = 4 / (limits.resonance_Hz or 1 / (0.05 * whole))
     return [
         ("a rest after one loop", idle, [(low, low + 0.5 * span, high), (0.01 * whole, 0.03 * whole, 0.2 * whole)]),
         ("a staircase up and down with long and short holds", staircase, [bottom, top, (0.3, 1.5, 2.5)]),
@@ -348,6 +348,10 @@ def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[tup
         (
             "a slow loop before and twice after a burst of hard driving",
             burst,
-            [(0.2 * span, 0.45 * span, 0.5 * span), (0.05 * whole, 0.3 * whole, 0.5 * whole), (period, period, 20 * period)],
+            [
+                (0.2 * span, 0.45 * span, 0.5 * span),
+                (0.05 * whole, 0.3 * whole, 0.5 * whole),
+                (period, period, 20 * period),
+            ],
         ),
     ]

@@ -4,22 +4,29 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.linalg import qr
-from scipy.optimize import least_squares
 
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Scored
-from microid import AbstractEffect, Coordinates, ParameterInfo
+from microid import AbstractEffect, Coordinates, ParameterInfo, Sensor
 
 _STEP = 1e-3
-_EVALUATIONS = 25
+# Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
+_ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
 
 
 def _own(info: ParameterInfo) -> bool:
     return not info.path.startswith("inner")
+
+
+def _alone(effect: AbstractEffect) -> AbstractEffect:
+    anything = Sensor(jnp.ones(()), jnp.zeros(()))
+    return replace(effect, inner=anything) if hasattr(effect, "inner") else effect  # type: ignore[call-arg]
 
 
 class Law:
@@ -30,8 +37,9 @@ class Law:
 
     def __init__(self, effects: Sequence[AbstractEffect]):
         self.form = type(effects[0])
-        self.maps = [Coordinates(effect, _own) for effect in effects]
-        vectors = [np.asarray(one.of(effect)) for one, effect in zip(self.maps, effects, strict=True)]
+        # The part that an effect is put around is put in anew wherever it is simulated.
+        self.maps = [Coordinates(_alone(effect), _own) for effect in effects]
+        vectors = [np.asarray(one.of(_alone(effect))) for one, effect in zip(self.maps, effects, strict=True)]
         names = [info.path for info in self.maps[0].table]
         strength = np.concatenate(
             [np.full(math.prod(info.shape), info.path in self.form.strength) for info in self.maps[0].table]
@@ -59,7 +67,12 @@ class Law:
 
     def effect(self, x: np.ndarray, run: int) -> AbstractEffect:
         """The effect in one run."""
-        return self.maps[run](jnp.asarray(self.vector(x, run)))
+        return _at(self.maps[run], jnp.asarray(self.vector(x, run)))
+
+
+@eqx.filter_jit
+def _at(coordinates: Coordinates[AbstractEffect], vector: Float[Array, " k"]) -> AbstractEffect:
+    return coordinates(vector)
 
 
 def law_of(scored: Scored, runs: int) -> Law:
@@ -148,26 +161,52 @@ def nothing(bench: Bench, projector: Projector) -> Refit:
     )
 
 
-def refit(bench: Bench, projector: Projector, laws: Sequence[Law], x: Sequence[np.ndarray] | None = None) -> Refit:
+def refit(
+    bench: Bench, projector: Projector, laws: Sequence[Law], x: Sequence[np.ndarray], rounds: int = _ROUNDS
+) -> Refit:
     """Fit effects together: Levenberg and Marquardt's steps, the baseline projected out (variable projection)."""
+    return _fit(bench, projector, laws, x, 0, np.zeros((len(projector.residual), 0)), rounds)
+
+
+def refit_beside(bench: Bench, projector: Projector, model: Refit, law: Law) -> Refit:
+    """Fit one more effect, those that are there following along their tangent."""
+    return _fit(bench, projector, [*model.laws, law], [*model.x, law.start], len(model.laws), model.basis(), _ROUNDS)
+
+
+def _fit(
+    bench: Bench,
+    projector: Projector,
+    laws: Sequence[Law],
+    x: Sequence[np.ndarray],
+    held: int,
+    basis: np.ndarray,
+    rounds: int,
+) -> Refit:
+    """Fit all laws but the first so many, which follow along `basis`."""
     runs = len(bench.prepared)
-    sizes = [law.size for law in laws]
+    sizes = [law.size for law in laws[held:]]
+
     target = projector.off(projector.residual)
 
     def parts(flat: np.ndarray) -> list[np.ndarray]:
         return np.split(flat, np.cumsum(sizes)[:-1])
 
+    fixed = [[law.effect(own, run) for law, own in zip(laws[:held], x[:held], strict=True)] for run in range(runs)]
+
     def change(flat: np.ndarray) -> list[np.ndarray]:
         cut = parts(flat)
-        effects = [[law.effect(own, run) for law, own in zip(laws, cut, strict=True)] for run in range(runs)]
+        effects = [
+            [*fixed[run], *(law.effect(own, run) for law, own in zip(laws[held:], cut, strict=True))]
+            for run in range(runs)
+        ]
         return [a - b for a, b in zip(bench.respond(effects), bench.plain, strict=True)]
 
     def left(flat: np.ndarray) -> np.ndarray:
-        moved = projector.off(projector.join(change(flat)))
-        return np.where(np.isfinite(moved), target - moved, 1e6)
+        moved = target - projector.off(projector.join(change(flat)))
+        moved = moved - basis @ (basis.T @ moved)
+        return np.where(np.isfinite(moved), moved, 1e6)
 
-    def slope(flat: np.ndarray) -> np.ndarray:
-        at = left(flat)
+    def slope(flat: np.ndarray, at: np.ndarray) -> np.ndarray:
         steps = []
         for k in range(len(flat)):
             ahead = flat.copy()
@@ -175,15 +214,33 @@ def refit(bench: Bench, projector: Projector, laws: Sequence[Law], x: Sequence[n
             steps.append((left(ahead) - at) / _STEP)
         return np.stack(steps, axis=1)
 
-    start = np.concatenate([law.start for law in laws] if x is None else list(x))
-    found = least_squares(
-        left, start, jac=slope, method="trf", x_scale="jac", max_nfev=_EVALUATIONS, ftol=1e-7, xtol=1e-6, gtol=1e-9
-    )
+    flat = np.concatenate(list(x[held:]))
+    residual = left(flat)
+    jacobian = slope(flat, residual)
+    damping = 1e-3
+    for _ in range(rounds):
+        cost = float(residual @ residual)
+        scale = np.linalg.norm(jacobian, axis=0) + 1e-300
+        gram, cross = (jacobian / scale).T @ (jacobian / scale), (jacobian / scale).T @ residual
+        moved = False
+        for _ in range(4):
+            step = -np.linalg.solve(gram + damping * np.eye(len(flat)), cross) / scale
+            # No coordinate moves by more than a few e-folds at a time.
+            step *= min(1.0, _FARTHEST / (float(np.max(np.abs(step))) + 1e-300))
+            trial = left(flat + step)
+            if float(trial @ trial) < cost:
+                flat, residual, damping, moved = flat + step, trial, damping / 10, True
+                break
+            damping *= 10
+        if not moved or cost - float(residual @ residual) < _ENOUGH:
+            break
+        jacobian = slope(flat, residual)
+    cut = parts(flat)
     return Refit(
         tuple(laws),
-        tuple(parts(found.x)),
-        tuple(change(found.x)),
-        found.fun,
-        -found.jac,
-        float(found.fun @ found.fun),
+        (*x[:held], *cut),
+        tuple(change(flat)),
+        residual,
+        -jacobian,
+        float(residual @ residual),
     )

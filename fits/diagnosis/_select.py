@@ -7,17 +7,19 @@ import numpy as np
 
 from fits.diagnosis._candidates import Bench, Probe
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Law, Refit, law_of, nothing, refit
+from fits.diagnosis._refit import Refit, law_of, nothing, refit, refit_beside
 from fits.diagnosis._score import Family, Scored, rescore, score
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
-_LEADERS, _FORMS = 6, 2
+_LEADERS, _FORMS = 5, 2
 _MOST = 4
 # Differences of the criterion, and standard deviations after projecting one effect off another, within which two
 # effects are not told apart.
 _SAME, _APART = 10.0, 4.0
+# Part of a cause's signature by which its model may be off.
+_INEXACT = 0.05
 # Scores below this share of the best are not worth a fit.
-_WORTH = 0.3
+_WORTH = 0.4
 
 
 @dataclass(frozen=True)
@@ -104,18 +106,19 @@ def select(
     scores = left = tuple(score(projector, probe, plain.residual) for probe in probes)
     family = Family(scores, rng)
     causes: list[Cause] = []
-    laws: list[Law] = []
     while len(causes) < _MOST:
         taken = {cause.name for cause in causes}
         open_ = [one for one in left if one.name not in taken]
         if not open_:
             break
         top = max(one.z for one in open_)
-        p = family.p(top)
+        # Models of effects are not exact: what is left of a cause may look like another.
+        inexact = _INEXACT * max(plain.cost - model.cost, 0.0) ** 0.5
+        p = family.p(max(top**2 - inexact**2, 0.0) ** 0.5)
         if p >= false_alarm:
             break
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
-        rivals = _contest(bench, projector, model, laws, open_, top)
+        rivals = _contest(bench, projector, model, open_, top)
         if not rivals:
             break
         first = rivals[0]
@@ -123,7 +126,7 @@ def select(
         causes.append(
             Cause(first.name, max(drop, 0.0) ** 0.5, family.p(max(drop, 0.0) ** 0.5), tuple(rivals[1:]), drop)
         )
-        model, laws = first.refit, list(first.refit.laws)
+        model = refit(bench, projector, first.refit.laws, first.refit.x) if model.laws else first.refit
         basis = model.basis()
         left = tuple(rescore(one, basis, model.residual) for one in scores)
         family = Family(left, rng)
@@ -131,9 +134,7 @@ def select(
     return Selection(tuple(causes), model, plain, scores, left, family)
 
 
-def _contest(
-    bench: Bench, projector: Projector, model: Refit, laws: Sequence[Law], scores: Sequence[Scored], top: float
-) -> list[Rival]:
+def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[Scored], top: float) -> list[Rival]:
     """Fit the leaders beside what is there already: the best, then those not told apart from it."""
     runs = len(bench.prepared)
     names = [name for name, one in best_of(scores).items() if one.z > _WORTH * top][:_LEADERS]
@@ -147,7 +148,7 @@ def _contest(
                 continue
             tried[form] = tried.get(form, 0) + 1
             law = law_of(one, runs)
-            found = refit(bench, projector, [*laws, law], [*model.x, law.start])
+            found = refit_beside(bench, projector, model, law)
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
     order = sorted(fitted, key=lambda name: fitted[name].criterion(projector.count))
@@ -171,7 +172,7 @@ def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Re
         trials = []
         for k in range(len(causes)):
             laws = [law for i, law in enumerate(model.laws) if i != k]
-            without = refit(bench, projector, laws, [x for i, x in enumerate(model.x) if i != k])
+            without = refit(bench, projector, laws, [x for i, x in enumerate(model.x) if i != k], 3)
             trials.append((without.criterion(projector.count), k, without))
         criterion, k, without = min(trials, key=lambda t: t[0])
         if criterion > model.criterion(projector.count) + _SAME:

@@ -131,7 +131,7 @@ def together(
 
 
 def cycles(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """Strongest period of the residual in the position: its period in um, evidence, and decrease of the sum of squares."""
+    """Strongest period of the residual in the position: period in um, evidence, decrease of the sum of squares."""
     parts = projector.split(residual)
     masks = projector.masks
     span = max(float(np.ptp(p)) for p in plain_um)
@@ -139,7 +139,7 @@ def cycles(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.nda
     best = (0.0, 0.0, 0.0)
     for count in np.geomspace(16, 2000, _CYCLES * 8):
         drop = 0.0
-        for part, mask, plain, noise in zip(parts, masks, plain_um, projector.noise, strict=True):
+        for part, mask, plain in zip(parts, masks, plain_um, strict=True):
             phase = 2 * np.pi * count * plain[mask] / span
             wave = np.exp(1j * phase)
             n = len(part)

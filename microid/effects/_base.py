@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from microid._linear import Times
-from microid._part import AbstractHysteresis, AbstractPart, Signal
+from microid._part import AbstractHysteresis, AbstractPart, Signal, innermost
 from microid._plant import Driver, Mechanics
 from microid._stage import Stage
 
@@ -154,13 +154,9 @@ def host(effect: type[AbstractEffect], stage: Stage) -> int | None:
         return None
     kinds = {"driver": Driver, "hysteresis": AbstractHysteresis, "mechanics": Mechanics}
     for place, part in enumerate(stage.parts):
-        if isinstance(_innermost(part), kinds[effect.place]):
+        if isinstance(innermost(part), kinds[effect.place]):
             return place
     raise ValueError(f"{effect.name!r} acts on a {effect.place}, and this stage has none")
-
-
-def _innermost(part: Any) -> Any:
-    return _innermost(part.inner) if isinstance(part, AbstractEffect) and hasattr(part, "inner") else part
 
 
 def extend(stage: Stage, effect: AbstractEffect) -> Stage:
@@ -184,14 +180,14 @@ def extend(stage: Stage, effect: AbstractEffect) -> Stage:
         return kept.swap(name, effect).freeze(*deeper)
     rank = PLACES.index(effect.place)
     for index, part in enumerate(stage.parts):
-        if _rank(part) > rank or (effect.place == "driver" and isinstance(_innermost(part), Driver)):
+        if _rank(part) > rank or (effect.place == "driver" and isinstance(innermost(part), Driver)):
             return stage.insert(index, effect.name, effect)
     return stage.append(effect.name, effect)
 
 
 def _rank(part: AbstractPart) -> float:
     """Place of a part among those of the effects: an effect comes behind what its place is named after."""
-    inner = _innermost(part)
+    inner = innermost(part)
     if isinstance(inner, AbstractHysteresis):
         return PLACES.index("hysteresis") - 0.5
     if isinstance(inner, Mechanics):

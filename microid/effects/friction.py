@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times
 from microid._param import param
-from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _innermost, register
+from microid._part import AbstractPart, Signal, innermost
+from microid.effects._base import AbstractEffect, Place, Scales, register
 from microid.effects._grids import decades
 from microid.effects._oscillator import forces_um
 
@@ -63,7 +63,7 @@ class Friction(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Let the mechanics answer to what the friction leaves of the piezo's displacement."""
-        mechanics = _innermost(self.inner)
+        mechanics = innermost(self.inner)
 
         def law(before: Array, there: Array, state: Array) -> tuple[Array, Array]:
             way = (there - before) / self.length_um

@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times
 from microid._param import param
-from microid._part import AbstractPart, Signal
+from microid._part import AbstractPart, Signal, innermost
 from microid._plant import Mechanics
-from microid.effects._base import AbstractEffect, Place, Scales, _innermost, register, times_of
+from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
 
 
 @register
@@ -108,7 +108,7 @@ def _loaded(
     start: Any,
     after_s: Float[Array, ""] | None,
 ) -> Signal:
-    plain = _innermost(inner)
+    plain = innermost(inner)
     slower = 1 / jnp.sqrt(1 + mass_ratio)
     loaded = Mechanics(plain.natural_frequency_Hz * slower, plain.damping_ratio * slower, plain.gain)
     more = loaded.run(time_s, signal, start).values - plain.run(time_s, signal, start).values

@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times
 from microid._param import param
-from microid._part import AbstractPart, Signal
+from microid._part import AbstractPart, Signal, innermost
 from microid._plant import Mechanics
-from microid.effects._base import AbstractEffect, Place, Scales, _innermost, register
+from microid.effects._base import AbstractEffect, Place, Scales, register
 
 
 @register
@@ -63,5 +63,5 @@ class SecondResonance(AbstractEffect):
         """Add the second mode's answer."""
         first = self.inner.run(time_s, signal, start)
         mode = Mechanics(self.frequency_Hz, self.damping_ratio)
-        more = _innermost(self.inner).gain * (mode.run(time_s, signal, start).values - signal.values)
+        more = innermost(self.inner).gain * (mode.run(time_s, signal, start).values - signal.values)
         return Signal(first.values + self.share * more, first.before, first.hold)

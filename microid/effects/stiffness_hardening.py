@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times
 from microid._param import array, param
-from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _innermost, register
+from microid._part import AbstractPart, Signal, innermost
+from microid.effects._base import AbstractEffect, Place, Scales, register
 from microid.effects._oscillator import forces_um
 
 _AT_REST = 8
@@ -69,7 +69,7 @@ class StiffnessHardening(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Let the mechanics answer to what the cubic leaves of the piezo's displacement."""
-        mechanics = _innermost(self.inner)
+        mechanics = innermost(self.inner)
 
         def law(_: Array, there: Array, memory: Any) -> tuple[Array, Any]:
             place = (there - self.centre_um) / self.half_stroke_um

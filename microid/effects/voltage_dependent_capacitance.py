@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times, _bend
 from microid._param import array, param
-from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _innermost, register, times_of
+from microid._part import AbstractPart, Signal, innermost
+from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
 
 _CORRECTIONS = 2
 
@@ -52,7 +52,7 @@ class VoltageDependentCapacitance(AbstractEffect):
         """A change of a tenth over half the range."""
         if inner is None:
             return ()
-        gain = _innermost(inner).gain
+        gain = innermost(inner).gain
         middle, half = (scales.upper_V + scales.lower_V) / 2, (scales.upper_V - scales.lower_V) / 2
         return ((cls(inner, jnp.asarray(0.1), gain * middle, gain * half),),)
 
@@ -63,7 +63,7 @@ class VoltageDependentCapacitance(AbstractEffect):
         return Signal(given.values + more, given.before, given.hold)
 
     def _followed(self, time_s: Times, signal: Signal, slope: Float[Array, ""]) -> Float[Array, " t"]:
-        driver = _innermost(self.inner)
+        driver = innermost(self.inner)
         first = driver.gain * signal.before
         if signal.values.shape[0] == 1:
             return first[None]

@@ -1,0 +1,209 @@
+"""The next experiment: the voltage program that would tell apart best what the records leave open."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fits.diagnosis._predict import Hypothesis, Predictor
+from fits.diagnosis._programs import Program, limits_of, menu
+from fits.diagnosis._refit import law_of
+from fits.diagnosis._result import Experiment, FoundCause
+from fits.diagnosis._select import Selection, best_of
+from microid import Mechanics
+
+if TYPE_CHECKING:
+    from fits.diagnosis._diagnose import Prepared
+
+# Samples of a program: as many as a diagnosis takes in easily.
+_MOST = 8192
+# An effect is suspected from this evidence on, or below this probability of as much by chance.
+_SUSPECT_Z, _SUSPECT_P = 2.5, 0.3
+# A class of effects that cannot be told apart counts so many others.
+_OTHERS = 2
+# Programs about as good as the best, of which the shortest is taken, and what an experiment must add to be worth it.
+_ALIKE, _WORTH = 0.95, 1.02
+# Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
+_PROBE, _LENGTHS = 0.05, (0.4, 0.15)
+_ROUNDS = 2
+
+_COLUMNS = (
+    (
+        ("creep", "thermal_drift", "mount_relaxation", "aging", "thermal_gain"),
+        "temperature_degC: the temperature of the stage's body, which what the room does follows and what the "
+        "command does ignores.",
+    ),
+    (
+        (
+            "transport_delay",
+            "sensor_lowpass",
+            "slew_limit",
+            "driver_saturation",
+            "voltage_dependent_capacitance",
+            "rate_dependence",
+        ),
+        "monitor_V: the voltage at the piezo, sampled with the displacement, which shows what the driver does and "
+        "nothing of the sensor.",
+    ),
+    (
+        ("cross_coupling", "floor_vibration"),
+        "other_um: the position of the second axis, without which its share of this one looks like a drift.",
+    ),
+    (
+        ("dropped_samples", "clock_mismatch", "timestamp_jitter"),
+        "raw time stamps of both clocks, which show a lost sample or a wrong rate at once.",
+    ),
+)
+
+
+def suggest(
+    ready: "Prepared",
+    found: Selection,
+    causes: tuple[FoundCause, ...],
+    duration_s: float | None,
+    progress: Callable[[str], None],
+) -> Experiment | None:
+    """Choose and refine the program that decides best what is open.
+
+    Each program of the menu is played virtually: the regression of the new run is added to that of the old ones, and
+    what the rivals change in all of them is projected off what the stage and the other rival can follow.
+
+    Parameters
+    ----------
+    ready, found
+        All that the diagnosis of the runs at hand knows.
+    causes
+        What it names; the first of them that has rivals is asked about. If there is none at all, what is suspected.
+    duration_s
+        Of the program; that of the longest run if None.
+    progress
+        Told what is being done.
+
+    Returns
+    -------
+    Experiment
+        None where every cause is told from all others or nothing is suspected, and where no program would help.
+    """
+    question = _open(ready, found, causes)
+    if question is None:
+        return None
+    names, hypotheses, pairs = question
+    progress("looking for the experiment that tells " + (" from ".join(names) if len(names) > 1 else names[0]))
+    baseline = ready.baseline
+    resonance = next((float(p.natural_frequency_Hz) for p in baseline.stage.parts if isinstance(p, Mechanics)), None)
+    limits = limits_of([run.record for run in baseline.runs], baseline.range_V, resonance, duration_s)
+    predictor = Predictor(ready.bench, ready.projector, hypotheses, pairs)
+    present = predictor.present_z
+    programs = menu(limits, _MOST)
+    if not programs:
+        return None
+    scores = [predictor.predicted_z(*program.samples(program.start)) for program in programs]
+    near = [k for k, z in enumerate(scores) if z >= _ALIKE * max(scores)]
+    chosen = min(near, key=lambda k: (programs[k].limits.duration_s, -scores[k]))
+    program, z = programs[chosen], scores[chosen]
+    progress(f"refining {program.words}")
+    parameters, z = refine(program, lambda p: predictor.predicted_z(*program.samples(p)), z)
+    column = _column(names, ready)
+    if z < _WORTH * present and not column:
+        return None
+    time_s, voltage_V = program.samples(parameters)
+    return Experiment(time_s, voltage_V, program.words, _purpose(names, z, present), names, z, present, column)
+
+
+Question = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
+
+
+def _open(ready: "Prepared", found: Selection, causes: tuple[FoundCause, ...]) -> Question | None:
+    """What is to be decided: names, hypotheses, and which is compared with which."""
+    named = {cause.name for cause in causes}
+    best = Hypothesis(found.model.laws, found.model.x)
+    for at, cause in enumerate(found.causes):
+        if cause.name not in named or not cause.rivals:
+            continue
+        rivals = cause.rivals[:_OTHERS]
+        others = [
+            Hypothesis(
+                (*best.laws[:at], rival.refit.laws[-1], *best.laws[at + 1 :]),
+                (*best.x[:at], rival.refit.x[-1], *best.x[at + 1 :]),
+            )
+            for rival in rivals
+            # Another cause may have turned out to be the rival.
+            if rival.name not in {c.name for i, c in enumerate(found.causes) if i != at}
+        ]
+        if others:
+            every = (best, *others)
+            # The cause and each rival, be the one or the other true: rivals among themselves may be alike for ever.
+            pairs = tuple(pair for k in range(1, len(every)) for pair in ((0, k), (k, 0)))
+            return tuple(h.names[at] for h in every), every, pairs
+    if causes:
+        return None
+    nothing = Hypothesis((), ())
+    if found.causes:
+        # What explains too little to be named is a suspicion all the same.
+        return (found.causes[0].name,), (Hypothesis(best.laws[:1], best.x[:1]), nothing), ((0, 1),)
+    leading = next(iter(best_of(found.left).values()), None)
+    if leading is None or (leading.z < _SUSPECT_Z and found.family.p(leading.z) >= _SUSPECT_P):
+        return None
+    law = law_of(leading, len(ready.bench.prepared))
+    return (leading.name,), (Hypothesis((law,), (law.start,)), nothing), ((0, 1),)
+
+
+def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) -> tuple[np.ndarray, float]:
+    """Climb the logarithm of a gain in a program's parameters, by finite differences, and keep the best.
+
+    Parameters
+    ----------
+    program
+        Where to begin, and the limits of its parameters.
+    gain
+        Of parameters, shape `(k,)`.
+    first
+        The gain at the program's start.
+    """
+    span = program.upper - program.lower
+    best, top = program.start.copy(), first
+    for _ in range(_ROUNDS):
+        slope = np.zeros(len(best))
+        for k in np.flatnonzero(span > 0):
+            ahead = best.copy()
+            # Towards the middle, so that a step is never cut off.
+            ahead[k] += span[k] * (_PROBE if best[k] < (program.lower + program.upper)[k] / 2 else -_PROBE)
+            slope[k] = np.log(max(gain(ahead), 1e-12) / max(top, 1e-12)) * span[k] / (ahead[k] - best[k])
+        size = float(np.max(np.abs(slope)))
+        if size == 0:
+            break
+        tried = [np.clip(best + length * span * slope / size, program.lower, program.upper) for length in _LENGTHS]
+        gains = [gain(p) for p in tried]
+        longest = int(np.argmax(gains))
+        if gains[longest] <= top:
+            break
+        best, top = tried[longest], gains[longest]
+    return best, top
+
+
+def _purpose(names: tuple[str, ...], z: float, present: float) -> str:
+    words = [name.replace("_", " ") for name in names]
+    if len(words) == 1:
+        return (
+            f"It would show {words[0]} of the size that is suspected by {z:.1f} standard deviations, where the "
+            f"records at hand show it by {present:.1f}."
+        )
+    listed = " and ".join([", ".join(words[:-1]), words[-1]])
+    return (
+        f"It would tell {listed} apart by {z:.1f} standard deviations at least, where the records at hand do by "
+        f"{present:.1f}."
+    )
+
+
+def _column(names: tuple[str, ...], ready: "Prepared") -> str:
+    """Which further column helps most of the suspects, and why; empty if none does, or it is there already."""
+    present = {name for run in ready.baseline.runs for name in run.record.extra}
+    counts = [sum(name in group for name in names) for group, _ in _COLUMNS]
+    k = int(np.argmax(counts))
+    if counts[k] == 0:
+        return ""
+    wanted = _COLUMNS[k][1]
+    there = {"temperature_degC": "temp", "monitor_V": "monitor", "other_um": "other"}.get(wanted.split(":")[0])
+    if there is not None and any(there in name.lower() for name in present):
+        return ""
+    return wanted

@@ -1,0 +1,215 @@
+"""What a run that was not measured yet would add: the information of the old runs plus that of a virtual one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import qr
+
+from fits._record import Record
+from fits._stage_run import prepare_stage_run
+from fits.diagnosis._candidates import Bench
+from fits.diagnosis._projector import Noise, Projector
+from fits.diagnosis._refit import Law
+from fits.diagnosis._regression import regress
+from microid import AbstractEffect
+
+_STEP = 1e-3
+# Relative precision below which a direction counts as not seen.
+_RIDGE = 1e-10
+# Noise that was learnt at a sampling interval so many times longer or shorter says nothing of its colour.
+_LIKE = 1.5
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Effects that the stage may have, with their coordinates in all runs; none for the plain stage."""
+
+    laws: tuple[Law, ...]
+    x: tuple[np.ndarray, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(law.form.name for law in self.laws)
+
+
+class Predictor:
+    """Predicts how well hypotheses are told apart after one more run.
+
+    Parameters
+    ----------
+    bench, projector
+        Of the runs at hand.
+    hypotheses
+        Of what the stage has.
+    pairs
+        Which are compared: the one that is true, and the one that is fitted.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        projector: Projector,
+        hypotheses: Sequence[Hypothesis],
+        pairs: Sequence[tuple[int, int]],
+    ):
+        self.bench, self.projector = bench, projector
+        self.hypotheses, self.pairs = tuple(hypotheses), tuple(pairs)
+        records = [one.run.record for one in bench.prepared]
+        # Where an effect differs from run to run, it will be as it was in the longest.
+        self._like = int(np.argmax([record.duration_s for record in records]))
+        self._vectors = [[law.vector(x, self._like) for law, x in zip(h.laws, h.x, strict=True)] for h in hypotheses]
+        self._extra = {name: np.asarray(values) for name, values in records[self._like].extra.items()}
+        self._kinds = _rough_kinds(projector)
+        regression = projector.regression
+        self._shared = regression.size + sum(regression.finer[kind][0].shape[1] for kind in self._kinds)
+        self._old = self._old_gram()
+
+    @property
+    def present_z(self) -> float:
+        """Standard deviations by which the worst pair differs in the runs at hand."""
+        return self._worst(self._old)
+
+    def predicted_z(self, time_s: np.ndarray, voltage_V: np.ndarray) -> float:
+        """The same after a run with this command, shape `(n,)` each."""
+        return self._worst(self._old + self._new_gram(time_s, voltage_V))
+
+    def _old_gram(self) -> np.ndarray:
+        """Gram matrix of what runs share and of the signals, each run's own unknowns eliminated."""
+        projector, runs = self.projector, range(len(self.bench.prepared))
+        columns: list[list[np.ndarray]] = []
+        for h in self.hypotheses:
+
+            def out(x: Sequence[np.ndarray], h: Hypothesis = h) -> list[np.ndarray]:
+                effects = [[law.effect(own, run) for law, own in zip(h.laws, x, strict=True)] for run in runs]
+                return self.bench.respond(effects)
+
+            at = out(h.x)
+            columns.append([a - b for a, b in zip(at, self.bench.plain, strict=True)])
+            for k, law in enumerate(h.laws):
+                for i in range(law.size):
+                    columns.append([(a - b) / _STEP for a, b in zip(out(_moved(h.x, k, i)), at, strict=True)])
+                # Strengths in the new run, which no old run says anything of.
+                columns += [[np.zeros_like(b) for b in at]] * int(_each(law).sum())
+        signals = np.stack([projector.join(column) for column in columns], axis=1)
+        root, inside = projector._r * projector._scale, projector._q.T @ signals
+        root[projector._weak] = 0.0
+        outside = projector.off(signals)
+        stacked = np.concatenate([root, inside], axis=1)
+        gram = stacked.T @ stacked
+        size = root.shape[1]
+        gram[size:, size:] += outside.T @ outside
+        keep = np.r_[0 : self._shared, size : len(gram)]
+        return _eliminated(gram, keep)
+
+    def _new_gram(self, time_s: np.ndarray, voltage_V: np.ndarray) -> np.ndarray:
+        """The same of a run with this command alone."""
+        baseline = self.bench.baseline
+        n = len(time_s)
+        share = np.linspace(0, 1, n)
+        extra = {
+            name: np.interp(share, np.linspace(0, 1, len(values)), values) for name, values in self._extra.items()
+        }
+        record = Record(time_s, voltage_V, np.zeros(n), extra, source="the next run")
+        run = prepare_stage_run(record, baseline.range_V, "unknown", 0.0, 1)
+        # What is known of the columns beforehand counts with the old runs.
+        alone = replace(baseline, prior=np.eye(1), runs=(run,), coarse=(run,), aside=(), coarse_aside=())
+        regression, bench = regress(alone), Bench(alone)
+        noise = self._noise(float(time_s[1] - time_s[0]))
+        shared = [regression.rows[0], *(regression.finer[kind][0] for kind in self._kinds)]
+        columns = []
+        for h, vectors in zip(self.hypotheses, self._vectors, strict=True):
+            at = self._respond(bench, h, vectors)
+            columns.append(at - bench.plain[0])
+            for k, law in enumerate(h.laws):
+                moved = [
+                    (self._respond(bench, h, _moved(vectors, k, i)) - at) / _STEP for i in range(len(vectors[k]))
+                ]
+                columns += _in_order(law, moved)
+        joined = np.concatenate([*shared, np.stack(columns, axis=1)], axis=1)
+        rows = noise.whiten(joined)[run.fitted]
+        own, _ = qr(noise.whiten(regression.own[0])[run.fitted], mode="economic")
+        rows -= own @ (own.T @ rows)
+        return rows.T @ rows
+
+    def _respond(self, bench: Bench, h: Hypothesis, vectors: Sequence[np.ndarray]) -> np.ndarray:
+        effects: list[AbstractEffect] = [
+            law.maps[self._like](jnp.asarray(v)) for law, v in zip(h.laws, vectors, strict=True)
+        ]
+        return bench.respond([effects])[0]
+
+    def _noise(self, interval_s: float) -> Noise:
+        """Noise of the run that was sampled most alike; white where none was."""
+        intervals = [float(np.median(np.diff(one.run.record.time_s))) for one in self.bench.prepared]
+        ratios = np.abs(np.log(np.asarray(intervals) / interval_s))
+        nearest = int(np.argmin(ratios))
+        noise = self.projector.noise[nearest]
+        colour = noise.past if ratios[nearest] < np.log(_LIKE) else np.zeros(0)
+        return Noise(noise.innovation_um if len(colour) else noise.total_um, colour)
+
+    def _worst(self, gram: np.ndarray) -> float:
+        """The smallest difference of all pairs, off what the stage and the fitted hypothesis can follow."""
+        left = _eliminated(gram, np.arange(self._shared, len(gram)))
+        starts, at = [], 0
+        for h in self.hypotheses:
+            starts.append(at)
+            at += 1 + sum(law.size + int(_each(law).sum()) for law in h.laws)
+        stops = [*starts[1:], at]
+        found = []
+        for true, fitted in self.pairs:
+            # Difference of the two, then the coordinates of the fitted one.
+            pick = np.zeros((len(left), stops[fitted] - starts[fitted]))
+            pick[starts[true], 0], pick[starts[fitted], 0] = 1.0, -1.0
+            pick[starts[fitted] + 1 : stops[fitted], 1:] = np.eye(pick.shape[1] - 1)
+            small = pick.T @ left @ pick
+            found.append(float(_eliminated(small, np.arange(1))[0, 0]))
+        return max(min(found), 0.0) ** 0.5
+
+
+def _rough_kinds(projector: Projector) -> tuple[int, ...]:
+    """Which kinds of finer roughness a projector takes off, by how many priors it has."""
+    sizes = [kind[0].shape[1] for kind in projector.regression.finer]
+    wanted = projector._priors - projector.regression.baseline.chain.size
+    subsets = (c for k in range(len(sizes) + 1) for c in combinations(range(len(sizes)), k))
+    return next(c for c in subsets if sum(sizes[i] for i in c) == wanted)
+
+
+def _each(law: Law) -> np.ndarray:
+    """Which coordinates of an effect differ from run to run, shape `(k,)`, also where there was one run so far."""
+    strength = [
+        np.full(int(np.prod(info.shape, dtype=int)), info.path in law.form.strength) for info in law.maps[0].table
+    ]
+    return np.concatenate(strength) & law.form.per_run
+
+
+def _in_order(law: Law, moved: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Derivatives in the new run, along the coordinates in the old runs and then along those that are its own."""
+    each = _each(law)
+    shared = ~each
+    out = [np.zeros_like(moved[0])] * law.size
+    # With one run so far, its strengths stand among the others.
+    own = np.flatnonzero(shared).tolist()
+    for place, i in enumerate(own) if law.each.any() else zip(own, own, strict=True):
+        out[place] = moved[i]
+    return out + [moved[i] for i in np.flatnonzero(each).tolist()]
+
+
+def _moved(x: Sequence[np.ndarray], k: int, i: int) -> list[np.ndarray]:
+    out = [np.array(own) for own in x]
+    out[k][i] += _STEP
+    return out
+
+
+def _eliminated(gram: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """What is left of a Gram matrix after all other columns followed (Schur complement)."""
+    other = np.setdiff1d(np.arange(len(gram)), keep)
+    if len(other) == 0:
+        return gram
+    scale = np.sqrt(np.diagonal(gram)[other]) + 1e-300
+    inner = gram[np.ix_(other, other)] / scale[:, None] / scale[None, :]
+    factor = np.linalg.cholesky(inner + _RIDGE * np.eye(len(other)))
+    half = np.linalg.solve(factor, gram[np.ix_(other, keep)] / scale[:, None])
+    return gram[np.ix_(keep, keep)] - half.T @ half
