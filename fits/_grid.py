@@ -86,11 +86,11 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
     if np.all(np.asarray(belief.mean) >= 0):
         done: Any = RESULTS.successful
         return GridSolution(belief.mean, belief, hyper, done)
-    columns, result = _non_negative(belief)
+    columns, result = non_negative(belief)
     return GridSolution(columns, belief, hyper, result)
 
 
-def _non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     """Find the mode of the belief among non-negative columns.
 
     Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of

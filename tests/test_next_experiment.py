@@ -12,8 +12,9 @@ from fits._stage_run import prepare_stage_run
 from fits.diagnosis import _baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._experiment import _open, refine, suggest
+from fits.diagnosis._path import Limits, limits_of, paces
 from fits.diagnosis._predict import Hypothesis, Predictor
-from fits.diagnosis._programs import Limits, Program, limits_of, menu, paces
+from fits.diagnosis._programs import Program, menu
 from fits.diagnosis._projector import Noise, Projector
 from fits.diagnosis._refit import Law, law_of, refit
 from fits.diagnosis._regression import regress
@@ -44,7 +45,7 @@ def test_programs_stay_within_range_rate_and_duration(rng):
         for program in menu(rig, MOST):
             for at in (program.start, rng.uniform(program.lower, program.upper)):
                 time_s, voltage_V = program.samples(at)
-                played.add(program.name)
+                played.add(program.words)
                 assert time_s.shape == voltage_V.shape
                 assert len(time_s) <= MOST
                 assert time_s[-1] <= rig.duration_s * (1 + 1e-9)
@@ -147,7 +148,8 @@ def fitted(made, name):
     target = made.projector.off(made.projector.residual)
     asked = [score(made.projector, probe, target) for probe in made.probes if probe.name == name]
     best = max(asked, key=lambda one: one.z)
-    return refit(made.bench, made.projector, [law_of(best, len(made.bench.prepared))])
+    law = law_of(best, len(made.bench.prepared))
+    return refit(made.bench, made.projector, [law], [law.start])
 
 
 def found_cause(name, rival):

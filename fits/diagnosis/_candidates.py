@@ -86,7 +86,7 @@ def scales_of(bench: Bench, noise_um: float) -> Scales:
     stage = baseline.stage
     mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
     fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
-    columns = {}
+    columns: dict[str, tuple[float, float]] = {}
     for run in baseline.runs:
         for name, values in columns_beside(run.record).items():
             columns.setdefault(name, (float(np.mean(values)), float(np.ptp(values))))

@@ -9,10 +9,10 @@ from scipy import stats
 
 from fits._errors import DataError
 from fits._record import Record, refuse_repeats
-from fits._stage_run import simulate_stage
 from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
-from fits.diagnosis._extend import Compared, corrected, extended_stage, feedforward, gain_of, left_of, shared_effects
+from fits.diagnosis._evaluate import simulate
+from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_of, left_of, shared_effects
 from fits.diagnosis._faults import Faults, find_faults, name_faults
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._refit import Refit, refit
@@ -21,7 +21,7 @@ from fits.diagnosis._result import Diagnosis, RunView, Test
 from fits.diagnosis._select import Selection, select
 from fits.diagnosis._structure import cycles, look, together, views
 from fits.diagnosis._tell import bounds, causes_of
-from microid import EFFECTS
+from microid import EFFECTS, AbstractEffect, Stage
 
 # A cause explains at least this part of what is reproducible, or it is none.
 _SHARE = 0.2
@@ -179,7 +179,7 @@ def _conclude(
     causes = causes_of(kept, model, projector, bench, misfit, faults, ready.faults)
     verdict = "effect_found" if causes else "unexplained" if left_over else "no_effect"
     progress("extending the stage")
-    extended, compared, effects = _extended(ready, model if kept else None, records, initial, fraction, progress)
+    extended, compared, effects = _extended(ready, model if kept else None)
     source = "the last part of each run" if not baseline.aside else "whole runs"
     gain = gain_of(compared, noise_um, source)
     if effects:
@@ -234,35 +234,22 @@ def _conclude(
     )
 
 
-def _extended(
-    ready: Prepared,
-    model: Refit | None,
-    records: Sequence[Record],
-    initial: str,
-    fraction: float,
-    progress: Callable[[str], None],
-) -> tuple:
-    """Fit the plain stage again to what the effects leave, and the effects again beside it."""
-    baseline = ready.baseline
+def _extended(ready: Prepared, model: Refit | None) -> tuple[Stage, list[Compared], list[AbstractEffect]]:
+    """Let the plain stage follow what the effects leave, and fit the effects again beside it."""
+    baseline, projector = ready.baseline, ready.projector
     substeps = baseline.runs[0].samples.stride
     runs = len(baseline.runs)
     if model is None or not model.laws:
         return baseline.stage.with_substeps(substeps), _compare(ready, ready.bench, None, ready.regression), []
-    clean = ready.faults.clean(records)
-    again = fit_baseline(
-        corrected(clean, model.change_um), [r.record for r in baseline.aside], fraction, initial, progress
-    )
-    # Measured again, not corrected: only the stage is new.
-    again = replace(
-        again,
-        runs=tuple(replace(run, record=old.record) for run, old in zip(again.runs, baseline.runs, strict=True)),
-        coarse=tuple(replace(run, record=old.record) for run, old in zip(again.coarse, baseline.coarse, strict=True)),
-    )
-    regression, bench = regress(again), Bench(again)
-    better = refit(bench, Projector(regression, ready.projector.noise), model.laws, model.x)
-    effects = shared_effects(better, runs)
-    substeps = again.runs[0].samples.stride
-    return extended_stage(again, effects, substeps), _compare(ready, bench, better, regression), effects
+    regression, bench = ready.regression, ready.bench
+    for rounds in (3, 2):
+        left = projector.residual - projector.join(model.change_um)
+        regression = regress(projector.move(left), finer=False)
+        bench = Bench(regression.baseline)
+        projector = Projector(regression, projector.noise)
+        model = refit(bench, projector, model.laws, model.x, rounds)
+    effects = shared_effects(model, runs)
+    return extended_stage(regression.baseline, effects, substeps), _compare(ready, bench, model, regression), effects
 
 
 def _compare(ready: Prepared, bench: Bench, model: Refit | None, regression: Regression) -> list[Compared]:
@@ -278,9 +265,9 @@ def _compare(ready: Prepared, bench: Bench, model: Refit | None, regression: Reg
     if ready.baseline.aside:
         shared = shared_effects(model, runs) if model is not None else []
         behind = Bench(bench.baseline, aside=True)
-        for k, (run, change_um) in enumerate(zip(ready.baseline.aside, behind.change(shared), strict=True)):
-            plain = simulate_stage(ready.baseline.stage, run)
-            better = simulate_stage(bench.baseline.stage, bench.baseline.aside[k]) + change_um
+        for run, change_um in zip(ready.baseline.aside, behind.change(shared), strict=True):
+            plain = simulate(ready.baseline.stage, run)
+            better = simulate(bench.baseline.stage, run) + change_um
             own, using = np.ones((len(run.record), 1)), run.known
             found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), using))
     return found

@@ -42,6 +42,12 @@ def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
     return found
 
 
+def simulate(stage: Stage, run: StageRun) -> np.ndarray:
+    """Response of a stage to a run that is refined already, in um, shape `(n,)`."""
+    values = signals(stage.with_substeps(1), prepare(stage, run))[-1].values
+    return np.asarray(values)[:: run.samples.stride][: len(run.record)]
+
+
 def respond_again(stage: Stage, base: Stage, known: Sequence[Signal], prepared: Prepared) -> np.ndarray:
     """Response of a stage that differs from a simulated one from some part on, in um, shape `(n,)`."""
     same = 0

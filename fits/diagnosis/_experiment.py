@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fits.diagnosis._path import limits_of
 from fits.diagnosis._predict import Hypothesis, Predictor
-from fits.diagnosis._programs import Program, limits_of, menu
+from fits.diagnosis._programs import Program, menu
 from fits.diagnosis._refit import law_of
 from fits.diagnosis._result import Experiment, FoundCause
 from fits.diagnosis._select import Selection, best_of

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from fits._record import Record
 from fits._stage_run import StageRun, without
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench
@@ -18,15 +17,6 @@ from microid import AbstractEffect, Stage
 
 _BLOCKS = 24
 _ROUNDS = 6
-
-
-def corrected(records: Sequence[Record], change_um: Sequence[np.ndarray]) -> list[Record]:
-    """Take off the records what effects change in them."""
-    out = []
-    for record, change in zip(records, change_um, strict=True):
-        assert record.displacement_um is not None
-        out.append(replace(record, displacement_um=record.displacement_um - change, extra=dict(record.extra)))
-    return out
 
 
 def shared_effects(model: Refit, runs: int) -> list[AbstractEffect]:

@@ -14,6 +14,8 @@ from fits.diagnosis._regression import Regression
 # So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
 _SPIKES, _PART = 3, 0.3
 _JITTER_Z, _LINE_Z = 8.0, 60.0
+# E-folds after which a motion has settled.
+_SETTLED = 8.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ def find_faults(regression: Regression) -> Faults:
     projector = Projector(regression, guess)
     dz, dw = projector.step(projector.residual)
     noise, found, heights, idle, jitters, lines = [], [], [], [], [], []
+    poles = np.asarray(baseline.stage.poles_rad_per_s).real
+    settling_s = float(_SETTLED / np.min(np.abs(poles))) if len(poles) else 0.0
     for run, rows, own, residual in zip(
         baseline.runs, regression.rows, regression.own, regression.residuals, strict=True
     ):
@@ -89,7 +93,7 @@ def find_faults(regression: Regression) -> Faults:
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)
         heights.append(np.where(bad, left - smooth, 0.0))
-        floor = floor_of(run, smooth)
+        floor = floor_of(run, smooth, settling_s)
         noise.append(floor.noise)
         idle.append(floor.idle)
         rate = np.gradient(run.displacement_um - left, run.record.time_s)

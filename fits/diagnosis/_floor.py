@@ -41,21 +41,25 @@ def rough_noise_um(residual_um: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(second - np.median(second))) / 6**0.5)
 
 
-def idle_stretches(voltage_V: np.ndarray) -> list[slice]:
-    """Stretches in which the command has rested for a while."""
+def idle_stretches(voltage_V: np.ndarray, settling: int) -> list[slice]:
+    """Stretches in which the command has rested for a while, and for so many samples at least."""
     still = np.concatenate([[False], np.diff(voltage_V) == 0, [False]])
     edges = np.flatnonzero(np.diff(still.astype(int)))
     found = []
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
-        if stop - first >= _REST:
-            found.append(slice(int(first + (stop - first) // 3), int(stop)))
+        begin = max(first + (stop - first) // 3, first + settling)
+        if stop - begin >= 2 * _REST // 3:
+            found.append(slice(int(begin), int(stop)))
     return found
 
 
-def floor_of(run: StageRun, residual_um: np.ndarray) -> Floor:
-    """Read the noise of a run off its idle stretches, or off the fastest changes of the residual."""
+def floor_of(run: StageRun, residual_um: np.ndarray, settling_s: float) -> Floor:
+    """Read the noise of a run off its idle stretches, or off the fastest changes of the residual.
+
+    A stretch is idle once the stage has settled, which takes it `settling_s`.
+    """
     pieces = []
-    for stretch in idle_stretches(run.record.voltage_V):
+    for stretch in idle_stretches(run.record.voltage_V, round(settling_s * run.rate_Hz)):
         piece = residual_um[stretch]
         time = np.linspace(-1, 1, len(piece))
         order = min(3, len(piece) // 12)

@@ -3,11 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
+from optimistix import RESULTS
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
+from fits._evidence import Posterior
+from fits._grid import non_negative
+from fits._result import FitError, FitStatus
+from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._regression import Regression
 
 
@@ -141,12 +147,43 @@ class Projector:
 
     def step(self, joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Steps of coordinates and columns by which the baseline follows a joined signal best."""
+        answer = self._answer(joined)
+        columns = self.regression.baseline.chain.size
+        return answer[columns : self.regression.size], answer[:columns]
+
+    def _answer(self, joined: np.ndarray) -> np.ndarray:
         right = self._q.T @ joined
         r = self._r.copy()
         r[np.diag_indices_from(r)] = np.where(self._weak, 1.0, np.diagonal(r))
-        answer = solve_triangular(r, np.where(self._weak, 0.0, right)) / self._scale
-        columns = self.regression.baseline.chain.size
-        return answer[columns : self.regression.size], answer[:columns]
+        return solve_triangular(r, np.where(self._weak, 0.0, right)) / self._scale
+
+    def move(self, joined: np.ndarray) -> Baseline:
+        """The baseline moved so that it follows a joined signal best, with columns that stay non-negative.
+
+        Raises
+        ------
+        FitError
+            If their solver fails.
+        """
+        baseline = self.regression.baseline
+        columns = baseline.chain.size
+        answer = self._answer(joined)
+        r = self._r * self._scale
+        gram = r.T @ r
+        own = gram[columns:, columns:]
+        own = own + 1e-12 * np.diag(np.diagonal(own)) + 1e-300 * np.eye(len(own))
+        follow = np.linalg.solve(own, gram[columns:, :columns])
+        precision = gram[:columns, :columns] - gram[:columns, columns:] @ follow
+        precision = (precision + precision.T) / 2 + 1e-12 * np.diag(np.diagonal(precision))
+        mean = baseline.columns_um + answer[:columns]
+        kept, result = non_negative(
+            Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
+        )
+        if result != RESULTS.successful:
+            raise FitError(FitStatus.MAX_STEPS)
+        change = np.asarray(kept) - baseline.columns_um
+        others = answer[columns:] - follow @ (change - answer[:columns])
+        return baseline.moved(others[: self.regression.size - columns], change)
 
 
 def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Noise:

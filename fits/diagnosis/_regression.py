@@ -1,6 +1,5 @@
 """All runs as one regression: derivatives of the baseline, and finer structure of the density than its grid has."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -55,13 +54,13 @@ class Regression:
         return self.rows[0].shape[1]
 
 
-def regress(baseline: Baseline, masks: Sequence[np.ndarray] | None = None) -> Regression:
-    """Linearise a baseline in all its runs."""
+def regress(baseline: Baseline, finer: bool = True) -> Regression:
+    """Linearise a baseline in all its runs, with structure finer than its grid or without."""
     chain, runs = baseline.chain, baseline.runs
     assert chain.grid is not None
     fine = Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE)
-    finer = Chain(chain.coordinates, chain.place, fine)
-    bases = _bases(baseline)
+    fine_chain = Chain(chain.coordinates, chain.place, fine)
+    bases = _bases(baseline) if finer else []
     rows, own, residuals = [], [], []
     kinds: list[list[np.ndarray]] = [[] for _ in bases]
     for run in runs:
@@ -74,12 +73,13 @@ def regress(baseline: Baseline, masks: Sequence[np.ndarray] | None = None) -> Re
         rows.append(both)
         own.append(free[:n])
         residuals.append(run.displacement_um - out[:n])
-        for kind, part in zip(kinds, _along(finer, baseline, run, bases), strict=True):
-            kind.append(part)
+        if finer:
+            for kind, part in zip(kinds, _along(fine_chain, baseline, run, bases), strict=True):
+                kind.append(part)
     trace = np.trace(baseline.prior) / len(baseline.prior)
     return Regression(
         baseline,
-        tuple(run.fitted for run in runs) if masks is None else tuple(masks),
+        tuple(run.fitted for run in runs),
         tuple(rows),
         tuple(own),
         tuple(tuple(kind) for kind in kinds),

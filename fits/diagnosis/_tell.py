@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._faults import Fault, Faults
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit
+from fits.diagnosis._refit import Law, Refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
 from fits.diagnosis._select import Cause, Selection, best_of
 from microid import EFFECTS
@@ -38,7 +39,6 @@ def causes_of(
     runs = len(bench.prepared)
     for cause, law, x in zip(causes, model.laws, model.x, strict=True):
         own = covariance[at : at + law.size, at : at + law.size]
-        tangent = model.tangent[:, at : at + law.size]
         at += law.size
         form = law.form
         changed = [[law.effect(x, run)] for run in range(runs)]
@@ -46,7 +46,6 @@ def causes_of(
         left = projector.off(projector.join(alone))
         noise_um = float(np.mean([n.innovation_um for n in projector.noise]))
         rms = float(np.linalg.norm(left) / projector.count**0.5) * noise_um
-        del tangent
         found.append(
             FoundCause(
                 cause.name,
@@ -88,7 +87,7 @@ def causes_of(
     return tuple(sorted(found, key=lambda cause: -cause.z))
 
 
-def _parameters(law, x: np.ndarray, covariance: np.ndarray) -> tuple[EffectParameter, ...]:
+def _parameters(law: Law, x: np.ndarray, covariance: np.ndarray) -> tuple[EffectParameter, ...]:
     """Values in their units: of the first run where they differ, the others by their place."""
     runs = len(law.maps) if law.each.any() else 1
     found = []
@@ -117,7 +116,7 @@ def _parameters(law, x: np.ndarray, covariance: np.ndarray) -> tuple[EffectParam
     return tuple(found)
 
 
-def _vector(law, x, run: int):
+def _vector(law: Law, x: Float[Array, " k"], run: int) -> Float[Array, " c"]:
     if not law.each.any():
         return x
     shared, own = int(np.sum(~law.each)), int(np.sum(law.each))
