@@ -22,6 +22,8 @@ from microid import Preisach, Stage
 
 # What a finer grid would follow has a prior of its own in the projection.
 _FINEST = 32
+# Steps between samples in which effects are simulated, at most.
+_COARSE = 4
 
 
 class Fixed(eqx.Module):
@@ -56,7 +58,7 @@ class Baseline:
     aside
         Whole runs that are held out.
     coarse, coarse_aside
-        The same without steps between the samples: what effects change is seen well enough there.
+        The same with few steps between the samples: what effects change is seen well enough there.
     dynamic
         Whether driver and mechanics were fitted.
     remarks
@@ -119,8 +121,8 @@ def fit_baseline(
         range_V,
         _prepared(records, range_V, initial, holdout, stride),
         _prepared(aside, range_V, initial, 0.0, stride),
-        _prepared(records, range_V, initial, holdout, 1),
-        _prepared(aside, range_V, initial, 0.0, 1),
+        _prepared(records, range_V, initial, holdout, min(stride, _COARSE)),
+        _prepared(aside, range_V, initial, 0.0, min(stride, _COARSE)),
         True,
         found.remarks,
     )

@@ -12,10 +12,11 @@ from fits._record import Record, refuse_repeats
 from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
 from fits.diagnosis._evaluate import simulate
+from fits.diagnosis._experiment import suggest
 from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_of, left_of, shared_effects
 from fits.diagnosis._faults import Faults, find_faults, name_faults
 from fits.diagnosis._projector import Projector, learn_roughness
-from fits.diagnosis._refit import Refit, refit
+from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Diagnosis, RunView, Test
 from fits.diagnosis._select import Selection, select
@@ -162,8 +163,8 @@ def _conclude(
     seen = look(projector, none, found.plain.residual, ways)
     # What the causes explain and what is left to be seen in any way is what there is to be explained.
     explained = found.plain.cost - found.model.cost
-    rest, rest_freedom = together(projector, found.model.basis(), found.model.residual, ways)
-    period_um, cycle_z, cycle_drop = cycles(projector, found.model.residual, bench.plain)
+    rest, rest_freedom = together(found.projector, found.model.basis(), found.model.residual, ways)
+    period_um, cycle_z, cycle_drop = cycles(found.projector, found.model.residual, bench.plain)
     rest = max(rest, cycle_drop)
     misfit = max(explained + max(rest - rest_freedom, 0.0), explained, 1e-300)
     rest_share = (max(rest - rest_freedom, 0.0) / projector.count) ** 0.5
@@ -176,14 +177,15 @@ def _conclude(
     if not kept:
         model = found.plain
     faults = name_faults(ready.faults, projector, model, false_alarm)
-    causes = causes_of(kept, model, projector, bench, misfit, faults, ready.faults)
+    causes = causes_of(kept, model, found.projector, found.bench, misfit, faults, ready.faults)
+    ahead = suggest(ready, found, causes, duration_s, progress)
     verdict = "effect_found" if causes else "unexplained" if left_over else "no_effect"
     progress("extending the stage")
-    extended, compared, effects = _extended(ready, model if kept else None)
+    extended, compared, effects = _extended(ready, found, model if kept else None)
     source = "the last part of each run" if not baseline.aside else "whole runs"
     gain = gain_of(compared, noise_um, source)
     if effects:
-        before, after = feedforward(bench, effects)
+        before, after = feedforward(found.bench, effects)
         gain = replace(gain, feedforward_before_um=before, feedforward_after_um=after)
     names = {cause.name for cause in causes} | {n for cause in causes for n in cause.also_consistent}
     tests = tuple(
@@ -207,8 +209,8 @@ def _conclude(
         upper_bounds=bounds(found, ready, names),
         tests=tests,
         gain=gain,
-        next_experiment=None,
-        remarks=(*baseline.remarks, *ready.faults.remarks),
+        next_experiment=ahead,
+        remarks=_remarks(ready, records),
         baseline=baseline.stage.with_substeps(substeps),
         extended=extended,
         runs=tuple(
@@ -234,20 +236,37 @@ def _conclude(
     )
 
 
-def _extended(ready: Prepared, model: Refit | None) -> tuple[Stage, list[Compared], list[AbstractEffect]]:
+def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
+    """What the user should know of the records and the fit."""
+    baseline = ready.baseline
+    said = [warning for record in records for warning in record.warnings]
+    said += [*baseline.remarks, *ready.faults.remarks]
+    for run in baseline.runs:
+        lost = int(np.sum(~run.known))
+        if lost:
+            said.append(
+                f"{run.record.source}: the first {lost} samples depend on what the rig went through before and were "
+                "not used, so that an unknown initial state is not taken for an effect; state it with --initial to "
+                "have it tested"
+            )
+    if not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
+        said.append("nothing was held out, so the gain is not measured: hold out a part, or a run with --holdout")
+    return tuple(dict.fromkeys(said))
+
+
+def _extended(
+    ready: Prepared, found: Selection, model: Refit | None
+) -> tuple[Stage, list[Compared], list[AbstractEffect]]:
     """Let the plain stage follow what the effects leave, and fit the effects again beside it."""
-    baseline, projector = ready.baseline, ready.projector
+    baseline = ready.baseline
     substeps = baseline.runs[0].samples.stride
     runs = len(baseline.runs)
     if model is None or not model.laws:
         return baseline.stage.with_substeps(substeps), _compare(ready, ready.bench, None, ready.regression), []
-    regression, bench = ready.regression, ready.bench
-    for rounds in (3, 2):
-        left = projector.residual - projector.join(model.change_um)
-        regression = regress(projector.move(left), finer=False)
-        bench = Bench(regression.baseline)
-        projector = Projector(regression, projector.noise)
-        model = refit(bench, projector, model.laws, model.x, rounds)
+    # What followed along the tangent is put into the stage itself.
+    bare = Projector(found.projector.regression, found.projector.noise)
+    regression = regress(bare.move(bare.residual - bare.join(model.change_um)), finer=False)
+    bench = Bench(regression.baseline)
     effects = shared_effects(model, runs)
     return extended_stage(regression.baseline, effects, substeps), _compare(ready, bench, model, regression), effects
 

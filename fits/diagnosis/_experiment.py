@@ -16,17 +16,19 @@ from microid import Mechanics
 if TYPE_CHECKING:
     from fits.diagnosis._diagnose import Prepared
 
-# Samples of a program: as many as a diagnosis takes in easily.
-_MOST = 8192
+# Samples of a program: as many as are played virtually, some twenty times, in a bearable time.
+_MOST = 4096
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
-_SUSPECT_Z, _SUSPECT_P = 2.5, 0.3
+_SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
 # A class of effects that cannot be told apart counts so many others.
 _OTHERS = 2
 # Programs about as good as the best, of which the shortest is taken, and what an experiment must add to be worth it.
 _ALIKE, _WORTH = 0.95, 1.02
 # Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
 _PROBE, _LENGTHS = 0.05, (0.4, 0.15)
-_ROUNDS = 2
+_ROUNDS = 1
+# Below so many standard deviations effects are not told apart.
+_APART = 3.0
 
 _COLUMNS = (
     (
@@ -190,6 +192,11 @@ def _purpose(names: tuple[str, ...], z: float, present: float) -> str:
             f"records at hand show it by {present:.1f}."
         )
     listed = " and ".join([", ".join(words[:-1]), words[-1]])
+    if z < _APART:
+        return (
+            f"No program within the rig's limits would tell {listed} apart for sure; this one comes nearest, with "
+            f"{z:.1f} standard deviations where the records at hand have {present:.1f}."
+        )
     return (
         f"It would tell {listed} apart by {z:.1f} standard deviations at least, where the records at hand do by "
         f"{present:.1f}."

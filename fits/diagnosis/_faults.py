@@ -80,7 +80,7 @@ def find_faults(regression: Regression) -> Faults:
     projector = Projector(regression, guess)
     dz, dw = projector.step(projector.residual)
     noise, found, heights, idle, jitters, lines = [], [], [], [], [], []
-    poles = np.asarray(baseline.stage.poles_rad_per_s).real
+    poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     settling_s = float(_SETTLED / np.min(np.abs(poles))) if len(poles) else 0.0
     for run, rows, own, residual in zip(
         baseline.runs, regression.rows, regression.own, regression.residuals, strict=True

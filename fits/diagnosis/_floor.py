@@ -13,8 +13,9 @@ from fits.diagnosis._projector import Noise, learn_noise
 _REST, _IDLE = 24, 150
 # Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
 _COLOURED = 4.0
-# A sample is a spike beyond this many standard deviations, where at most this many stand together.
-_SPIKE, _TOGETHER = 7.0, 3
+# A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
+# so far away are much smaller.
+_SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
 # A command that moves by more than this part of its range within some samples may cause what looks like a spike.
 _EDGE, _NEAR = 0.02, 6
 
@@ -88,6 +89,13 @@ def spikes(run: StageRun, residual_um: np.ndarray) -> np.ndarray:
     spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")
     spread = np.maximum(spread, 1.4826 * float(np.median(np.abs(off))))
     far = np.abs(off) > _SPIKE * np.maximum(spread, 1e-300)
+    # What rings has neighbours as large; what is alone has none.
+    size = np.abs(off)
+    around = np.zeros_like(size)
+    for lag in range(_TOGETHER + 1, _ALONE + 1):
+        around[lag:] = np.maximum(around[lag:], size[:-lag])
+        around[:-lag] = np.maximum(around[:-lag], size[lag:])
+    far &= size > 3 * around
     voltage = run.record.voltage_V
     moved = np.abs(np.diff(voltage, prepend=voltage[0])) > _EDGE * float(np.ptp(voltage))
     near = np.convolve(moved, np.ones(2 * _NEAR + 1), mode="same") > 0.5

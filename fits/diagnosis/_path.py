@@ -90,8 +90,10 @@ class Path:
         self.limits = limits
         self._time_s, self._voltage_V = [0.0], [limits.lower_V]
         pace = 2 * limits.span_V / (_LOOP * limits.duration_s)
-        self.to(limits.upper_V, pace)
-        self.to(limits.lower_V, pace)
+        for end_V in (limits.upper_V, limits.lower_V):
+            self.to(end_V, pace)
+            # Long enough that a sample is taken there.
+            self.rest(limits.interval_s)
 
     @property
     def left_s(self) -> float:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import jax.numpy as jnp
 import numpy as np
@@ -63,7 +62,7 @@ class Predictor:
         self._like = int(np.argmax([record.duration_s for record in records]))
         self._vectors = [[law.vector(x, self._like) for law, x in zip(h.laws, h.x, strict=True)] for h in hypotheses]
         self._extra = {name: np.asarray(values) for name, values in records[self._like].extra.items()}
-        self._kinds = _rough_kinds(projector)
+        self._kinds = [kind for kind, size in enumerate(projector.roughness) if size > 0]
         regression = projector.regression
         self._shared = regression.size + sum(regression.finer[kind][0].shape[1] for kind in self._kinds)
         self._old = self._old_gram()
@@ -167,14 +166,6 @@ class Predictor:
             small = pick.T @ left @ pick
             found.append(float(_eliminated(small, np.arange(1))[0, 0]))
         return max(min(found), 0.0) ** 0.5
-
-
-def _rough_kinds(projector: Projector) -> tuple[int, ...]:
-    """Which kinds of finer roughness a projector takes off, by how many priors it has."""
-    sizes = [kind[0].shape[1] for kind in projector.regression.finer]
-    wanted = projector._priors - projector.regression.baseline.chain.size
-    subsets = (c for k in range(len(sizes) + 1) for c in combinations(range(len(sizes)), k))
-    return next(c for c in subsets if sum(sizes[i] for i in c) == wanted)
 
 
 def _each(law: Law) -> np.ndarray:

@@ -79,7 +79,7 @@ class Projector:
         roughness: Sequence[float] = (),
         more: Sequence[Sequence[np.ndarray]] = (),
     ):
-        self.regression, self.noise = regression, tuple(noise)
+        self.regression, self.noise, self.roughness = regression, tuple(noise), tuple(roughness)
         self.masks = regression.masks
         self.count = sum(int(mask.sum()) for mask in self.masks)
         grid = regression.baseline.chain.size
@@ -156,6 +156,23 @@ class Projector:
         r = self._r.copy()
         r[np.diag_indices_from(r)] = np.where(self._weak, 1.0, np.diagonal(r))
         return solve_triangular(r, np.where(self._weak, 0.0, right)) / self._scale
+
+    def ahead(self, change_um: Sequence[np.ndarray]) -> float:
+        """Mean square of the errors in what is held out of the runs, in noise variances, under effects.
+
+        The baseline and the runs' own unknowns follow what was fitted. NaN where nothing is held out.
+        """
+        regression = self.regression
+        step, columns = self.step(self.residual - self.join(change_um))
+        square = count = 0.0
+        for k, run in enumerate(regression.baseline.runs):
+            left = regression.residuals[k] - change_um[k] - regression.rows[k] @ np.concatenate([columns, step])
+            own, mask, held = regression.own[k], self.masks[k], run.held_out
+            if held.any():
+                left = left - own @ np.linalg.lstsq(own[mask], left[mask], rcond=None)[0]
+                square += float(np.sum(left[held] ** 2)) / self.noise[k].total_um ** 2
+                count += float(held.sum())
+        return square / count if count else float("nan")
 
     def move(self, joined: np.ndarray) -> Baseline:
         """The baseline moved so that it follows a joined signal best, with columns that stay non-negative.

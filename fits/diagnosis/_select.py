@@ -1,6 +1,6 @@
 """Which effects the records need: forward selection with refits, a backward check, and what cannot be told apart."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +8,9 @@ import numpy as np
 from fits.diagnosis._candidates import Bench, Probe
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, law_of, nothing, refit, refit_beside
+from fits.diagnosis._regression import regress
 from fits.diagnosis._score import Family, Scored, rescore, score
+from microid import EFFECTS
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
 _LEADERS, _FORMS = 5, 2
@@ -16,8 +18,10 @@ _MOST = 4
 # Differences of the criterion, and standard deviations after projecting one effect off another, within which two
 # effects are not told apart.
 _SAME, _APART = 10.0, 4.0
-# Part of a cause's signature by which its model may be off.
-_INEXACT = 0.05
+# Part of a cause's signature by which its model may be off, and by which it may be off along its confusions.
+_INEXACT, _CONFUSED = 0.06, 0.6
+# An effect that makes the square of the errors in what was held out so many times larger is none.
+_WORSE = 1.2
 # Scores below this share of the best are not worth a fit.
 _WORTH = 0.4
 
@@ -75,6 +79,8 @@ class Selection:
         Of all probes, beside the causes.
     family
         Chance of the largest score.
+    bench, projector
+        Of the baseline as it is beside the causes.
     """
 
     causes: tuple[Cause, ...]
@@ -83,6 +89,8 @@ class Selection:
     scores: tuple[Scored, ...]
     left: tuple[Scored, ...]
     family: Family
+    bench: Bench
+    projector: Projector
 
 
 def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
@@ -108,13 +116,17 @@ def select(
     causes: list[Cause] = []
     while len(causes) < _MOST:
         taken = {cause.name for cause in causes}
-        open_ = [one for one in left if one.name not in taken]
+        # Models of effects are not exact: what one leaves may look like another, above all like its confusions.
+        explained = max(plain.cost - model.cost, 0.0) ** 0.5
+        open_ = [
+            one
+            for one in left
+            if one.name not in taken and one.z > explained * (_CONFUSED if _confusable(one, taken) else _INEXACT)
+        ]
         if not open_:
             break
         top = max(one.z for one in open_)
-        # Models of effects are not exact: what is left of a cause may look like another.
-        inexact = _INEXACT * max(plain.cost - model.cost, 0.0) ** 0.5
-        p = family.p(max(top**2 - inexact**2, 0.0) ** 0.5)
+        p = family.p(top)
         if p >= false_alarm:
             break
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
@@ -126,12 +138,35 @@ def select(
         causes.append(
             Cause(first.name, max(drop, 0.0) ** 0.5, family.p(max(drop, 0.0) ** 0.5), tuple(rivals[1:]), drop)
         )
-        model = refit(bench, projector, first.refit.laws, first.refit.x) if model.laws else first.refit
+        bench, projector, model = settle(bench, projector, first.refit)
         basis = model.basis()
-        left = tuple(rescore(one, basis, model.residual) for one in scores)
+        left = tuple(rescore(score(projector, one.probe, model.residual), basis, model.residual) for one in scores)
         family = Family(left, rng)
     causes, model = _backward(bench, projector, causes, model)
-    return Selection(tuple(causes), model, plain, scores, left, family)
+    return Selection(tuple(causes), model, plain, scores, left, family, bench, projector)
+
+
+def settle(
+    bench: Bench, projector: Projector, model: Refit, rounds: Sequence[int] = (4, 2)
+) -> tuple[Bench, Projector, Refit]:
+    """Let the baseline follow what effects leave, and fit those again beside it.
+
+    A baseline fitted without them may be far from where it belongs, farther than its tangent reaches.
+    """
+    for count in rounds:
+        # What roughness beyond the grid would explain is not put into the grid.
+        bare = Projector(projector.regression, projector.noise)
+        regression = regress(bare.move(bare.residual - bare.join(model.change_um)))
+        bench = Bench(regression.baseline)
+        projector = Projector(regression, projector.noise, projector.roughness)
+        model = refit(bench, projector, model.laws, model.x, count)
+    return bench, projector, model
+
+
+def _confusable(one: Scored, causes: Collection[str]) -> bool:
+    """Whether an effect is mistaken for one of some others, by what is known of them."""
+    own = set(type(one.probe.effects[0]).confusions)
+    return any(form.name in causes and (one.name in form.confusions or form.name in own) for form in EFFECTS)
 
 
 def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[Scored], top: float) -> list[Rival]:
@@ -139,6 +174,8 @@ def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[
     runs = len(bench.prepared)
     names = [name for name, one in best_of(scores).items() if one.z > _WORTH * top][:_LEADERS]
     fitted: dict[str, Refit] = {}
+    bare = Projector(projector.regression, projector.noise)
+    before = bare.ahead(model.change_um)
     for name in names:
         own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
         tried: dict[type, int] = {}
@@ -149,6 +186,8 @@ def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[
             tried[form] = tried.get(form, 0) + 1
             law = law_of(one, runs)
             found = refit_beside(bench, projector, model, law)
+            if bare.ahead(found.change_um) > _WORSE * before:
+                continue
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
     order = sorted(fitted, key=lambda name: fitted[name].criterion(projector.count))

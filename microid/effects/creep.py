@@ -31,7 +31,7 @@ class Creep(AbstractEffect):
     gain_per_decade
         `gamma`: creep per decade of time over the step before.
     onset_s
-        `t0`, where creep begins.
+        `t0`, where creep begins. What lags by less than its bound is a matter of driver, sensor or mechanics.
     """
 
     name: ClassVar[str] = "creep"
@@ -47,12 +47,12 @@ class Creep(AbstractEffect):
     experiment: ClassVar[str] = "Steps up and down, each held for three decades of time."
     source: ClassVar[str] = "PI piezo tutorial: dL (1 + gamma lg(t / 0.1 s)), gamma of 0.01 to 0.02"
     gain_per_decade: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
-    onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=1e-4, upper=1e3)
+    onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Onsets in steps of a decade, from some samples to a tenth of the record."""
-        first = max(10 * scales.interval_s, 0.01)
+        first = max(10 * scales.interval_s, 0.03)
         return tuple(
             (cls(jnp.asarray(0.01), jnp.asarray(float(onset))),)
             for onset in 10 ** np.arange(np.log10(first), np.log10(scales.duration_s / 10) + 1e-9)
@@ -92,12 +92,12 @@ class KelvinVoigtCreep(AbstractEffect):
     experiment: ClassVar[str] = Creep.experiment
     source: ClassVar[str] = "Kelvin-Voigt element; see Jung & Gweon, Rev. Sci. Instrum. 71 (2000) 1896"
     gain: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
-    time_constant_s: Float[Array, ""] = param(unit="s", lower=1e-4, upper=1e5)
+    time_constant_s: Float[Array, ""] = param(unit="s", lower=0.02, upper=1e5)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Time constants in steps of half a decade, from some samples to the length of the record."""
-        first = max(10 * scales.interval_s, 0.01)
+        first = max(10 * scales.interval_s, 0.03)
         return tuple(
             (cls(jnp.asarray(0.01), jnp.asarray(float(constant))),)
             for constant in 10 ** np.arange(np.log10(first), np.log10(scales.duration_s) + 1e-9, 0.5)

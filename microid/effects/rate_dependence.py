@@ -123,3 +123,49 @@ class RelaxingHysteresis(AbstractEffect):
         beside = given.values - anhysteretic(self.inner, signal, start).values
         late = lowpass(time_s, beside, self.time_constant_s)
         return Signal(given.values + self.share * (late - beside), given.before, given.hold)
+
+
+@register
+class ActivatedSwitching(AbstractEffect):
+    r"""Relays that switch the later, the faster the voltage: thermally activated walls (Eyring's law).
+
+    .. math:: u \leftarrow u - v \, \mathrm{asinh}(\dot u / r)
+
+    Attributes
+    ----------
+    inner
+        The hysteresis.
+    lag_V
+        `v`: lag of the switching voltages.
+    onset_V_per_s
+        `r`: below it the lag is in proportion to the rate, above it to its logarithm.
+    """
+
+    name: ClassVar[str] = "rate_dependence"
+    form: ClassVar[str] = "activated"
+    takes: ClassVar[str] = "V"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("lag_V",)
+    fingerprint: ClassVar[str] = RateDependence.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = RateDependence.confusions
+    experiment: ClassVar[str] = RateDependence.experiment
+    source: ClassVar[str] = "thermally activated domain walls, a law of Eyring's kind; onsets are estimates"
+    inner: AbstractPart
+    lag_V: Float[Array, ""] = param(unit="V", scale=0.1, lower=0.0)
+    onset_V_per_s: Float[Array, ""] = param(unit="V/s", scale=10.0, lower=1e-3, upper=1e7)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Onsets in steps of a decade, down to a ten-thousandth of the fastest rate."""
+        if inner is None:
+            return ()
+        grid = decades(max(scales.fastest_V_per_s / 10000, 1e-2), scales.fastest_V_per_s / 3)
+        return tuple((cls(inner, jnp.asarray(0.1), jnp.asarray(onset)),) for onset in grid)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Let the hysteresis see a voltage that stays behind."""
+        if signal.values.shape[0] < 2:
+            return self.inner.run(time_s, signal, start)
+        late = self.lag_V * jnp.arcsinh(rate_of(time_s, signal.values) / self.onset_V_per_s)
+        return self.inner.run(time_s, Signal(signal.values - late, signal.before, signal.hold), start)

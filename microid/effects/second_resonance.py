@@ -15,9 +15,11 @@ from microid.effects._base import AbstractEffect, Place, Scales, register
 
 @register
 class SecondResonance(AbstractEffect):
-    r"""A second mode beside the mechanics, without a share in the displacement at rest.
+    r"""A second mode that takes over a share of the displacement.
 
-    .. math:: y = G w + g \lambda (H_2 - 1) w, \qquad H_2 = \frac{\omega_2^2}{s^2 + 2 \zeta_2 \omega_2 s + \omega_2^2}
+    .. math:: y = (1 - g) G w + g \lambda H_2 w
+
+    with `H_2 = omega_2^2 / (s^2 + 2 zeta_2 omega_2 s + omega_2^2)`.
 
     Attributes
     ----------
@@ -51,13 +53,63 @@ class SecondResonance(AbstractEffect):
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
-        """Eight frequencies from 1.3 to 6 times the first resonance, as far as samples can follow."""
+        """Frequencies from 1.15 to 6 times the first resonance, close enough for the peaks between them to be met."""
         if scales.resonance_Hz is None or inner is None:
             return ()
-        first, last = 1.3 * scales.resonance_Hz, min(6 * scales.resonance_Hz, 0.2 / scales.interval_s)
-        grid = np.geomspace(first, last, 8) if last > first else np.zeros(0)
-        share, damping = jnp.asarray(0.01), jnp.asarray(0.02)
+        first, last = 1.15 * scales.resonance_Hz, min(6 * scales.resonance_Hz, 0.2 / scales.interval_s)
+        grid = np.geomspace(first, last, 40) if last > first else np.zeros(0)
+        share, damping = jnp.asarray(0.01), jnp.asarray(0.03)
         return tuple((cls(inner, share, jnp.asarray(float(frequency)), damping),) for frequency in grid)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Add the second mode's answer."""
+        first = self.inner.run(time_s, signal, start)
+        mode = Mechanics(self.frequency_Hz, self.damping_ratio)
+        more = innermost(self.inner).gain * mode.run(time_s, signal, start).values - first.values
+        return Signal(first.values + self.share * more, first.before, first.hold)
+
+
+@register
+class AddedResonance(AbstractEffect):
+    r"""A second mode on top of the mechanics, less what it does at rest: all else is rigid behind it.
+
+    .. math:: y = G w + g \lambda (H_2 - 1) w, \qquad H_2 = \frac{\omega_2^2}{s^2 + 2 \zeta_2 \omega_2 s + \omega_2^2}
+
+    Attributes
+    ----------
+    inner
+        The mechanics `G`, of static gain `lambda`.
+    share
+        `g`: positive where both modes move the sensor alike, negative where an anti-resonance lies between them.
+    frequency_Hz
+        `omega_2 / 2 pi`.
+    damping_ratio
+        `zeta_2`.
+    """
+
+    name: ClassVar[str] = "second_resonance"
+    form: ClassVar[str] = "added"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "mechanics"
+    strength: ClassVar[tuple[str, ...]] = ("share",)
+    fast: ClassVar[bool] = True
+    fingerprint: ClassVar[str] = SecondResonance.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = SecondResonance.confusions
+    experiment: ClassVar[str] = SecondResonance.experiment
+    source: ClassVar[str] = SecondResonance.source
+    inner: AbstractPart
+    share: Float[Array, ""] = param(unit="1", scale=0.01)
+    frequency_Hz: Float[Array, ""] = param(unit="Hz", scale=100.0, lower=1e-3)
+    damping_ratio: Float[Array, ""] = param(unit="1", scale=0.01, lower=1e-5, upper=1.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """The same as for a mode that takes over a share."""
+        return tuple(
+            tuple(cls(p.inner, p.share, p.frequency_Hz, p.damping_ratio) for p in group)
+            for group in SecondResonance.probes(scales, inner)
+        )
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the second mode's answer."""

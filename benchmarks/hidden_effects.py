@@ -1,0 +1,218 @@
+"""What `microid diagnose` finds of effects that the bench hides, over random rigs.
+
+Each rig has a hysteresis, a driver, a mechanics and a noise of its own, and one hidden effect, none, a pair, or one
+that no effect of the library describes. The diagnosis reads nothing but the CSVs; its answer is then held against the
+truth. Every answer is appended to a JSON-lines file as it comes, so that the study can be stopped with Ctrl-C and
+goes on where it was; answers of other code or settings are left alone. Prints the tables in Markdown. A few minutes
+per rig on one core.
+
+    python benchmarks/hidden_effects.py --rigs 20 --seed 700 [--effects creep none creep+slew_limit] [--jobs 2]
+
+A row is replayed by `data_synth.hidden([effect], seed=seed)`.
+"""
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import os
+import secrets
+import signal
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from _hidden_tables import report
+
+PAIRS = (
+    ("creep", "second_resonance"),
+    ("thermal_drift", "slew_limit"),
+    ("transport_delay", "backlash"),
+    ("creep", "sensor_nonlinearity"),
+    ("mains_hum", "driver_saturation"),
+    ("creep", "offset_jumps"),
+)
+_NONE_PER_EFFECT = 4
+# A worker keeps every program that it has compiled, and is replaced before they fill the memory.
+_TASKS_PER_WORKER = 25
+
+
+def source_digest() -> str:
+    """Name of the code that answers: answers of other code are not counted with its own."""
+    root = Path(__file__).parents[1]
+    parts = hashlib.sha256()
+    for package in ("microid", "fits", "data_synth"):
+        for path in sorted((root / package).rglob("*.py")):
+            parts.update(path.read_bytes())
+    return parts.hexdigest()[:12]
+
+
+def begin() -> None:
+    """Prepare a worker."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from fits._cli_jax import start_jax
+
+    start_jax()
+
+
+def answer(task: tuple[str, int, dict[str, Any]]) -> dict[str, Any]:
+    """Hide, diagnose and compare."""
+    hidden, seed, settings = task
+    import data_synth
+    import fits
+    from fits.diagnosis._diagnose import diagnose
+    from fits.diagnosis._select import best_of
+
+    names = () if hidden == "none" else tuple(hidden.split("+"))
+    bench = data_synth.hidden(
+        names,
+        seed=seed,
+        rms_per_noise=settings["rms_per_noise"],
+        slow_samples=settings["slow_samples"],
+        fast_samples=settings["fast_samples"],
+    )
+    row: dict[str, Any] = {
+        "hidden": hidden,
+        "seed": seed,
+        "settings": settings,
+        "rig": bench.rig.kind,
+        "noise_um": bench.scenario.sensor.noise_um,
+        "resonance_Hz": bench.plant.natural_frequency_Hz if bench.plant else None,
+        "range_V": [bench.rig.lower_V, bench.rig.upper_V],
+        "columns": sorted({name for r in bench.records for name in r.columns()} & {"temperature_C", "other_um"}),
+        "truth": {
+            e.name: {"parameters": e.parameters, "rms_um": e.rms_um, "capped": e.capped} for e in bench.effects
+        },
+    }
+    began = time.monotonic()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            data_synth.write(bench, folder)
+            slow, fast, *aside = (fits.read_csv(Path(folder) / f"{r.name}.csv") for r in bench.records)
+        found = diagnose([slow, fast], holdout=aside, false_alarm=settings["false_alarm"])
+    except (fits.DataError, fits.FitError) as error:
+        return row | {"refused": str(error), "seconds": time.monotonic() - began}
+    except Exception as error:  # a study does not end for one rig
+        return row | {"failed": f"{type(error).__name__}: {error}", "seconds": time.monotonic() - began}
+    best = best_of(found.details["selection"].scores)
+    gain = found.gain
+    return row | {
+        "seconds": time.monotonic() - began,
+        "verdict": found.verdict,
+        "found_noise_um": found.noise_um,
+        "unexplained_rms_um": found.unexplained_rms_um,
+        "truth_z": {name: float(best[name].z) if name in best else None for name in names},
+        "causes": [
+            {
+                "name": cause.name,
+                "form": cause.form,
+                "also": list(cause.also_consistent),
+                "z": float(cause.z),
+                "p": float(cause.p_family),
+                "share": float(cause.share_of_misfit),
+                "parameters": {p.name: [p.value, p.sd] for p in cause.parameters},
+            }
+            for cause in found.causes
+        ],
+        "heldout_um": [float(gain.heldout_rms_before_um), float(gain.heldout_rms_after_um)],
+        "next_experiment": None if found.next_experiment is None else found.next_experiment.kind,
+    }
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """All whole lines; the last may have been cut off."""
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return rows
+
+
+def words(row: dict[str, Any]) -> str:
+    """Say what a row says, for the progress."""
+    if "verdict" not in row:
+        return row.get("refused") or row.get("failed") or ""
+    named = ", ".join(" or ".join([c["name"], *c["also"]]) + f" {c['z']:.1f}" for c in row["causes"])
+    return f"{row['verdict']} {named}"
+
+
+def main() -> None:
+    """Run the study."""
+    # Before NumPy is imported: each worker is one thread.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    from data_synth import EFFECTS, OUTSIDE
+
+    singles = [*EFFECTS, *OUTSIDE, "none"]
+    parser = argparse.ArgumentParser(description="What a diagnosis finds of hidden effects.")
+    parser.add_argument("--rigs", type=int, default=10, help="for each effect (default 10)")
+    parser.add_argument("--none", type=int, help="rigs without effect (default 4 times --rigs)")
+    parser.add_argument("--seed", type=int, help="of the first rig (default a fresh one)")
+    parser.add_argument(
+        "--effects", nargs="+", metavar="EFFECT", help="some, `none`, or pairs as a+b; all by default"
+    )
+    parser.add_argument("--rms-per-noise", type=float, default=5.0, help="strength over the noise (default 5)")
+    parser.add_argument("--samples", type=int, nargs=2, default=(4000, 8000), metavar=("SLOW", "FAST"))
+    parser.add_argument("--false-alarm", type=float, default=0.01)
+    parser.add_argument("--jobs", type=int, default=2, help="rigs at a time (default 2)")
+    parser.add_argument(
+        "--results", type=Path, default=Path("build/hidden_effects.jsonl"), help="where answers are kept"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="also write the tables to a file")
+    parser.add_argument("--tables", action="store_true", help="tables of the answers that there are, and no more")
+    options = parser.parse_args()
+    chosen = options.effects or [*singles, *("+".join(pair) for pair in PAIRS)]
+    unknown = sorted({part for name in chosen for part in name.split("+")} - set(singles))
+    if unknown:
+        parser.error(f"there is no effect {unknown[0]!r}: choose some of {', '.join(singles)}")
+    seed = secrets.randbelow(10**6) if options.seed is None else options.seed
+    settings = {
+        "code": source_digest(),
+        "rms_per_noise": options.rms_per_noise,
+        "slow_samples": options.samples[0],
+        "fast_samples": options.samples[1],
+        "false_alarm": options.false_alarm,
+    }
+    plain = _NONE_PER_EFFECT * options.rigs if options.none is None else options.none
+    counts = {name: plain if name == "none" else options.rigs for name in chosen}
+    # Rig by rig, so that a study that is stopped has some of everything.
+    wanted = [(name, seed + k) for k in range(max(counts.values())) for name in chosen if k < counts[name]]
+    rows = {(r["hidden"], r["seed"]): r for r in read_rows(options.results) if r["settings"] == settings}
+    tasks = [] if options.tables else [(*one, settings) for one in wanted if one not in rows]
+    print(f"{len(wanted)} rigs from seed {seed}, {len(tasks)} to go, code {settings['code']}", flush=True)
+    try:
+        run(tasks, options.jobs, options.results, rows)
+    except KeyboardInterrupt:
+        print("stopped: the same command with this seed goes on")
+    text = report([rows[one] for one in wanted if one in rows], settings, seed)
+    print(text)
+    if options.out is not None:
+        options.out.write_text(text + "\n", encoding="utf-8")
+
+
+def run(tasks: list[Any], jobs: int, path: Path, rows: dict[tuple[str, int], dict[str, Any]]) -> None:
+    """Answer the tasks, and keep each answer at once."""
+    if not tasks:
+        return
+    began = time.monotonic()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pool = multiprocessing.get_context("spawn").Pool(min(jobs, len(tasks)), begin, maxtasksperchild=_TASKS_PER_WORKER)
+    with pool, path.open("a", encoding="utf-8") as file:
+        for k, row in enumerate(pool.imap_unordered(answer, tasks), 1):
+            rows[row["hidden"], row["seed"]] = row
+            file.write(json.dumps(row, default=float) + "\n")
+            file.flush()
+            left_min = (time.monotonic() - began) / k * (len(tasks) - k) / 60
+            print(
+                f"{k}/{len(tasks)} {row['hidden']} {row['seed']}: {words(row)}; {row['seconds']:.0f} s, "
+                f"{left_min:.0f} min to go",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""The whole question on fresh rigs: an effect is hidden, the command sees only CSVs, and then the truth is opened."""
+
+import json
+import os
+import secrets
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from _command import files, run
+from test_diagnosis_report import violations
+
+import data_synth
+from fits.diagnosis._json import diagnosis_schema
+
+# Effects of the library that are found as good as always at five times the noise.
+FOUND = ("creep", "slew_limit")
+# What the library does not describe, and the verdicts that are right.
+OUTSIDE = {"offset_jumps": {"unexplained"}}
+# Without an effect, a rig in a thousand may be accused.
+FALSE_ALARM = 0.001
+SAMPLES = {"slow_samples": 2500, "fast_samples": 4000}
+
+
+def diagnosed(folder, effects, *options):
+    """Hide effects in a fresh rig, and diagnose its CSVs; the truth stays in a folder of its own."""
+    seed = int(os.environ.get("MICROID_SEED") or secrets.randbelow(2**31))
+    print(f"{effects}: replay with MICROID_SEED={seed}")
+    bench = data_synth.hidden(effects, seed=seed, **SAMPLES)
+    runs, truth = folder / "runs", folder / "truth"
+    data_synth.write(bench, runs)
+    truth.mkdir()
+    (runs / "truth.json").rename(truth / "truth.json")
+    slow, fast, *aside = (runs / f"{record.name}.csv" for record in bench.records)
+    holdout = [word for path in aside for word in ("--holdout", path)]
+    done = run("diagnose", slow, fast, *holdout, *options, "--out", folder / "diagnosis", "--quiet")
+    assert done.exit_code == 0, f"seed {seed}: {done.output}"
+    found = json.loads((folder / "diagnosis" / "diagnosis.json").read_text())
+    return SimpleNamespace(
+        seed=f"replay with MICROID_SEED={seed}",
+        folder=folder,
+        aside=aside,
+        words=done.stdout,
+        found=found,
+        truth=json.loads((truth / "truth.json").read_text()),
+    )
+
+
+def named(cause):
+    return {cause["name"], *cause["also_consistent"]}
+
+
+@pytest.fixture(scope="module", params=FOUND)
+def case(request, tmp_path_factory):
+    return diagnosed(tmp_path_factory.mktemp(request.param), [request.param])
+
+
+def test_the_hidden_effect_is_named(case):
+    [hidden] = case.truth["effects"]
+    assert case.found["verdict"] == "effect_found", case.seed
+    first = case.found["causes"][0]
+    assert hidden["name"] in named(first), case.seed
+    assert first["z"] > 5, case.seed
+    assert first["p_family"] < 0.01, case.seed
+    assert first["name"] in case.words, case.seed
+
+
+def test_the_noise_is_that_of_the_sensor(case):
+    assert case.found["noise_um"] == pytest.approx(case.truth["sensor"]["noise_um"], rel=0.25), case.seed
+
+
+def test_the_extension_is_worth_something_on_runs_it_has_not_seen(case):
+    gain = case.found["gain"]
+    assert gain["heldout_rms_after_um"] <= gain["heldout_rms_before_um"], case.seed
+
+
+def test_all_files_are_there_and_keep_to_their_schema(case):
+    written = set(files(case.folder / "diagnosis"))
+    assert {"report.html", "diagnosis.json", "baseline.json", "extended.json"} <= written
+    assert ("next_experiment.csv" in written) == (case.found["next_experiment"] is not None)
+    assert violations(case.found, diagnosis_schema()) == [], case.seed
+
+
+def test_the_extended_model_simulates_new_runs_better(case):
+    squares = {}
+    for which in ("baseline", "extended"):
+        model = case.folder / "diagnosis" / f"{which}.json"
+        squares[which] = 0.0
+        for csv in case.aside:
+            out = case.folder / f"{which}_{csv.name}"
+            done = run("simulate", model, csv, "--out", out)
+            assert done.exit_code == 0, f"{case.seed}: {done.output}"
+            measured = np.genfromtxt(csv, delimiter=",", names=True)
+            off_um = measured["displacement_um"] - np.genfromtxt(out, delimiter=",", names=True)["displacement_um"]
+            squares[which] += np.sum((off_um - off_um.mean()) ** 2)
+    assert squares["extended"] <= squares["baseline"], case.seed
+
+
+def test_a_rig_without_an_effect_is_not_accused(tmp_path):
+    case = diagnosed(tmp_path, [], "--false-alarm", FALSE_ALARM)
+    assert "effects" not in case.truth
+    assert case.found["verdict"] != "effect_found", case.seed
+    assert case.found["causes"] == [], case.seed
+
+
+@pytest.mark.parametrize("effect", OUTSIDE)
+def test_what_the_library_does_not_know_is_not_explained_away(tmp_path, effect):
+    case = diagnosed(tmp_path, [effect])
+    assert [hidden["name"] for hidden in case.truth["effects"]] == [effect]
+    assert case.found["verdict"] in OUTSIDE[effect], case.seed
+    assert violations(case.found, diagnosis_schema()) == [], case.seed
