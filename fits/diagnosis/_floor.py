@@ -143,7 +143,9 @@ def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray) -> tuple[float,
         return 0.0, 0.0
     # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
     error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
-    return float((more / np.median(speed[quick])) ** 0.5), float(more / error)
+    # The slower half jitters, too.
+    faster = float(np.median(speed[quick]) - np.median(speed[slow]))
+    return float((more / faster) ** 0.5) if faster > 0 else 0.0, float(more / error)
 
 
 def line_of(

@@ -1,0 +1,171 @@
+"""The parts of a diagnosis, each against something plainer: dense least squares, known noise, planted faults."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.signal import lfilter
+
+from fits.diagnosis._candidates import Probe
+from fits.diagnosis._floor import floor_of, jitter_s, quantum_um, spikes
+from fits.diagnosis._projector import Noise, Projector, learn_noise, learn_roughness
+from fits.diagnosis._score import Family, score
+from microid import EFFECTS
+
+WHITE = np.zeros(0)
+
+
+def regression(rng, lengths=(300, 400), columns=12, coordinates=3, kinds=2):
+    """Random derivatives of two runs, as a linearised stage would have them."""
+    prior = np.eye(columns) * 0.3
+    baseline = SimpleNamespace(
+        chain=SimpleNamespace(size=columns), columns_um=rng.standard_normal(columns), prior=prior
+    )
+    return SimpleNamespace(
+        baseline=baseline,
+        masks=tuple(np.arange(n) >= 20 for n in lengths),
+        rows=tuple(rng.standard_normal((n, columns + coordinates)) for n in lengths),
+        own=tuple(np.ones((n, 1)) for n in lengths),
+        finer=tuple(tuple(rng.standard_normal((n, 5)) for n in lengths) for _ in range(kinds)),
+        residuals=tuple(rng.standard_normal(n) for n in lengths),
+        root=np.linalg.cholesky(prior).T,
+        size=columns + coordinates,
+    )
+
+
+def test_the_projection_is_generalised_least_squares(rng):
+    # The same as conditioning on all unknowns with their priors, the noise coloured: by dense covariances.
+    reg = regression(rng)
+    noise = [Noise(0.5, np.array([0.6])), Noise(2.0, WHITE)]
+    sizes = (0.7, 0.2)
+    projector = Projector(reg, noise, sizes)
+    signal = [rng.standard_normal(len(r)) for r in reg.residuals]
+    found = projector.off(projector.join(signal))
+    other = projector.off(projector.join([rng.standard_normal(len(r)) for r in reg.residuals]))
+    # Dense: whitening matrices, a flat prior on coordinates and offsets, Gaussian ones on the others.
+    white = []
+    for one, n, mask in zip(noise, (300, 400), reg.masks, strict=True):
+        matrix = np.eye(n)
+        for k, past in enumerate(one.past, 1):
+            matrix -= past * np.eye(n, k=-k)
+        white.append((matrix / one.innovation_um)[mask])
+    total = sum(len(w) for w in white)
+    design, prior = [], []
+    for c in range(15):
+        design.append(np.concatenate([w @ rows[:, c] for w, rows in zip(white, reg.rows, strict=True)]))
+        prior.append(0.3 if c < 12 else 0.0)
+    for kind, size in zip(reg.finer, sizes, strict=True):
+        for c in range(5):
+            design.append(np.concatenate([w @ rows[:, c] for w, rows in zip(white, kind, strict=True)]))
+            prior.append(1 / size**2)
+    for k in range(2):
+        design.append(
+            np.concatenate([w @ o[:, 0] * (i == k) for i, (w, o) in enumerate(zip(white, reg.own, strict=True))])
+        )
+        prior.append(0.0)
+    design = np.stack(design, axis=1)
+    precision = np.eye(total) - design @ np.linalg.solve(design.T @ design + np.diag(prior), design.T)
+    target = np.concatenate([w @ s for w, s in zip(white, signal, strict=True)])
+    np.testing.assert_allclose(found @ found, target @ precision @ target, rtol=1e-9)
+    np.testing.assert_allclose(projector.off(found), found, atol=1e-10)
+    assert abs(found @ other) <= np.linalg.norm(found) * np.linalg.norm(other)
+
+
+def probe(signatures, positive=False):
+    effect = next(form for form in EFFECTS if form.name == "thermal_drift")
+    return Probe((SimpleNamespace(name=effect.name),), tuple(signatures), positive)
+
+
+def test_scores_are_standard_normal_where_there_is_nothing(rng):
+    reg = regression(rng)
+    noise = [Noise(1.0, WHITE), Noise(1.0, WHITE)]
+    reg.baseline.columns_um = np.zeros(12)
+    one = probe([[rng.standard_normal(n) for n in (300, 400)]])
+    draws = []
+    for _ in range(200):
+        reg.residuals = tuple(rng.standard_normal(n) for n in (300, 400))
+        projector = Projector(reg, noise)
+        found = score(projector, one, projector.off(projector.residual))
+        draws.append(found.z * np.sign(found.coefficients[0]))
+    assert stats.kstest(draws, "norm").pvalue > 1e-4
+
+
+def test_family_wise_probabilities_are_uniform_where_there_is_nothing(rng):
+    reg = regression(rng)
+    reg.baseline.columns_um = np.zeros(12)
+    noise = [Noise(1.0, WHITE), Noise(1.0, WHITE)]
+    probes = [probe([[rng.standard_normal(n) for n in (300, 400)]], positive=k % 2 == 0) for k in range(8)]
+    probes.append(probe([[rng.standard_normal(n) for n in (300, 400)] for _ in range(3)]))
+    found = []
+    for _ in range(150):
+        reg.residuals = tuple(rng.standard_normal(n) for n in (300, 400))
+        projector = Projector(reg, noise)
+        residual = projector.off(projector.residual)
+        scored = [score(projector, one, residual) for one in probes]
+        found.append(Family(scored, rng).p(max(one.z for one in scored)))
+    # One-sided tests that are all below zero give a probability of one.
+    assert stats.binomtest(int(np.sum(np.array(found) < 0.05)), len(found), 0.05).pvalue > 1e-4
+    assert stats.binomtest(int(np.sum(np.array(found) < 0.3)), len(found), 0.3).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("past", [(), (0.7,), (1.2, -0.5)])
+def test_noise_is_learnt(rng, past):
+    n = 20_000
+    noise = lfilter([1.0], np.r_[1.0, -np.array(past)], 0.03 * rng.standard_normal(n))
+    found = learn_noise(noise, 10.0)
+    assert found.innovation_um == pytest.approx(0.03, rel=0.03)
+    assert found.total_um == pytest.approx(float(np.std(noise)), rel=0.08)
+    white = found.whiten(noise)[20:]
+    assert abs(np.mean(white[1:] * white[:-1])) < 5 / n**0.5
+
+
+def test_roughness_is_learnt_only_where_it_is(rng):
+    reg = regression(rng)
+    noise = [Noise(1.0, WHITE), Noise(1.0, WHITE)]
+    assert sum(learn_roughness(Projector(reg, noise), [])) < 0.5
+    bend = 3.0 * rng.standard_normal(5)
+    reg.residuals = tuple(r + kind @ bend for r, kind in zip(reg.residuals, reg.finer[0], strict=True))
+    first, _ = learn_roughness(Projector(reg, noise), [])
+    assert 1.0 < first < 10.0
+
+
+def run_of(voltage_V, displacement_um, rate_Hz=1000.0):
+    time_s = np.arange(len(voltage_V)) / rate_Hz
+    record = SimpleNamespace(voltage_V=voltage_V, time_s=time_s, displacement_um=displacement_um)
+    fitted = np.ones(len(voltage_V), dtype=bool)
+    return SimpleNamespace(record=record, displacement_um=displacement_um, fitted=fitted, rate_Hz=rate_Hz)
+
+
+def test_the_floor_is_read_off_idle_stretches(rng):
+    voltage = np.concatenate([np.linspace(0, 100, 1000), np.full(1000, 100.0), np.linspace(100, 0, 1000)])
+    left = 0.05 * rng.standard_normal(3000) + 2 * np.sin(np.arange(3000) / 30) * (np.arange(3000) % 2000 < 1000)
+    floor = floor_of(run_of(voltage, left), left, 0.01)
+    assert floor.idle
+    assert floor.noise.total_um == pytest.approx(0.05, rel=0.15)
+
+
+def test_spikes_are_found_and_ringing_is_not(rng):
+    time = np.arange(4000) / 1000
+    ringing = 0.5 * np.exp(-(time % 1.0) / 0.05) * np.sin(2 * np.pi * 100 * time)
+    left = 0.02 * rng.standard_normal(4000) + ringing
+    assert spikes(run_of(np.sin(time), left), left).sum() == 0
+    where = 300 + 400 * np.arange(8)
+    left[where] += rng.choice([-1, 1], 8) * rng.uniform(0.6, 3.0, 8)
+    assert set(np.flatnonzero(spikes(run_of(np.sin(time), left), left))) == set(where)
+
+
+def test_a_last_digit_is_found_and_noise_has_none(rng):
+    values = 20 * np.sin(np.arange(6000) / 300) + 0.01 * rng.standard_normal(6000)
+    assert quantum_um(values) == 0
+    assert quantum_um(np.round(values / 0.076) * 0.076) == pytest.approx(0.076, rel=1e-3)
+
+
+def test_jitter_is_noise_that_grows_with_the_speed(rng):
+    time = np.arange(20_000) / 1000
+    speed = 500 * np.cos(2 * np.pi * time)
+    quiet = 0.02 * rng.standard_normal(len(time))
+    assert jitter_s(quiet, speed)[1] < 8
+    size, z = jitter_s(quiet + 1e-4 * speed * rng.standard_normal(len(time)), speed)
+    assert z > 8
+    assert size == pytest.approx(1e-4, rel=0.1)
