@@ -61,7 +61,7 @@ def answer(task: tuple[str, int, dict[str, Any]]) -> dict[str, Any]:
     hidden, seed, settings = task
     import data_synth
     import fits
-    from fits.diagnosis._diagnose import diagnose
+    from fits import diagnose
     from fits.diagnosis._select import best_of
 
     names = () if hidden == "none" else tuple(hidden.split("+"))

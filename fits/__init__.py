@@ -96,6 +96,16 @@ if TYPE_CHECKING:
     from fits._stage_toml import write_design as write_design
     from fits._stage_uncertainty import StageUncertainty as StageUncertainty
     from fits._uncertainty import Uncertainty as Uncertainty
+    from fits.diagnosis._diagnose import diagnose as diagnose
+    from fits.diagnosis._json import diagnosis_json as diagnosis_json
+    from fits.diagnosis._json import diagnosis_schema as diagnosis_schema
+    from fits.diagnosis._report import report_html as report_html
+    from fits.diagnosis._result import Bound as Bound
+    from fits.diagnosis._result import Diagnosis as Diagnosis
+    from fits.diagnosis._result import EffectParameter as EffectParameter
+    from fits.diagnosis._result import Experiment as Experiment
+    from fits.diagnosis._result import FoundCause as FoundCause
+    from fits.diagnosis._result import Gain as Gain
 
 # Names are looked up when first used, so that the command's help does not wait for JAX and pandas.
 _HOMES = {
@@ -104,18 +114,24 @@ _HOMES = {
     "AxisBudget": "_budget",
     "AxisSensitivity": "_sensitivity",
     "AxisSpread": "_monte_carlo",
+    "Bound": "diagnosis._result",
     "Budget": "_budget",
     "Claim": "_paper_claims",
     "Compensation": "_compensate",
     "DataError": "_errors",
     "Design": "_stage_design",
+    "Diagnosis": "diagnosis._result",
     "DimensionEffect": "_sensitivity",
     "Draws": "_posterior",
     "Driving": "_budget",
+    "EffectParameter": "diagnosis._result",
     "Errors": "_metrics",
+    "Experiment": "diagnosis._result",
     "FitError": "_result",
     "FitResult": "_result",
     "FitStatus": "_result",
+    "FoundCause": "diagnosis._result",
+    "Gain": "diagnosis._result",
     "IdleNoise": "_idle",
     "LADDER": "_fit",
     "LevelTrial": "_result",
@@ -150,6 +166,9 @@ _HOMES = {
     "describe_claims": "_paper_claims",
     "describe_sensitivity": "_sensitivity_report",
     "describe_stage": "_stage_report",
+    "diagnose": "diagnosis._diagnose",
+    "diagnosis_json": "diagnosis._json",
+    "diagnosis_schema": "diagnosis._json",
     "errors": "_metrics",
     "estimate_response": "_frequency",
     "export_c": "_export_c",
@@ -182,6 +201,7 @@ _HOMES = {
     "read_response": "_read_response",
     "read_runs": "_read_csv",
     "relative_error": "_modal_fit",
+    "report_html": "diagnosis._report",
     "sample_posterior": "_posterior",
     "save_model": "_model_file",
     "second_order": "_second_order",

@@ -14,7 +14,7 @@ from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scal
 from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._experiment import suggest
 from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_of, left_of, shared_effects
-from fits.diagnosis._faults import Faults, find_faults, name_faults
+from fits.diagnosis._faults import SINGLE, Faults, find_faults, name_faults
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
@@ -24,8 +24,8 @@ from fits.diagnosis._structure import cycles, look, together, views
 from fits.diagnosis._tell import bounds, causes_of
 from microid import EFFECTS, AbstractEffect, Stage
 
-# A cause explains at least this part of what is reproducible, or it is none.
-_SHARE = 0.2
+# Causes explain at least this part of what is reproducible, or the true ones are not in the library.
+_SHARE = 0.5
 # What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
 _REST, _CHANCE = 0.3, 1e-6
 
@@ -138,7 +138,8 @@ def prepare_diagnosis(
             continue
         own = list(probes_of(bench, form, scales))
         if not own:
-            skipped.append((form.name, "the runs are too short or too plain to show it"))
+            why = "the runs are too short or too plain to show it"
+            skipped.append((form.name, "nothing of it was found, sample by sample" if form.name in SINGLE else why))
         probes += own
     progress("learning how rough the density is")
     signatures = [column for probe in probes for column in probe.signatures]

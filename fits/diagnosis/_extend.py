@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from fits._stage_run import StageRun, without
 from fits.diagnosis._baseline import Baseline
@@ -17,19 +18,27 @@ from microid import AbstractEffect, Stage
 
 _BLOCKS = 24
 _ROUNDS = 6
+# Relative spread of strengths that are the same in all runs.
+_ALIKE = 0.3
 
 
 def shared_effects(model: Refit, runs: int) -> list[AbstractEffect]:
-    """The effects as a model holds them: strengths that differ from run to run by their mean."""
+    """The effects as a model holds them: strengths that every run has by their mean, and others not at all."""
     found = []
     for law, x in zip(model.laws, model.x, strict=True):
         each = [law.effect(x, run) for run in range(runs)]
         if law.each.any():
-            mean = {name: jnp.mean(jnp.stack([getattr(e, name) for e in each]), axis=0) for name in law.form.strength}
-            found.append(replace(each[0], **mean))
+            found.append(replace(each[0], **{name: _common(each, name) for name in law.form.strength}))
         else:
             found.append(each[0])
     return found
+
+
+def _common(each: Sequence[AbstractEffect], name: str) -> Float[Array, "..."]:
+    values = jnp.stack([getattr(effect, name) for effect in each])
+    mean = jnp.mean(values, axis=0)
+    # What one run had says nothing of the next.
+    return jnp.where(jnp.std(values, axis=0) < _ALIKE * jnp.abs(mean), mean, 0.0)
 
 
 def extended_stage(baseline: Baseline, effects: Sequence[AbstractEffect], substeps: int) -> Stage:

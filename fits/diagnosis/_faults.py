@@ -11,6 +11,8 @@ from fits.diagnosis._projector import Noise, Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression
 
+# Effects that are looked for in single samples and in the noise.
+SINGLE = ("outliers", "quantisation", "timestamp_jitter")
 # So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
 _SPIKES, _PART = 3, 0.3
 _JITTER_Z, _LINE_Z = 8.0, 60.0

@@ -16,6 +16,9 @@ from fits._result import FitError, FitStatus
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._regression import Regression
 
+# A density no rougher than this, relative to itself: beyond, it would follow effects.
+_ROUGHEST = 0.5
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -251,7 +254,7 @@ def learn_roughness(projector: Projector, candidates: Sequence[Sequence[np.ndarr
     count = projector.count - projector.freedom - len(candidates)
 
     def unlikely(logs: np.ndarray) -> float:
-        scale = np.repeat(np.exp(logs), sizes)
+        scale = np.repeat(np.minimum(np.exp(logs), _ROUGHEST), sizes)
         inner = np.eye(len(scale)) + scale[:, None] * gram * scale[None, :]
         root = np.linalg.cholesky(inner)
         half = solve_triangular(root, scale * cross, lower=True)
@@ -264,4 +267,4 @@ def learn_roughness(projector: Projector, candidates: Sequence[Sequence[np.ndarr
         found = minimize(unlikely, start, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 0.05, "maxiter": 80})
         if found.fun < best - 0.5:
             best, at = float(found.fun), found.x
-    return tuple(float(np.exp(a)) if a > -12 else 0.0 for a in at)
+    return tuple(float(min(np.exp(a), _ROUGHEST)) if a > -12 else 0.0 for a in at)

@@ -133,6 +133,10 @@ def bounds(found: Selection, ready: "Prepared", named: Collection[str]) -> tuple
         if name in named:
             continue
         size = float(np.linalg.norm(one.columns))
+        if size == 0:
+            reason = "the plain stage follows all of it in these runs, so that they cannot show it"
+            out.append(Bound(name, 0.0, 1.0, float("nan"), reason))
+            continue
         raw = size / max(one.share_left, 1e-12)
         # The largest multiple that would not have been noticed, by the size that it has in the displacement.
         bound = (one.z + _TWO_SIDED) / max(size, 1e-300) * raw / ready.projector.count**0.5 * noise

@@ -196,21 +196,21 @@ def _rank(part: AbstractPart) -> float:
     return PLACES.index(part.place) if isinstance(part, AbstractEffect) else -1 if part.gives == "V" else 3.5
 
 
-def times_of(time_s: Times, count: int) -> Float[Array, " t"]:
+def _times_of(time_s: Times, count: int) -> Float[Array, " t"]:
     """Times of the samples from the first on, shape `(t,)`, be it given or only the interval."""
     if time_s.ndim == 0:
         return time_s * jnp.arange(count, dtype=time_s.dtype)
     return time_s - time_s[0]
 
 
-def rate_of(time_s: Times, values: Float[Array, " t"]) -> Float[Array, " t"]:
+def _rate_of(time_s: Times, values: Float[Array, " t"]) -> Float[Array, " t"]:
     """Rate of change at the samples, by central differences, shape `(t,)`."""
-    time = times_of(time_s, values.shape[0])
+    time = _times_of(time_s, values.shape[0])
     inner = (values[2:] - values[:-2]) / (time[2:] - time[:-2])
     ends = (values[1] - values[0]) / (time[1] - time[0]), (values[-1] - values[-2]) / (time[-1] - time[-2])
     return jnp.concatenate([ends[0][None], inner, ends[1][None]])
 
 
-def lowpass(time_s: Times, values: Float[Array, " t"], time_constant_s: Float[Array, ""]) -> Float[Array, " t"]:
+def _lowpass(time_s: Times, values: Float[Array, " t"], time_constant_s: Float[Array, ""]) -> Float[Array, " t"]:
     """Follow values with a lag of the first order, from rest at the first, shape `(t,)`."""
     return Driver(time_constant_s).system().respond(time_s, values, values[0], "first")

@@ -12,7 +12,7 @@ from microid._part import AbstractPart, Signal
 _LEVELS, _SLOW_S = 65, 1e4
 
 
-def anhysteretic(inner: AbstractPart, signal: Signal, start: Any) -> Signal:
+def _anhysteretic(inner: AbstractPart, signal: Signal, start: Any) -> Signal:
     """Mean of the two branches of the loop over the range of a voltage, in um, at the voltages of the signal."""
     low = jnp.minimum(jnp.min(signal.values), signal.before)
     step = (jnp.maximum(jnp.max(signal.values), signal.before) - low) / (_LEVELS - 1)

@@ -16,7 +16,9 @@ _PIECE, _CORRECTIONS = 256, 2
 Law = Callable[[Array, Array, Any], tuple[Array, Any]]
 
 
-def propagators(system: LinearSystem, time_s: Times, count: int) -> tuple[Float[Array, "k n n"], Float[Array, "k n"]]:
+def _propagators(
+    system: LinearSystem, time_s: Times, count: int
+) -> tuple[Float[Array, "k n n"], Float[Array, "k n"]]:
     """Matrix of every interval, and what its states lose by an input that rises by one in a line."""
     intervals, n = count - 1, system.order
     time = lax.stop_gradient(time_s).astype(system.rest.dtype)
@@ -40,7 +42,7 @@ def propagators(system: LinearSystem, time_s: Times, count: int) -> tuple[Float[
     return lax.cond(jnp.max(jnp.abs(interval - mean)) <= rounding, lambda _: even(mean), uneven, interval)
 
 
-def forces_um(
+def _forces_um(
     mechanics: Mechanics, time_s: Times, signal: Signal, law: Law, before_um: Float[Array, ""], state: Any
 ) -> Float[Array, " t"]:
     """Forces on the mass along a record, each as the piezo's displacement that would balance it, shape `(t,)`.
@@ -66,7 +68,7 @@ def forces_um(
     if signal.values.shape[0] == 1:
         return before_um[None]
     gain = mechanics.gain
-    step, taken = propagators(mechanics.system(), time_s, signal.values.shape[0])
+    step, taken = _propagators(mechanics.system(), time_s, signal.values.shape[0])
     change = jnp.diff(signal.values)
 
     def visit(carry: tuple[Any, ...], now: tuple[Array, ...]) -> tuple[tuple[Any, ...], Array]:

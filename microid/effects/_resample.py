@@ -6,12 +6,12 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times
 from microid._part import Signal
-from microid.effects._base import times_of
+from microid.effects._base import _times_of
 
 _NODES = 4
 
 
-def read_at(time_s: Times, signal: Signal, when_s: Float[Array, " t"]) -> Float[Array, " t"]:
+def _read_at(time_s: Times, signal: Signal, when_s: Float[Array, " t"]) -> Float[Array, " t"]:
     """Read a signal at other times, by cubics through the four samples around each (Lagrange), shape `(t,)`.
 
     Parameters
@@ -24,7 +24,7 @@ def read_at(time_s: Times, signal: Signal, when_s: Float[Array, " t"]) -> Float[
         Times to read at, counted from the first sample, shape `(t,)`. Derivatives flow into them.
     """
     count = signal.values.shape[0]
-    time = times_of(time_s, count)
+    time = _times_of(time_s, count)
     if count < _NODES:
         return jnp.interp(when_s, time, signal.values, left=signal.before)
     fixed = lax.stop_gradient(when_s)

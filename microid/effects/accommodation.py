@@ -10,7 +10,7 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, register
-from microid.effects._irreversible import anhysteretic
+from microid.effects._irreversible import _anhysteretic
 
 _PASSES = 2
 
@@ -59,7 +59,7 @@ class Accommodation(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Pass on the voltage and what is fed back."""
-        straight = anhysteretic(self.inner, signal, start)
+        straight = _anhysteretic(self.inner, signal, start)
 
         # A loop that JAX sees, so that the hysteresis is compiled once; its first pass has nothing to feed back.
         def improve(found: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
-from microid.effects._resample import read_at
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._resample import _read_at
 
 
 @register
@@ -40,5 +40,5 @@ class ClockMismatch(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Read the signal at the times of the other clock."""
-        when = times_of(time_s, signal.values.shape[0]) * (1 + 1e-6 * self.rate_ppm)
-        return Signal(read_at(time_s, signal, when), signal.before, signal.hold)
+        when = _times_of(time_s, signal.values.shape[0]) * (1 + 1e-6 * self.rate_ppm)
+        return Signal(_read_at(time_s, signal, when), signal.before, signal.hold)

@@ -10,21 +10,21 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, lowpass, register
+from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, register
 
-# Relaxations per decade, and the decades that they cover.
-_PER_DECADE, _DECADES = 2, 6
-# Relaxations whose time constants begin at t0 run ahead of log10(1 + t / t0) by Euler's constant.
-_AHEAD = float(np.exp(np.euler_gamma))
+# Relaxations per decade of time constants, and the decades ahead of the onset and behind it that they cover.
+_PER_DECADE, _AHEAD, _BEHIND = 3, 1, 5
 
 
 @register
 class Creep(AbstractEffect):
-    r"""Relaxations with time constants evenly spaced on a logarithmic scale, which together creep along its line.
+    r"""Relaxations of all time constants, which together creep along the logarithm of time.
 
-    .. math:: w \leftarrow w + \gamma \sum_j \frac{1}{m} \, \mathrm{LP}_{\tau_j}[w - w(0)]
+    .. math:: w \leftarrow w + \gamma \sum_j \frac{e^{-t_0 / \tau_j}}{m} \, \mathrm{LP}_{\tau_j}[w - w(0)]
 
-    With `m` of them per decade a step of one answers with nearly `gamma log10(1 + t / t0)`.
+    With `m` time constants per decade this is the trapezoidal rule for the integral over the logarithm of `tau` that
+    `log10(1 + t / t0)` is (Laplace's of `1 / (t + t0)`): a step of one answers with `gamma log10(1 + t / t0)`, up to
+    five decades behind `t0`.
 
     Attributes
     ----------
@@ -61,10 +61,12 @@ class Creep(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a displacement that was at rest."""
         moved = signal.values - signal.before
-        steps = (np.arange(_DECADES * _PER_DECADE) + 0.5) / _PER_DECADE
-        constants = _AHEAD * self.onset_s * jnp.asarray(10**steps, dtype=moved.dtype)
-        total = jnp.sum(jax.vmap(lambda constant: lowpass(time_s, moved, constant))(constants), axis=0)
-        return Signal(signal.values + self.gain_per_decade / _PER_DECADE * total, signal.before, signal.hold)
+        ratio = 10 ** (np.arange(-_AHEAD * _PER_DECADE, _BEHIND * _PER_DECADE + 1) / _PER_DECADE)
+        weights = jnp.asarray(np.exp(-1 / ratio) / _PER_DECADE, dtype=moved.dtype)
+        constants = self.onset_s * jnp.asarray(ratio, dtype=moved.dtype)
+        each = jax.vmap(lambda constant: _lowpass(time_s, moved, constant))(constants)
+        total = jnp.sum(weights[:, None] * each, axis=0)
+        return Signal(signal.values + self.gain_per_decade * total, signal.before, signal.hold)
 
 
 @register
@@ -105,5 +107,5 @@ class KelvinVoigtCreep(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a displacement that was at rest."""
-        moved = lowpass(time_s, signal.values - signal.before, self.time_constant_s)
+        moved = _lowpass(time_s, signal.values - signal.before, self.time_constant_s)
         return Signal(signal.values + self.gain * moved, signal.before, signal.hold)

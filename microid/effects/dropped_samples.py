@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
-from microid.effects._resample import read_at
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._resample import _read_at
 
 _INSTANTS = 12
 
@@ -53,7 +53,7 @@ class DroppedSamples(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Read the signal at later times after the loss."""
-        time = times_of(time_s, signal.values.shape[0])
+        time = _times_of(time_s, signal.values.shape[0])
         width = time[1] - time[0] if time.shape[0] > 1 else jnp.ones_like(self.after_s)
         when = time + self.dropped_s * jax.nn.sigmoid((time - self.after_s) / width)
-        return Signal(read_at(time_s, signal, when), signal.before, signal.hold)
+        return Signal(_read_at(time_s, signal, when), signal.before, signal.hold)

@@ -9,8 +9,8 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal, innermost
 from microid.effects._base import AbstractEffect, Place, Scales, register
-from microid.effects._grids import decades
-from microid.effects._oscillator import forces_um
+from microid.effects._grids import _decades
+from microid.effects._oscillator import _forces_um
 
 _SMALL = 1e-6
 
@@ -58,7 +58,7 @@ class Friction(AbstractEffect):
         if scales.resonance_Hz is None or inner is None:
             return ()
         size = jnp.asarray(0.001 * scales.stroke_um)
-        grid = decades(max(0.001 * scales.stroke_um, 1e-3), 0.1 * scales.stroke_um, 2)
+        grid = _decades(max(0.001 * scales.stroke_um, 1e-3), 0.1 * scales.stroke_um, 2)
         return tuple((cls(inner, size, jnp.asarray(length)),) for length in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
@@ -73,5 +73,5 @@ class Friction(AbstractEffect):
             return self.amplitude_um * state / mechanics.gain, state
 
         none = jnp.zeros_like(signal.before)
-        taken = forces_um(mechanics, time_s, signal, law, none, none)
+        taken = _forces_um(mechanics, time_s, signal, law, none, none)
         return self.inner.run(time_s, Signal(signal.values - taken, signal.before, signal.hold), start)

@@ -11,7 +11,7 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal, innermost
 from microid._plant import Mechanics
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
 
 
 @register
@@ -113,7 +113,7 @@ def _loaded(
     loaded = Mechanics(plain.natural_frequency_Hz * slower, plain.damping_ratio * slower, plain.gain)
     more = loaded.run(time_s, signal, start).values - plain.run(time_s, signal, start).values
     if after_s is not None:
-        time = times_of(time_s, more.shape[0])
+        time = _times_of(time_s, more.shape[0])
         # Over a period of the resonance, so that there is a derivative.
         more = more * jax.nn.sigmoid((time - after_s) * plain.natural_frequency_Hz * 4)
     other = inner.run(time_s, signal, start)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
 
 _HARMONICS, _MOST = 3, 11
 # By which the mains may run fast or slow.
@@ -113,7 +113,7 @@ def _hum(
     sine_um: Float[Array, " 3"],
     frequency_Hz: Float[Array, ""],
 ) -> Signal:
-    phase = 2 * jnp.pi * frequency_Hz * times_of(time_s, signal.values.shape[0])
+    phase = 2 * jnp.pi * frequency_Hz * _times_of(time_s, signal.values.shape[0])
     total = signal.values
     for h in range(_HARMONICS):
         total = total + cosine_um[h] * jnp.cos((h + 1) * phase) + sine_um[h] * jnp.sin((h + 1) * phase)

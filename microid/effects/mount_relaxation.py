@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
-from microid.effects._grids import decades
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._grids import _decades
 
 
 @register
@@ -43,12 +43,12 @@ class MountRelaxation(AbstractEffect):
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Time constants in steps of half a decade, from a thirtieth of the record to three of it."""
-        grid = decades(scales.duration_s / 30, 3 * scales.duration_s, 2)
+        grid = _decades(scales.duration_s / 30, 3 * scales.duration_s, 2)
         return tuple((cls(jnp.asarray(3 * scales.noise_um), jnp.asarray(constant)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add what has settled since the first sample."""
-        time = times_of(time_s, signal.values.shape[0])
+        time = _times_of(time_s, signal.values.shape[0])
         moved = -self.change_um * jnp.expm1(-time / self.time_constant_s)
         return Signal(signal.values + moved, signal.before, signal.hold)
 
@@ -82,11 +82,11 @@ class LogarithmicMountRelaxation(AbstractEffect):
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Ages in steps of a decade, from a thousandth of the record to its length."""
-        grid = decades(max(scales.duration_s / 1000, 2e-3), scales.duration_s)
+        grid = _decades(max(scales.duration_s / 1000, 2e-3), scales.duration_s)
         return tuple((cls(jnp.asarray(3 * scales.noise_um), jnp.asarray(age)),) for age in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add what has settled since the first sample."""
-        time = times_of(time_s, signal.values.shape[0])
+        time = _times_of(time_s, signal.values.shape[0])
         moved = self.change_per_decade_um * jnp.log1p(time / self.age_s) / jnp.log(10.0)
         return Signal(signal.values + moved, signal.before, signal.hold)

@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, lowpass, rate_of, register
-from microid.effects._grids import decades
-from microid.effects._irreversible import anhysteretic
+from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _rate_of, register
+from microid.effects._grids import _decades
+from microid.effects._irreversible import _anhysteretic
 
 # By which the widening lags behind the rate: a width that jumped at reversals would be a step in the displacement.
 _LAG_S = 2e-3
@@ -66,7 +66,7 @@ class RateDependence(AbstractEffect):
         """Onsets in steps of a decade, down to a thousandth of the fastest rate."""
         if inner is None:
             return ()
-        grid = decades(max(scales.fastest_V_per_s / 1000, 1e-2), scales.fastest_V_per_s)
+        grid = _decades(max(scales.fastest_V_per_s / 1000, 1e-2), scales.fastest_V_per_s)
         return tuple((cls(inner, jnp.asarray(0.05), jnp.asarray(onset)),) for onset in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
@@ -74,9 +74,9 @@ class RateDependence(AbstractEffect):
         given = self.inner.run(time_s, signal, start)
         if signal.values.shape[0] < 2:
             return given
-        beside = given.values - anhysteretic(self.inner, signal, start).values
-        speed = jnp.log1p(jnp.abs(rate_of(time_s, signal.values)) / self.onset_V_per_s) / jnp.log(10.0)
-        wider = lowpass(time_s, speed, jnp.asarray(_LAG_S, dtype=speed.dtype))
+        beside = given.values - _anhysteretic(self.inner, signal, start).values
+        speed = jnp.log1p(jnp.abs(_rate_of(time_s, signal.values)) / self.onset_V_per_s) / jnp.log(10.0)
+        wider = _lowpass(time_s, speed, jnp.asarray(_LAG_S, dtype=speed.dtype))
         return Signal(given.values + self.gain_per_decade * wider * beside, given.before, given.hold)
 
 
@@ -114,14 +114,14 @@ class RelaxingHysteresis(AbstractEffect):
         if inner is None:
             return ()
         first = max(3 * scales.interval_s, 3e-4)
-        grid = decades(first, max(0.1, 10 * first))
+        grid = _decades(first, max(0.1, 10 * first))
         return tuple((cls(inner, jnp.asarray(0.1), jnp.asarray(constant)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Let a share of the irreversible part come late."""
         given = self.inner.run(time_s, signal, start)
-        beside = given.values - anhysteretic(self.inner, signal, start).values
-        late = lowpass(time_s, beside, self.time_constant_s)
+        beside = given.values - _anhysteretic(self.inner, signal, start).values
+        late = _lowpass(time_s, beside, self.time_constant_s)
         return Signal(given.values + self.share * (late - beside), given.before, given.hold)
 
 
@@ -160,12 +160,12 @@ class ActivatedSwitching(AbstractEffect):
         """Onsets in steps of a decade, down to a ten-thousandth of the fastest rate."""
         if inner is None:
             return ()
-        grid = decades(max(scales.fastest_V_per_s / 10000, 1e-2), scales.fastest_V_per_s / 3)
+        grid = _decades(max(scales.fastest_V_per_s / 10000, 1e-2), scales.fastest_V_per_s / 3)
         return tuple((cls(inner, jnp.asarray(0.1), jnp.asarray(onset)),) for onset in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Let the hysteresis see a voltage that stays behind."""
         if signal.values.shape[0] < 2:
             return self.inner.run(time_s, signal, start)
-        late = self.lag_V * jnp.arcsinh(rate_of(time_s, signal.values) / self.onset_V_per_s)
+        late = self.lag_V * jnp.arcsinh(_rate_of(time_s, signal.values) / self.onset_V_per_s)
         return self.inner.run(time_s, Signal(signal.values - late, signal.before, signal.hold), start)

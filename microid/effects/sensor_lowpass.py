@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times, _bend, recur
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
 
 # Of the interval: of what is faster nothing is left after one sample.
 _INSTANT = 0.01
@@ -52,7 +52,7 @@ class SensorLowpass(AbstractEffect):
         """Follow the signal; one that jumps at the first sample has done so one interval before."""
         if signal.values.shape[0] == 1:
             return signal
-        interval = jnp.diff(times_of(time_s, signal.values.shape[0]))
+        interval = jnp.diff(_times_of(time_s, signal.values.shape[0]))
         lag = self.time_constant_s / interval
         slow = jnp.maximum(lag, _INSTANT)
         left = jnp.exp(-1 / slow)

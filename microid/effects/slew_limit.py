@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
 
 
 @register
@@ -56,7 +56,7 @@ class SlewLimit(AbstractEffect):
         """Follow the command as fast as can be; one that jumps at the first sample has had one interval for it."""
         if signal.values.shape[0] == 1:
             return signal
-        interval = jnp.diff(times_of(time_s, signal.values.shape[0]))
+        interval = jnp.diff(_times_of(time_s, signal.values.shape[0]))
         reach = self.limit_V_per_s * jnp.concatenate([interval[:1], interval])
 
         def visit(before: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:

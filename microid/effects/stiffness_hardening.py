@@ -9,7 +9,7 @@ from microid._linear import Times
 from microid._param import array, param
 from microid._part import AbstractPart, Signal, innermost
 from microid.effects._base import AbstractEffect, Place, Scales, register
-from microid.effects._oscillator import forces_um
+from microid.effects._oscillator import _forces_um
 
 _AT_REST = 8
 
@@ -78,5 +78,5 @@ class StiffnessHardening(AbstractEffect):
         before = jnp.zeros_like(signal.before)
         for _ in range(_AT_REST):
             before, _ = law(before, mechanics.gain * (signal.before - before), ())
-        taken = forces_um(mechanics, time_s, signal, law, before, ())
+        taken = _forces_um(mechanics, time_s, signal, law, before, ())
         return self.inner.run(time_s, Signal(signal.values - taken, signal.before - before, signal.hold), start)

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, lowpass, register, times_of
-from microid.effects._grids import decades
+from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _times_of, register
+from microid.effects._grids import _decades
 
 
 @register
@@ -46,7 +46,7 @@ class ThermalDrift(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the drift since the first sample."""
-        time = times_of(time_s, signal.values.shape[0])
+        time = _times_of(time_s, signal.values.shape[0])
         return Signal(signal.values + self.rate_um_per_s * time, signal.before, signal.hold)
 
 
@@ -79,12 +79,12 @@ class ExponentialThermalDrift(AbstractEffect):
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Time constants in steps of half a decade, from a thirtieth of the record to three of it."""
-        grid = decades(scales.duration_s / 30, 3 * scales.duration_s, 2)
+        grid = _decades(scales.duration_s / 30, 3 * scales.duration_s, 2)
         return tuple((cls(jnp.asarray(3 * scales.noise_um), jnp.asarray(constant)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the drift since the first sample."""
-        time = times_of(time_s, signal.values.shape[0])
+        time = _times_of(time_s, signal.values.shape[0])
         moved = -self.change_um * jnp.expm1(-time / self.time_constant_s)
         return Signal(signal.values + moved, signal.before, signal.hold)
 
@@ -121,12 +121,12 @@ class TemperatureDrift(AbstractEffect):
         spread = {name: spread for name, _, spread in scales.columns}.get("temperature_degC", 0.0)
         if not spread > 0:
             return ()
-        grid = decades(max(3 * scales.interval_s, scales.duration_s / 300, 1e-3), scales.duration_s, 2)
+        grid = _decades(max(3 * scales.interval_s, scales.duration_s / 300, 1e-3), scales.duration_s, 2)
         size = jnp.asarray(3 * scales.noise_um / spread)
         return tuple((cls(size, jnp.asarray(constant)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the expansion since the first sample."""
         temperature = start.columns["temperature_degC"]
-        followed = lowpass(time_s, temperature - temperature[0], self.time_constant_s)
+        followed = _lowpass(time_s, temperature - temperature[0], self.time_constant_s)
         return Signal(signal.values + self.expansion_um_per_K * followed, signal.before, signal.hold)

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import _as_inexact, array, param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, lowpass, rate_of, register
-from microid.effects._grids import decades
+from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _rate_of, register
+from microid.effects._grids import _decades
 
 
 @register
@@ -57,12 +57,12 @@ class ThermalGain(AbstractEffect):
         mean, spread = found.get("temperature_degC", (0.0, 0.0))
         if not spread > 0:
             return ()
-        grid = decades(max(3 * scales.interval_s, scales.duration_s / 300, 1e-3), scales.duration_s, 2)
+        grid = _decades(max(3 * scales.interval_s, scales.duration_s / 300, 1e-3), scales.duration_s, 2)
         return tuple((cls(jnp.asarray(1e-3), jnp.asarray(constant), jnp.asarray(mean)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Scale the displacement."""
-        above = lowpass(time_s, start.columns["temperature_degC"] - self.reference_degC, self.time_constant_s)
+        above = _lowpass(time_s, start.columns["temperature_degC"] - self.reference_degC, self.time_constant_s)
         more = self.gain_per_K * above
         before = signal.before + more[0] * (signal.before - self.zero_um)
         return Signal(signal.values + more * (signal.values - self.zero_um), before, signal.hold)
@@ -109,7 +109,7 @@ class SelfHeating(AbstractEffect):
         losses = max(abs(scales.lower_V), abs(scales.upper_V)) * scales.fastest_V_per_s / 2
         if not losses > 0:
             return ()
-        grid = decades(max(scales.duration_s / 30, 2e-3), 10 * scales.duration_s, 2)
+        grid = _decades(max(scales.duration_s / 30, 2e-3), 10 * scales.duration_s, 2)
         return tuple((cls(jnp.asarray(0.01), jnp.asarray(constant), jnp.asarray(losses)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
@@ -117,7 +117,7 @@ class SelfHeating(AbstractEffect):
         command = start.command.values
         if command.shape[0] == 1:
             return signal
-        losses = jnp.abs(command * rate_of(time_s, command)) / self.reference_V2_per_s
+        losses = jnp.abs(command * _rate_of(time_s, command)) / self.reference_V2_per_s
         # The part before the record was at rest, and cold.
-        heat = lowpass(time_s, losses.at[0].set(0), self.time_constant_s)
+        heat = _lowpass(time_s, losses.at[0].set(0), self.time_constant_s)
         return Signal(signal.values + self.gain * heat * (signal.values - self.zero_um), signal.before, signal.hold)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, rate_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, _rate_of, register
 
 
 @register
@@ -44,4 +44,4 @@ class TimestampJitter(AbstractEffect):
 
     def variance_um2(self, time_s: Times, signal: Signal) -> Float[Array, " t"]:
         """Variance that the errors of time add, shape `(t,)`."""
-        return (rate_of(time_s, signal.values) * self.jitter_s) ** 2
+        return (_rate_of(time_s, signal.values) * self.jitter_s) ** 2

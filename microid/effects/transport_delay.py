@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
-from microid.effects._resample import read_at
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._resample import _read_at
 
 
 @register
@@ -43,5 +43,5 @@ class TransportDelay(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Read the signal as it was before."""
-        when = times_of(time_s, signal.values.shape[0]) - self.delay_s
-        return Signal(read_at(time_s, signal, when), signal.before, signal.hold)
+        when = _times_of(time_s, signal.values.shape[0]) - self.delay_s
+        return Signal(_read_at(time_s, signal, when), signal.before, signal.hold)

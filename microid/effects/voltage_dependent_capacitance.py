@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times, _bend
 from microid._param import array, param
 from microid._part import AbstractPart, Signal, innermost
-from microid.effects._base import AbstractEffect, Place, Scales, register, times_of
+from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
 
 _CORRECTIONS = 2
 
@@ -69,7 +69,7 @@ class VoltageDependentCapacitance(AbstractEffect):
             return first[None]
         bend = _bend(time_s, signal.values) if signal.hold == "smooth" else jnp.zeros_like(signal.values)
         target = driver.gain * (signal.values - bend)
-        interval = jnp.diff(times_of(time_s, target.shape[0]))
+        interval = jnp.diff(_times_of(time_s, target.shape[0]))
 
         def visit(voltage: Array, now: tuple[Array, ...]) -> tuple[Array, Array]:
             old, new, step = now
