@@ -121,8 +121,10 @@ def test_second_resonance_and_load_change_against_lsim(rng):
     time, push = 2e-4 * np.arange(400), wander(rng, 400, 5, 30)
     first = m.Mechanics(120.0, 0.03, 1.5)
     found = through(BY_NAME["second_resonance", ""](first, -0.1, 400.0, 0.02), 2e-4, push)
-    truth = 1.5 * (lagged(time, push, 120, 0.03) - 0.1 * (lagged(time, push, 400, 0.02) - push))
-    np.testing.assert_allclose(found, truth, atol=1e-8)
+    one, other = lagged(time, push, 120, 0.03), lagged(time, push, 400, 0.02)
+    np.testing.assert_allclose(found, 1.5 * (1.1 * one - 0.1 * other), atol=1e-8)
+    found = through(BY_NAME["second_resonance", "added"](first, -0.1, 400.0, 0.02), 2e-4, push)
+    np.testing.assert_allclose(found, 1.5 * (one - 0.1 * (other - push)), atol=1e-8)
     loaded = through(BY_NAME["load_change", ""](first, 0.44), 2e-4, push)
     np.testing.assert_allclose(loaded, 1.5 * lagged(time, push, 100, 0.025), atol=1e-8)
 
@@ -313,7 +315,7 @@ def test_creep_goes_on_along_the_logarithm():
     step = np.where(time > 0, 10.0, 0.0)
     crept = through(BY_NAME["creep", ""](0.02, 0.1), 2e-3, step) - step
     line = 0.02 * 10 * np.log10(1 + time / 0.1)
-    np.testing.assert_allclose(crept, line, atol=0.1 * line[-1])
+    np.testing.assert_allclose(crept[1:], line[1:], atol=0.01 * line[-1])
 
 
 def test_noise_has_the_variance_that_is_said(rng):

@@ -28,6 +28,9 @@ from microid import EFFECTS, AbstractEffect, Stage
 _SHARE = 0.5
 # What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
 _REST, _CHANCE = 0.3, 1e-6
+# Where whole runs are held out, this part of the others is still kept aside, to check what is found; it must not be
+# predicted so many times worse, in squares.
+_CHECK, _WORSE = 0.12, 1.1
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ def diagnose(
     if not 0 < false_alarm <= 0.5:
         raise DataError(f"the probability of a false alarm is {false_alarm:g}: choose it above 0 and up to 0.5")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
-    fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
+    fraction = float(holdout) if isinstance(holdout, int | float) else _CHECK
     if not 0 <= fraction <= 0.9:
         raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
     refuse_repeats([*records, *aside])
@@ -173,16 +176,27 @@ def _conclude(
     chance = stats.chi2.sf(rest, rest_freedom)
     left_over = rest_share > _REST and chance < _CHANCE
     share = explained / misfit
-    model = found.model
-    kept = found.causes if share >= _SHARE else ()
-    if not kept:
-        model = found.plain
+    progress("extending the stage")
+    extended, compared, effects = _extended(ready, found, found.model if found.causes else None)
+    model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
+    checked = _worse(compared[: len(baseline.runs)])
+    if kept and (share < _SHARE or checked > _WORSE):
+        suspects = ", ".join(cause.name for cause in kept)
+        why = f"explains only {share:.0%} of what is left" if share < _SHARE else "predicts what was kept aside worse"
+        remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
+        model, kept = found.plain, ()
+        left_over, rest_share = True, ((explained + max(rest - rest_freedom, 0.0)) / projector.count) ** 0.5
+        extended, compared, effects = _extended(ready, found, None)
     faults = name_faults(ready.faults, projector, model, false_alarm)
     causes = causes_of(kept, model, found.projector, found.bench, misfit, faults, ready.faults)
     ahead = suggest(ready, found, causes, duration_s, progress)
     verdict = "effect_found" if causes else "unexplained" if left_over else "no_effect"
-    progress("extending the stage")
-    extended, compared, effects = _extended(ready, found, model if kept else None)
+    if baseline.aside:
+        # What was kept aside of the fitted runs has been looked at.
+        compared = [
+            one if k >= len(baseline.runs) else replace(one, held_out=one.held_out & False)
+            for k, one in enumerate(compared)
+        ]
     source = "the last part of each run" if not baseline.aside else "whole runs"
     gain = gain_of(compared, noise_um, source)
     if effects:
@@ -211,7 +225,7 @@ def _conclude(
         tests=tests,
         gain=gain,
         next_experiment=ahead,
-        remarks=_remarks(ready, records),
+        remarks=tuple(remarks),
         baseline=baseline.stage.with_substeps(substeps),
         extended=extended,
         runs=tuple(
@@ -235,6 +249,18 @@ def _conclude(
             "share": share,
         },
     )
+
+
+def _worse(compared: Sequence[Compared]) -> float:
+    """Mean square error of the extended stage over the plain one's, in what was kept aside of the fitted runs."""
+    held = [one for one in compared if one.held_out.any()]
+    if not held:
+        return 0.0
+    before, after = (
+        np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)])
+        for pick in ([one.before_um for one in held], [one.after_um for one in held])
+    )
+    return float(np.mean(after**2) / np.mean(before**2))
 
 
 def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:

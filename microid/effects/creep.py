@@ -11,6 +11,7 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, register
+from microid.effects._grids import _decades
 
 # Relaxations per decade of time constants, and the decades ahead of the onset and behind it that they cover.
 _PER_DECADE, _AHEAD, _BEHIND = 3, 1, 5
@@ -54,8 +55,7 @@ class Creep(AbstractEffect):
         """Onsets in steps of a decade, from some samples to a tenth of the record."""
         first = max(10 * scales.interval_s, 0.03)
         return tuple(
-            (cls(jnp.asarray(0.01), jnp.asarray(float(onset))),)
-            for onset in 10 ** np.arange(np.log10(first), np.log10(scales.duration_s / 10) + 1e-9)
+            (cls(jnp.asarray(0.01), jnp.asarray(onset)),) for onset in _decades(first, scales.duration_s / 10)
         )
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
@@ -101,8 +101,7 @@ class KelvinVoigtCreep(AbstractEffect):
         """Time constants in steps of half a decade, from some samples to the length of the record."""
         first = max(10 * scales.interval_s, 0.03)
         return tuple(
-            (cls(jnp.asarray(0.01), jnp.asarray(float(constant))),)
-            for constant in 10 ** np.arange(np.log10(first), np.log10(scales.duration_s) + 1e-9, 0.5)
+            (cls(jnp.asarray(0.01), jnp.asarray(constant)),) for constant in _decades(first, scales.duration_s, 2)
         )
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
