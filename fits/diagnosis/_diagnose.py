@@ -31,6 +31,8 @@ _REST, _CHANCE = 0.3, 1e-6
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found; it must not be
 # predicted so many times worse, in squares.
 _CHECK, _WORSE = 0.12, 1.1
+# Evidence for a period in the position, in e-folds of chance, and the part of what is left that it explains.
+_CYCLIC, _PART = 50.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,13 @@ def _conclude(
         model, kept = found.plain, ()
         left_over, rest_share = True, ((explained + max(rest - rest_freedom, 0.0)) / projector.count) ** 0.5
         extended, compared, effects = _extended(ready, found, None)
-    faults = name_faults(ready.faults, projector, model, false_alarm)
+    cyclic = cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)
+    if cyclic:
+        remarks.append(
+            f"what is left repeats itself every {period_um:.3g} um of the position, as the error of an interferometer "
+            "or an encoder does"
+        )
+    faults = name_faults(ready.faults, cyclic)
     causes = causes_of(kept, model, found.projector, found.bench, misfit, faults, ready.faults)
     ahead = suggest(ready, found, causes, duration_s, progress)
     verdict = "effect_found" if causes else "unexplained" if left_over else "no_effect"

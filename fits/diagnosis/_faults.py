@@ -8,7 +8,6 @@ import numpy as np
 from fits._record import Record
 from fits.diagnosis._floor import floor_of, jitter_s, line_of, quantum_um, rough_noise_um, spikes
 from fits.diagnosis._projector import Noise, Projector
-from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression
 
 # Effects that are looked for in single samples and in the noise.
@@ -133,8 +132,8 @@ class Fault:
     variance_um2: float
 
 
-def name_faults(faults: Faults, projector: Projector, model: Refit, false_alarm: float) -> list[Fault]:
-    """Which of them explain enough of what is left to be named."""
+def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
+    """Which of them explain enough of what is left to be named; what repeats itself with the position is no jitter."""
     found = []
     total = float(np.mean([n.total_um**2 for n in faults.noise]))
     count = sum(int(s.sum()) for s in faults.spikes)
@@ -155,7 +154,7 @@ def name_faults(faults: Faults, projector: Projector, model: Refit, false_alarm:
     if step**2 / 12 > _PART * total:
         z = (samples * step**2 / 12 / total) ** 0.5
         found.append(Fault("quantisation", z, (("step_um", step, 1e-6 * step, "um"),), step**2 / 12))
-    if faults.jitter_s > 0:
+    if faults.jitter_s > 0 and not cyclic:
         sd = faults.jitter_s / (2 * max(faults.jitter_z, 1e-9))
         found.append(Fault("timestamp_jitter", faults.jitter_z, (("jitter_s", faults.jitter_s, sd, "s"),), 0.0))
     return found
