@@ -192,8 +192,8 @@ def _conclude(
     cyclic = cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)
     if cyclic:
         remarks.append(
-            f"what is left repeats itself every {period_um:.3g} um of the position, as the error of an interferometer "
-            "or an encoder does"
+            f"what is left repeats itself every {period_um:.3g} um of the position, as the error of an "
+            "interferometer or an encoder does"
         )
     faults = name_faults(ready.faults, cyclic)
     causes = causes_of(kept, model, found.projector, found.bench, misfit, faults, ready.faults)

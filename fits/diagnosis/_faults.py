@@ -133,7 +133,7 @@ class Fault:
 
 
 def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
-    """Which of them explain enough of what is left to be named; what repeats itself with the position is no jitter."""
+    """Which of them explain enough of what is left; what repeats itself with the position (`cyclic`) is no jitter."""
     found = []
     total = float(np.mean([n.total_um**2 for n in faults.noise]))
     count = sum(int(s.sum()) for s in faults.spikes)

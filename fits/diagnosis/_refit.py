@@ -16,6 +16,8 @@ from fits.diagnosis._score import Scored
 from microid import AbstractEffect, Coordinates, ParameterInfo, Sensor
 
 _STEP = 1e-3
+# Standard deviations that a strength must be away from zero.
+_DETERMINED = 3.0
 # Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
 _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
 
@@ -73,6 +75,11 @@ class Law:
 @eqx.filter_jit
 def _at(coordinates: Coordinates[AbstractEffect], vector: Float[Array, " k"]) -> AbstractEffect:
     return coordinates(vector)
+
+
+def _strength(law: Law, x: np.ndarray, run: int) -> np.ndarray:
+    effect = law.effect(x, run)
+    return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
 
 
 def law_of(scored: Scored, runs: int) -> Law:
@@ -138,6 +145,22 @@ class Refit:
     def covariance(self) -> np.ndarray:
         """Of all coordinates together."""
         return np.linalg.pinv(self.tangent.T @ self.tangent, rcond=1e-12, hermitian=True)
+
+    def determined(self) -> bool:
+        """Whether the data determine the strength of the last effect, in some run at least."""
+        law, x = self.laws[-1], self.x[-1]
+        if not law.form.strength:
+            return True
+        covariance = self.covariance()[-law.size :, -law.size :]
+        found = False
+        for run in range(len(law.maps) if law.each.any() else 1):
+            here = _strength(law, x, run)
+            slope = np.stack(
+                [(_strength(law, x + step, run) - here) / _STEP for step in _STEP * np.eye(law.size)], axis=1
+            )
+            sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
+            found = found or bool(np.any(np.abs(here) > _DETERMINED * sd))
+        return found
 
     def basis(self) -> np.ndarray:
         """Orthonormal columns that span the tangent."""

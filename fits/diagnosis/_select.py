@@ -135,10 +135,13 @@ def select(
             break
         first = rivals[0]
         drop = model.cost - first.refit.cost
-        causes.append(
-            Cause(first.name, max(drop, 0.0) ** 0.5, family.p(max(drop, 0.0) ** 0.5), tuple(rivals[1:]), drop)
-        )
-        bench, projector, model = settle(bench, projector, first.refit)
+        settled = settle(bench, projector, first.refit)
+        if not settled[-1].determined():
+            # Beside a baseline that has followed, its strength is anybody's guess.
+            break
+        bench, projector, model = settled
+        z = max(drop, 0.0) ** 0.5
+        causes.append(Cause(first.name, z, family.p(z), tuple(rivals[1:]), drop))
         basis = model.basis()
         left = tuple(rescore(score(projector, one.probe, model.residual), basis, model.residual) for one in scores)
         family = Family(left, rng)
@@ -186,7 +189,7 @@ def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[
             tried[form] = tried.get(form, 0) + 1
             law = law_of(one, runs)
             found = refit_beside(bench, projector, model, law)
-            if bare.ahead(found.change_um) > _WORSE * before:
+            if bare.ahead(found.change_um) > _WORSE * before or not found.determined():
                 continue
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
