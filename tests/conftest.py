@@ -2,6 +2,8 @@
 
 import os
 import secrets
+from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import matplotlib as mpl
@@ -12,6 +14,19 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 mpl.use("Agg")
+
+
+# Every compiled function maps some memory, of which a process on Linux may have 65530 pieces. Beyond that it crashes.
+_MAPPINGS = 15_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_mappings() -> Iterator[None]:
+    """Forget what was compiled, once there is too much of it."""
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > _MAPPINGS:
+        jax.clear_caches()
 
 
 @pytest.fixture
