@@ -35,6 +35,8 @@ _WHITE = 1.2
 _SHAPE_LEVELS = 34
 # Correlation of displacement with voltage below which there is no loop.
 _FOLLOWS = 0.3
+# Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
+_AHEAD = 0.5
 # Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
 _EDGE = 0.02
 _MINOR = 0.01
@@ -240,7 +242,24 @@ def _stroke(run: Run) -> float:
             f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
             "change the sign of one of the two columns"
         )
+    if _leads(voltage, displacement) > _AHEAD:
+        raise DataError(
+            f"{run.record.source}: the displacement runs ahead of the voltage round its loops, where a piezo stays "
+            "behind: the two columns are exchanged; correct the header, or name them the other way with --columns"
+        )
     return float(np.ptp(displacement))
+
+
+def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:
+    """How the loops are run through: -1 where the displacement stays behind everywhere, 1 where it runs ahead.
+
+    That is the area of the loops about the smooth curve through them, over the same with all parts counted as
+    positive.
+    """
+    place = (voltage_V - voltage_V.mean()) / np.ptp(voltage_V)
+    beside = displacement_um - np.polyval(np.polyfit(place, displacement_um, 3), place)
+    parts = (beside[1:] + beside[:-1]) * np.diff(place)
+    return float(parts.sum() / (np.abs(parts).sum() + 1e-300))
 
 
 def _check(result: RESULTS) -> None:

@@ -173,6 +173,16 @@ def test_simulate_refuses_what_it_cannot_predict(bench, tmp_path):
     assert files(tmp_path) == ["changed.json", "program.csv"]
 
 
+def test_exchanged_columns_are_noticed(bench, tmp_path):
+    header, *rows = (bench[0] / "csv" / "train.csv").read_text().splitlines()
+    assert header.startswith("time_s,voltage_V,displacement_um")
+    path = tmp_path / "exchanged.csv"
+    path.write_text("\n".join([header.replace("voltage_V,displacement_um", "displacement_um,voltage_V"), *rows]) + "\n")
+    refused(run("fit", path, "--out", tmp_path / "model.json"), "exchanged.csv", "--columns")
+    refused(run("diagnose", path, "--out", tmp_path / "report"), "exchanged.csv", "--columns")
+    assert set(files(tmp_path)) <= {"exchanged.csv", "report"}
+
+
 def test_synth_refuses_unknown_scenarios_and_places(tmp_path):
     (tmp_path / "file").write_text("")
     refused(run("synth", "quickstrat", "--out", tmp_path / "q"), "quickstart")

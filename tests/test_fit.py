@@ -137,6 +137,7 @@ def test_a_second_record_of_the_same_length_compiles_nothing():
 def test_records_that_cannot_be_fitted_are_refused(bench):
     train, _ = records(bench)
     turned = fits.Record(train.time_s, train.voltage_V, -train.displacement_um, source="turned.csv")
+    exchanged = fits.Record(train.time_s, train.displacement_um, train.voltage_V, source="exchanged.csv")
     noise = fits.Record(
         train.time_s, train.voltage_V, np.random.default_rng(0).normal(size=len(train)), source="noise.csv"
     )
@@ -148,6 +149,7 @@ def test_records_that_cannot_be_fitted_are_refused(bench):
         ([train], {"holdout": 0.95}, "between 0 and 0.9"),
         ([train], {"initial": "warm"}, "unknown initial state 'warm'"),
         ([turned], {}, "turned.csv: the displacement falls where the voltage rises"),
+        ([exchanged], {}, "exchanged.csv: the displacement runs ahead of the voltage"),
         ([train[:40]], {}, "50 are needed"),
     ]:
         with pytest.raises(fits.DataError, match=words):
