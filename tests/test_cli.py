@@ -177,7 +177,8 @@ def test_exchanged_columns_are_noticed(bench, tmp_path):
     header, *rows = (bench[0] / "csv" / "train.csv").read_text().splitlines()
     assert header.startswith("time_s,voltage_V,displacement_um")
     path = tmp_path / "exchanged.csv"
-    path.write_text("\n".join([header.replace("voltage_V,displacement_um", "displacement_um,voltage_V"), *rows]) + "\n")
+    other = header.replace("voltage_V,displacement_um", "displacement_um,voltage_V")
+    path.write_text("\n".join([other, *rows]) + "\n")
     refused(run("fit", path, "--out", tmp_path / "model.json"), "exchanged.csv", "--columns")
     refused(run("diagnose", path, "--out", tmp_path / "report"), "exchanged.csv", "--columns")
     assert set(files(tmp_path)) <= {"exchanged.csv", "report"}
