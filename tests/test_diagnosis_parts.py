@@ -9,7 +9,8 @@ from scipy.signal import lfilter
 
 from fits.diagnosis._candidates import Probe
 from fits.diagnosis._floor import floor_of, jitter_s, quantum_um, spikes
-from fits.diagnosis._projector import Noise, Projector, learn_noise, learn_roughness
+from fits.diagnosis._noise import Noise, learn_noise
+from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._score import Family, score
 from microid import EFFECTS
 

@@ -15,7 +15,8 @@ from fits.diagnosis._experiment import _open, refine, suggest
 from fits.diagnosis._path import Limits, limits_of, paces
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._programs import Program, menu
-from fits.diagnosis._projector import Noise, Projector
+from fits.diagnosis._noise import Noise
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Law, law_of, refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._result import FoundCause

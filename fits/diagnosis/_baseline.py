@@ -1,5 +1,6 @@
 """The plain stage that a diagnosis starts from, fitted to all runs, and its regression."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,12 +19,17 @@ from fits._run import prepare_run
 from fits._stage_moments import Chain
 from fits._stage_run import StageRun, prepare_stage_run
 from fits._stage_solve import prior_precision
+from fits.diagnosis._evaluate import simulate
+from fits.diagnosis._noise import rough_noise_um
 from microid import Preisach, Stage
 
 # What a finer grid would follow has a prior of its own in the projection.
 _FINEST = 32
 # Steps between samples in which effects are simulated, at most.
 _COARSE = 4
+# Steps between samples in which the plain stage is simulated, at most: so many that what they are off by, in all
+# samples together, is less than this, in noise.
+_FINE, _OFF = 32, 1.0
 
 
 class Fixed(eqx.Module):
@@ -59,6 +65,8 @@ class Baseline:
         Whole runs that are held out.
     coarse, coarse_aside
         The same with few steps between the samples: what effects change is seen well enough there.
+    fine, fine_aside
+        The same with so many steps that the plain stage's own simulation is exact within the noise.
     dynamic
         Whether driver and mechanics were fitted.
     remarks
@@ -75,6 +83,8 @@ class Baseline:
     aside: tuple[StageRun, ...]
     coarse: tuple[StageRun, ...]
     coarse_aside: tuple[StageRun, ...]
+    fine: tuple[StageRun, ...]
+    fine_aside: tuple[StageRun, ...]
     dynamic: bool
     remarks: tuple[str, ...]
 
@@ -112,6 +122,11 @@ def fit_baseline(
         return _static(records, aside, range_V, holdout, initial, remarks, progress)
     prior = prior_precision(found.chain, found.solved.hyper, found.stroke_um)
     stride = found.solved.runs[0].samples.stride
+    runs, held = (
+        _prepared(records, range_V, initial, holdout, stride),
+        _prepared(aside, range_V, initial, 0.0, stride),
+    )
+    plain = found.stage
     return Baseline(
         found.chain,
         found.solved.z,
@@ -119,10 +134,12 @@ def fit_baseline(
         prior,
         found.stroke_um,
         range_V,
-        _prepared(records, range_V, initial, holdout, stride),
-        _prepared(aside, range_V, initial, 0.0, stride),
+        runs,
+        held,
         _prepared(records, range_V, initial, holdout, min(stride, _COARSE)),
         _prepared(aside, range_V, initial, 0.0, min(stride, _COARSE)),
+        tuple(_finely(plain, run, range_V, initial, holdout) for run in runs),
+        tuple(_finely(plain, run, range_V, initial, 0.0) for run in held),
         True,
         found.remarks,
     )
@@ -132,6 +149,21 @@ def _prepared(
     records: Sequence[Record], range_V: tuple[float, float], initial: str, holdout: float, stride: int
 ) -> tuple[StageRun, ...]:
     return tuple(prepare_stage_run(record, range_V, initial, holdout, stride) for record in records)
+
+
+def _finely(stage: Stage, run: StageRun, range_V: tuple[float, float], initial: str, holdout: float) -> StageRun:
+    """Divide intervals until the simulation no longer depends on it."""
+    while run.samples.stride < _FINE:
+        finer = prepare_stage_run(run.record, range_V, initial, holdout, 2 * run.samples.stride)
+        better = simulate(stage, finer)
+        noise_um = max(rough_noise_um(run.displacement_um - better), 1e-9 * float(np.ptp(run.displacement_um)))
+        # Halving the step takes three quarters of its error off.
+        off = float(np.linalg.norm((better - simulate(stage, run))[run.fitted])) / noise_um / 0.75
+        if off <= _OFF:
+            break
+        stride = min(_FINE, run.samples.stride * 2 ** math.ceil(math.log2(off / _OFF) / 2))
+        run = prepare_stage_run(run.record, range_V, initial, holdout, stride) if stride > 2 else finer
+    return run
 
 
 def _static(
@@ -151,7 +183,22 @@ def _static(
     chain = Chain(Fixed(stage), 0, grid)  # type: ignore[arg-type]
     prior = np.asarray(roughness(grid.levels).precision(tried.solution.hyper)) / stroke**2
     ready, held = _prepared(records, range_V, initial, holdout, 1), _prepared(aside, range_V, initial, 0.0, 1)
-    return Baseline(chain, np.zeros(0), columns, prior, stroke, range_V, ready, held, ready, held, False, remarks)
+    return Baseline(
+        chain,
+        np.zeros(0),
+        columns,
+        prior,
+        stroke,
+        range_V,
+        ready,
+        held,
+        ready,
+        held,
+        ready,
+        held,
+        False,
+        remarks,
+    )
 
 
 def columns_in(stage: Stage) -> np.ndarray:

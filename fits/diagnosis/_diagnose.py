@@ -221,7 +221,7 @@ def _conclude(
         )
         for one in seen
     )
-    substeps = baseline.runs[0].samples.stride
+    substeps = max(run.samples.stride for run in baseline.fine)
     return Diagnosis(
         verdict=verdict,  # type: ignore[arg-type]
         noise_um=noise_um,
@@ -294,7 +294,7 @@ def _extended(
 ) -> tuple[Stage, list[Compared], list[AbstractEffect]]:
     """Let the plain stage follow what the effects leave, and fit the effects again beside it."""
     baseline = ready.baseline
-    substeps = baseline.runs[0].samples.stride
+    substeps = max(run.samples.stride for run in baseline.fine)
     runs = len(baseline.runs)
     if model is None or not model.laws:
         return baseline.stage.with_substeps(substeps), _compare(ready, ready.bench, None, ready.regression), []
@@ -319,7 +319,7 @@ def _compare(ready: Prepared, bench: Bench, model: Refit | None, regression: Reg
     if ready.baseline.aside:
         shared = shared_effects(model, runs) if model is not None else []
         behind = Bench(bench.baseline, aside=True)
-        for run, change_um in zip(ready.baseline.aside, behind.change(shared), strict=True):
+        for run, change_um in zip(ready.baseline.fine_aside, behind.change(shared), strict=True):
             plain = simulate(ready.baseline.stage, run)
             better = simulate(bench.baseline.stage, run) + change_um
             own, using = np.ones((len(run.record), 1)), run.known

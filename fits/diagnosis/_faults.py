@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits._record import Record
-from fits.diagnosis._floor import floor_of, jitter_s, line_of, quantum_um, rough_noise_um, spikes
-from fits.diagnosis._projector import Noise, Projector
+from fits.diagnosis._floor import floor_of, jitter_s, line_of, quantum_um, spikes
+from fits.diagnosis._noise import Noise, rough_noise_um
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 
 # Effects that are looked for in single samples and in the noise.

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from fits._stage_run import StageRun
-from fits.diagnosis._projector import Noise, learn_noise
+from fits.diagnosis._noise import Noise, learn_noise, rough_noise_um
 
 # A command that rests for this many samples is idle from a third of the rest on; so many idle samples are a floor.
 _REST, _IDLE = 24, 150
@@ -34,12 +34,6 @@ class Floor:
 
     noise: Noise
     idle: bool
-
-
-def rough_noise_um(residual_um: np.ndarray) -> float:
-    """Standard deviation of white noise in a residual, by its second differences, whatever slowly changes."""
-    second = np.diff(residual_um, 2)
-    return float(1.4826 * np.median(np.abs(second - np.median(second))) / 6**0.5)
 
 
 def idle_stretches(voltage_V: np.ndarray, settling: int) -> list[slice]:

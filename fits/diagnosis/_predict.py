@@ -10,7 +10,8 @@ from scipy.linalg import qr
 from fits._record import Record
 from fits._stage_run import prepare_stage_run
 from fits.diagnosis._candidates import Bench
-from fits.diagnosis._projector import Noise, Projector
+from fits.diagnosis._noise import Noise
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Law
 from fits.diagnosis._regression import regress
 from microid import AbstractEffect

@@ -1,59 +1,22 @@
 """What a re-fitted baseline leaves of a signal: projection off its whole tangent, in units of the noise."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 from optimistix import RESULTS
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 
 from fits._evidence import Posterior
 from fits._grid import non_negative
 from fits._result import FitError, FitStatus
 from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._noise import Noise
 from fits.diagnosis._regression import Regression
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
 _ROUGHEST = 0.5
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Noise of one run: its innovations' standard deviation, and how it depends on its past.
-
-    Attributes
-    ----------
-    innovation_um
-        Standard deviation of what is new in every sample.
-    past
-        Coefficients of the autoregression, shape `(order,)`; empty for white noise.
-    spread
-        Factor by which a sample is noisier than that, shape `(n,)`; None where all are alike.
-    """
-
-    innovation_um: float
-    past: np.ndarray
-    spread: np.ndarray | None = None
-
-    @property
-    def total_um(self) -> float:
-        """Standard deviation of the noise itself."""
-        if len(self.past) == 0:
-            return self.innovation_um
-        impulse = np.zeros(4096)
-        impulse[0] = 1.0
-        return self.innovation_um * float(np.linalg.norm(lfilter([1.0], np.r_[1.0, -self.past], impulse)))
-
-    def whiten(self, values: np.ndarray) -> np.ndarray:
-        """Turn noise into independent numbers of variance one, along the first axis."""
-        if len(self.past):
-            values = lfilter(np.r_[1.0, -self.past], [1.0], values, axis=0)
-        if self.spread is not None:
-            values = values / self.spread.reshape(-1, *(1,) * (values.ndim - 1))
-        return values / self.innovation_um
 
 
 class Projector:
@@ -204,36 +167,6 @@ class Projector:
         change = np.asarray(kept) - baseline.columns_um
         others = answer[columns:] - follow @ (change - answer[:columns])
         return baseline.moved(others[: self.regression.size - columns], change)
-
-
-def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Noise:
-    """Learn the noise of a run from what nothing explains.
-
-    Parameters
-    ----------
-    residual_um
-        Shape `(n,)`.
-    freedom
-        Unknowns that were fitted to it.
-    order
-        Largest order of the autoregression; the Bayesian information criterion chooses.
-    """
-    n = len(residual_um)
-    inflate = (n / max(n - freedom, n / 2)) ** 0.5
-    lags = np.array([residual_um[: n - k] @ residual_um[k:] / n for k in range(order + 1)])
-    best, past, variance = np.inf, np.zeros(0), lags[0]
-    coefficients, error = np.zeros(0), lags[0]
-    for k in range(order + 1):
-        if k:
-            # Levinson and Durbin's recursion.
-            reflection = (lags[k] - coefficients @ lags[k - 1 : 0 : -1]) / error if k > 1 else lags[1] / error
-            coefficients = np.append(coefficients - reflection * coefficients[::-1], reflection)
-            error = error * (1 - reflection**2)
-        score = n * np.log(error) + k * np.log(n)
-        # A correlation too small to matter is not worth a filter.
-        if score < best - 6:
-            best, past, variance = score, coefficients.copy(), error
-    return Noise(float(np.sqrt(variance)) * inflate, past)
 
 
 def learn_roughness(projector: Projector, candidates: Sequence[Sequence[np.ndarray]]) -> tuple[float, ...]:

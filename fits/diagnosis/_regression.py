@@ -11,6 +11,7 @@ from fits._prior import interpolation
 from fits._stage_moments import Chain, linearise, pieces
 from fits._stage_run import StageRun
 from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._evaluate import simulate
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
 _FINE = 64
@@ -63,8 +64,9 @@ def regress(baseline: Baseline, finer: bool = True) -> Regression:
     bases = _bases(baseline) if finer else []
     rows, own, residuals = [], [], []
     kinds: list[list[np.ndarray]] = [[] for _ in bases]
-    for run in runs:
-        out, slope, free = linearise(chain, jnp.asarray(baseline.z), jnp.asarray(baseline.columns_um), run)
+    stage = baseline.stage
+    for run, fine_run in zip(runs, baseline.fine, strict=True):
+        _, slope, free = linearise(chain, jnp.asarray(baseline.z), jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
         both[:, chain.size :] = slope[:n]
@@ -72,7 +74,7 @@ def regress(baseline: Baseline, finer: bool = True) -> Regression:
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         rows.append(both)
         own.append(free[:n])
-        residuals.append(run.displacement_um - out[:n])
+        residuals.append(run.displacement_um - simulate(stage, fine_run))
         if finer:
             for kind, part in zip(kinds, _along(fine_chain, baseline, run, bases), strict=True):
                 kind.append(part)

@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times
 from microid._param import param
-from microid._part import AbstractPart, Signal
+from microid._part import AbstractPart, Signal, innermost
+from microid._preisach import Preisach
 from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _rate_of, register
 from microid.effects._grids import _decades
 from microid.effects._irreversible import _anhysteretic
@@ -131,6 +132,8 @@ class ActivatedSwitching(AbstractEffect):
 
     .. math:: u \leftarrow u - v \, \mathrm{asinh}(\dot u / r)
 
+    The memoryless part of a `Preisach` hysteresis follows at once.
+
     Attributes
     ----------
     inner
@@ -167,5 +170,11 @@ class ActivatedSwitching(AbstractEffect):
         """Let the hysteresis see a voltage that stays behind."""
         if signal.values.shape[0] < 2:
             return self.inner.run(time_s, signal, start)
-        late = self.lag_V * jnp.arcsinh(_rate_of(time_s, signal.values) / self.onset_V_per_s)
-        return self.inner.run(time_s, Signal(signal.values - late, signal.before, signal.hold), start)
+        behind = signal.values - self.lag_V * jnp.arcsinh(_rate_of(time_s, signal.values) / self.onset_V_per_s)
+        given = self.inner.run(time_s, Signal(behind, signal.before, signal.hold), start)
+        law = innermost(self.inner)
+        if not isinstance(law, Preisach):
+            return given
+        # What has no loop has no walls that could be late.
+        memoryless = law.reversible(signal.values) - law.reversible(behind)
+        return Signal(given.values + memoryless, given.before, given.hold)
