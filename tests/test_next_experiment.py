@@ -12,10 +12,10 @@ from fits._stage_run import prepare_stage_run
 from fits.diagnosis import _baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._experiment import _open, refine, suggest
+from fits.diagnosis._noise import Noise
 from fits.diagnosis._path import Limits, limits_of, paces
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._programs import Program, menu
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Law, law_of, refit
 from fits.diagnosis._regression import regress
@@ -162,7 +162,7 @@ def by_least_squares(made, true, other, time_s, voltage_V):
     again = Record(time_s, voltage_V, np.zeros(len(time_s)))
     both = [made.bench.prepared[0].run.record, again]
     runs = tuple(prepare_stage_run(one, made.baseline.range_V, "unknown", 0.0, 1) for one in both)
-    baseline = replace(made.baseline, runs=runs, coarse=runs)
+    baseline = replace(made.baseline, runs=runs, coarse=runs, fine=runs)
     bench, regression = Bench(baseline), regress(baseline)
     noise = made.projector.noise[0].innovation_um
     laws = [Law([one.laws[0].effect(one.x[0], 0)] * 2) for one in (true, other)]

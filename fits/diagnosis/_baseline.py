@@ -1,6 +1,5 @@
 """The plain stage that a diagnosis starts from, fitted to all runs, and its regression."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -27,9 +26,9 @@ from microid import Preisach, Stage
 _FINEST = 32
 # Steps between samples in which effects are simulated, at most.
 _COARSE = 4
-# Steps between samples in which the plain stage is simulated, at most: so many that what they are off by, in all
-# samples together, is less than this, in noise.
-_FINE, _OFF = 32, 1.0
+# Steps between samples in which the plain stage is simulated where those of its fit are off by more than this, in
+# all samples together, in noise.
+_FINE, _OFF = 16, 1.0
 
 
 class Fixed(eqx.Module):
@@ -152,18 +151,14 @@ def _prepared(
 
 
 def _finely(stage: Stage, run: StageRun, range_V: tuple[float, float], initial: str, holdout: float) -> StageRun:
-    """Divide intervals until the simulation no longer depends on it."""
-    while run.samples.stride < _FINE:
-        finer = prepare_stage_run(run.record, range_V, initial, holdout, 2 * run.samples.stride)
-        better = simulate(stage, finer)
-        noise_um = max(rough_noise_um(run.displacement_um - better), 1e-9 * float(np.ptp(run.displacement_um)))
-        # Halving the step takes three quarters of its error off.
-        off = float(np.linalg.norm((better - simulate(stage, run))[run.fitted])) / noise_um / 0.75
-        if off <= _OFF:
-            break
-        stride = min(_FINE, run.samples.stride * 2 ** math.ceil(math.log2(off / _OFF) / 2))
-        run = prepare_stage_run(run.record, range_V, initial, holdout, stride) if stride > 2 else finer
-    return run
+    """Divide intervals into many steps where a simulation with those of the fit is off by more than chance."""
+    if run.samples.stride >= _FINE:
+        return run
+    finer = prepare_stage_run(run.record, range_V, initial, holdout, _FINE)
+    better = simulate(stage, finer)
+    noise_um = max(rough_noise_um(run.displacement_um - better), 1e-9 * float(np.ptp(run.displacement_um)))
+    off = float(np.linalg.norm((better - simulate(stage, run))[run.fitted]))
+    return finer if off > _OFF * noise_um else run
 
 
 def _static(

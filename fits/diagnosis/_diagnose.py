@@ -174,7 +174,7 @@ def _conclude(
     rest = max(rest, cycle_drop)
     misfit = max(explained + max(rest - rest_freedom, 0.0), explained, 1e-300)
     rest_share = (max(rest - rest_freedom, 0.0) / projector.count) ** 0.5
-    noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in ready.faults.noise])))
+    noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in found.projector.noise])))
     chance = stats.chi2.sf(rest, rest_freedom)
     left_over = rest_share > _REST and chance < _CHANCE
     share = explained / misfit
@@ -187,7 +187,8 @@ def _conclude(
         why = f"explains only {share:.0%} of what is left" if share < _SHARE else "predicts what was kept aside worse"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
         model, kept = found.plain, ()
-        left_over, rest_share = True, ((explained + max(rest - rest_freedom, 0.0)) / projector.count) ** 0.5
+        rest_share = ((explained + max(rest - rest_freedom, 0.0)) / projector.count) ** 0.5
+        left_over = rest_share > _REST
         extended, compared, effects = _extended(ready, found, None)
     cyclic = cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)
     if cyclic:

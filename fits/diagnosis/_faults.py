@@ -6,16 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits._record import Record
-from fits.diagnosis._floor import floor_of, jitter_s, line_of, quantum_um, spikes
+from fits.diagnosis._floor import Band, band_of, floor_of, jitter_s, quantum_um, spikes
 from fits.diagnosis._noise import Noise, rough_noise_um
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 
 # Effects that are looked for in single samples and in the noise.
-SINGLE = ("outliers", "quantisation", "timestamp_jitter")
+SINGLE = ("outliers", "quantisation", "timestamp_jitter", "floor_vibration")
 # So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
 _SPIKES, _PART = 3, 0.3
-_JITTER_Z, _LINE_Z = 8.0, 60.0
+_JITTER_Z, _BAND_Z = 8.0, 8.0
+# Mains and their multiples have lines of their own, and so near to those nothing else is told apart.
+_MAINS_Hz, _NEAR = (50.0, 60.0), 0.015
 # E-folds after which a motion has settled.
 _SETTLED = 8.0
 
@@ -38,8 +40,8 @@ class Faults:
         Last digit of the sensor, the largest of all runs; 0 for none.
     jitter_s, jitter_z
         Jitter of the instants of sampling, and its evidence.
-    line_Hz, line_um, line_z
-        Strongest narrow band, its size, and its evidence.
+    band
+        The strongest narrow band of all runs.
     remarks
         What the user should know, one sentence each.
     """
@@ -51,9 +53,7 @@ class Faults:
     quantum_um: float
     jitter_s: float
     jitter_z: float
-    line_Hz: float
-    line_um: float
-    line_z: float
+    band: Band
     remarks: tuple[str, ...] = ()
 
     @property
@@ -81,7 +81,10 @@ def find_faults(regression: Regression) -> Faults:
     ]
     projector = Projector(regression, guess)
     dz, dw = projector.step(projector.residual)
-    noise, found, heights, idle, jitters, lines = [], [], [], [], [], []
+    quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
+    # Rounding is noise that a command at rest does not show.
+    least = quantum / 12**0.5
+    noise, found, heights, idle, jitters, bands = [], [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     settling_s = float(_SETTLED / np.min(np.abs(poles))) if len(poles) else 0.0
     for run, rows, own, residual in zip(
@@ -91,26 +94,25 @@ def find_faults(regression: Regression) -> Faults:
         mask = run.fitted
         free = np.linalg.lstsq(own[mask], moved[mask], rcond=None)[0]
         left = moved - own @ free
-        bad = spikes(run, left)
+        bad = spikes(run, left, 2 * quantum)
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)
         heights.append(np.where(bad, left - smooth, 0.0))
         floor = floor_of(run, smooth, settling_s)
-        noise.append(floor.noise)
+        noise.append(floor.noise if floor.noise.total_um > least else Noise(least, np.zeros(0)))
         idle.append(floor.idle)
         rate = np.gradient(run.displacement_um - left, run.record.time_s)
-        size, z = jitter_s(smooth[mask], rate[mask])
+        size, z = jitter_s(smooth[mask], rate[mask], least)
         jitters.append((z, size, np.abs(rate)))
         interval = float(np.median(np.diff(run.record.time_s)))
-        lines.append(line_of(smooth[mask], interval))
+        bands.append(band_of(smooth[mask], interval, run.record.voltage_V[mask]))
     z, size, _ = max(jitters, key=lambda j: j[0])
     if z > _JITTER_Z:
         noise = [
             replace(n, spread=np.sqrt(1 + (size * rate / n.innovation_um) ** 2))
             for n, (_, _, rate) in zip(noise, jitters, strict=True)
         ]
-    quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
-    line = max(lines, key=lambda one: one[2])
+    band = max(bands, key=lambda one: one.z)
     source = (
         "idle stretches of the runs"
         if all(idle)
@@ -119,7 +121,7 @@ def find_faults(regression: Regression) -> Faults:
         else "idle stretches where there are any, and the fastest changes of the residual elsewhere"
     )
     return Faults(
-        tuple(noise), source, tuple(found), tuple(heights), quantum, size if z > _JITTER_Z else 0.0, z, *line
+        tuple(noise), source, tuple(found), tuple(heights), quantum, size if z > _JITTER_Z else 0.0, z, band
     )
 
 
@@ -158,4 +160,21 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
     if faults.jitter_s > 0 and not cyclic:
         sd = faults.jitter_s / (2 * max(faults.jitter_z, 1e-9))
         found.append(Fault("timestamp_jitter", faults.jitter_z, (("jitter_s", faults.jitter_s, sd, "s"),), 0.0))
+    band = faults.band
+    if band.z > _BAND_Z and band.size_um**2 > _PART / 3 * total and not _mains(band.frequency_Hz):
+        found.append(
+            Fault(
+                "floor_vibration",
+                band.z,
+                (
+                    ("amplitude_um", band.size_um, band.sd_um, "um"),
+                    ("frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"),
+                ),
+                band.size_um**2,
+            )
+        )
     return found
+
+
+def _mains(frequency_Hz: float) -> bool:
+    return any(abs(frequency_Hz - k * mains) < _NEAR * k * mains for mains in _MAINS_Hz for k in range(1, 5))

@@ -1,6 +1,5 @@
 """Noise floors, and faults of single samples: what is asked of the data before any physics."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,12 +76,12 @@ def floor_of(run: StageRun, residual_um: np.ndarray, settling_s: float) -> Floor
     return Floor(Noise(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um))), np.zeros(0)), False)
 
 
-def spikes(run: StageRun, residual_um: np.ndarray) -> np.ndarray:
+def spikes(run: StageRun, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarray:
     """Samples that stand alone, far off their neighbours, where the command gives no reason; shape `(n,)`."""
     off = residual_um - median_filter(residual_um, 7, mode="nearest")
     spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")
     spread = np.maximum(spread, 1.4826 * float(np.median(np.abs(off))))
-    far = np.abs(off) > _SPIKE * np.maximum(spread, 1e-300)
+    far = np.abs(off) > np.maximum(_SPIKE * spread, least_um + 1e-300)
     # What rings has neighbours as large; what is alone has none.
     size = np.abs(off)
     around = np.zeros_like(size)
@@ -120,7 +119,7 @@ def quantum_um(values_um: np.ndarray) -> float:
     return spacing if float(np.mean(off < 0.1)) > 0.95 else 0.0
 
 
-def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray) -> tuple[float, float]:
+def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float = 0.0) -> tuple[float, float]:
     """Jitter of the instants of sampling, and its evidence in standard deviations.
 
     Noise that grows with the speed, from sample to sample: the variance of the residual about its neighbours is
@@ -131,7 +130,7 @@ def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray) -> tuple[float,
     speed = rate_um_per_s[1:-1] ** 2
     order = np.argsort(speed)
     slow, quick = order[: len(order) // 2], order[-len(order) // 10 :]
-    base = float(np.median(square[slow])) / 0.4549
+    base = max(float(np.median(square[slow])) / 0.4549, least_um**2)
     more = float(np.median(square[quick])) / 0.4549 - base
     if more <= 0 or base <= 0 or float(np.mean(speed[quick])) == 0:
         return 0.0, 0.0
@@ -142,20 +141,62 @@ def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray) -> tuple[float,
     return float((more / faster) ** 0.5) if faster > 0 else 0.0, float(more / error)
 
 
-def line_of(
-    residual_um: np.ndarray, interval_s: float, mains: Sequence[float] = (50.0, 60.0)
-) -> tuple[float, float, float]:
-    """Strongest narrow band of a residual from 2 to 200 Hz: frequency, amplitude (rms), evidence over the rest."""
+@dataclass(frozen=True)
+class Band:
+    """The strongest narrow band of a residual: middle, size (rms) and its sd, quality, and evidence."""
+
+    frequency_Hz: float
+    size_um: float
+    sd_um: float
+    quality: float
+    z: float
+
+
+def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -> Band:
+    """Find a narrow band between 2 and 200 Hz that goes on throughout and that the command does not play.
+
+    Bins of the spectrum are compared with the median of those around; a band of noise has the chance of so many
+    exponential variables.
+    """
+    none = Band(0.0, 0.0, 0.0, 0.0, 0.0)
     n = len(residual_um)
-    power = np.abs(np.fft.rfft(residual_um * np.hanning(n))) ** 2 / (np.sum(np.hanning(n) ** 2))
+    window = np.hanning(n)
     frequency = np.fft.rfftfreq(n, interval_s)
-    inside = (frequency > 2.0) & (frequency < 200.0)
+
+    def spectrum(values: np.ndarray) -> np.ndarray:
+        return np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2 / np.sum(window**2)
+
+    power, played = spectrum(residual_um), spectrum(command_V)
+    inside = (frequency > max(2.0, 5 * frequency[1])) & (frequency < min(200.0, 0.45 / interval_s))
     if inside.sum() < 20:
-        return 0.0, 0.0, 0.0
-    around = median_filter(power, 2 * (len(power) // 16) + 1, mode="nearest") / 0.693
-    ratio = np.where(inside, power / np.maximum(around, 1e-300), 0.0)
-    best = int(np.argmax(ratio))
-    low = np.searchsorted(frequency, frequency[best] * 0.85)
-    high = np.searchsorted(frequency, frequency[best] * 1.15) + 1
-    excess = float(np.sum(np.maximum(power[low:high] - around[low:high], 0))) * 2 / n
-    return float(frequency[best]), excess**0.5, float(ratio[best])
+        return none
+    wide = 2 * (len(power) // 16) + 1
+    around = np.maximum(median_filter(power, wide, mode="nearest") / 0.693, 1e-300)
+    best = int(np.argmax(np.where(inside, power / around, 0.0)))
+    chance = float(np.log(inside.sum())) - power[best] / around[best]
+    smooth = np.convolve(power, np.ones(3) / 3, mode="same")
+    above = smooth > max(smooth[best] / 4, 3 * around[best])
+    low, high = best, best
+    while low > 1 and above[low - 1]:
+        low -= 1
+    while high < len(power) - 2 and above[high + 1]:
+        high += 1
+    if frequency[high] - frequency[low] > frequency[best] / 2:
+        return none
+    # A loop played again and again has lines at multiples of its frequency.
+    lines = median_filter(played, wide, mode="nearest")
+    for k in range(1, 13):
+        at = round(best / k)
+        near = slice(max(at - 2, 1), at + 3)
+        if at > 2 and played[near].max() > max(1e3 * lines[at], 1e-4 * played.sum()):
+            return none
+    # It goes on throughout: no block has nearly all of it.
+    swing = np.exp(-2j * np.pi * frequency[best] * interval_s * np.arange(n)) * (residual_um - residual_um.mean())
+    blocks = np.array([np.abs(block.sum()) ** 2 for block in np.array_split(swing, 8)])
+    if blocks.max() > 0.7 * blocks.sum():
+        return none
+    excess = float(np.sum(np.maximum(power[low : high + 1] - around[low : high + 1], 0))) * 2 / n
+    width = max((high - low) * frequency[1] / 2, frequency[1])
+    # Noise of this width has so many independent values.
+    sd = excess**0.5 / (2 * max(width * n * interval_s, 1.0) ** 0.5)
+    return Band(float(frequency[best]), excess**0.5, sd, float(frequency[best] / width), max(-2 * chance, 0.0) ** 0.5)

@@ -116,7 +116,17 @@ class Predictor:
         record = Record(time_s, voltage_V, np.zeros(n), extra, source="the next run")
         run = prepare_stage_run(record, baseline.range_V, "unknown", 0.0, 1)
         # What is known of the columns beforehand counts with the old runs.
-        alone = replace(baseline, prior=np.eye(1), runs=(run,), coarse=(run,), aside=(), coarse_aside=())
+        only, none = (run,), ()
+        alone = replace(
+            baseline,
+            prior=np.eye(1),
+            runs=only,
+            coarse=only,
+            fine=only,
+            aside=none,
+            coarse_aside=none,
+            fine_aside=none,
+        )
         regression, bench = regress(alone), Bench(alone)
         noise = self._noise(float(time_s[1] - time_s[0]))
         shared = [regression.rows[0], *(regression.finer[kind][0] for kind in self._kinds)]

@@ -20,6 +20,8 @@ _STEP = 1e-3
 _DETERMINED = 3.0
 # Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
 _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
+# Multiples of the linearised answer from which a fit may start.
+_MORE = (1.0, 3.0, 9.0)
 
 
 def _own(info: ParameterInfo) -> bool:
@@ -82,8 +84,8 @@ def _strength(law: Law, x: np.ndarray, run: int) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
 
 
-def law_of(scored: Scored, runs: int) -> Law:
-    """Start from a probe and the multiples of its signatures that the data ask for."""
+def law_of(scored: Scored, runs: int, more: float = 1.0) -> Law:
+    """Start from a probe and the multiples of its signatures that the data ask for, or more of them."""
     form = type(scored.probe.effects[0])
     effects: list[AbstractEffect] = []
     per_run = form.per_run and runs > 1
@@ -95,7 +97,7 @@ def law_of(scored: Scored, runs: int) -> Law:
             total = np.zeros(np.shape(getattr(first, name)))
             for k, effect in enumerate(scored.probe.effects):
                 share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]
-                total = total + float(share) * np.asarray(getattr(effect, name))
+                total = total + more * float(share) * np.asarray(getattr(effect, name))
             values[name] = jnp.asarray(np.clip(total, spec.lower, spec.upper))
         effects.append(replace(first, **values) if values else first)
     return Law(effects)
@@ -191,9 +193,20 @@ def refit(
     return _fit(bench, projector, laws, x, 0, np.zeros((len(projector.residual), 0)), rounds)
 
 
-def refit_beside(bench: Bench, projector: Projector, model: Refit, law: Law) -> Refit:
-    """Fit one more effect, those that are there following along their tangent."""
-    return _fit(bench, projector, [*model.laws, law], [*model.x, law.start], len(model.laws), model.basis(), _ROUNDS)
+def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Scored) -> Refit:
+    """Fit one more effect, those that are there following along their tangent.
+
+    It starts from the multiple of the linearised answer that explains most: effects level off as they grow, and
+    from too weak a start a fit ends beside the truth.
+    """
+    basis, runs = model.basis(), len(bench.prepared)
+
+    def fit(law: Law, rounds: int) -> Refit:
+        return _fit(bench, projector, [*model.laws, law], [*model.x, law.start], len(model.laws), basis, rounds)
+
+    laws = [law_of(scored, runs, more) for more in (_MORE if type(scored.probe.effects[0]).strength else (1.0,))]
+    best = min(laws, key=lambda law: fit(law, 0).cost)
+    return fit(best, _ROUNDS)
 
 
 def _fit(
@@ -239,7 +252,7 @@ def _fit(
 
     flat = np.concatenate(list(x[held:]))
     residual = left(flat)
-    jacobian = slope(flat, residual)
+    jacobian = slope(flat, residual) if rounds else np.zeros((len(residual), len(flat)))
     damping = 1e-3
     for _ in range(rounds):
         cost = float(residual @ residual)

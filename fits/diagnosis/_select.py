@@ -1,20 +1,23 @@
 """Which effects the records need: forward selection with refits, a backward check, and what cannot be told apart."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fits.diagnosis._candidates import Bench, Probe
+from fits.diagnosis._faults import find_faults
+from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, law_of, nothing, refit, refit_beside
+from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
 from fits.diagnosis._regression import regress
 from fits.diagnosis._score import Family, Scored, rescore, score
 from microid import EFFECTS
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
 _LEADERS, _FORMS = 5, 2
-_MOST = 4
+# Causes that are sought, at most, and laws in all, as some causes come several times.
+_MOST, _LAWS = 4, 6
 # Differences of the criterion, and standard deviations after projecting one effect off another, within which two
 # effects are not told apart.
 _SAME, _APART = 10.0, 4.0
@@ -22,6 +25,8 @@ _SAME, _APART = 10.0, 4.0
 _INEXACT, _CONFUSED = 0.06, 0.6
 # An effect that makes the square of the errors in what was held out so many times larger is none.
 _WORSE = 1.2
+# Noise that falls by less than this factor is the same.
+_LESS = 0.8
 # Scores below this share of the best are not worth a fit.
 _WORTH = 0.4
 
@@ -108,20 +113,24 @@ def select(
     false_alarm: float,
     rng: np.random.Generator,
     progress: Callable[[str], None],
+    again: int = 2,
 ) -> Selection:
-    """Add effects one at a time until chance explains the rest."""
+    """Add effects one at a time until chance explains the rest; where they are less noise, begin again so often."""
     plain = model = nothing(bench, projector)
     scores = left = tuple(score(projector, probe, plain.residual) for probe in probes)
     family = Family(scores, rng)
     causes: list[Cause] = []
-    while len(causes) < _MOST:
+    first_bench, first_regression = bench, projector.regression
+    once = {form.name for form in EFFECTS if not form.repeats}
+    while len({cause.name for cause in causes}) < _MOST and len(causes) < _LAWS:
         taken = {cause.name for cause in causes}
         # Models of effects are not exact: what one leaves may look like another, above all like its confusions.
         explained = max(plain.cost - model.cost, 0.0) ** 0.5
         open_ = [
             one
             for one in left
-            if one.name not in taken and one.z > explained * (_CONFUSED if _confusable(one, taken) else _INEXACT)
+            if one.name not in taken & once
+            and one.z > explained * (_CONFUSED if _confusable(one, taken) else _INEXACT)
         ]
         if not open_:
             break
@@ -140,6 +149,11 @@ def select(
             # Beside a baseline that has followed, its strength is anybody's guess.
             break
         bench, projector, model = settled
+        quieter = _quieter(projector, model) if again else None
+        if quieter is not None:
+            # The cause was taken for noise, too: all is asked again beside what noise there is.
+            afresh = Projector(first_regression, quieter, projector.roughness)
+            return select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)
         z = max(drop, 0.0) ** 0.5
         causes.append(Cause(first.name, z, family.p(z), tuple(rivals[1:]), drop))
         basis = model.basis()
@@ -166,6 +180,15 @@ def settle(
     return bench, projector, model
 
 
+def _quieter(projector: Projector, model: Refit) -> tuple[Noise, ...] | None:
+    """The noise of the runs beside the causes, where there is less of it than was thought."""
+    regression = projector.regression
+    left = tuple(r - change for r, change in zip(regression.residuals, model.change_um, strict=True))
+    found = find_faults(replace(regression, residuals=left)).noise
+    less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
+    return tuple(found) if any(less) else None
+
+
 def _confusable(one: Scored, causes: Collection[str]) -> bool:
     """Whether an effect is mistaken for one of some others, by what is known of them."""
     own = set(type(one.probe.effects[0]).confusions)
@@ -174,7 +197,6 @@ def _confusable(one: Scored, causes: Collection[str]) -> bool:
 
 def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[Scored], top: float) -> list[Rival]:
     """Fit the leaders beside what is there already: the best, then those not told apart from it."""
-    runs = len(bench.prepared)
     names = [name for name, one in best_of(scores).items() if one.z > _WORTH * top][:_LEADERS]
     fitted: dict[str, Refit] = {}
     bare = Projector(projector.regression, projector.noise)
@@ -187,8 +209,7 @@ def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[
             if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < _WORTH * own[0].z:
                 continue
             tried[form] = tried.get(form, 0) + 1
-            law = law_of(one, runs)
-            found = refit_beside(bench, projector, model, law)
+            found = refit_beside(bench, projector, model, one)
             if bare.ahead(found.change_um) > _WORSE * before or not found.determined():
                 continue
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):

@@ -1,6 +1,7 @@
 """What was found, in the terms of its users: parameters with intervals, shares, and bounds of what was not found."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import jax
@@ -34,7 +35,8 @@ def causes_of(
     noise: Faults,
 ) -> tuple[FoundCause, ...]:
     """Describe the causes, the most important first."""
-    found = []
+    found: list[FoundCause] = []
+    told: dict[str, int] = {}
     covariance, at = model.covariance(), 0
     runs = len(bench.prepared)
     for cause, law, x in zip(causes, model.laws, model.x, strict=True):
@@ -46,6 +48,11 @@ def causes_of(
         left = projector.off(projector.join(alone))
         noise_um = float(np.mean([n.innovation_um for n in projector.noise]))
         rms = float(np.linalg.norm(left) / projector.count**0.5) * noise_um
+        told[cause.name] = count = told.get(cause.name, 0) + 1
+        if count > 1:
+            again = next(k for k, one in enumerate(found) if one.name == cause.name)
+            found[again] = _joined(found[again], _parameters(law, x, own), count, cause.drop / misfit, rms)
+            continue
         found.append(
             FoundCause(
                 cause.name,
@@ -85,6 +92,18 @@ def causes_of(
             )
         )
     return tuple(sorted(found, key=lambda cause: -cause.z))
+
+
+def _joined(
+    first: FoundCause, more: Sequence[EffectParameter], count: int, share: float, rms_um: float
+) -> FoundCause:
+    """One cause for several of its kind."""
+    return replace(
+        first,
+        parameters=(*first.parameters, *(replace(one, name=f"{one.name}, number {count}") for one in more)),
+        share_of_misfit=float(min(1.0, first.share_of_misfit + share)),
+        rms_um=float(np.hypot(first.rms_um, rms_um)),
+    )
 
 
 def _parameters(law: Law, x: np.ndarray, covariance: np.ndarray) -> tuple[EffectParameter, ...]:

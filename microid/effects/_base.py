@@ -80,6 +80,8 @@ class AbstractEffect(AbstractPart):
         Whether it differs from record to record, as a drift does.
     finite
         Whether it must be tried at its full size, because at zero it has no derivative, or none that says much.
+    repeats
+        Whether there may be several of them in a record.
     fingerprint
         What it leaves in the residual of the plain stage, one sentence.
     confusions
@@ -102,6 +104,7 @@ class AbstractEffect(AbstractPart):
     fast: ClassVar[bool] = False
     per_run: ClassVar[bool] = False
     finite: ClassVar[bool] = False
+    repeats: ClassVar[bool] = False
 
     @classmethod
     @abc.abstractmethod
@@ -165,24 +168,28 @@ def extend(stage: Stage, effect: AbstractEffect) -> Stage:
     Raises
     ------
     ValueError
-        If the stage has it already, or lacks the part that it acts on.
+        If the stage has it already and there is only one of its kind, or lacks the part that it acts on.
     """
-    if effect.name in stage.names:
-        raise ValueError(f"the stage has the effect {effect.name!r} already")
+    name = effect.name
+    if name in stage.names and not effect.repeats:
+        raise ValueError(f"the stage has the effect {name!r} already")
+    count = sum(type(part) is type(effect) for part in stage.parts)
+    if count:
+        name = f"{name}_{count + 1}"
     place = host(type(effect), stage)
     if place is not None:
-        name = stage.names[place]
+        own = stage.names[place]
         # What was frozen of the part lies one level deeper now.
         deeper = tuple(
-            path.replace(f"{name}.", f"{name}.inner.", 1) for path in stage.frozen if path.startswith(f"{name}.")
+            path.replace(f"{own}.", f"{own}.inner.", 1) for path in stage.frozen if path.startswith(f"{own}.")
         )
-        kept = stage.thaw(*(path for path in stage.frozen if path.startswith(f"{name}.")))
-        return kept.swap(name, effect).freeze(*deeper)
+        kept = stage.thaw(*(path for path in stage.frozen if path.startswith(f"{own}.")))
+        return kept.swap(own, effect).freeze(*deeper)
     rank = PLACES.index(effect.place)
     for index, part in enumerate(stage.parts):
         if _rank(part) > rank or (effect.place == "driver" and isinstance(innermost(part), Driver)):
-            return stage.insert(index, effect.name, effect)
-    return stage.append(effect.name, effect)
+            return stage.insert(index, name, effect)
+    return stage.append(name, effect)
 
 
 def _rank(part: AbstractPart) -> float:

@@ -35,6 +35,7 @@ class DroppedSamples(AbstractEffect):
     strength: ClassVar[tuple[str, ...]] = ("dropped_s",)
     finite: ClassVar[bool] = True
     per_run: ClassVar[bool] = True
+    repeats: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "The residual is the velocity times a factor that jumps by whole intervals between samples."
     )
