@@ -87,7 +87,7 @@ def test_scores_are_standard_normal_where_there_is_nothing(rng):
     for _ in range(200):
         reg.residuals = tuple(rng.standard_normal(n) for n in (300, 400))
         projector = Projector(reg, noise)
-        found = score(projector, one, projector.off(projector.residual))
+        (found,) = score(projector, [one], projector.off(projector.residual))
         draws.append(found.z * np.sign(found.coefficients[0]))
     assert stats.kstest(draws, "norm").pvalue > 1e-4
 
@@ -103,7 +103,7 @@ def test_family_wise_probabilities_are_uniform_where_there_is_nothing(rng):
         reg.residuals = tuple(rng.standard_normal(n) for n in (300, 400))
         projector = Projector(reg, noise)
         residual = projector.off(projector.residual)
-        scored = [score(projector, one, residual) for one in probes]
+        scored = score(projector, probes, residual)
         found.append(Family(scored, rng).p(max(one.z for one in scored)))
     # One-sided tests that are all below zero give a probability of one.
     assert stats.binomtest(int(np.sum(np.array(found) < 0.05)), len(found), 0.05).pvalue > 1e-4

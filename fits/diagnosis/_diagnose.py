@@ -25,7 +25,7 @@ from fits.diagnosis._tell import bounds, causes_of
 from microid import EFFECTS, AbstractEffect, Stage
 
 # Causes explain at least this part of what is reproducible, or the true ones are not in the library.
-_SHARE = 0.5
+_SHARE = 0.65
 # What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
 _REST, _CHANCE = 0.3, 1e-6
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found; it must not be

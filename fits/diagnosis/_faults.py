@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits._record import Record
-from fits.diagnosis._floor import Band, band_of, floor_of, jitter_s, quantum_um, spikes
+from fits.diagnosis._floor import Band, MAINS_Hz, band_of, floor_of, jitter_s, quantum_um, spikes
 from fits.diagnosis._noise import Noise, rough_noise_um
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
@@ -17,7 +17,7 @@ SINGLE = ("outliers", "quantisation", "timestamp_jitter", "floor_vibration")
 _SPIKES, _PART = 3, 0.3
 _JITTER_Z, _BAND_Z = 8.0, 8.0
 # Mains and their multiples have lines of their own, and so near to those nothing else is told apart.
-_MAINS_Hz, _NEAR = (50.0, 60.0), 0.015
+_NEAR = 0.015
 # E-folds after which a motion has settled.
 _SETTLED = 8.0
 
@@ -177,4 +177,4 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
 
 
 def _mains(frequency_Hz: float) -> bool:
-    return any(abs(frequency_Hz - k * mains) < _NEAR * k * mains for mains in _MAINS_Hz for k in range(1, 5))
+    return any(abs(frequency_Hz - k * mains) < _NEAR * k * mains for mains in MAINS_Hz for k in range(1, 5))

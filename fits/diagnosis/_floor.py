@@ -12,6 +12,10 @@ from fits.diagnosis._noise import Noise, learn_noise, rough_noise_um
 _REST, _IDLE = 24, 150
 # Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
 _COLOURED = 4.0
+# Mains, and by how much they drift; lines are looked for in stretches of so many samples, and count where no more than
+# this part of the variance is left without them.
+MAINS_Hz, _DRIFT = (50.0, 60.0), 0.002
+_LONG, _MOSTLY = 60, 0.7
 # A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
 # so far away are much smaller.
 _SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
@@ -61,6 +65,8 @@ def floor_of(run: StageRun, residual_um: np.ndarray, settling_s: float) -> Floor
         pieces.append(piece - np.polyval(np.polyfit(time, piece, order), time))
     count = sum(len(piece) for piece in pieces)
     if count >= _IDLE:
+        pieces = _without_mains(pieces, 1 / run.rate_Hz)
+        count = sum(len(piece) for piece in pieces)
         joined = np.concatenate(pieces)
         joined = (
             joined[np.abs(joined) < 8 * rough_noise_um(joined) + 1e-300] if rough_noise_um(joined) > 0 else joined
@@ -74,6 +80,26 @@ def floor_of(run: StageRun, residual_um: np.ndarray, settling_s: float) -> Floor
             return Floor(Noise(level, np.zeros(0)), True)
     used = residual_um[run.fitted]
     return Floor(Noise(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um))), np.zeros(0)), False)
+
+
+def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarray]:
+    """Take the lines of mains out of stretches, where they are most of what is there: hum is a cause, not noise."""
+    long = [piece for piece in pieces if len(piece) >= _LONG]
+    if sum(len(piece) for piece in long) < _IDLE:
+        return pieces
+    before = sum(float(piece @ piece) for piece in long)
+    best, found = _MOSTLY * before, pieces
+    for mains in MAINS_Hz:
+        for frequency in mains * (1 + np.linspace(-_DRIFT, _DRIFT, 9)):
+            left = []
+            for piece in long:
+                phase = 2 * np.pi * frequency * interval_s * np.arange(len(piece))
+                lines = np.stack([wave(h * phase) for h in (1, 2, 3) for wave in (np.cos, np.sin)], axis=1)
+                left.append(piece - lines @ np.linalg.lstsq(lines, piece, rcond=None)[0])
+            rest = sum(float(piece @ piece) for piece in left)
+            if rest < best:
+                best, found = rest, left
+    return found
 
 
 def spikes(run: StageRun, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarray:

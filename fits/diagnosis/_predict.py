@@ -95,8 +95,7 @@ class Predictor:
                 # Strengths in the new run, which no old run says anything of.
                 columns += [[np.zeros_like(b) for b in at]] * int(_each(law).sum())
         signals = np.stack([projector.join(column) for column in columns], axis=1)
-        root, inside = projector._r * projector._scale, projector._q.T @ signals
-        root[projector._weak] = 0.0
+        root, inside = projector.root, projector.orthonormal.T @ signals
         outside = projector.off(signals)
         stacked = np.concatenate([root, inside], axis=1)
         gram = stacked.T @ stacked

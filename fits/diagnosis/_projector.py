@@ -17,6 +17,8 @@ from fits.diagnosis._regression import Regression
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
 _ROUGHEST = 0.5
+# Squares of singular values of the tangent, over the largest, below which the runs show nothing.
+_SHOWN = 1e-10
 
 
 class Projector:
@@ -67,18 +69,35 @@ class Projector:
             k = kind[0].shape[1]
             matrix[row : row + k, at : at + k] = np.eye(k) / size
             at, row = at + k, row + k
-        self._scale = np.linalg.norm(matrix, axis=0) + 1e-300
-        self._q, self._r = qr(matrix / self._scale, mode="economic", overwrite_a=True, check_finite=False)
+        self._scale = np.sqrt(np.einsum("ij,ij->j", matrix, matrix)) + 1e-300
+        matrix /= self._scale
+        value, vector = np.linalg.eigh(matrix.T @ matrix)
         # Directions that the runs do not show have nothing to be projected on.
-        self._weak = np.abs(np.diagonal(self._r)) < 1e-9
-        self._q[:, self._weak] = 0.0
+        shown = value > _SHOWN * value[-1]
+        self._inverse = vector[:, shown] / np.sqrt(value[shown])
+        self._root = (vector[:, shown] * np.sqrt(value[shown])).T
+        self._matrix: np.ndarray | None = matrix
+        self._q: np.ndarray | None = None
         self.residual = self.join(regression.residuals)
         self.residual[self.count : self.count + grid] = -root @ regression.baseline.columns_um
 
     @property
     def freedom(self) -> float:
         """Samples that are worth one of the unknowns: what is fitted takes so many degrees of freedom off."""
-        return float(np.sum(self._q[: self.count] ** 2))
+        return float(np.sum(self.orthonormal[: self.count] ** 2))
+
+    @property
+    def orthonormal(self) -> np.ndarray:
+        """Columns that span the tangent, whitened and joined, shape `(rows, k)`."""
+        if self._q is None:
+            assert self._matrix is not None
+            self._q, self._matrix = self._matrix @ self._inverse, None
+        return self._q
+
+    @property
+    def root(self) -> np.ndarray:
+        """The tangent's columns in terms of `orthonormal`, shape `(k, unknowns)`."""
+        return self._root * self._scale
 
     def _joined_rows(self, signals: Sequence[np.ndarray]) -> np.ndarray:
         return self.join(signals)
@@ -104,7 +123,7 @@ class Projector:
 
     def off(self, joined: np.ndarray) -> np.ndarray:
         """Project joined signals off the tangent."""
-        return joined - self._q @ (self._q.T @ joined)
+        return joined - self.orthonormal @ (self.orthonormal.T @ joined)
 
     def split(self, joined: np.ndarray) -> list[np.ndarray]:
         """Cut a joined signal into those of the runs, whitened, at the samples that count."""
@@ -118,10 +137,8 @@ class Projector:
         return answer[columns : self.regression.size], answer[:columns]
 
     def _answer(self, joined: np.ndarray) -> np.ndarray:
-        right = self._q.T @ joined
-        r = self._r.copy()
-        r[np.diag_indices_from(r)] = np.where(self._weak, 1.0, np.diagonal(r))
-        return solve_triangular(r, np.where(self._weak, 0.0, right)) / self._scale
+        along = self.orthonormal.T @ joined if self._matrix is None else self._inverse.T @ (self._matrix.T @ joined)
+        return (self._inverse @ along) / self._scale
 
     def ahead(self, change_um: Sequence[np.ndarray]) -> float:
         """Mean square of the errors in what is held out of the runs, in noise variances, under effects.
@@ -151,8 +168,7 @@ class Projector:
         baseline = self.regression.baseline
         columns = baseline.chain.size
         answer = self._answer(joined)
-        r = self._r * self._scale
-        gram = r.T @ r
+        gram = self.root.T @ self.root
         own = gram[columns:, columns:]
         own = own + 1e-12 * np.diag(np.diagonal(own)) + 1e-300 * np.eye(len(own))
         follow = np.linalg.solve(own, gram[columns:, :columns])

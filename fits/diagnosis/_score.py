@@ -12,6 +12,8 @@ from fits.diagnosis._projector import Projector
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
+# Samples that are taken to err alike.
+_BLOCK = 25
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,9 @@ class Scored:
         Its signatures off the baseline's tangent, whitened and joined, shape `(rows, k)`.
     z
         Evidence, in standard deviations.
+    sure
+        The same if what is left counts as noise that stays alike for a while, as large as it is where it is: little
+        for an effect that only comes nearest to a misfit of another shape.
     coefficients
         Best multiples of the signatures, shape `(k,)`.
     drop
@@ -37,6 +42,7 @@ class Scored:
     probe: Probe
     columns: np.ndarray
     z: float
+    sure: float
     coefficients: np.ndarray
     drop: float
     share_left: float
@@ -47,26 +53,53 @@ class Scored:
         return self.probe.name
 
 
-def score(projector: Projector, probe: Probe, residual: np.ndarray) -> Scored:
-    """Ask about one probe; `residual` is joined and off the tangent already."""
-    joined = np.stack([projector.join(column) for column in probe.signatures], axis=1)
-    raw = np.linalg.norm(joined)
-    columns = projector.off(joined)
-    z, coefficients, drop = evidence(columns, residual, probe.positive)
-    left = float(np.linalg.norm(columns) / raw) if raw > 0 else 0.0
+def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -> tuple[Scored, ...]:
+    """Ask about probes; `residual` is joined and off the tangent already."""
+    signals = [column for probe in probes for column in probe.signatures]
+    if not signals:
+        return ()
+    # Columns that lie together are projected all at once, and taken out without a copy.
+    joined = np.empty((len(residual), len(signals)), order="F")
+    for k, column in enumerate(signals):
+        joined[:, k] = projector.join(column)
+    raw = _squares(joined)
+    off = np.asfortranarray(projector.off(joined))
+    found, at = [], 0
+    for probe in probes:
+        own = slice(at, at + len(probe.signatures))
+        at = own.stop
+        found.append(_scored(probe, off[:, own], residual, float(np.sum(raw[own])) ** 0.5))
+    return tuple(found)
+
+
+def rescore(scores: Sequence[Scored], basis: np.ndarray, residual: np.ndarray) -> tuple[Scored, ...]:
+    """Ask again beside effects that are fitted already; `basis` spans their tangent, off the baseline's."""
+    found = []
+    for one in scores:
+        columns = one.columns - basis @ (basis.T @ one.columns)
+        raw = float(np.sum(_squares(one.columns))) ** 0.5 / max(one.share_left, 1e-300)
+        found.append(_scored(one.probe, columns, residual, raw))
+    return tuple(found)
+
+
+def _scored(probe: Probe, columns: np.ndarray, residual: np.ndarray, raw: float) -> Scored:
+    left = float(np.sum(_squares(columns))) ** 0.5 / raw if raw > 0 else 0.0
     if left < _BLIND:
         # What the baseline follows but for rounding cannot be asked about.
-        return Scored(probe, np.zeros_like(columns), 0.0, np.zeros_like(coefficients), 0.0, left)
-    return Scored(probe, columns, z, coefficients, drop, left)
+        return Scored(probe, np.zeros_like(columns), 0.0, 0.0, np.zeros(columns.shape[1]), 0.0, left)
+    z, coefficients, drop = evidence(columns, residual, probe.positive)
+    return Scored(probe, columns, z, _sure(columns @ coefficients, residual), coefficients, drop, left)
 
 
-def rescore(scored: Scored, basis: np.ndarray, residual: np.ndarray) -> Scored:
-    """Ask again beside effects that are fitted already; `basis` spans their tangent, off the baseline's."""
-    columns = scored.columns - basis @ (basis.T @ scored.columns)
-    z, coefficients, drop = evidence(columns, residual, scored.probe.positive)
-    raw = np.linalg.norm(scored.columns) / max(scored.share_left, 1e-300)
-    left = float(np.linalg.norm(columns) / raw) if raw > 0 else 0.0
-    return Scored(scored.probe, columns, z, coefficients, drop, left)
+def _squares(columns: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->j", columns, columns)
+
+
+def _sure(along: np.ndarray, residual: np.ndarray) -> float:
+    """Size of a fitted signal over the standard deviation that blocks of what is left of the residual give it."""
+    products = along * (residual - along)
+    blocks = np.add.reduceat(products, np.arange(0, len(products), _BLOCK))
+    return float(along @ along / max(float(np.linalg.norm(blocks)), 1e-300)) if np.any(along) else 0.0
 
 
 def evidence(columns: np.ndarray, residual: np.ndarray, positive: bool) -> tuple[float, np.ndarray, float]:

@@ -25,6 +25,8 @@ _SAME, _APART = 10.0, 4.0
 _INEXACT, _CONFUSED = 0.06, 0.6
 # An effect that makes the square of the errors in what was held out so many times larger is none.
 _WORSE = 1.2
+# Evidence that a cause must have against what else is left, in standard deviations.
+_SURE = 3.0
 # Noise that falls by less than this factor is the same.
 _LESS = 0.8
 # Scores below this share of the best are not worth a fit.
@@ -117,7 +119,7 @@ def select(
 ) -> Selection:
     """Add effects one at a time until chance explains the rest; where they are less noise, begin again so often."""
     plain = model = nothing(bench, projector)
-    scores = left = tuple(score(projector, probe, plain.residual) for probe in probes)
+    scores = left = score(projector, probes, plain.residual)
     family = Family(scores, rng)
     causes: list[Cause] = []
     first_bench, first_regression = bench, projector.regression
@@ -130,6 +132,7 @@ def select(
             one
             for one in left
             if one.name not in taken & once
+            and one.sure > _SURE
             and one.z > explained * (_CONFUSED if _confusable(one, taken) else _INEXACT)
         ]
         if not open_:
@@ -157,7 +160,7 @@ def select(
         z = max(drop, 0.0) ** 0.5
         causes.append(Cause(first.name, z, family.p(z), tuple(rivals[1:]), drop))
         basis = model.basis()
-        left = tuple(rescore(score(projector, one.probe, model.residual), basis, model.residual) for one in scores)
+        left = rescore(score(projector, probes, model.residual), basis, model.residual)
         family = Family(left, rng)
     causes, model = _backward(bench, projector, causes, model)
     return Selection(tuple(causes), model, plain, scores, left, family, bench, projector)

@@ -116,7 +116,8 @@ def look(projector: Projector, basis: np.ndarray, residual: np.ndarray, ways: Se
         along = left[:, keep].T @ residual
         drop, freedom = float(along @ along), int(keep.sum())
         p = float(stats.chi2.sf(drop, freedom))
-        z = float(max(drop - freedom, 0.0) / (2 * freedom) ** 0.5)
+        # Fisher's root of a chi-square variable is nearly normal.
+        z = float(max((2 * drop) ** 0.5 - (2 * freedom - 1) ** 0.5, 0.0))
         found.append(Seen(view, drop, freedom, z, p))
     return found
 

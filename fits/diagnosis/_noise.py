@@ -1,0 +1,78 @@
+"""Noise of one run, and how it is learnt."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one run: its innovations' standard deviation, and how it depends on its past.
+
+    Attributes
+    ----------
+    innovation_um
+        Standard deviation of what is new in every sample.
+    past
+        Coefficients of the autoregression, shape `(order,)`; empty for white noise.
+    spread
+        Factor by which a sample is noisier than that, shape `(n,)`; None where all are alike.
+    """
+
+    innovation_um: float
+    past: np.ndarray
+    spread: np.ndarray | None = None
+
+    @property
+    def total_um(self) -> float:
+        """Standard deviation of the noise itself."""
+        if len(self.past) == 0:
+            return self.innovation_um
+        impulse = np.zeros(4096)
+        impulse[0] = 1.0
+        return self.innovation_um * float(np.linalg.norm(lfilter([1.0], np.r_[1.0, -self.past], impulse)))
+
+    def whiten(self, values: np.ndarray) -> np.ndarray:
+        """Turn noise into independent numbers of variance one, along the first axis."""
+        if len(self.past):
+            values = lfilter(np.r_[1.0, -self.past], [1.0], values, axis=0)
+        if self.spread is not None:
+            values = values / self.spread.reshape(-1, *(1,) * (values.ndim - 1))
+        return values / self.innovation_um
+
+
+def rough_noise_um(residual_um: np.ndarray) -> float:
+    """Standard deviation of white noise in a residual, by its second differences, whatever slowly changes."""
+    second = np.diff(residual_um, 2)
+    return float(1.4826 * np.median(np.abs(second - np.median(second))) / 6**0.5)
+
+
+def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Noise:
+    """Learn the noise of a run from what nothing explains.
+
+    Parameters
+    ----------
+    residual_um
+        Shape `(n,)`.
+    freedom
+        Unknowns that were fitted to it.
+    order
+        Largest order of the autoregression; the Bayesian information criterion chooses.
+    """
+    n = len(residual_um)
+    inflate = (n / max(n - freedom, n / 2)) ** 0.5
+    lags = np.array([residual_um[: n - k] @ residual_um[k:] / n for k in range(order + 1)])
+    best, past, variance = np.inf, np.zeros(0), lags[0]
+    coefficients, error = np.zeros(0), lags[0]
+    for k in range(order + 1):
+        if k:
+            # Levinson and Durbin's recursion.
+            reflection = (lags[k] - coefficients @ lags[k - 1 : 0 : -1]) / error if k > 1 else lags[1] / error
+            coefficients = np.append(coefficients - reflection * coefficients[::-1], reflection)
+            error = error * (1 - reflection**2)
+        score = n * np.log(error) + k * np.log(n)
+        # A correlation too small to matter is not worth a filter.
+        if score < best - 6:
+            best, past, variance = score, coefficients.copy(), error
+    return Noise(float(np.sqrt(variance)) * inflate, past)
