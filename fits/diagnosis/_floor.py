@@ -12,8 +12,8 @@ from fits.diagnosis._noise import Noise, learn_noise, rough_noise_um
 _REST, _IDLE = 24, 150
 # Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
 _COLOURED = 4.0
-# Mains, and by how much they drift; lines are looked for in stretches of so many samples, and count where no more than
-# this part of the variance is left without them.
+# Mains, and by how much they drift; lines are looked for in stretches of so many samples, and count where no more
+# than this part of the variance is left without them.
 MAINS_Hz, _DRIFT = (50.0, 60.0), 0.002
 _LONG, _MOSTLY = 60, 0.7
 # A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to

@@ -1,0 +1,19 @@
+"""Controllers for a stage, the closed loop, and its figures of merit (Sections 3.3 and 4.3-4.4)."""
+
+from microid.control._base import AbstractController as AbstractController
+from microid.control._bp_pid import BPPID as BPPID
+from microid.control._bp_pid import GainNetwork as GainNetwork
+from microid.control._cmac_pid import CMACPID as CMACPID
+from microid.control._errors import StepMetrics as StepMetrics
+from microid.control._errors import TrackingErrors as TrackingErrors
+from microid.control._errors import step_metrics as step_metrics
+from microid.control._errors import tracking_errors as tracking_errors
+from microid.control._loop import ControlledRun as ControlledRun
+from microid.control._loop import simulate_loop as simulate_loop
+from microid.control._margins import Margins as Margins
+from microid.control._margins import loop_gain as loop_gain
+from microid.control._margins import margins as margins
+from microid.control._margins import require_stable as require_stable
+from microid.control._pid import PID as PID
+from microid.control._sampled import AbstractPlant as AbstractPlant
+from microid.control._sampled import SampledStage as SampledStage
