@@ -104,7 +104,9 @@ def is_defined(value):
     return callable(value) and typing.get_origin(value) is None
 
 
-@pytest.mark.parametrize("package", [*PACKAGES, "microid.control", "microid.densities", "microid.effects", "microid.hysteresis"])
+@pytest.mark.parametrize(
+    "package", [*PACKAGES, "microid.control", "microid.densities", "microid.effects", "microid.hysteresis"]
+)
 def test_public_names_are_the_listed_ones(package):
     module, names = importlib.import_module(package), listed(package)
     assert names
@@ -164,7 +166,9 @@ def documented(owner, value):
                 yield f"{owner}.{name}", bool(inspect.getdoc(member))
 
 
-@pytest.mark.parametrize("package", [*PACKAGES, "microid.control", "microid.densities", "microid.effects", "microid.hysteresis"])
+@pytest.mark.parametrize(
+    "package", [*PACKAGES, "microid.control", "microid.densities", "microid.effects", "microid.hysteresis"]
+)
 def test_public_names_have_docstrings(package):
     module = importlib.import_module(package)
     values = {name: getattr(module, name) for name in listed(package)}

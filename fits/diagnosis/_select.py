@@ -148,6 +148,9 @@ def select(
         first = rivals[0]
         drop = model.cost - first.refit.cost
         settled = settle(bench, projector, first.refit)
+        if settled[-1].cost > first.refit.cost:
+            # A baseline that moved without the roughness beyond its grid may have moved away.
+            settled = bench, projector, refit(bench, projector, first.refit.laws, first.refit.x, 4)
         if not settled[-1].determined():
             # Beside a baseline that has followed, its strength is anybody's guess.
             break
