@@ -76,6 +76,9 @@ def report(rows: Sequence[Row], settings: Row, seed: int) -> str:
         parts.append(_outside(outside))
     if pairs:
         parts.append(_pairs(pairs))
+    asked = [row for row in done if row.get("again")]
+    if asked:
+        parts.append(_again(asked))
     parts.append(_undone([row for row in rows if "verdict" not in row]))
     return "\n\n".join(part for part in parts if part)
 
@@ -240,6 +243,22 @@ def _pairs(pairs: dict[str, list[Row]]) -> str:
         lines.append([pair.replace("+", " + "), *counts, str(sum(map(bool, wrong))), str(len(rows)), after])
     head = ["hidden", "all named", "one of two", "none", "with another name too", "rigs", "held out after / noise"]
     return "## Two at once\n\n" + _table(head, lines)
+
+
+def _again(rows: list[Row]) -> str:
+    lines = [
+        [
+            row["hidden"],
+            str(row["seed"]),
+            " or ".join([row["causes"][0]["name"], *row["causes"][0]["also"]]),
+            " or ".join([row["again"]["first"] or "nothing", *row["again"]["also"]]),
+            "yes" if row["again"]["resolved"] else "no",
+        ]
+        for row in rows
+    ]
+    resolved = sum(row["again"]["resolved"] for row in rows)
+    text = "## The suggested experiment, played on the same rig\n\nResolved: " + _share(resolved, len(rows))
+    return text + "\n\n" + _table(["hidden", "seed", "before", "after", "resolved"], lines)
 
 
 def _undone(rows: list[Row]) -> str:

@@ -159,8 +159,12 @@ def solve_stage(
     loss: str,
     progress: Callable[[str], None],
     finest: int = LADDER[-1],
+    anyway: bool = False,
 ) -> Solution:
-    """Fit a stage, on a grid of at most the finest levels; other arguments and errors are those of `fit_stage`."""
+    """Fit a stage, on a grid of at most the finest levels; other arguments and errors are those of `fit_stage`.
+
+    `anyway` takes the best place for an answer where the fit does not become stationary.
+    """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
     if loss not in LOSSES:
@@ -184,7 +188,9 @@ def solve_stage(
             "the stage holds its command in steps, which is fitted only with a driver ahead of the hysteresis: "
             "insert one, or use hold='first'"
         )
-    plan = _Plan(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold)
+    plan = _Plan(
+        tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, anyway
+    )
     problem = _start(plan, stage, levels, finest)
     problem, solved, precision = _refine(plan, problem)
     fitted = problem.at(solved)
@@ -203,6 +209,7 @@ class _Plan:
     progress: Callable[[str], None]
     gain: float | None
     hold: Hold
+    anyway: bool
 
     def runs(self, stride: int) -> list[StageRun]:
         """The records, each interval divided into so many steps."""
@@ -304,7 +311,7 @@ def _refine(plan: _Plan, problem: _Problem) -> tuple[_Problem, Solved, Precision
     while True:
         runs = plan.runs(stride)
         start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
-        solved = solve_chain(problem.chain, *start, plan.loss, plan.progress)
+        solved = solve_chain(problem.chain, *start, plan.loss, plan.progress, anyway=plan.anyway)
         problem = replace(problem, z=solved.z, columns_um=solved.columns_um, hyper=solved.hyper)
         precision = Precision(problem.chain, solved, problem.stroke_um)
         if plan.gain is None or stride > 1:

@@ -171,15 +171,22 @@ def prepare_stage_run(
     return StageRun(record, eqx.tree_at(lambda s: s.start.memory, samples, memory, is_leaf=_none), known, fitted)
 
 
+PATH = "path_V"
+"""Name of a column that says through how many volts the command went before each sample, other records included."""
+
+
 def columns_beside(record: Record) -> dict[str, np.ndarray]:
     """Further columns of a record under the names that effects know, shape `(n,)` each.
 
     A name that speaks of temperature, or is in degrees, is `temperature_degC`; another one in a unit of length or
-    voltage is the second axis, `other_um`. A column that does not change shows nothing.
+    voltage is the second axis, `other_um`; `path_V` is itself. A column that does not change shows nothing.
     """
     found: dict[str, np.ndarray] = {}
     for name, values in record.extra.items():
         low = name.lower()
+        if name == PATH:
+            found[name] = values
+            continue
         if np.ptp(values) == 0 or not np.all(np.isfinite(values)):
             continue
         if "temp" in low or low.endswith(("_degc", "_k", "_c")):

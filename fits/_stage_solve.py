@@ -71,6 +71,7 @@ def solve_chain(
     loss: str,
     progress: Callable[[str], None],
     rough: bool = False,
+    anyway: bool = False,
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
@@ -96,11 +97,13 @@ def solve_chain(
         Told what is being done.
     rough
         Whether the place found is only a start for another fit, so that it need not be stationary.
+    anyway
+        Whether the best place is an answer, too, if it does not become stationary: for those who go on from there.
 
     Raises
     ------
     FitError
-        If it does not become stationary.
+        If it does not become stationary and must.
     """
     damping = _DAMPING
     for number in range(_ROUGH if rough else _ROUNDS):
@@ -118,8 +121,10 @@ def solve_chain(
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
-                if damping > _HIGHEST:
+                if damping > _HIGHEST and not (anyway and number):
                     raise
+                if damping > _HIGHEST:
+                    return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
                 continue
             hyper = better
             prior = prior_precision(chain, hyper, stroke_um)
@@ -135,12 +140,14 @@ def solve_chain(
             damping *= _FACTOR
             if damping > _HIGHEST:
                 break
+        if damping > _HIGHEST and anyway:
+            break
         if damping > _HIGHEST and not rough:
             raise FitError(FitStatus.NOT_STATIONARY)
         if distance < _STATIONARY:
             runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None)
             return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
-    if rough:
+    if rough or anyway:
         return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
     raise FitError(FitStatus.MAX_STEPS)
 

@@ -16,7 +16,7 @@ from fits._record import Record
 from fits._result import FitError
 from fits._run import prepare_run
 from fits._stage_moments import Chain
-from fits._stage_run import StageRun, prepare_stage_run
+from fits._stage_run import PATH, StageRun, prepare_stage_run
 from fits._stage_solve import prior_precision
 from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._noise import rough_noise_um
@@ -111,11 +111,12 @@ def fit_baseline(
     DataError, FitError
         If neither can be fitted.
     """
+    records, aside = _with_paths(records, aside)
     voltages = [record.voltage_V for record in (*records, *aside)]
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     remarks: tuple[str, ...] = ()
     try:
-        found = solve_stage(records, None, None, holdout, initial, "squares", progress, _FINEST)
+        found = solve_stage(records, None, None, holdout, initial, "squares", progress, _FINEST, anyway=True)
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
         return _static(records, aside, range_V, holdout, initial, remarks, progress)
@@ -142,6 +143,18 @@ def fit_baseline(
         True,
         found.remarks,
     )
+
+
+def _with_paths(records: Sequence[Record], aside: Sequence[Record]) -> tuple[Sequence[Record], Sequence[Record]]:
+    """Say of each record how far the command had gone before, if they were taken one after the other."""
+    if len(records) + len(aside) < 2:
+        return records, aside
+    gone, out = 0.0, []
+    for record in (*records, *aside):
+        path_V = gone + np.cumsum(np.abs(np.diff(record.voltage_V, prepend=record.voltage_V[0])))
+        gone = float(path_V[-1])
+        out.append(replace(record, extra={**record.extra, PATH: path_V}))
+    return out[: len(records)], out[len(records) :]
 
 
 def _prepared(

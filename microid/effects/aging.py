@@ -58,5 +58,49 @@ class Aging(AbstractEffect):
         """Scale the displacement by what the command has gone through since the first sample."""
         command = start.command.values
         path = jnp.concatenate([jnp.zeros_like(command[:1]), jnp.cumsum(jnp.abs(jnp.diff(command)))])
-        more = self.gain_per_decade * jnp.log1p(path / self.cycle_V) / jnp.log(10.0)
-        return Signal(signal.values + more * (signal.values - self.zero_um), signal.before, signal.hold)
+        return _scaled(signal, self.gain_per_decade * jnp.log1p(path / self.cycle_V), self.zero_um)
+
+
+@register
+class AgingOverRecords(AbstractEffect):
+    """The same with the path of the records before: they follow one another on one stage.
+
+    Attributes
+    ----------
+    gain_per_decade
+        Positive for wake-up, negative for aging.
+    cycle_V
+        The path after which it has begun.
+    zero_um
+        The displacement that stays, given.
+    """
+
+    name: ClassVar[str] = "aging"
+    form: ClassVar[str] = "over_records"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
+    needs: ClassVar[tuple[str, ...]] = ("path_V",)
+    fingerprint: ClassVar[str] = Aging.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = Aging.confusions
+    experiment: ClassVar[str] = Aging.experiment
+    source: ClassVar[str] = Aging.source
+    gain_per_decade: Float[Array, ""] = param(unit="1", scale=1e-3)
+    cycle_V: Float[Array, ""] = param(unit="V", scale=100.0, lower=1e-3)
+    zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Paths of 0.3, one and three whole cycles."""
+        cycle = 2 * (scales.upper_V - scales.lower_V)
+        return tuple((cls(jnp.asarray(1e-3), jnp.asarray(share * cycle)),) for share in (0.3, 1.0, 3.0))
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Scale the displacement by what the command has gone through in all records so far."""
+        return _scaled(signal, self.gain_per_decade * jnp.log1p(start.columns["path_V"] / self.cycle_V), self.zero_um)
+
+
+def _scaled(signal: Signal, more: Float[Array, " t"], zero_um: Float[Array, ""]) -> Signal:
+    factor = more / jnp.log(10.0)
+    return Signal(signal.values + factor * (signal.values - zero_um), signal.before, signal.hold)
