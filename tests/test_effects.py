@@ -35,7 +35,7 @@ def scales():
         INTERVAL_S * SAMPLES,
         0.03,
         100.0,
-        (("temperature_degC", 21.0, 2.0), ("other_um", 10.0, 20.0)),
+        (("temperature_degC", 21.0, 2.0), ("other_um", 10.0, 20.0), ("path_V", 900.0, 800.0)),
     )
 
 
@@ -54,7 +54,12 @@ def command_V():
 
 def columns():
     time = INTERVAL_S * np.arange(SAMPLES)
-    return {"temperature_degC": jnp.asarray(20 + 10 * time), "other_um": jnp.asarray(10 * np.sin(30 * time))}
+    path = np.cumsum(np.abs(np.diff(command_V(), prepend=0.0)))
+    return {
+        "temperature_degC": jnp.asarray(20 + 10 * time),
+        "other_um": jnp.asarray(10 * np.sin(30 * time)),
+        "path_V": jnp.asarray(500 + path),
+    }
 
 
 def examples(effect):

@@ -272,6 +272,9 @@ def test_gains_that_follow_the_command(rng):
     travelled = np.concatenate([[0], np.cumsum(np.abs(np.diff(path)))])
     found = through(BY_NAME["aging", ""](0.01, 200.0, 3.0), interval, path)
     np.testing.assert_allclose(found - path, 0.01 * np.log10(1 + travelled / 200) * (path - 3), atol=1e-9)
+    found = through(BY_NAME["aging", "over_records"](0.01, 200.0, 3.0), interval, path, path_V=700 + travelled)
+    truth = 0.01 * np.log10(1 + (700 + travelled) / 200) * (path - 3)
+    np.testing.assert_allclose(found - path, truth, atol=1e-9)
     ramp = 20 * time
     found = through(BY_NAME["thermal_gain", "self_heating"](0.1, 2.0, 500.0), interval, ramp)
     heat = 400 / 500 * (time - 2 * (1 - np.exp(-time / 2)))

@@ -16,6 +16,10 @@ _COLOURED = 4.0
 # than this part of the variance is left without them.
 MAINS_Hz, _DRIFT = (50.0, 60.0), 0.002
 _LONG, _MOSTLY = 60, 0.7
+# Lines drift out of step with their frequency after so many s.
+_STEADY_s = 1.5
+# A narrow band lies within this part of its frequency on either side.
+_WIDE = 0.2
 # A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
 # so far away are much smaller.
 _SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
@@ -84,7 +88,10 @@ def floor_of(run: StageRun, residual_um: np.ndarray, settling_s: float) -> Floor
 
 def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarray]:
     """Take the lines of mains out of stretches, where they are most of what is there: hum is a cause, not noise."""
-    long = [piece for piece in pieces if len(piece) >= _LONG]
+    most = max(round(_STEADY_s / interval_s), _LONG)
+    long = [
+        part for piece in pieces if len(piece) >= _LONG for part in np.array_split(piece, max(len(piece) // most, 1))
+    ]
     if sum(len(piece) for piece in long) < _IDLE:
         return pieces
     before = sum(float(piece @ piece) for piece in long)
@@ -200,15 +207,6 @@ def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -
     around = np.maximum(median_filter(power, wide, mode="nearest") / 0.693, 1e-300)
     best = int(np.argmax(np.where(inside, power / around, 0.0)))
     chance = float(np.log(inside.sum())) - power[best] / around[best]
-    smooth = np.convolve(power, np.ones(3) / 3, mode="same")
-    above = smooth > max(smooth[best] / 4, 3 * around[best])
-    low, high = best, best
-    while low > 1 and above[low - 1]:
-        low -= 1
-    while high < len(power) - 2 and above[high + 1]:
-        high += 1
-    if frequency[high] - frequency[low] > frequency[best] / 2:
-        return none
     # A loop played again and again has lines at multiples of its frequency.
     lines = median_filter(played, wide, mode="nearest")
     for k in range(1, 13):
@@ -219,10 +217,15 @@ def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -
     # It goes on throughout: no block has nearly all of it.
     swing = np.exp(-2j * np.pi * frequency[best] * interval_s * np.arange(n)) * (residual_um - residual_um.mean())
     blocks = np.array([np.abs(block.sum()) ** 2 for block in np.array_split(swing, 8)])
-    if blocks.max() > 0.7 * blocks.sum():
+    if np.sort(blocks)[-2:].sum() > 0.85 * blocks.sum():
         return none
-    excess = float(np.sum(np.maximum(power[low : high + 1] - around[low : high + 1], 0))) * 2 / n
-    width = max((high - low) * frequency[1] / 2, frequency[1])
+    low = np.searchsorted(frequency, frequency[best] * (1 - _WIDE))
+    high = max(np.searchsorted(frequency, frequency[best] * (1 + _WIDE)), best + 4)
+    above = power[low:high] - around[low:high]
+    excess = max(float(above.sum()), 0.0) * 2 / n
+    # As wide as a rectangle of the same height and area.
+    peak = np.convolve(above, np.ones(5) / 5, mode="same").max()
+    width = max(float(above.sum() / peak), 1.0) * frequency[1]
     # Noise of this width has so many independent values.
     sd = excess**0.5 / (2 * max(width * n * interval_s, 1.0) ** 0.5)
     return Band(float(frequency[best]), excess**0.5, sd, float(frequency[best] / width), max(-2 * chance, 0.0) ** 0.5)
