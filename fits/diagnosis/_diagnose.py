@@ -301,7 +301,7 @@ def _extended(
         return baseline.stage.with_substeps(substeps), _compare(ready, ready.bench, None, ready.regression), []
     # What followed along the tangent is put into the stage itself.
     bare = Projector(found.projector.regression, found.projector.noise)
-    regression = regress(bare.move(bare.residual - bare.join(model.change_um)), finer=False)
+    regression = regress(bare.move(bare.residual - bare.join(model.change_um)), ())
     bench = Bench(regression.baseline)
     effects = shared_effects(model, runs)
     return extended_stage(regression.baseline, effects, substeps), _compare(ready, bench, model, regression), effects

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits._record import Record
-from fits.diagnosis._floor import Band, MAINS_Hz, band_of, floor_of, jitter_s, quantum_um, spikes
+from fits.diagnosis._floor import Band, band_of, floor_of, jitter_s, quantum_um, spikes
 from fits.diagnosis._noise import Noise, rough_noise_um
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
@@ -16,8 +16,6 @@ SINGLE = ("outliers", "quantisation", "timestamp_jitter", "floor_vibration")
 # So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
 _SPIKES, _PART = 3, 0.3
 _JITTER_Z, _BAND_Z = 8.0, 8.0
-# Mains and their multiples have lines of their own, and so near to those nothing else is told apart.
-_NEAR = 0.015
 # E-folds after which a motion has settled.
 _SETTLED = 8.0
 
@@ -112,7 +110,8 @@ def find_faults(regression: Regression) -> Faults:
             replace(n, spread=np.sqrt(1 + (size * rate / n.innovation_um) ** 2))
             for n, (_, _, rate) in zip(noise, jitters, strict=True)
         ]
-    band = max(bands, key=lambda one: one.z)
+    # What may be hum in one run may be told from it in another.
+    band = max(bands, key=lambda one: (not one.mains, one.z))
     source = (
         "idle stretches of the runs"
         if all(idle)
@@ -161,7 +160,7 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
         sd = faults.jitter_s / (2 * max(faults.jitter_z, 1e-9))
         found.append(Fault("timestamp_jitter", faults.jitter_z, (("jitter_s", faults.jitter_s, sd, "s"),), 0.0))
     band = faults.band
-    if band.z > _BAND_Z and band.size_um**2 > _PART / 3 * total and not _mains(band.frequency_Hz):
+    if band.z > _BAND_Z and band.size_um**2 > _PART / 3 * total and not band.mains:
         found.append(
             Fault(
                 "floor_vibration",
@@ -174,7 +173,3 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
             )
         )
     return found
-
-
-def _mains(frequency_Hz: float) -> bool:
-    return any(abs(frequency_Hz - k * mains) < _NEAR * k * mains for mains in MAINS_Hz for k in range(1, 5))

@@ -183,6 +183,18 @@ class Band:
     sd_um: float
     quality: float
     z: float
+    rate_Hz: float = 0.0
+
+    @property
+    def mains(self) -> bool:
+        """Whether it is near a line of mains, or near what sampling makes of one."""
+        rate, own = self.rate_Hz, _DRIFT * 4
+        return any(
+            abs(self.frequency_Hz - abs((k * line + rate / 2) % rate - rate / 2))
+            < own * k * line + self.frequency_Hz / 60
+            for line in MAINS_Hz
+            for k in range(1, 5)
+        )
 
 
 def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -> Band:
@@ -228,4 +240,11 @@ def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -
     width = max(float(above.sum() / peak), 1.0) * frequency[1]
     # Noise of this width has so many independent values.
     sd = excess**0.5 / (2 * max(width * n * interval_s, 1.0) ** 0.5)
-    return Band(float(frequency[best]), excess**0.5, sd, float(frequency[best] / width), max(-2 * chance, 0.0) ** 0.5)
+    return Band(
+        float(frequency[best]),
+        excess**0.5,
+        sd,
+        float(frequency[best] / width),
+        max(-2 * chance, 0.0) ** 0.5,
+        1 / interval_s,
+    )

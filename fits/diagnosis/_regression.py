@@ -1,6 +1,7 @@
 """All runs as one regression: derivatives of the baseline, and finer structure of the density than its grid has."""
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,10 @@ from fits.diagnosis._evaluate import simulate
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
 _FINE = 64
 _EXAMPLES = 120
+
+
+# By kind, per run.
+Kinds: TypeAlias = tuple[tuple[np.ndarray, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ class Regression:
     masks: tuple[np.ndarray, ...]
     rows: tuple[np.ndarray, ...]
     own: tuple[np.ndarray, ...]
-    finer: tuple[tuple[np.ndarray, ...], ...]
+    finer: Kinds
     residuals: tuple[np.ndarray, ...]
     root: np.ndarray
 
@@ -55,13 +60,16 @@ class Regression:
         return self.rows[0].shape[1]
 
 
-def regress(baseline: Baseline, finer: bool = True) -> Regression:
-    """Linearise a baseline in all its runs, with structure finer than its grid or without."""
+def regress(baseline: Baseline, finer: Kinds | None = None) -> Regression:
+    """Linearise a baseline in all its runs.
+
+    Structure finer than its grid is computed where it is not known already, from a baseline nearby.
+    """
     chain, runs = baseline.chain, baseline.runs
     assert chain.grid is not None
     fine = Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE)
     fine_chain = Chain(chain.coordinates, chain.place, fine)
-    bases = _bases(baseline) if finer else []
+    bases = _bases(baseline) if finer is None else []
     rows, own, residuals = [], [], []
     kinds: list[list[np.ndarray]] = [[] for _ in bases]
     stage = baseline.stage
@@ -75,7 +83,7 @@ def regress(baseline: Baseline, finer: bool = True) -> Regression:
         rows.append(both)
         own.append(free[:n])
         residuals.append(run.displacement_um - simulate(stage, fine_run))
-        if finer:
+        if finer is None:
             for kind, part in zip(kinds, _along(fine_chain, baseline, run, bases), strict=True):
                 kind.append(part)
     trace = np.trace(baseline.prior) / len(baseline.prior)
@@ -84,7 +92,7 @@ def regress(baseline: Baseline, finer: bool = True) -> Regression:
         tuple(run.fitted for run in runs),
         tuple(rows),
         tuple(own),
-        tuple(tuple(kind) for kind in kinds),
+        tuple(tuple(kind) for kind in kinds) if finer is None else finer,
         tuple(residuals),
         cholesky(baseline.prior + 1e-12 * trace * np.eye(len(baseline.prior))),
     )

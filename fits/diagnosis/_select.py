@@ -179,7 +179,8 @@ def settle(
     for count in rounds:
         # What roughness beyond the grid would explain is not put into the grid.
         bare = Projector(projector.regression, projector.noise)
-        regression = regress(bare.move(bare.residual - bare.join(model.change_um)))
+        moved = bare.move(bare.residual - bare.join(model.change_um))
+        regression = regress(moved, projector.regression.finer)
         bench = Bench(regression.baseline)
         projector = Projector(regression, projector.noise, projector.roughness)
         model = refit(bench, projector, model.laws, model.x, count)

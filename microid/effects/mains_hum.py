@@ -37,6 +37,8 @@ class MainsHum(AbstractEffect):
     place: ClassVar[Place] = "sensor"
     strength: ClassVar[tuple[str, ...]] = ("cosine_um", "sine_um")
     per_run: ClassVar[bool] = True
+    # Its frequency is another one in the next record.
+    repeats: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "Lines in the spectrum at multiples of 50 or 60 Hz, also at rest, whatever the command."
     )
@@ -76,6 +78,8 @@ class MainsHum60(AbstractEffect):
     place: ClassVar[Place] = "sensor"
     strength: ClassVar[tuple[str, ...]] = ("cosine_um", "sine_um")
     per_run: ClassVar[bool] = True
+    # Its frequency is another one in the next record.
+    repeats: ClassVar[bool] = True
     fingerprint: ClassVar[str] = MainsHum.fingerprint
     confusions: ClassVar[tuple[str, ...]] = MainsHum.confusions
     experiment: ClassVar[str] = MainsHum.experiment
