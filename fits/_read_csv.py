@@ -24,6 +24,8 @@ _MAX_REVERSALS = 0.2  # share of the samples
 # noise drive; smaller ones are the last digit of a 14-bit converter, too small to matter.
 _WIGGLE_MIN, _WIGGLE_MAX = 1e-4, 0.05
 _GAP = 5.0  # in median time steps
+# So many equal readings, over so much of the voltage's range, are no peak: the sensor is at its end.
+_STANDS, _MOVES = 8, 0.03
 
 
 def read_csv(
@@ -85,6 +87,7 @@ def read_csv(
         warnings += _odd_voltage(table, sources, voltage_V, displacement_um)
         if displacement_um is not None:
             warnings += _odd_stroke(table, sources, voltage_V, displacement_um)
+            warnings += _saturated(table, sources, voltage_V, displacement_um)
     return Record(time_s, voltage_V, displacement_um, extra, os.path.basename(table.path), tuple(warnings))
 
 
@@ -227,6 +230,25 @@ def _odd_stroke(
             f"{place}: the displacement falls as the voltage rises; flip its sign with "
             f"--columns displacement_um={source.spec(flip=True)} if the sensor faces the other way."
         )
+
+
+def _saturated(
+    table: Table, sources: Mapping[str, Source], voltage_V: FloatArray, displacement_um: FloatArray
+) -> Iterator[str]:
+    """Readings that stand at one end while the voltage moves on: the longest such stretch."""
+    for end, words in ((displacement_um.max(), "largest"), (displacement_um.min(), "smallest")):
+        stands = np.concatenate([[False], displacement_um == end, [False]])
+        edges = np.flatnonzero(np.diff(stands.astype(int)))
+        for first, stop in zip(edges[::2], edges[1::2], strict=True):
+            moved = float(np.ptp(voltage_V[first:stop]))
+            if stop - first >= _STANDS and moved > _MOVES * float(np.ptp(voltage_V)):
+                yield (
+                    f"{table.path}, line {table.line(int(first))}, column '{sources['displacement_um'].column}': "
+                    f"{stop - first} readings in a row are the {words}, {end:.6g} um, while the voltage moves by "
+                    f"{moved:.3g} V, so the sensor is at its end there; leave these lines out, or measure with more "
+                    "range."
+                )
+                break
 
 
 def _likely_slips(sources: Mapping[str, Source], ratio_um_per_V: float) -> Iterator[str]:
