@@ -187,9 +187,9 @@ class Band:
 
     @property
     def mains(self) -> bool:
-        """Whether it is near a line of mains, or near what sampling makes of one."""
+        """Whether it is near a line of mains, or near what sampling makes of one, or is nothing at all."""
         rate, own = self.rate_Hz, _DRIFT * 4
-        return any(
+        return rate == 0 or any(
             abs(self.frequency_Hz - abs((k * line + rate / 2) % rate - rate / 2))
             < own * k * line + self.frequency_Hz / 60
             for line in MAINS_Hz
