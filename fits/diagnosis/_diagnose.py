@@ -196,7 +196,7 @@ def _conclude(
             f"what is left repeats itself every {period_um:.3g} um of the position, as the error of an "
             "interferometer or an encoder does"
         )
-    faults = name_faults(ready.faults, cyclic)
+    faults = name_faults(_beside(ready, found, model) if kept else ready.faults, cyclic)
     causes = causes_of(kept, model, found.projector, found.bench, misfit, faults, ready.faults)
     ahead = suggest(ready, found, causes, duration_s, progress)
     verdict = "effect_found" if causes else "unexplained" if left_over else "no_effect"
@@ -258,6 +258,14 @@ def _conclude(
             "share": share,
         },
     )
+
+
+def _beside(ready: Prepared, found: Selection, model: Refit) -> Faults:
+    """Faults of samples and noise, as they are beside the causes."""
+    regression = found.projector.regression
+    left = tuple(r - change for r, change in zip(regression.residuals, model.change_um, strict=True))
+    now = find_faults(replace(regression, residuals=left))
+    return replace(now, spikes=ready.faults.spikes, heights_um=ready.faults.heights_um)
 
 
 def _worse(compared: Sequence[Compared]) -> float:

@@ -1,7 +1,8 @@
 """Which effects the records need: forward selection with refits, a backward check, and what cannot be told apart."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -23,12 +24,17 @@ _MOST, _LAWS = 4, 6
 _SAME, _APART = 10.0, 4.0
 # Part of a cause's signature by which its model may be off, and by which it may be off along its confusions.
 _INEXACT, _CONFUSED = 0.06, 0.6
-# An effect that makes the square of the errors in what was held out so many times larger is none.
-_WORSE = 1.2
+# An effect that makes the square of the errors in what was held out so many times larger is none, and one with
+# little evidence against the rest of the misfit is one if it makes it so much smaller.
+_WORSE, _BETTER = 1.2, 0.85
+# Part of what a cause explains by itself that must be left of it once all is fitted together.
+_REAL = 0.3
 # Evidence that a cause must have against what else is left, in standard deviations.
 _SURE = 3.0
 # Noise that falls by less than this factor is the same.
 _LESS = 0.8
+# Scores above this share of the best may be those of the cause, if so much of what it explains is left for another.
+_NEAR, _FURTHER = 0.95, 0.15
 # Scores below this share of the best are not worth a fit.
 _WORTH = 0.4
 
@@ -122,6 +128,7 @@ def select(
     scores = left = score(projector, probes, plain.residual)
     family = Family(scores, rng)
     causes: list[Cause] = []
+    refused: set[str] = set()
     first_bench, first_regression = bench, projector.regression
     once = {form.name for form in EFFECTS if not form.repeats}
     while len({cause.name for cause in causes}) < _MOST and len(causes) < _LAWS:
@@ -131,8 +138,7 @@ def select(
         open_ = [
             one
             for one in left
-            if one.name not in taken & once
-            and one.sure > _SURE
+            if one.name not in (taken & once) | refused
             and one.z > explained * (_CONFUSED if _confusable(one, taken) else _INEXACT)
         ]
         if not open_:
@@ -142,18 +148,17 @@ def select(
         if p >= false_alarm:
             break
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
-        rivals = _contest(bench, projector, model, open_, top)
-        if not rivals:
-            break
-        first = rivals[0]
+        fitted = _contest(bench, projector, model, open_, top, explained)
+        if not fitted:
+            refused |= {one.name for one in open_ if one.z > _WORTH * top}
+            continue
+        first, settled = _leader(bench, projector, probes, model, fitted, best_of(open_))
+        rivals = _rivals(first, fitted, projector.count)
         drop = model.cost - first.refit.cost
-        settled = settle(bench, projector, first.refit)
-        if settled[-1].cost > first.refit.cost:
-            # A baseline that moved without the roughness beyond its grid may have moved away.
-            settled = bench, projector, refit(bench, projector, first.refit.laws, first.refit.x, 4)
-        if not settled[-1].determined():
-            # Beside a baseline that has followed, its strength is anybody's guess.
-            break
+        if not settled[-1].determined() or model.cost - settled[-1].cost < _REAL * drop:
+            # Its strength is anybody's guess, or what it explains is out of reach where all is fitted together.
+            refused.add(first.name)
+            continue
         bench, projector, model = settled
         quieter = _quieter(projector, model) if again else None
         if quieter is not None:
@@ -161,12 +166,75 @@ def select(
             afresh = Projector(first_regression, quieter, projector.roughness)
             return select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)
         z = max(drop, 0.0) ** 0.5
-        causes.append(Cause(first.name, z, family.p(z), tuple(rivals[1:]), drop))
+        causes.append(Cause(first.name, z, family.p(z), rivals, drop))
         basis = model.basis()
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
         family = Family(left, rng)
     causes, model = _backward(bench, projector, causes, model)
     return Selection(tuple(causes), model, plain, scores, left, family, bench, projector)
+
+
+Settled: TypeAlias = tuple[Bench, Projector, Refit]
+
+
+def _leader(
+    bench: Bench,
+    projector: Projector,
+    probes: Sequence[Probe],
+    model: Refit,
+    fitted: Sequence[Rival],
+    scores: Mapping[str, Scored],
+) -> tuple[Rival, Settled]:
+    """Choose the cause: the best, or among those about as good the one beside which another explains most.
+
+    Where two causes act, one that is neither may follow part of each and come first.
+    """
+    best, settled = fitted[0], _settled(bench, projector, fitted[0].refit)
+    highest = max(scores[one.name].z for one in fitted)
+    near = [one for one in fitted if scores[one.name].z > _NEAR * highest]
+
+    def further(one: Rival, at: Settled) -> tuple[float, float]:
+        there, beside, own = at
+        basis = own.basis()
+        left = rescore(score(beside, probes, own.residual), basis, own.residual)
+        others = [other for other in left if other.name != one.name]
+        next_ = max(others, key=lambda other: other.z)
+        _, _, pair = _settled(there, beside, refit_beside(there, beside, own, next_))
+        return next_.z, min(own.cost, pair.cost)
+
+    if len(near) < 2 or best not in near:
+        return best, settled
+    left, cost = further(best, settled)
+    if left < _FURTHER * max(model.cost - settled[-1].cost, 0.0) ** 0.5:
+        return best, settled
+    for one in near:
+        if one is best:
+            continue
+        trial = _settled(bench, projector, one.refit)
+        _, pair = further(one, trial)
+        if pair < cost - _SAME:
+            best, settled, cost = one, trial, pair
+    return best, settled
+
+
+def _settled(bench: Bench, projector: Projector, model: Refit) -> Settled:
+    settled = settle(bench, projector, model)
+    if settled[-1].cost > model.cost:
+        # A baseline that moved without the roughness beyond its grid may have moved away.
+        here = refit(bench, projector, model.laws, model.x, 4)
+        settled = settled if settled[-1].cost < here.cost else (bench, projector, here)
+    return settled
+
+
+def _rivals(first: Rival, fitted: Sequence[Rival], count: int) -> tuple[Rival, ...]:
+    """Effects that explain the same about as well as the cause."""
+    found = []
+    for other in fitted:
+        # What the cause explains beyond the other.
+        apart = max(other.refit.cost - first.refit.cost, 0.0) ** 0.5
+        if other is not first and (other.criterion - first.criterion < _SAME or apart < _APART):
+            found.append(replace(other, apart=apart))
+    return tuple(found)
 
 
 def settle(
@@ -202,8 +270,10 @@ def _confusable(one: Scored, causes: Collection[str]) -> bool:
     return any(form.name in causes and (one.name in form.confusions or form.name in own) for form in EFFECTS)
 
 
-def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[Scored], top: float) -> list[Rival]:
-    """Fit the leaders beside what is there already: the best, then those not told apart from it."""
+def _contest(
+    bench: Bench, projector: Projector, model: Refit, scores: Sequence[Scored], top: float, explained: float
+) -> list[Rival]:
+    """Fit the leaders beside what is there already, the best first."""
     names = [name for name, one in best_of(scores).items() if one.z > _WORTH * top][:_LEADERS]
     fitted: dict[str, Refit] = {}
     bare = Projector(projector.regression, projector.noise)
@@ -217,23 +287,15 @@ def _contest(bench: Bench, projector: Projector, model: Refit, scores: Sequence[
                 continue
             tried[form] = tried.get(form, 0) + 1
             found = refit_beside(bench, projector, model, one)
-            if bare.ahead(found.change_um) > _WORSE * before or not found.determined():
+            # What does not stand out of the rest of the misfit must show in what was kept aside.
+            plain = one.sure > (_SURE if one.z > 2 * _INEXACT * explained else 2 * _SURE)
+            most = _WORSE if plain else _BETTER
+            if bare.ahead(found.change_um) > most * before or not found.determined():
                 continue
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
     order = sorted(fitted, key=lambda name: fitted[name].criterion(projector.count))
-    if not order:
-        return []
-    best = fitted[order[0]]
-    rivals = [Rival(order[0], best, best.criterion(projector.count), 0.0)]
-    for name in order[1:]:
-        other = fitted[name]
-        worse = other.criterion(projector.count) - rivals[0].criterion
-        # What the best explains beyond the other, and the other's change that the best cannot follow.
-        apart = max(other.cost - best.cost, 0.0) ** 0.5
-        if worse < _SAME or apart < _APART:
-            rivals.append(Rival(name, other, other.criterion(projector.count), apart))
-    return rivals
+    return [Rival(name, fitted[name], fitted[name].criterion(projector.count), 0.0) for name in order]
 
 
 def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Refit) -> tuple[list[Cause], Refit]:
