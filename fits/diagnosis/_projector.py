@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from optimistix import RESULTS
 from scipy.linalg import qr, solve_triangular
-from scipy.optimize import minimize
+from scipy.optimize import minimize, nnls
 
 from fits._evidence import Posterior
 from fits._grid import non_negative
-from fits._result import FitError, FitStatus
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._regression import Regression
@@ -158,13 +157,7 @@ class Projector:
         return square / count if count else float("nan")
 
     def move(self, joined: np.ndarray) -> Baseline:
-        """The baseline moved so that it follows a joined signal best, with columns that stay non-negative.
-
-        Raises
-        ------
-        FitError
-            If their solver fails.
-        """
+        """The baseline moved so that it follows a joined signal best, with columns that stay non-negative."""
         baseline = self.regression.baseline
         columns = baseline.chain.size
         answer = self._answer(joined)
@@ -179,7 +172,9 @@ class Projector:
             Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
         )
         if result != RESULTS.successful:
-            raise FitError(FitStatus.MAX_STEPS)
+            # Block pivoting may go round in circles; one column at a time is slow and sure.
+            upper = np.linalg.cholesky(precision).T
+            kept, _ = nnls(upper, upper @ mean, maxiter=30 * len(mean))
         change = np.asarray(kept) - baseline.columns_um
         others = answer[columns:] - follow @ (change - answer[:columns])
         return baseline.moved(others[: self.regression.size - columns], change)
