@@ -12,6 +12,8 @@ from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host
 
 # Strength at which an effect's derivative is taken, as a share of that of its probe.
 _STEP = 1e-2
+# Part of a period of the resonance between samples, beyond which a run does not resolve it.
+_PERIOD = 0.25
 
 
 class Bench:
@@ -31,6 +33,8 @@ class Bench:
         # What a fit may move is looked up anew for every stage that is built.
         self.stage = stage.thaw(*stage.frozen)
         runs = baseline.coarse_aside if aside else baseline.coarse
+        mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
+        self.resonance_Hz = float(mechanics[0].natural_frequency_Hz) if mechanics else 0.0
         self.prepared = [prepare(self.stage, run) for run in runs]
         self.known = [signals(self.stage, one) for one in self.prepared]
         self.plain = [self._out(known[-1], one) for known, one in zip(self.known, self.prepared, strict=True)]
@@ -42,9 +46,16 @@ class Bench:
     def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
         """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
         return [
-            respond_again(with_effects(self.stage, own), self.stage, known, one)
+            respond_again(with_effects(self.stage, self._seen(own, one)), self.stage, known, one)
             for own, known, one in zip(effects, self.known, self.prepared, strict=True)
         ]
+
+    def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
+        """Those that a run may be asked about: none that is its own and too fast for its samples."""
+        interval_s = float(np.median(np.diff(prepared.run.record.time_s)))
+        if not self.resonance_Hz * interval_s > _PERIOD:
+            return list(effects)
+        return [effect for effect in effects if not (effect.fast and effect.per_run)]
 
     def change(
         self, effects: Sequence[AbstractEffect], before: Sequence[np.ndarray] | None = None

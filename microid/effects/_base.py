@@ -173,7 +173,7 @@ def extend(stage: Stage, effect: AbstractEffect) -> Stage:
     name = effect.name
     if name in stage.names and not effect.repeats:
         raise ValueError(f"the stage has the effect {name!r} already")
-    count = sum(type(part) is type(effect) for part in stage.parts)
+    count = sum(isinstance(part, AbstractEffect) and part.name == name for part in stage.parts)
     if count:
         name = f"{name}_{count + 1}"
     place = host(type(effect), stage)
