@@ -218,3 +218,23 @@ def test_all_effects_together_stand_in_the_order_of_the_signal(rng):
     assert ranks == sorted(ranks)
     assert order.index("slew_limit") < order.index("driver") < order.index("hysteresis") < order.index("creep")
     assert order.index("creep") < order.index("backlash") < order.index("mechanics") < order.index("sensor_lowpass")
+
+
+def test_what_may_come_twice_has_names_of_its_own():
+    stage = plain_stage()
+    given = jnp.asarray(command_V())
+    run = compiled(lambda s, v: s(jnp.asarray(INTERVAL_S), v, columns=columns()))
+    before = np.asarray(run(stage, given))
+    hums = [
+        BY_NAME["mains_hum", form](np.full(3, 0.1), np.zeros(3), 1.0 * f)
+        for form, f in (("50_Hz", 50), ("60_Hz", 60))
+    ]
+    changes = []
+    for hum in hums:
+        changes.append(np.asarray(run(fx.extend(plain_stage(), hum), given)) - before)
+        stage = fx.extend(stage, hum)
+    assert set(stage.names) - set(plain_stage().names) == {"mains_hum", "mains_hum_2"}
+    np.testing.assert_allclose(np.asarray(run(stage, given)) - before, sum(changes), atol=1e-9)
+    once = examples(BY_NAME["slew_limit", ""])[0]
+    with pytest.raises(ValueError, match="slew_limit"):
+        fx.extend(fx.extend(plain_stage(), once), once)

@@ -198,6 +198,8 @@ def _leader(
         basis = own.basis()
         left = rescore(score(beside, probes, own.residual), basis, own.residual)
         others = [other for other in left if other.name != one.name]
+        if not others:
+            return 0.0, own.cost
         next_ = max(others, key=lambda other: other.z)
         _, _, pair = _settled(there, beside, refit_beside(there, beside, own, next_))
         return next_.z, min(own.cost, pair.cost)
