@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _REPORT, _JSON, _BASELINE, _EXTENDED = "report.html", "diagnosis.json", "baseline.json", "extended.json"
 _PROGRAM = "next_experiment.csv"
+_LONGEST_s = 1e5
 _FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
 
 
@@ -42,8 +43,8 @@ def run_diagnose(
     """Do `microid diagnose`; the options are the command's."""
     if not 0 < false_alarm <= 0.5:
         raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {false_alarm:g}.")
-    if duration is not None and not (math.isfinite(duration) and duration > 0):
-        raise DataError(f"--duration: expected a time above 0 in s, found {duration:g}.")
+    if duration is not None and not 0 < duration <= _LONGEST_s:
+        raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {duration:g}.")
     mapping = parse_columns(columns)
     fraction, files = fraction_or_files(holdout)
     for name in _FILES:
@@ -139,7 +140,7 @@ def _lines(diagnosis: "Diagnosis") -> list[str]:
         if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
             lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
         lines += [_parameter(each) for each in cause.parameters]
-    if diagnosis.verdict == "unexplained":
+    if diagnosis.unexplained_rms_um > 0:
         lines.append(f"  unexplained: {diagnosis.unexplained_rms_um:.3g} um")
     gain = diagnosis.gain
     if math.isfinite(gain.heldout_rms_before_um):

@@ -29,29 +29,34 @@ def run_simulate(*, model: str, program: str, out: str, initial: str, columns: s
     loaded = load_model(model)
     record = read_csv(program, parse_columns(columns), required=("time_s", "voltage_V"))
     prediction = _predict(model, loaded, record, initial)
-    write_csv(
-        out,
-        {
-            "time_s": record.time_s,
-            "voltage_V": record.voltage_V,
-            "displacement_um": prediction.displacement_um,
-            "displacement_sd_um": prediction.displacement_sd_um,
-        },
-    )
+    table = {
+        "time_s": record.time_s,
+        "voltage_V": record.voltage_V,
+        "displacement_um": prediction.displacement_um,
+    }
+    known = bool(np.all(np.isfinite(prediction.displacement_sd_um)))
+    if known:
+        table["displacement_sd_um"] = prediction.displacement_sd_um
+    write_csv(out, table)
     summary = {
         "out": out,
         "samples": len(record),
         "displacement_min_um": float(prediction.displacement_um.min()),
         "displacement_max_um": float(prediction.displacement_um.max()),
-        "displacement_sd_median_um": float(np.median(prediction.displacement_sd_um)),
+        "displacement_sd_median_um": float(np.median(prediction.displacement_sd_um)) if known else None,
         "remarks": list(record.warnings),
     }
     if as_json:
         click.echo(json.dumps(summary, indent=1, allow_nan=False))
         return
+    spread = (
+        f"standard deviation {summary['displacement_sd_median_um']:.3g} um in the median"
+        if known
+        else "of unknown standard deviation, as the model has none"
+    )
     click.echo(
         f"{len(record)} samples, {summary['displacement_min_um']:.6g} to {summary['displacement_max_um']:.6g} um, "
-        f"standard deviation {summary['displacement_sd_median_um']:.3g} um in the median"
+        f"{spread}"
     )
     click.echo("\n".join([f"Note: {remark}" for remark in record.warnings] + [f"prediction  {out}"]))
 

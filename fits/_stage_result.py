@@ -5,12 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fits._errors import DataError
 from fits._metrics import Errors
 from fits._record import Record
 from fits._result import FitStatus, Prediction, RunReport, pool, refuse_outside
-from fits._stage_run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, simulate_stage
+from fits._stage_run import (
+    PATH,
+    StageRun,
+    columns_beside,
+    gain_ahead,
+    place_of_hysteresis,
+    prepare_stage_run,
+    simulate_stage,
+)
 from fits._stage_uncertainty import StageUncertainty
-from microid import Preisach, Stage, innermost
+from microid import AbstractEffect, Preisach, Stage, innermost
 
 
 @dataclass(frozen=True)
@@ -144,11 +153,21 @@ def predict_stage(
     Raises
     ------
     DataError
-        If the voltage leaves the range that the stage was fitted on.
+        If the voltage leaves the range that the stage was fitted on, or the stage has an effect of another column
+        that the program lacks.
     """
     lower, upper = range_of(stage)
     refuse_outside(record, lower, upper)
     program = Record(record.time_s, record.voltage_V, np.zeros(len(record)), record.extra, source=record.source)
+    missing = sorted(
+        {name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs}
+        - {PATH}
+        - set(columns_beside(program))
+    )
+    if missing:
+        raise DataError(
+            f"{record.source}: the model depends on {', '.join(missing)}: add a column of that name that varies"
+        )
     run = prepare_stage_run(program, (lower, upper), initial, 1.0, stage.substeps, gain_ahead(stage), stage.hold)
     # The program is refined already.
     stage = stage.with_substeps(1)

@@ -122,8 +122,8 @@ def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
     if form.fast and not baseline.dynamic:
         return "the runs do not show the dynamics"
     for name in form.needs:
-        if not all(name in columns_beside(run.record) for run in baseline.runs):
-            return f"the runs lack a column {name} that varies"
+        if not all(name in columns_beside(run.record) for run in (*baseline.runs, *baseline.aside)):
+            return f"not all runs, those held out included, have a column {name} that varies"
     try:
         host(form, stage)
     except ValueError as error:

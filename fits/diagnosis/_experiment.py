@@ -14,7 +14,7 @@ from fits.diagnosis._select import Selection, best_of
 from microid import Mechanics
 
 if TYPE_CHECKING:
-    from fits.diagnosis._diagnose import Prepared
+    from fits.diagnosis._prepare import Prepared
 
 # Samples of a program: as many as are played virtually, some twenty times, in a bearable time.
 _MOST = 4096

@@ -36,8 +36,8 @@ class Faults:
         How far off they are, shape `(n,)`.
     quantum_um
         Last digit of the sensor, the largest of all runs; 0 for none.
-    jitter_s, jitter_z
-        Jitter of the instants of sampling, and its evidence.
+    jitter_s, jitter_um, jitter_z
+        Jitter of the instants of sampling, what it makes in the readings, and its evidence.
     band
         The strongest narrow band of all runs.
     remarks
@@ -50,6 +50,7 @@ class Faults:
     heights_um: tuple[np.ndarray, ...]
     quantum_um: float
     jitter_s: float
+    jitter_um: float
     jitter_z: float
     band: Band
     remarks: tuple[str, ...] = ()
@@ -84,7 +85,7 @@ def find_faults(regression: Regression) -> Faults:
     least = quantum / 12**0.5
     noise, found, heights, idle, jitters, bands = [], [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
-    settling_s = float(_SETTLED / np.min(np.abs(poles))) if len(poles) else 0.0
+    settling_s = float(_SETTLED / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
     for run, rows, own, residual in zip(
         baseline.runs, regression.rows, regression.own, regression.residuals, strict=True
     ):
@@ -119,9 +120,9 @@ def find_faults(regression: Regression) -> Faults:
         if not any(idle)
         else "idle stretches where there are any, and the fastest changes of the residual elsewhere"
     )
-    return Faults(
-        tuple(noise), source, tuple(found), tuple(heights), quantum, size if z > _JITTER_Z else 0.0, z, band
-    )
+    size = size if z > _JITTER_Z else 0.0
+    made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate in jitters]) ** 2)))
+    return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,8 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
         found.append(Fault("quantisation", z, (("step_um", step, 1e-6 * step, "um"),), step**2 / 12))
     if faults.jitter_s > 0 and not cyclic:
         sd = faults.jitter_s / (2 * max(faults.jitter_z, 1e-9))
-        found.append(Fault("timestamp_jitter", faults.jitter_z, (("jitter_s", faults.jitter_s, sd, "s"),), 0.0))
+        known = (("jitter_s", faults.jitter_s, sd, "s"),)
+        found.append(Fault("timestamp_jitter", faults.jitter_z, known, faults.jitter_um**2))
     band = faults.band
     if band.z > _BAND_Z and band.size_um**2 > _PART / 3 * total and not band.mains:
         found.append(

@@ -33,6 +33,11 @@ class Noise:
         impulse[0] = 1.0
         return self.innovation_um * float(np.linalg.norm(lfilter([1.0], np.r_[1.0, -self.past], impulse)))
 
+    @property
+    def correlation_samples(self) -> float:
+        """Samples that are worth one independent one."""
+        return float((self.innovation_um / (1 - np.sum(self.past)) / self.total_um) ** 2)
+
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Turn noise into independent numbers of variance one, along the first axis."""
         if len(self.past):

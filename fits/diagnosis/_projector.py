@@ -198,7 +198,7 @@ def learn_roughness(projector: Projector, candidates: Sequence[Sequence[np.ndarr
     count = projector.count - projector.freedom - len(candidates)
 
     def unlikely(logs: np.ndarray) -> float:
-        scale = np.repeat(np.minimum(np.exp(logs), _ROUGHEST), sizes)
+        scale = np.repeat(np.exp(np.minimum(logs, np.log(_ROUGHEST))), sizes)
         inner = np.eye(len(scale)) + scale[:, None] * gram * scale[None, :]
         root = np.linalg.cholesky(inner)
         half = solve_triangular(root, scale * cross, lower=True)

@@ -10,6 +10,8 @@ from fits.diagnosis._result import Diagnosis, EffectParameter, FoundCause, RunVi
 # Below this, probabilities are those of tails that nobody has checked.
 _SMALLEST_P = 1e-9
 _UNITS = {"um": "µm", "degC": "°C"}
+# These are in no model: they are of single samples, or noise.
+_FAULTS = ("outliers", "quantisation", "timestamp_jitter", "floor_vibration")
 # What stands for a number that is not known.
 NONE = "\N{EN DASH}"
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
@@ -166,12 +168,12 @@ def _found(diagnosis: Diagnosis, length: Lengths) -> str:
         )
     sentences = []
     for cause in diagnosis.causes:
+        what = "noise" if cause.name in _FAULTS else "reproducible misfit of the plain stage"
         sentences.append(
-            f"{plain(cause.name).capitalize()} explains {percent(cause.share_of_misfit)} of the reproducible misfit "
-            f"of the plain stage ({sigmas(cause.z)} standard deviations; probability by chance "
-            f"{chance(cause.p_family)})."
+            f"{plain(cause.name).capitalize()} explains {percent(cause.share_of_misfit)} of the {what} "
+            f"({sigmas(cause.z)} standard deviations; probability by chance {chance(cause.p_family)})."
         )
-    if diagnosis.verdict == "unexplained":
+    if diagnosis.unexplained_rms_um > 0:
         left = length(diagnosis.unexplained_rms_um)
         sentences.append(f"A reproducible error of {left}, root mean square, is left without an explanation.")
     return " ".join(sentences)
@@ -187,14 +189,15 @@ def _told_apart(diagnosis: Diagnosis) -> list[str]:
 
 def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
     gain = diagnosis.gain
-    if not diagnosis.causes:
+    modelled = [cause.name for cause in diagnosis.causes if cause.name not in _FAULTS]
+    if not modelled:
         return []
     if not math.isfinite(gain.heldout_rms_before_um) or not math.isfinite(gain.heldout_rms_after_um):
         return ["Nothing was held out, so what this is worth on new data is not known."]
     before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
     change = "falls" if after < before else "does not fall: it goes"
     return [
-        f"With {listed([cause.name for cause in diagnosis.causes])} in the model, the error on data that were not "
+        f"With {listed(modelled)} in the model, the error on data that were not "
         f"used {change} from {length(before)} to {length(after)}, root mean square; the noise "
         f"floor is {length(diagnosis.noise_um)}."
     ]

@@ -94,6 +94,8 @@ class Selection:
         Chance of the largest score.
     bench, projector
         Of the baseline as it is beside the causes.
+    first
+        Projector of the baseline without them.
     """
 
     causes: tuple[Cause, ...]
@@ -104,6 +106,7 @@ class Selection:
     family: Family
     bench: Bench
     projector: Projector
+    first: Projector
 
 
 def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
@@ -129,7 +132,7 @@ def select(
     family = Family(scores, rng)
     causes: list[Cause] = []
     refused: set[str] = set()
-    first_bench, first_regression = bench, projector.regression
+    first_bench, first_projector = bench, projector
     once = {form.name for form in EFFECTS if not form.repeats}
     while len({cause.name for cause in causes}) < _MOST and len(causes) < _LAWS:
         taken = {cause.name for cause in causes}
@@ -163,7 +166,7 @@ def select(
         quieter = _quieter(projector, model) if again else None
         if quieter is not None:
             # The cause was taken for noise, too: all is asked again beside what noise there is.
-            afresh = Projector(first_regression, quieter, projector.roughness)
+            afresh = Projector(first_projector.regression, quieter, projector.roughness)
             return select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)
         z = max(drop, 0.0) ** 0.5
         causes.append(Cause(first.name, z, family.p(z), rivals, drop))
@@ -171,7 +174,7 @@ def select(
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
         family = Family(left, rng)
     causes, model = _backward(bench, projector, causes, model)
-    return Selection(tuple(causes), model, plain, scores, left, family, bench, projector)
+    return Selection(tuple(causes), model, plain, scores, left, family, bench, projector, first_projector)
 
 
 Settled: TypeAlias = tuple[Bench, Projector, Refit]

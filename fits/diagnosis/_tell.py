@@ -8,17 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy import stats
 
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._faults import Fault, Faults
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Law, Refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
+from fits.diagnosis._score import Scored
 from fits.diagnosis._select import Cause, Selection, best_of
 from microid import EFFECTS
 
 if TYPE_CHECKING:
-    from fits.diagnosis._diagnose import Prepared
+    from fits.diagnosis._prepare import Prepared
 
 _TWO_SIDED = 1.96
 # A class of effects that cannot be told apart names at most so many others.
@@ -45,9 +47,9 @@ def causes_of(
         form = law.form
         changed = [[law.effect(x, run)] for run in range(runs)]
         alone = [a - b for a, b in zip(bench.respond(changed), bench.plain, strict=True)]
-        left = projector.off(projector.join(alone))
-        noise_um = float(np.mean([n.innovation_um for n in projector.noise]))
-        rms = float(np.linalg.norm(left) / projector.count**0.5) * noise_um
+        joined = projector.join(alone)
+        seen = float(np.linalg.norm(projector.off(joined)) / max(float(np.linalg.norm(joined)), 1e-300))
+        rms = seen * _rms(alone, projector)
         told[cause.name] = count = told.get(cause.name, 0) + 1
         if count > 1:
             again = next(k for k, one in enumerate(found) if one.name == cause.name)
@@ -81,8 +83,8 @@ def causes_of(
                 fault.name,
                 form.form,
                 (),
-                fault.z,
-                0.0,
+                float(fault.z),
+                float(2 * stats.norm.sf(fault.z)),
                 parameters,
                 float(min(1.0, fault.variance_um2 / max(total, fault.variance_um2, 1e-300))),
                 fault.variance_um2**0.5,
@@ -91,7 +93,13 @@ def causes_of(
                 form.source,
             )
         )
-    return tuple(sorted(found, key=lambda cause: -cause.z))
+    return tuple(sorted(found, key=lambda cause: -cause.rms_um))
+
+
+def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:
+    """Root mean square of a signal over the samples that count, in um."""
+    square = sum(float(np.sum(s[mask] ** 2)) for s, mask in zip(signal_um, projector.masks, strict=True))
+    return (square / projector.count) ** 0.5
 
 
 def _joined(
@@ -144,11 +152,10 @@ def _vector(law: Law, x: Float[Array, " k"], run: int) -> Float[Array, " c"]:
     return full.at[np.flatnonzero(law.each)].set(x[shared + run * own : shared + (run + 1) * own])
 
 
-def bounds(found: Selection, ready: "Prepared", named: Collection[str]) -> tuple[Bound, ...]:
-    """How large each effect that was not named may still be."""
+def bounds(found: Selection, ready: "Prepared", left: Sequence[Scored], named: Collection[str]) -> tuple[Bound, ...]:
+    """How large each effect that was not named may still be, by the scores that are left."""
     out = []
-    noise = float(np.mean([n.innovation_um for n in ready.projector.noise]))
-    for name, one in best_of(found.left).items():
+    for name, one in best_of(left).items():
         if name in named:
             continue
         size = float(np.linalg.norm(one.columns))
@@ -156,9 +163,9 @@ def bounds(found: Selection, ready: "Prepared", named: Collection[str]) -> tuple
             reason = "the plain stage follows all of it in these runs, so that they cannot show it"
             out.append(Bound(name, 0.0, 1.0, float("nan"), reason))
             continue
-        raw = size / max(one.share_left, 1e-12)
         # The largest multiple that would not have been noticed, by the size that it has in the displacement.
-        bound = (one.z + _TWO_SIDED) / max(size, 1e-300) * raw / ready.projector.count**0.5 * noise
+        raw = float(np.linalg.norm([_rms(column, found.first) for column in one.probe.signatures]))
+        bound = (one.z + _TWO_SIDED) / size * raw
         out.append(Bound(name, one.z, 1.0 - one.share_left, bound))
     asked = {bound.name for bound in out} | set(named)
     for name, reason in dict(ready.skipped).items():

@@ -56,8 +56,7 @@ class Aging(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Scale the displacement by what the command has gone through since the first sample."""
-        command = start.command.values
-        path = jnp.concatenate([jnp.zeros_like(command[:1]), jnp.cumsum(jnp.abs(jnp.diff(command)))])
+        path = _path_V(start.command.values)
         return _scaled(signal, self.gain_per_decade * jnp.log1p(path / self.cycle_V), self.zero_um)
 
 
@@ -97,8 +96,16 @@ class AgingOverRecords(AbstractEffect):
         return tuple((cls(jnp.asarray(1e-3), jnp.asarray(share * cycle)),) for share in (0.3, 1.0, 3.0))
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
-        """Scale the displacement by what the command has gone through in all records so far."""
-        return _scaled(signal, self.gain_per_decade * jnp.log1p(start.columns["path_V"] / self.cycle_V), self.zero_um)
+        """Scale the displacement by what the command has gone through in all records so far.
+
+        Without a column `path_V` that is the path since the first sample.
+        """
+        path = start.columns.get("path_V", _path_V(start.command.values))
+        return _scaled(signal, self.gain_per_decade * jnp.log1p(path / self.cycle_V), self.zero_um)
+
+
+def _path_V(command_V: Float[Array, " t"]) -> Float[Array, " t"]:
+    return jnp.concatenate([jnp.zeros_like(command_V[:1]), jnp.cumsum(jnp.abs(jnp.diff(command_V)))])
 
 
 def _scaled(signal: Signal, more: Float[Array, " t"], zero_um: Float[Array, ""]) -> Signal:

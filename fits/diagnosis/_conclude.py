@@ -1,0 +1,233 @@
+"""From what the selection found to a diagnosis: verdict, extension, gain and what else is to be said."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from fits._record import Record
+from fits.diagnosis._candidates import Bench
+from fits.diagnosis._evaluate import simulate
+from fits.diagnosis._experiment import suggest
+from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_of, left_of, shared_effects
+from fits.diagnosis._faults import Faults, find_faults, name_faults
+from fits.diagnosis._prepare import Prepared
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import Refit
+from fits.diagnosis._regression import Regression, regress
+from fits.diagnosis._result import Diagnosis, RunView, Test
+from fits.diagnosis._select import Selection
+from fits.diagnosis._structure import cycles, look, together, views
+from fits.diagnosis._tell import bounds, causes_of
+from microid import AbstractEffect, Stage
+
+# Causes explain at least this part of what is reproducible, or the true ones are not in the library.
+_SHARE = 0.65
+# What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
+_REST, _CHANCE = 0.3, 1e-6
+# What was kept aside must not be predicted so many times worse, in squares.
+_WORSE = 1.1
+# A way of looking has seen something below this probability by chance.
+_SEEN = 1e-3
+# Evidence for a period in the position, in e-folds of chance, and the part of what is left that it explains.
+_CYCLIC, _PART = 50.0, 0.3
+
+
+def conclude(
+    ready: Prepared,
+    found: Selection,
+    records: Sequence[Record],
+    false_alarm: float,
+    initial: str,
+    fraction: float,
+    progress: Callable[[str], None],
+    duration_s: float | None,
+) -> Diagnosis:
+    # With the noise that was found in the end.
+    ready = replace(ready, projector=found.first)
+    projector, bench, baseline = ready.projector, ready.bench, ready.baseline
+    ways = views(baseline.runs, bench.plain)
+    none = np.zeros((len(found.plain.residual), 0))
+    seen = look(projector, none, found.plain.residual, ways)
+    # What the causes explain and what is left to be seen in any way is what there is to be explained.
+    explained = found.plain.cost - found.model.cost
+    rest, rest_freedom = together(found.projector, found.model.basis(), found.model.residual, ways)
+    period_um, cycle_z, cycle_drop = cycles(found.projector, found.model.residual, bench.plain)
+    rest = max(rest, cycle_drop)
+    misfit = max(explained + max(rest - rest_freedom, 0.0), explained, 1e-300)
+    rest_share = (max(rest - rest_freedom, 0.0) / projector.count) ** 0.5
+    noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in found.projector.noise])))
+    chance = stats.chi2.sf(rest, rest_freedom)
+    left_over = rest_share > _REST and chance < _CHANCE
+    share = explained / misfit
+    progress("extending the stage")
+    extended, compared, effects = _extended(ready, found, found.model if found.causes else None)
+    model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
+    checked = _worse(compared[: len(baseline.runs)])
+    if kept and (share < _SHARE or checked > _WORSE):
+        suspects = ", ".join(cause.name for cause in kept)
+        why = f"explains only {share:.0%} of what is left" if share < _SHARE else "predicts what was kept aside worse"
+        remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
+        model, kept = found.plain, ()
+        rest_share = ((explained + max(rest - rest_freedom, 0.0)) / projector.count) ** 0.5
+        left_over = rest_share > _REST
+        extended, compared, effects = _extended(ready, found, None)
+    cyclic = cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)
+    if cyclic:
+        remarks.append(
+            f"what is left repeats itself every {period_um:.3g} um of the position, as the error of an "
+            "interferometer or an encoder does"
+        )
+    faults = name_faults(_beside(ready, found, model) if kept else ready.faults, cyclic)
+    causes = causes_of(kept, model, found.projector, found.bench, misfit, faults, ready.faults)
+    ahead = suggest(ready, found, causes, duration_s, progress)
+    if ahead is None and any(cause.also_consistent for cause in causes):
+        remarks.append(
+            "no program of this length within the limits of these runs tells the class apart; allow a longer"
+        )
+    # Faults of samples and noise explain nothing that is reproducible.
+    verdict = "unexplained" if left_over and not kept else "effect_found" if causes else "no_effect"
+    if baseline.aside:
+        # What was kept aside of the fitted runs has been looked at.
+        compared = [
+            one if k >= len(baseline.runs) else replace(one, held_out=one.held_out & False)
+            for k, one in enumerate(compared)
+        ]
+    source = "the last part of each run" if not baseline.aside else "whole runs"
+    gain = gain_of(compared, noise_um, source)
+    if effects:
+        # What only the readings have is not to be compensated.
+        moving = [effect for effect in effects if effect.place not in ("time", "sensor", "noise")]
+        if moving:
+            before, after = feedforward(found.bench, moving)
+            gain = replace(gain, feedforward_before_um=before, feedforward_after_um=after)
+        silent = sorted({effect.name for effect in effects if effect.per_run and len(baseline.runs) > 1})
+        if silent:
+            remarks.append(
+                f"{', '.join(silent)}: of what differs from run to run the extended stage has only what all have in "
+                "common, so that it may explain these runs and not the next"
+            )
+    names = {cause.name for cause in causes} | {rival.name for cause in kept for rival in cause.rivals}
+    tests = tuple(
+        Test(
+            one.view.name,
+            one.z,
+            one.p,
+            max(one.drop - one.freedom, 0.0) / max(found.plain.cost, 1e-300),
+            one.view.sentence if one.p < _SEEN else f"no sign of this: {one.view.sentence}",
+        )
+        for one in seen
+    )
+    substeps = max(run.samples.stride for run in baseline.fine)
+    return Diagnosis(
+        verdict=verdict,  # type: ignore[arg-type]
+        noise_um=noise_um,
+        noise_source=ready.faults.source,
+        noise_samples=float(np.mean([noise.correlation_samples for noise in found.projector.noise])),
+        causes=causes,
+        unexplained_rms_um=rest_share * noise_um if left_over else 0.0,
+        upper_bounds=bounds(found, ready, found.left if kept else found.scores, names),
+        tests=tests,
+        gain=gain,
+        next_experiment=ahead,
+        remarks=tuple(remarks),
+        baseline=baseline.stage.with_substeps(substeps),
+        extended=extended,
+        runs=tuple(
+            RunView(
+                one.run.record.source,
+                np.asarray(one.run.record.time_s),
+                np.asarray(one.run.record.voltage_V),
+                one.run.displacement_um,
+                one.before_um,
+                one.after_um,
+                one.run.fitted & ~one.held_out,
+            )
+            for one in compared
+        ),
+        false_alarm=false_alarm,
+        details={
+            "selection": found,
+            "ready": ready,
+            "cycles": (period_um, cycle_z),
+            "rest": rest_share,
+            "share": share,
+        },
+    )
+
+
+def _beside(ready: Prepared, found: Selection, model: Refit) -> Faults:
+    """Faults of samples and noise, as they are beside the causes."""
+    regression = found.projector.regression
+    left = tuple(r - change for r, change in zip(regression.residuals, model.change_um, strict=True))
+    now = find_faults(replace(regression, residuals=left))
+    return replace(now, spikes=ready.faults.spikes, heights_um=ready.faults.heights_um)
+
+
+def _worse(compared: Sequence[Compared]) -> float:
+    """Mean square error of the extended stage over the plain one's, in what was kept aside of the fitted runs."""
+    held = [one for one in compared if one.held_out.any()]
+    if not held:
+        return 0.0
+    before, after = (
+        np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)])
+        for pick in ([one.before_um for one in held], [one.after_um for one in held])
+    )
+    return float(np.mean(after**2) / np.mean(before**2))
+
+
+def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
+    """What the user should know of the records and the fit."""
+    baseline = ready.baseline
+    said = [warning for record in records for warning in record.warnings]
+    said += [*baseline.remarks, *ready.faults.remarks]
+    for run in baseline.runs:
+        lost = int(np.sum(~run.known))
+        if lost:
+            said.append(
+                f"{run.record.source}: the first {lost} samples depend on what the rig went through before and were "
+                "not used, so that an unknown initial state is not taken for an effect; state it with --initial to "
+                "have it tested"
+            )
+    if not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
+        said.append("nothing was held out, so the gain is not measured: hold out a part, or a run with --holdout")
+    return tuple(dict.fromkeys(said))
+
+
+def _extended(
+    ready: Prepared, found: Selection, model: Refit | None
+) -> tuple[Stage, list[Compared], list[AbstractEffect]]:
+    """Let the plain stage follow what the effects leave, and fit the effects again beside it."""
+    baseline = ready.baseline
+    substeps = max(run.samples.stride for run in baseline.fine)
+    runs = len(baseline.runs)
+    if model is None or not model.laws:
+        return baseline.stage.with_substeps(substeps), _compare(ready, ready.bench, None, ready.regression), []
+    # What followed along the tangent is put into the stage itself.
+    bare = Projector(found.projector.regression, found.projector.noise)
+    regression = regress(bare.move(bare.residual - bare.join(model.change_um)), ())
+    bench = Bench(regression.baseline)
+    effects = shared_effects(model, runs)
+    return extended_stage(regression.baseline, effects, substeps), _compare(ready, bench, model, regression), effects
+
+
+def _compare(ready: Prepared, bench: Bench, model: Refit | None, regression: Regression) -> list[Compared]:
+    """Residuals of the plain stage and of the extended one in all runs, those held out whole last."""
+    runs = len(bench.prepared)
+    change = [np.zeros_like(plain) for plain in bench.plain] if model is None else model.change_um
+    found = []
+    for k, run in enumerate(ready.baseline.runs):
+        plain = run.displacement_um - ready.regression.residuals[k]
+        better = run.displacement_um - regression.residuals[k] + change[k]
+        own, using = ready.regression.own[k], run.fitted
+        found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), run.held_out))
+    if ready.baseline.aside:
+        shared = shared_effects(model, runs) if model is not None else []
+        behind = Bench(bench.baseline, aside=True)
+        for run, change_um in zip(ready.baseline.fine_aside, behind.change(shared), strict=True):
+            plain = simulate(ready.baseline.stage, run)
+            better = simulate(bench.baseline.stage, run) + change_um
+            own, using = np.ones((len(run.record), 1)), run.known
+            found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), using))
+    return found
