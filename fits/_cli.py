@@ -319,7 +319,9 @@ def budget(**options: Any) -> None:
 @click.option(
     "--false-alarm", type=float, default=0.01, show_default=True, help="Chance of a cause where there is none."
 )
-@click.option("--duration", type=float, metavar="SECONDS", help="Of the next experiment; as the runs by default.")
+@click.option(
+    "--duration", type=float, metavar="SECONDS", help="Of the next experiment at most; as the runs by default."
+)
 @click.option(
     "--initial",
     type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
@@ -335,6 +337,8 @@ def diagnose(**options: Any) -> None:
     """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.
 
     Writes report.html, diagnosis.json, the plain and the extended stage, and the voltages of the next experiment.
+    Name the runs in the order in which they were taken. A column that begins with temp, and one of a second axis in
+    um, nm, mm or m, are used. The end of every run is kept aside to check what is found.
     """
     from fits._cli_diagnose import run_diagnose
 

@@ -27,7 +27,10 @@ def shared_effects(model: Refit, runs: int) -> list[AbstractEffect]:
     found = []
     for law, x in zip(model.laws, model.x, strict=True):
         each = [law.effect(x, run) for run in range(runs)]
-        if law.each.any():
+        if hasattr(each[0], "after_s"):
+            # What happened at one instant does not happen again.
+            found.append(replace(each[0], **{name: 0 * getattr(each[0], name) for name in law.form.strength}))
+        elif law.each.any():
             found.append(replace(each[0], **{name: _common(each, name) for name in law.form.strength}))
         else:
             found.append(each[0])

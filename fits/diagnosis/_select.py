@@ -156,8 +156,8 @@ def select(
             refused |= {one.name for one in open_ if one.z > _WORTH * top}
             continue
         first, settled = _leader(bench, projector, probes, model, fitted, best_of(open_))
-        rivals = _rivals(first, fitted, projector.count)
         drop = model.cost - first.refit.cost
+        rivals = _rivals(first, fitted, max(drop, 0.0))
         if not settled[-1].determined() or model.cost - settled[-1].cost < _REAL * drop:
             # Its strength is anybody's guess, or what it explains is out of reach where all is fitted together.
             refused.add(first.name)
@@ -231,13 +231,14 @@ def _settled(bench: Bench, projector: Projector, model: Refit) -> Settled:
     return settled
 
 
-def _rivals(first: Rival, fitted: Sequence[Rival], count: int) -> tuple[Rival, ...]:
-    """Effects that explain the same about as well as the cause."""
+def _rivals(first: Rival, fitted: Sequence[Rival], drop: float) -> tuple[Rival, ...]:
+    """Effects that explain the same about as well as the cause, which takes so much off the sum of squares."""
     found = []
     for other in fitted:
-        # What the cause explains beyond the other.
+        # What the cause explains beyond the other: no more than models of effects are off by.
         apart = max(other.refit.cost - first.refit.cost, 0.0) ** 0.5
-        if other is not first and (other.criterion - first.criterion < _SAME or apart < _APART):
+        most = max(_APART, _INEXACT * drop**0.5)
+        if other is not first and (other.criterion - first.criterion < _SAME or apart < most):
             found.append(replace(other, apart=apart))
     return tuple(found)
 
