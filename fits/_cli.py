@@ -319,9 +319,7 @@ def budget(**options: Any) -> None:
 @click.option(
     "--false-alarm", type=float, default=0.01, show_default=True, help="Chance of a cause where there is none."
 )
-@click.option(
-    "--duration", type=float, metavar="SECONDS", help="Of the next experiment at most; as the runs by default."
-)
+@click.option("--duration", type=float, metavar="SECONDS", help="Of the next experiment, at most.")
 @click.option(
     "--initial",
     type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
