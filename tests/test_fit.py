@@ -175,6 +175,6 @@ def test_a_solver_that_runs_out_of_steps_gives_no_answer(bench, monkeypatch):
 def test_remarks_name_what_the_record_cannot_teach():
     t = np.arange(2000) * 0.01
     voltage = 60 - 60 * np.cos(2 * np.pi * t / 5)
-    record = fits.Record(t, voltage, 0.3 * voltage + 2 * np.sin(2 * np.pi * t / 5 - 0.1), source="major.csv")
+    record = fits.Record(t, voltage, 0.3 * voltage - 2 * np.sin(2 * np.pi * t / 5 + 0.1), source="major.csv")
     found = fits.fit([record], levels=LEVELS, holdout=0.0)
     assert any("no loop smaller than the full range" in remark for remark in found.remarks)
