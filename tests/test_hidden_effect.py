@@ -86,8 +86,10 @@ def test_the_extended_model_simulates_new_runs_better(case):
         squares[which] = 0.0
         for csv in case.aside:
             out = case.folder / f"{which}_{csv.name}"
-            done = run("simulate", model, csv, "--out", out)
+            done = run("simulate", model, csv, "--out", out, "--json")
             assert done.exit_code == 0, f"{case.seed}: {done.output}"
+            # A diagnosis gives its models no uncertainty, and none is made up.
+            assert json.loads(done.stdout)["displacement_sd_median_um"] is None
             measured = np.genfromtxt(csv, delimiter=",", names=True)
             off_um = measured["displacement_um"] - np.genfromtxt(out, delimiter=",", names=True)["displacement_um"]
             squares[which] += np.sum((off_um - off_um.mean()) ** 2)

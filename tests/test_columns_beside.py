@@ -1,0 +1,49 @@
+"""Further columns of a record: which are the temperature and the second axis, and what a stage does without them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fits
+from fits._stage_run import columns_beside
+from microid import Dahl, Driver, Mechanics, Sensor, Stage
+from microid.effects import EFFECTS, extend
+
+
+def record(rng, **extra):
+    time = np.arange(400) / 100
+    voltage = 50 - 50 * np.cos(time)
+    return fits.Record(time, voltage, 0.3 * voltage + 0.01 * rng.standard_normal(400), extra, source="run.csv")
+
+
+def test_columns_are_known_by_their_names_and_other_readings_are_not_taken(rng):
+    warm, other = 20 + np.linspace(0, 1, 400) ** 2, np.sin(np.arange(400) / 7)
+    own = record(rng)
+    taken = columns_beside(record(rng, temperature_C=warm, y_um=other))
+    np.testing.assert_array_equal(taken["temperature_degC"], warm)
+    np.testing.assert_array_equal(taken["other_um"], other)
+    others = {
+        "raw_nm": 1e3 * own.displacement_um,
+        "monitor_V": own.voltage_V + 0.1,
+        "attempt": warm,
+        "gain_c": other,
+        "path_m": 2 * own.time_s,
+        "still_um": np.full(400, 3.0),
+    }
+    assert columns_beside(record(rng, **others)) == {}
+
+
+def test_a_stage_with_an_effect_of_a_column_asks_for_it(rng):
+    coupling = next(one for one in EFFECTS if (one.name, one.form) == ("cross_coupling", ""))
+    plain = Stage.of(
+        driver=Driver(8e-4), hysteresis=Dahl(0.2, 1.0, 8.0, 1.0), mechanics=Mechanics(100.0, 0.05), sensor=Sensor()
+    )
+    stage = extend(plain, coupling(jnp.asarray(0.01)))
+    given = record(rng, y_um=np.sin(np.arange(400) / 7))
+    moved = (
+        fits.predict_stage(stage, None, given).displacement_um
+        - fits.predict_stage(plain, None, given).displacement_um
+    )
+    assert np.ptp(moved) > 1e-3
+    with pytest.raises(fits.DataError, match="other_um"):
+        fits.predict_stage(stage, None, record(rng))
