@@ -237,7 +237,7 @@ def _rivals(first: Rival, fitted: Sequence[Rival], drop: float) -> tuple[Rival, 
     for other in fitted:
         # What the cause explains beyond the other: no more than models of effects are off by.
         apart = max(other.refit.cost - first.refit.cost, 0.0) ** 0.5
-        most = max(_APART, _INEXACT * drop**0.5)
+        most = max(_APART, 2 * _INEXACT * drop**0.5)
         if other is not first and (other.criterion - first.criterion < _SAME or apart < most):
             found.append(replace(other, apart=apart))
     return tuple(found)
