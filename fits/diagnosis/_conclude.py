@@ -41,11 +41,14 @@ def conclude(
     found: Selection,
     records: Sequence[Record],
     false_alarm: float,
-    initial: str,
-    fraction: float,
     progress: Callable[[str], None],
     duration_s: float | None,
 ) -> Diagnosis:
+    """Decide on the verdict, extend the stage, measure the gain, and say what else is to be said.
+
+    `records` are those whose warnings are passed on, `false_alarm` is what was asked for, and `duration_s` is the
+    length of the next experiment in s; see `diagnose`.
+    """
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
     projector, bench, baseline = ready.projector, ready.bench, ready.baseline
@@ -163,9 +166,7 @@ def conclude(
 
 def _beside(ready: Prepared, found: Selection, model: Refit) -> Faults:
     """Faults of samples and noise, as they are beside the causes."""
-    regression = found.projector.regression
-    left = tuple(r - change for r, change in zip(regression.residuals, model.change_um, strict=True))
-    now = find_faults(replace(regression, residuals=left))
+    now = find_faults(found.projector.regression, model.change_um)
     return replace(now, spikes=ready.faults.spikes, heights_um=ready.faults.heights_um)
 
 

@@ -78,4 +78,4 @@ def diagnose(
     ready = prepare_diagnosis(records, aside, fraction, initial, progress)
     progress("asking for every effect")
     found = select(ready.bench, ready.projector, ready.probes, false_alarm, rng, progress)
-    return conclude(ready, found, [*records, *aside], false_alarm, initial, fraction, progress, duration_s)
+    return conclude(ready, found, [*records, *aside], false_alarm, progress, duration_s)

@@ -71,8 +71,14 @@ class Faults:
         return out
 
 
-def find_faults(regression: Regression) -> Faults:
-    """Look at what a fitted plain stage leaves of each run, sample by sample."""
+def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None = None) -> Faults:
+    """Look at what a fitted plain stage leaves of each run, sample by sample.
+
+    Where effects are known, `change_um` is what they change in each run, shape `(n,)`, and is taken off before.
+    """
+    if change_um is not None:
+        left = tuple(r - change for r, change in zip(regression.residuals, change_um, strict=True))
+        regression = replace(regression, residuals=left)
     baseline = regression.baseline
     guess = [
         Noise(max(rough_noise_um(r[m]), 1e-9 * baseline.stroke_um), np.zeros(0))

@@ -263,9 +263,7 @@ def settle(
 
 def _quieter(projector: Projector, model: Refit) -> tuple[Noise, ...] | None:
     """The noise of the runs beside the causes, where there is less of it than was thought."""
-    regression = projector.regression
-    left = tuple(r - change for r, change in zip(regression.residuals, model.change_um, strict=True))
-    found = find_faults(replace(regression, residuals=left)).noise
+    found = find_faults(projector.regression, model.change_um).noise
     less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
     return tuple(found) if any(less) else None
 
