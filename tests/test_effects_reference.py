@@ -129,13 +129,33 @@ def test_second_resonance_and_load_change_against_lsim(rng):
     np.testing.assert_allclose(loaded, 1.5 * lagged(time, push, 100, 0.025), atol=1e-8)
 
 
+def test_a_load_put_on_in_motion_goes_on_from_there(rng):
+    time, push = 1e-4 * np.arange(600), 10 + rng.normal(size=600).cumsum() * 0.1
+    at = 250
+
+    def under(mass):
+        # The same spring and damper, at 120 Hz and 0.03 with a mass of 1.
+        rate = 2 * np.pi * 120
+        return lambda y, u: [y[1], (rate**2 * (u - y[0]) - 2 * 0.03 * rate * y[1]) / mass]
+
+    before = motion(time[: at + 1], push[: at + 1], under(1.0), np.array([push[0], 0.0]))
+    after = motion(time[at:], push[at:], under(1.3), before[-1])
+    truth = np.concatenate([before[:, 0], after[1:, 0]])
+    mechanics = m.Mechanics(120.0, 0.03)
+    found, plain = (
+        through(part, 1e-4, push) for part in (BY_NAME["load_change", "within"](mechanics, 0.3, time[at]), mechanics)
+    )
+    np.testing.assert_array_equal(found[:at], plain[:at])
+    np.testing.assert_allclose(found, truth, atol=0.01 * np.max(np.abs(truth - plain)))
+
+
 def test_backlash_drags_along(rng):
-    path, gap = wander(rng, 400, 0, 20), rng.uniform(0.1, 2)
-    place, truth = path[0], []
+    path, gap, start = wander(rng, 400, 0, 20), rng.uniform(0.1, 2), rng.uniform(-1, 1)
+    place, truth = path[0] + start * gap, []
     for value in path:
         place = min(max(place, value - gap), value + gap)
         truth.append(place)
-    np.testing.assert_allclose(through(BY_NAME["backlash", ""](gap), 1e-3, path), truth, atol=1e-12)
+    np.testing.assert_allclose(through(BY_NAME["backlash", ""](gap, start), 1e-3, path), truth, atol=1e-12)
 
 
 def dahl(path, state=0.0, slope=0.2, amplitude=1.0, length=8.0):
@@ -283,10 +303,10 @@ def test_gains_that_follow_the_command(rng):
 
 def test_rails_cut_off_what_is_beyond(rng):
     path = wander(rng, 500, 0, 100)
-    upper = through(BY_NAME["driver_saturation", ""](80.0, 0.01), 1e-3, path)
-    lower = through(BY_NAME["driver_saturation", "lower"](20.0, 0.01), 1e-3, path)
-    np.testing.assert_allclose(upper, np.minimum(path, 80), atol=0.01)
-    np.testing.assert_allclose(lower, np.maximum(path, 20), atol=0.01)
+    upper = through(BY_NAME["driver_saturation", ""](80.0), 1e-3, path)
+    lower = through(BY_NAME["driver_saturation", "lower"](20.0), 1e-3, path)
+    np.testing.assert_allclose(upper, np.minimum(path, 80), atol=1e-12)
+    np.testing.assert_allclose(lower, np.maximum(path, 20), atol=1e-12)
 
 
 def test_hum_has_its_lines(rng):

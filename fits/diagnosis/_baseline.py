@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 from fits._design import columns_of
 from fits._errors import DataError
 from fits._fit import choose_grid
-from fits._fit_stage import solve_stage
+from fits._fit_stage import default_stage, solve_stage
 from fits._prior import roughness
 from fits._record import Record
 from fits._result import FitError
@@ -20,7 +21,7 @@ from fits._stage_run import PATH, StageRun, prepare_stage_run
 from fits._stage_solve import prior_precision
 from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._noise import rough_noise_um
-from microid import Preisach, Stage
+from microid import Hold, Preisach, Stage
 
 # What a finer grid would follow has a prior of its own in the projection.
 _FINEST = 32
@@ -64,6 +65,8 @@ class Baseline:
         Whole runs that are held out.
     coarse, coarse_aside
         The same with few steps between the samples: what effects change is seen well enough there.
+    finest, finest_aside
+        The same with many steps, for effects that need them.
     fine, fine_aside
         The same with so many steps that the plain stage's own simulation is exact within the noise.
     dynamic
@@ -82,6 +85,8 @@ class Baseline:
     aside: tuple[StageRun, ...]
     coarse: tuple[StageRun, ...]
     coarse_aside: tuple[StageRun, ...]
+    finest: tuple[StageRun, ...]
+    finest_aside: tuple[StageRun, ...]
     fine: tuple[StageRun, ...]
     fine_aside: tuple[StageRun, ...]
     dynamic: bool
@@ -103,8 +108,11 @@ def fit_baseline(
     holdout: float,
     initial: str,
     progress: Callable[[str], None],
+    hold: Hold = "first",
 ) -> Baseline:
     """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
+
+    The command runs in lines between samples, or with a `hold` of "zero" stays what it is until the next.
 
     Raises
     ------
@@ -116,17 +124,21 @@ def fit_baseline(
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     remarks: tuple[str, ...] = ()
     try:
-        found = solve_stage(records, None, None, holdout, initial, "squares", progress, _FINEST, anyway=True)
+        stage = default_stage(hold) if hold != "first" else None
+        found = solve_stage(records, stage, None, holdout, initial, "squares", progress, _FINEST, anyway=True)
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
         return _static(records, aside, range_V, holdout, initial, remarks, progress)
     prior = prior_precision(found.chain, found.solved.hyper, found.stroke_um)
     stride = found.solved.runs[0].samples.stride
-    runs, held = (
-        _prepared(records, range_V, initial, holdout, stride),
-        _prepared(aside, range_V, initial, 0.0, stride),
-    )
-    plain = found.stage
+
+    def prepared(many: int) -> tuple[tuple[StageRun, ...], tuple[StageRun, ...]]:
+        return (
+            _prepared(records, range_V, initial, holdout, many, hold),
+            _prepared(aside, range_V, initial, 0.0, many, hold),
+        )
+
+    (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, _FINE))
     return Baseline(
         found.chain,
         found.solved.z,
@@ -136,10 +148,11 @@ def fit_baseline(
         range_V,
         runs,
         held,
-        _prepared(records, range_V, initial, holdout, min(stride, _COARSE)),
-        _prepared(aside, range_V, initial, 0.0, min(stride, _COARSE)),
-        tuple(_finely(plain, run, range_V, initial, holdout) for run in runs),
-        tuple(_finely(plain, run, range_V, initial, 0.0) for run in held),
+        *prepared(min(stride, _COARSE)),
+        finest,
+        finest_held,
+        tuple(map(partial(_finely, found.stage), runs, finest)),
+        tuple(map(partial(_finely, found.stage), held, finest_held)),
         True,
         found.remarks,
     )
@@ -158,16 +171,20 @@ def _with_paths(records: Sequence[Record], aside: Sequence[Record]) -> tuple[Seq
 
 
 def _prepared(
-    records: Sequence[Record], range_V: tuple[float, float], initial: str, holdout: float, stride: int
+    records: Sequence[Record],
+    range_V: tuple[float, float],
+    initial: str,
+    holdout: float,
+    stride: int,
+    hold: Hold = "first",
 ) -> tuple[StageRun, ...]:
-    return tuple(prepare_stage_run(record, range_V, initial, holdout, stride) for record in records)
+    return tuple(prepare_stage_run(record, range_V, initial, holdout, stride, hold=hold) for record in records)
 
 
-def _finely(stage: Stage, run: StageRun, range_V: tuple[float, float], initial: str, holdout: float) -> StageRun:
+def _finely(stage: Stage, run: StageRun, finer: StageRun) -> StageRun:
     """Divide intervals into many steps where a simulation with those of the fit is off by more than chance."""
-    if run.samples.stride >= _FINE:
+    if run.samples.stride >= finer.samples.stride:
         return run
-    finer = prepare_stage_run(run.record, range_V, initial, holdout, _FINE)
     better = simulate(stage, finer)
     noise_um = max(rough_noise_um(run.displacement_um - better), 1e-9 * float(np.ptp(run.displacement_um)))
     off = float(np.linalg.norm((better - simulate(stage, run))[run.fitted]))
@@ -198,12 +215,7 @@ def _static(
         prior,
         stroke,
         range_V,
-        ready,
-        held,
-        ready,
-        held,
-        ready,
-        held,
+        *(ready, held) * 4,
         False,
         remarks,
     )

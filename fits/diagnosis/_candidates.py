@@ -23,16 +23,19 @@ class Bench:
     ----------
     baseline
         The plain stage.
-    effects
-        What is in the stage already: per run, effects by their class.
+    aside
+        Whether the runs are those that are held out whole.
+    finest
+        Whether intervals are divided into many steps, rather than few.
     """
 
-    def __init__(self, baseline: Baseline, aside: bool = False):
+    def __init__(self, baseline: Baseline, aside: bool = False, finest: bool = False):
         self.baseline = baseline
         stage = baseline.stage.with_substeps(1)
         # What a fit may move is looked up anew for every stage that is built.
         self.stage = stage.thaw(*stage.frozen)
-        runs = baseline.coarse_aside if aside else baseline.coarse
+        few, many = (baseline.coarse_aside, baseline.finest_aside) if aside else (baseline.coarse, baseline.finest)
+        runs = many if finest else few
         mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
         self.resonance_Hz = float(mechanics[0].natural_frequency_Hz) if mechanics else 0.0
         self.prepared = [prepare(self.stage, run) for run in runs]
@@ -121,9 +124,13 @@ def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
     stage: Stage = baseline.stage
     if form.fast and not baseline.dynamic:
         return "the runs do not show the dynamics"
+    beside = [columns_beside(run.record) for run in (*baseline.runs, *baseline.aside)]
     for name in form.needs:
-        if not all(name in columns_beside(run.record) for run in (*baseline.runs, *baseline.aside)):
+        if not all(name in columns for columns in beside):
             return f"not all runs, those held out included, have a column {name} that varies"
+    for name in form.unless:
+        if all(name in columns for columns in beside):
+            return f"the column {name} says what it would be, and that is asked about instead"
     try:
         host(form, stage)
     except ValueError as error:

@@ -12,13 +12,14 @@ from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._experiment import suggest
 from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_of, left_of, shared_effects
 from fits.diagnosis._faults import Faults, find_faults, name_faults
+from fits.diagnosis._irregular import irregular
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Diagnosis, RunView, Test
 from fits.diagnosis._select import Selection
-from fits.diagnosis._structure import cycles, look, together, views
+from fits.diagnosis._structure import cycles, further_views, look, together, views
 from fits.diagnosis._tell import bounds, causes_of
 from microid import AbstractEffect, Stage
 
@@ -54,7 +55,7 @@ def conclude(
     projector, bench, baseline = ready.projector, ready.bench, ready.baseline
     ways = views(baseline.runs, bench.plain)
     none = np.zeros((len(found.plain.residual), 0))
-    seen = look(projector, none, found.plain.residual, ways)
+    seen = look(projector, none, found.plain.residual, [*ways, *further_views(baseline.runs)])
     # What the causes explain and what is left to be seen in any way is what there is to be explained.
     explained = found.plain.cost - found.model.cost
     rest, rest_freedom = together(found.projector, found.model.basis(), found.model.residual, ways)
@@ -93,6 +94,12 @@ def conclude(
         )
     # Faults of samples and noise explain nothing that is reproducible, but a narrow band may look as if it were.
     explained_all = any(one.name == "floor_vibration" and one.share_of_misfit > _BAND for one in causes)
+    unlike, bursts = irregular(projector, found.plain.residual)
+    if bursts and not kept:
+        remarks.append("what is left comes in bursts that no effect of the library makes")
+        explained_all, left_over = False, True
+        excess = found.plain.cost / max(projector.count - projector.freedom, 1.0) - 1
+        rest_share = max(rest_share, max(excess, 0.0) ** 0.5)
     open_ = left_over and not kept and not explained_all
     verdict = "unexplained" if open_ else "effect_found" if causes else "no_effect"
     if baseline.aside:
@@ -125,8 +132,10 @@ def conclude(
             one.view.sentence if one.p < _SEEN else f"no sign of this: {one.view.sentence}",
         )
         for one in seen
+    ) + tuple(
+        Test(one.name, one.z, one.p, 0.0, one.sentence if one.p < _SEEN else f"no sign of this: {one.sentence}")
+        for one in unlike
     )
-    substeps = max(run.samples.stride for run in baseline.fine)
     return Diagnosis(
         verdict=verdict,  # type: ignore[arg-type]
         noise_um=noise_um,
@@ -139,7 +148,7 @@ def conclude(
         gain=gain,
         next_experiment=ahead,
         remarks=tuple(remarks),
-        baseline=baseline.stage.with_substeps(substeps),
+        baseline=baseline.stage.with_substeps(_substeps(ready, False)),
         extended=extended,
         runs=tuple(
             RunView(
@@ -195,7 +204,8 @@ def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
                 "not used, so that an unknown initial state is not taken for an effect; state it with --initial to "
                 "have it tested"
             )
-    if not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
+    known = any("nothing was held out" in words for words in said)
+    if not known and not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
         said.append("nothing was held out, so the gain is not measured: hold out a part, or a run with --holdout")
     return tuple(dict.fromkeys(said))
 
@@ -205,19 +215,27 @@ def _extended(
 ) -> tuple[Stage, list[Compared], list[AbstractEffect]]:
     """Let the plain stage follow what the effects leave, and fit the effects again beside it."""
     baseline = ready.baseline
-    substeps = max(run.samples.stride for run in baseline.fine)
     runs = len(baseline.runs)
     if model is None or not model.laws:
-        return baseline.stage.with_substeps(substeps), _compare(ready, ready.bench, None, ready.regression), []
+        stage = baseline.stage.with_substeps(_substeps(ready, False))
+        return stage, _compare(ready, ready.bench, None, ready.regression), []
     # What followed along the tangent is put into the stage itself.
     bare = Projector(found.projector.regression, found.projector.noise)
     regression = regress(bare.move(bare.residual - bare.join(model.change_um)), ())
     bench = Bench(regression.baseline)
     effects = shared_effects(model, runs)
-    return extended_stage(regression.baseline, effects, substeps), _compare(ready, bench, model, regression), effects
+    stage = extended_stage(regression.baseline, effects, _substeps(ready, found.finest))
+    return stage, _compare(ready, bench, model, regression, found.finest), effects
 
 
-def _compare(ready: Prepared, bench: Bench, model: Refit | None, regression: Regression) -> list[Compared]:
+def _substeps(ready: Prepared, finest: bool) -> int:
+    """Steps between samples that a stage needs."""
+    return max(run.samples.stride for run in (ready.baseline.finest if finest else ready.baseline.fine))
+
+
+def _compare(
+    ready: Prepared, bench: Bench, model: Refit | None, regression: Regression, finest: bool = False
+) -> list[Compared]:
     """Residuals of the plain stage and of the extended one in all runs, those held out whole last."""
     runs = len(bench.prepared)
     change = [np.zeros_like(plain) for plain in bench.plain] if model is None else model.change_um
@@ -229,7 +247,7 @@ def _compare(ready: Prepared, bench: Bench, model: Refit | None, regression: Reg
         found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), run.held_out))
     if ready.baseline.aside:
         shared = shared_effects(model, runs) if model is not None else []
-        behind = Bench(bench.baseline, aside=True)
+        behind = Bench(bench.baseline, aside=True, finest=finest)
         for run, change_um in zip(ready.baseline.fine_aside, behind.change(shared), strict=True):
             plain = simulate(ready.baseline.stage, run)
             better = simulate(bench.baseline.stage, run) + change_um

@@ -113,7 +113,7 @@ class Predictor:
             name: np.interp(share, np.linspace(0, 1, len(values)), values) for name, values in self._extra.items()
         }
         record = Record(time_s, voltage_V, np.zeros(n), extra, source="the next run")
-        run = prepare_stage_run(record, baseline.range_V, "unknown", 0.0, 1)
+        run = prepare_stage_run(record, baseline.range_V, "unknown", 0.0, 1, hold=baseline.stage.hold)
         # What is known of the columns beforehand counts with the old runs.
         only, none = (run,), ()
         alone = replace(
@@ -121,9 +121,11 @@ class Predictor:
             prior=np.eye(1),
             runs=only,
             coarse=only,
+            finest=only,
             fine=only,
             aside=none,
             coarse_aside=none,
+            finest_aside=none,
             fine_aside=none,
         )
         regression, bench = regress(alone), Bench(alone)

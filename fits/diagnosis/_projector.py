@@ -180,16 +180,22 @@ class Projector:
         return baseline.moved(others[: self.regression.size - columns], change)
 
 
-def learn_roughness(projector: Projector, candidates: Sequence[Sequence[np.ndarray]]) -> tuple[float, ...]:
+def learn_roughness(
+    projector: Projector,
+    candidates: Sequence[Sequence[np.ndarray]],
+    change_um: Sequence[np.ndarray] | None = None,
+) -> tuple[float, ...]:
     """Find how rough the density is beyond its grid, from what neither the baseline nor any candidate explains.
 
     Maximises the probability of the residual (the evidence) over the standard deviations of the relative roughness
-    of all kinds; a kind without which the residual is as probable is left out.
+    of all kinds; a kind without which the residual is as probable is left out. What known effects change in each run,
+    `change_um`, of shape `(n,)`, is taken off before.
     """
     finer = projector.regression.finer
     joined = [projector.join(kind) for kind in finer]
     sizes = [kind.shape[1] for kind in joined]
-    off = projector.off(np.concatenate([*joined, projector.residual[:, None]], axis=1))
+    residual = projector.residual if change_um is None else projector.residual - projector.join(change_um)
+    off = projector.off(np.concatenate([*joined, residual[:, None]], axis=1))
     if candidates:
         fixed, _ = qr(projector.off(np.stack([projector.join(c) for c in candidates], axis=1)), mode="economic")
         off = off - fixed @ (fixed.T @ off)

@@ -20,6 +20,11 @@ _STEP = 1e-3
 _DETERMINED = 3.0
 # Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
 _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
+# Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
+# the runs do not show.
+_UNSEEN, _ANYTHING = 1e-4, 1e6
+# Part of the shortest record by which another instant is tried at first.
+_AROUND = 0.05
 # Multiples of the linearised answer from which a fit may start.
 _MORE = (1.0, 3.0, 9.0)
 
@@ -146,7 +151,12 @@ class Refit:
 
     def covariance(self) -> np.ndarray:
         """Of all coordinates together."""
-        return np.linalg.pinv(self.tangent.T @ self.tangent, rcond=1e-12, hermitian=True)
+        size = np.linalg.norm(self.tangent, axis=0)
+        scale = np.where(size > 0, size, 1.0)
+        value, vector = np.linalg.eigh((self.tangent / scale).T @ (self.tangent / scale))
+        # What the runs do not show may be anything.
+        spread = vector / np.sqrt(np.maximum(value, _UNSEEN**2)) / scale[:, None]
+        return np.where((size > 0)[:, None] & (size > 0), spread @ spread.T, np.diag(np.full(len(size), _ANYTHING)))
 
     def determined(self) -> bool:
         """Whether the data determine the strength of the last effect, in some run at least."""
@@ -209,6 +219,32 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
     return fit(best, _ROUNDS)
 
 
+def relocate(bench: Bench, projector: Projector, model: Refit) -> Refit:
+    """Look for a better instant of what happened at one, farther than a fit's steps see.
+
+    The sum of squares over the instant is jagged where the stage rings: better ones are tried on both sides, nearer
+    and nearer.
+    """
+    runs = range(len(bench.prepared))
+    step_s = _AROUND * min(one.run.record.duration_s for one in bench.prepared)
+    least_s = min(float(np.median(np.diff(one.run.record.time_s))) for one in bench.prepared)
+    for k, law in enumerate(model.laws):
+        while hasattr(law.effect(model.x[k], 0), "after_s") and step_s > least_s:
+            found = [model]
+            for way in (-step_s, step_s):
+                here = [law.effect(model.x[k], run) for run in runs]
+                moved = Law([replace(one, after_s=jnp.maximum(one.after_s + way, least_s)) for one in here])  # type: ignore[attr-defined,call-arg]
+                laws, x = list(model.laws), list(model.x)
+                laws[k], x[k] = moved, moved.start
+                found.append(refit(bench, projector, laws, x, 2))
+            best = min(found, key=lambda one: one.cost)
+            if best is model:
+                step_s /= 2
+            model = best
+            law = model.laws[k]
+    return model
+
+
 def _fit(
     bench: Bench,
     projector: Projector,
@@ -237,22 +273,28 @@ def _fit(
         ]
         return [a - b for a, b in zip(bench.respond(effects), bench.plain, strict=True)]
 
-    def left(flat: np.ndarray) -> np.ndarray:
-        moved = target - projector.off(projector.join(change(flat)))
-        moved = moved - basis @ (basis.T @ moved)
+    def off(joined: np.ndarray) -> np.ndarray:
+        moved = projector.off(joined)
+        return moved - basis @ (basis.T @ moved)
+
+    def joined(flat: np.ndarray) -> np.ndarray:
+        return projector.join(change(flat))
+
+    def left(joined: np.ndarray) -> np.ndarray:
+        moved = aim - off(joined)
         return np.where(np.isfinite(moved), moved, 1e6)
 
     def slope(flat: np.ndarray, at: np.ndarray) -> np.ndarray:
-        steps = []
-        for k in range(len(flat)):
-            ahead = flat.copy()
-            ahead[k] += _STEP
-            steps.append((left(ahead) - at) / _STEP)
-        return np.stack(steps, axis=1)
+        raw = np.stack([(joined(flat + step) - at) / _STEP for step in _STEP * np.eye(len(flat))], axis=1)
+        raw = np.where(np.isfinite(raw), raw, 0.0)
+        seen = -off(raw)
+        return np.where(np.linalg.norm(seen, axis=0) > _UNSEEN * np.linalg.norm(raw, axis=0), seen, 0.0)
 
+    aim = target - basis @ (basis.T @ target)
     flat = np.concatenate(list(x[held:]))
-    residual = left(flat)
-    jacobian = slope(flat, residual) if rounds else np.zeros((len(residual), len(flat)))
+    at = joined(flat)
+    residual = left(at)
+    jacobian = slope(flat, at) if rounds else np.zeros((len(residual), len(flat)))
     damping = 1e-3
     for _ in range(rounds):
         cost = float(residual @ residual)
@@ -263,14 +305,15 @@ def _fit(
             step = -np.linalg.solve(gram + damping * np.eye(len(flat)), cross) / scale
             # No coordinate moves by more than a few e-folds at a time.
             step *= min(1.0, _FARTHEST / (float(np.max(np.abs(step))) + 1e-300))
-            trial = left(flat + step)
+            ahead = joined(flat + step)
+            trial = left(ahead)
             if float(trial @ trial) < cost:
-                flat, residual, damping, moved = flat + step, trial, damping / 10, True
+                flat, at, residual, damping, moved = flat + step, ahead, trial, damping / 10, True
                 break
             damping *= 10
         if not moved or cost - float(residual @ residual) < _ENOUGH:
             break
-        jacobian = slope(flat, residual)
+        jacobian = slope(flat, at)
     cut = parts(flat)
     return Refit(
         tuple(laws),

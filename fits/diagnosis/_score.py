@@ -68,7 +68,10 @@ def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -
     for probe in probes:
         own = slice(at, at + len(probe.signatures))
         at = own.stop
-        found.append(_scored(probe, off[:, own], residual, float(np.sum(raw[own])) ** 0.5))
+        columns = off[:, own]
+        # A line that sampling turns into a constant, for example: what is left of it is rounding.
+        columns[:, _squares(columns) < _BLIND**2 * raw[own]] = 0.0
+        found.append(_scored(probe, columns, residual, float(np.sum(raw[own])) ** 0.5))
     return tuple(found)
 
 

@@ -2,17 +2,14 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
 from fits.diagnosis._candidates import Bench, Probe
-from fits.diagnosis._faults import find_faults
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
-from fits.diagnosis._regression import regress
 from fits.diagnosis._score import Family, Scored, rescore, score
+from fits.diagnosis._settle import Settled, finely, quieter, settled, smoother
 from microid import EFFECTS
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
@@ -31,8 +28,6 @@ _WORSE, _BETTER = 1.2, 0.85
 _REAL = 0.3
 # Evidence that a cause must have against what else is left, in standard deviations.
 _SURE = 3.0
-# Noise that falls by less than this factor is the same.
-_LESS = 0.8
 # Scores above this share of the best may be those of the cause, if so much of what it explains is left for another.
 _NEAR, _FURTHER = 0.95, 0.15
 # Scores below this share of the best are not worth a fit.
@@ -94,6 +89,8 @@ class Selection:
         Chance of the largest score.
     bench, projector
         Of the baseline as it is beside the causes.
+    finest
+        Whether the causes were simulated with many steps between samples in the end.
     first
         Projector of the baseline without them.
     """
@@ -107,6 +104,7 @@ class Selection:
     bench: Bench
     projector: Projector
     first: Projector
+    finest: bool = False
 
 
 def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
@@ -155,18 +153,18 @@ def select(
         if not fitted:
             refused |= {one.name for one in open_ if one.z > _WORTH * top}
             continue
-        first, settled = _leader(bench, projector, probes, model, fitted, best_of(open_))
+        first, beside = _leader(bench, projector, probes, model, fitted, best_of(open_))
         drop = model.cost - first.refit.cost
         rivals = _rivals(first, fitted, max(drop, 0.0))
-        if not settled[-1].determined() or model.cost - settled[-1].cost < _REAL * drop:
+        if not beside[-1].determined() or model.cost - beside[-1].cost < _REAL * drop:
             # Its strength is anybody's guess, or what it explains is out of reach where all is fitted together.
             refused.add(first.name)
             continue
-        bench, projector, model = settled
-        quieter = _quieter(projector, model) if again else None
-        if quieter is not None:
+        bench, projector, model = beside
+        less = quieter(projector, model) if again else None
+        if less is not None:
             # The cause was taken for noise, too: all is asked again beside what noise there is.
-            afresh = Projector(first_projector.regression, quieter, projector.roughness)
+            afresh = Projector(first_projector.regression, less, projector.roughness)
             return select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)
         z = max(drop, 0.0) ** 0.5
         causes.append(Cause(first.name, z, family.p(z), rivals, drop))
@@ -174,10 +172,9 @@ def select(
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
         family = Family(left, rng)
     causes, model = _backward(bench, projector, causes, model)
-    return Selection(tuple(causes), model, plain, scores, left, family, bench, projector, first_projector)
-
-
-Settled: TypeAlias = tuple[Bench, Projector, Refit]
+    bench, projector, model = smoother(bench, projector, model)
+    model, finest = finely(bench, projector, model)
+    return Selection(tuple(causes), model, plain, scores, left, family, bench, projector, first_projector, finest)
 
 
 def _leader(
@@ -192,7 +189,7 @@ def _leader(
 
     Where two causes act, one that is neither may follow part of each and come first.
     """
-    best, settled = fitted[0], _settled(bench, projector, fitted[0].refit)
+    best, chosen = fitted[0], settled(bench, projector, fitted[0].refit)
     highest = max(scores[one.name].z for one in fitted)
     near = [one for one in fitted if scores[one.name].z > _NEAR * highest]
 
@@ -204,31 +201,22 @@ def _leader(
         if not others:
             return 0.0, own.cost
         next_ = max(others, key=lambda other: other.z)
-        _, _, pair = _settled(there, beside, refit_beside(there, beside, own, next_))
+        _, _, pair = settled(there, beside, refit_beside(there, beside, own, next_))
         return next_.z, min(own.cost, pair.cost)
 
     if len(near) < 2 or best not in near:
-        return best, settled
-    left, cost = further(best, settled)
-    if left < _FURTHER * max(model.cost - settled[-1].cost, 0.0) ** 0.5:
-        return best, settled
+        return best, chosen
+    left, cost = further(best, chosen)
+    if left < _FURTHER * max(model.cost - chosen[-1].cost, 0.0) ** 0.5:
+        return best, chosen
     for one in near:
         if one is best:
             continue
-        trial = _settled(bench, projector, one.refit)
+        trial = settled(bench, projector, one.refit)
         _, pair = further(one, trial)
         if pair < cost - _SAME:
-            best, settled, cost = one, trial, pair
-    return best, settled
-
-
-def _settled(bench: Bench, projector: Projector, model: Refit) -> Settled:
-    settled = settle(bench, projector, model)
-    if settled[-1].cost > model.cost:
-        # A baseline that moved without the roughness beyond its grid may have moved away.
-        here = refit(bench, projector, model.laws, model.x, 4)
-        settled = settled if settled[-1].cost < here.cost else (bench, projector, here)
-    return settled
+            best, chosen, cost = one, trial, pair
+    return best, chosen
 
 
 def _rivals(first: Rival, fitted: Sequence[Rival], drop: float) -> tuple[Rival, ...]:
@@ -241,31 +229,6 @@ def _rivals(first: Rival, fitted: Sequence[Rival], drop: float) -> tuple[Rival, 
         if other is not first and (other.criterion - first.criterion < _SAME or apart < most):
             found.append(replace(other, apart=apart))
     return tuple(found)
-
-
-def settle(
-    bench: Bench, projector: Projector, model: Refit, rounds: Sequence[int] = (4, 2)
-) -> tuple[Bench, Projector, Refit]:
-    """Let the baseline follow what effects leave, and fit those again beside it.
-
-    A baseline fitted without them may be far from where it belongs, farther than its tangent reaches.
-    """
-    for count in rounds:
-        # What roughness beyond the grid would explain is not put into the grid.
-        bare = Projector(projector.regression, projector.noise)
-        moved = bare.move(bare.residual - bare.join(model.change_um))
-        regression = regress(moved, projector.regression.finer)
-        bench = Bench(regression.baseline)
-        projector = Projector(regression, projector.noise, projector.roughness)
-        model = refit(bench, projector, model.laws, model.x, count)
-    return bench, projector, model
-
-
-def _quieter(projector: Projector, model: Refit) -> tuple[Noise, ...] | None:
-    """The noise of the runs beside the causes, where there is less of it than was thought."""
-    found = find_faults(projector.regression, model.change_um).noise
-    less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
-    return tuple(found) if any(less) else None
 
 
 def _confusable(one: Scored, causes: Collection[str]) -> bool:

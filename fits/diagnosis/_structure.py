@@ -1,16 +1,19 @@
 """Ways of looking at a residual: what is left in it that noise is not, whatever its cause."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from fits._stage_run import StageRun
+from fits._stage_run import StageRun, columns_beside
 from fits.diagnosis._projector import Projector
 
 _WAVES, _POWERS = 12, 4
 _CYCLES = 240
+# Bands of the command, from two periods in a run to half the sampling rate, and the part of its energy that counts.
+_BANDS, _PLAYED = 12, 1e-8
 
 
 @dataclass(frozen=True)
@@ -44,11 +47,20 @@ class Seen:
 
 
 def views(runs: Sequence[StageRun], plain_um: Sequence[np.ndarray]) -> list[View]:
-    """All ways of looking, each run by itself."""
+    """The ways of looking in which structure counts as left over, each run by itself."""
+    return _joined(runs, [_of_run(run, plain) for run, plain in zip(runs, plain_um, strict=True)])
+
+
+def further_views(runs: Sequence[StageRun]) -> list[View]:
+    """Ways of looking that say more of the cause: along the command and along what was measured besides."""
+    return _joined(runs, [_beside(run) for run in runs])
+
+
+def _joined(runs: Sequence[StageRun], found: Sequence[dict[str, list[np.ndarray]]]) -> list[View]:
     kinds: dict[str, list[list[np.ndarray]]] = {}
     sizes = [len(run.record) for run in runs]
-    for k, (run, plain) in enumerate(zip(runs, plain_um, strict=True)):
-        for name, columns in _of_run(run, plain).items():
+    for k, own in enumerate(found):
+        for name, columns in own.items():
             for column in columns:
                 kinds.setdefault(name, []).append(
                     [column if i == k else np.zeros(size) for i, size in enumerate(sizes)]
@@ -63,6 +75,10 @@ _SENTENCES = {
     "reversal": "the residual depends on the time since the command last turned",
     "cycles": "the residual repeats itself with the position",
     "jumps": "the residual jumps",
+    "voltage": "the residual depends on the command and its direction",
+    "frequency": "the residual goes with the command, by another factor and phase at each frequency",
+    "temperature": "the residual goes with the temperature",
+    "other axis": "the residual goes with the second axis",
     "gain": "the residual is in proportion to the displacement, by a factor that changes along the run",
 }
 
@@ -101,6 +117,38 @@ def _of_run(run: StageRun, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
         found["reversal"] = [sign * np.cos(np.pi * k * age) for k in range(1, _POWERS + 1)]
     edges = np.linspace(0, n, 25).astype(int)[1:-1]
     found["jumps"] = [(np.arange(n) >= edge).astype(float) for edge in edges]
+    return found
+
+
+def _beside(run: StageRun) -> dict[str, list[np.ndarray]]:
+    voltage = run.record.voltage_V
+    share = (voltage - voltage.min()) / (float(np.ptp(voltage)) or 1.0)
+    up = np.gradient(voltage) >= 0
+    found = {
+        "voltage": [np.cos(np.pi * k * share) * side for side in (up.astype(float), 1.0 - up) for k in range(8)],
+        "frequency": _bands(voltage),
+    }
+    beside = columns_beside(run.record)
+    for name, column in (("temperature", "temperature_degC"), ("other axis", "other_um")):
+        if column in beside:
+            values = beside[column] - np.mean(beside[column])
+            found[name] = [values, np.gradient(values), np.cumsum(values)]
+    return found
+
+
+def _bands(values: np.ndarray) -> list[np.ndarray]:
+    """A signal in bands of its frequencies, and the same a quarter of a period later."""
+    n = len(values)
+    # Played forth and back, so that it has no jump at its end.
+    spectrum = np.fft.rfft(np.concatenate([values, values[::-1]]) - values.mean())
+    edges = np.geomspace(2, len(spectrum), _BANDS + 1).astype(int)
+    total = float(np.sum(np.abs(spectrum) ** 2))
+    found = []
+    for low, high in itertools.pairwise(edges):
+        band = np.zeros_like(spectrum)
+        band[low:high] = spectrum[low:high]
+        if float(np.sum(np.abs(band) ** 2)) > _PLAYED * total:
+            found += [np.fft.irfft(turn * band, 2 * n)[:n] for turn in (1.0, 1j)]
     return found
 
 

@@ -74,6 +74,8 @@ class AbstractEffect(AbstractPart):
         Names of the fields that are zero where there is no effect; all else says what it would be like.
     needs
         Columns beside time, command and displacement without which there is nothing to see.
+    unless
+        Columns with which another form of it says what this one guesses.
     fast
         Whether it is only seen in records that show the dynamics.
     per_run
@@ -101,6 +103,7 @@ class AbstractEffect(AbstractPart):
     source: eqx.AbstractClassVar[str]
     form: ClassVar[str] = ""
     needs: ClassVar[tuple[str, ...]] = ()
+    unless: ClassVar[tuple[str, ...]] = ()
     fast: ClassVar[bool] = False
     per_run: ClassVar[bool] = False
     finite: ClassVar[bool] = False

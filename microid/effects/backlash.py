@@ -18,12 +18,12 @@ class Backlash(AbstractEffect):
 
     .. math:: y_k = \min(\max(y_{k-1}, w_k - b), w_k + b)
 
-    At rest before the first sample it stands in the middle of its clearance.
-
     Attributes
     ----------
     half_gap_um
         `b`.
+    start
+        Where in its clearance it stands before the first sample, from -1 to 1: at 1 where it came down to rest.
     """
 
     name: ClassVar[str] = "backlash"
@@ -40,14 +40,16 @@ class Backlash(AbstractEffect):
     experiment: ClassVar[str] = "Fast downward steps of several heights, and chirps at a low and a high bias."
     source: ClassVar[str] = "play operator; Micromachines 16 (2025) 1024 on preload; 0.05 to 2 um (estimate)"
     half_gap_um: Float[Array, ""] = param(unit="um", scale=0.1, lower=0.0)
+    start: Float[Array, ""] = param(unit="1", lower=-1.0, upper=1.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """A thousandth of the stroke, three and ten."""
-        return tuple((cls(jnp.asarray(share * scales.stroke_um)),) for share in (0.001, 0.003, 0.01))
+        return tuple(
+            (cls(jnp.asarray(share * scales.stroke_um), jnp.asarray(0.0)),) for share in (0.001, 0.003, 0.01)
+        )
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Drag the output along."""
-        return Signal(
-            _plays(signal.values, self.half_gap_um[None], signal.before[None])[:, 0], signal.before, signal.hold
-        )
+        place = signal.before + self.start * self.half_gap_um
+        return Signal(_plays(signal.values, self.half_gap_um[None], place[None])[:, 0], place, signal.hold)

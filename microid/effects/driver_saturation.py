@@ -2,23 +2,22 @@
 
 from typing import Any, ClassVar, Self
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from microid._linear import Times
-from microid._param import array, param
+from microid._param import param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, register
 
-_SOFTNESS, _LEVELS = 0.002, (0.99, 0.97, 0.94, 0.90)
+_LEVELS = (0.99, 0.97, 0.94, 0.90)
 
 
 @register
 class DriverSaturation(AbstractEffect):
-    r"""A soft upper rail.
+    r"""An upper rail.
 
-    .. math:: u - s \ln\left(1 + e^{(u - u_{max}) / s}\right)
+    .. math:: \min(u, u_{max})
 
     There is no strength: the effect vanishes as the rail moves beyond the range of the command.
 
@@ -26,8 +25,6 @@ class DriverSaturation(AbstractEffect):
     ----------
     rail_V
         `u_max`, of the command.
-    softness_V
-        `s`, given.
     """
 
     name: ClassVar[str] = "driver_saturation"
@@ -43,32 +40,27 @@ class DriverSaturation(AbstractEffect):
     experiment: ClassVar[str] = "Two peaks of different height beyond the level, each held."
     source: ClassVar[str] = "rails at 95 to 103 % of the nominal range under load (estimate)"
     rail_V: Float[Array, ""] = param(unit="V", scale=10.0)
-    softness_V: Float[Array, ""] = array()
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Rails at 99, 97, 94 and 90 % of the range."""
         span = scales.upper_V - scales.lower_V
-        softness = jnp.asarray(_SOFTNESS * span)
-        return tuple((cls(jnp.asarray(scales.lower_V + level * span), softness),) for level in _LEVELS)
+        return tuple((cls(jnp.asarray(scales.lower_V + level * span)),) for level in _LEVELS)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Cut off what is above the rail."""
-        above = _beyond(signal.values - self.rail_V, self.softness_V)
-        before = _beyond(signal.before - self.rail_V, self.softness_V)
-        return Signal(signal.values - above, signal.before - before, signal.hold)
+        values, before = (jnp.minimum(x, self.rail_V) for x in (signal.values, signal.before))
+        return Signal(values, before, signal.hold)
 
 
 @register
 class LowerDriverSaturation(AbstractEffect):
-    """A soft lower rail; see `DriverSaturation`.
+    """A lower rail; see `DriverSaturation`.
 
     Attributes
     ----------
     rail_V
         `u_min`, of the command.
-    softness_V
-        `s`, given.
     """
 
     name: ClassVar[str] = "driver_saturation"
@@ -83,21 +75,14 @@ class LowerDriverSaturation(AbstractEffect):
     experiment: ClassVar[str] = DriverSaturation.experiment
     source: ClassVar[str] = DriverSaturation.source
     rail_V: Float[Array, ""] = param(unit="V", scale=10.0)
-    softness_V: Float[Array, ""] = array()
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Rails at 1, 3, 6 and 10 % of the range."""
         span = scales.upper_V - scales.lower_V
-        softness = jnp.asarray(_SOFTNESS * span)
-        return tuple((cls(jnp.asarray(scales.upper_V - level * span), softness),) for level in _LEVELS)
+        return tuple((cls(jnp.asarray(scales.upper_V - level * span)),) for level in _LEVELS)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Cut off what is below the rail."""
-        below = _beyond(self.rail_V - signal.values, self.softness_V)
-        before = _beyond(self.rail_V - signal.before, self.softness_V)
-        return Signal(signal.values + below, signal.before + before, signal.hold)
-
-
-def _beyond(excess_V: Float[Array, "..."], softness_V: Float[Array, ""]) -> Float[Array, "..."]:
-    return softness_V * jax.nn.softplus(excess_V / softness_V)
+        values, before = (jnp.maximum(x, self.rail_V) for x in (signal.values, signal.before))
+        return Signal(values, before, signal.hold)

@@ -2,7 +2,6 @@
 
 from typing import Any, ClassVar, Self
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,7 +10,7 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal, innermost
 from microid._plant import Mechanics
-from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, _rate_of, _times_of, register
 
 
 @register
@@ -58,8 +57,7 @@ class LoadChange(AbstractEffect):
 class LoadChangeWithin(AbstractEffect):
     r"""Mechanics whose mass changes during a record.
 
-    From the instant on the answer is that of the other mass, as if it had been there before: what rings on from one
-    mass to the other is left out.
+    At the instant displacement and velocity are those of the mass before, and go on from there.
 
     Attributes
     ----------
@@ -114,7 +112,26 @@ def _loaded(
     more = loaded.run(time_s, signal, start).values - plain.run(time_s, signal, start).values
     if after_s is not None:
         time = _times_of(time_s, more.shape[0])
-        # Over a period of the resonance, so that there is a derivative.
-        more = more * jax.nn.sigmoid((time - after_s) * plain.natural_frequency_Hz * 4)
+        since = jnp.maximum(time - after_s, 0.0)
+        more = jnp.where(time >= after_s, more - _decay(loaded, since, *_at(after_s, time, more)), 0.0)
     other = inner.run(time_s, signal, start)
     return Signal(other.values + more, other.before, other.hold)
+
+
+def _at(
+    instant_s: Float[Array, ""], time_s: Float[Array, " t"], values: Float[Array, " t"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Value and rate of change at an instant."""
+    return jnp.interp(instant_s, time_s, values), jnp.interp(instant_s, time_s, _rate_of(time_s, values))
+
+
+def _decay(
+    mechanics: Mechanics, since_s: Float[Array, " t"], place_um: Float[Array, ""], speed_um_per_s: Float[Array, ""]
+) -> Float[Array, " t"]:
+    """How a stage rings down from a place and a speed."""
+    omega, zeta = 2 * jnp.pi * mechanics.natural_frequency_Hz, mechanics.damping_ratio
+    swing = omega * jnp.sqrt(jnp.maximum(1 - zeta**2, 1e-6))
+    quarter = (speed_um_per_s + zeta * omega * place_um) / swing
+    return jnp.exp(-zeta * omega * since_s) * (
+        place_um * jnp.cos(swing * since_s) + quarter * jnp.sin(swing * since_s)
+    )

@@ -27,6 +27,7 @@ class ThermalDrift(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "environment"
     strength: ClassVar[tuple[str, ...]] = ("rate_um_per_s",)
+    unless: ClassVar[tuple[str, ...]] = ("temperature_degC",)
     per_run: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "The residual moves slowly in one direction whatever the command does, also while it rests, and follows the "
@@ -68,6 +69,7 @@ class ExponentialThermalDrift(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "environment"
     strength: ClassVar[tuple[str, ...]] = ("change_um",)
+    unless: ClassVar[tuple[str, ...]] = ("temperature_degC",)
     per_run: ClassVar[bool] = True
     fingerprint: ClassVar[str] = ThermalDrift.fingerprint
     confusions: ClassVar[tuple[str, ...]] = ThermalDrift.confusions

@@ -1,0 +1,79 @@
+"""Causes and the baseline fitted to each other: where both belong, beside what noise and roughness there is."""
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from fits.diagnosis._candidates import Bench
+from fits.diagnosis._faults import find_faults
+from fits.diagnosis._noise import Noise
+from fits.diagnosis._projector import Projector, learn_roughness
+from fits.diagnosis._refit import Refit, refit, relocate
+from fits.diagnosis._regression import regress
+
+# Simulations that differ by more than this, in all samples together, in noise, are not the same.
+_OFF = 1.0
+# Noise or roughness that falls by less than this factor is the same.
+_LESS = 0.8
+
+Settled: TypeAlias = tuple[Bench, Projector, Refit]
+
+
+def settled(bench: Bench, projector: Projector, model: Refit) -> Settled:
+    """Let baseline and causes follow each other, unless that makes it worse."""
+    moved = settle(bench, projector, relocate(bench, projector, model))
+    if moved[-1].cost > model.cost:
+        # A baseline that moved without the roughness beyond its grid may have moved away.
+        here = refit(bench, projector, model.laws, model.x, 4)
+        moved = moved if moved[-1].cost < here.cost else (bench, projector, here)
+    return moved
+
+
+def settle(
+    bench: Bench, projector: Projector, model: Refit, rounds: Sequence[int] = (4, 2)
+) -> tuple[Bench, Projector, Refit]:
+    """Let the baseline follow what effects leave, and fit those again beside it.
+
+    A baseline fitted without them may be far from where it belongs, farther than its tangent reaches.
+    """
+    for count in rounds:
+        # What roughness beyond the grid would explain is not put into the grid.
+        bare = Projector(projector.regression, projector.noise)
+        moved = bare.move(bare.residual - bare.join(model.change_um))
+        regression = regress(moved, projector.regression.finer)
+        bench = Bench(regression.baseline)
+        projector = Projector(regression, projector.noise, projector.roughness)
+        model = refit(bench, projector, model.laws, model.x, count)
+    return bench, projector, model
+
+
+def smoother(bench: Bench, projector: Projector, model: Refit) -> Settled:
+    """Fit the causes again where beside them the density is smoother than was thought without them."""
+    if not model.laws or not any(projector.roughness):
+        return bench, projector, model
+    bare = Projector(projector.regression, projector.noise)
+    rough = learn_roughness(bare, (), model.change_um)
+    if not any(new < _LESS * old for new, old in zip(rough, projector.roughness, strict=True)):
+        return bench, projector, model
+    less = tuple(map(min, rough, projector.roughness))
+    return settled(bench, Projector(projector.regression, projector.noise, less), model)
+
+
+def finely(bench: Bench, projector: Projector, model: Refit) -> tuple[Refit, bool]:
+    """Fit the causes again with many steps between samples, where few are off by more than chance."""
+    if not model.laws:
+        return model, False
+    finer = Bench(bench.baseline, finest=True)
+    better = refit(finer, projector, model.laws, model.x, 0)
+    off = [a - b for a, b in zip(better.change_um, model.change_um, strict=True)]
+    if float(np.linalg.norm(projector.join(off))) < _OFF:
+        return model, False
+    return refit(finer, projector, model.laws, model.x, 4), True
+
+
+def quieter(projector: Projector, model: Refit) -> tuple[Noise, ...] | None:
+    """The noise of the runs beside the causes, where there is less of it than was thought."""
+    found = find_faults(projector.regression, model.change_um).noise
+    less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
+    return tuple(found) if any(less) else None
