@@ -23,6 +23,8 @@ _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
 # the runs do not show.
 _UNSEEN, _ANYTHING = 1e-4, 1e6
+# Samples that are taken to err alike.
+_BLOCK = 25
 # Part of the shortest record by which another instant is tried at first.
 _AROUND = 0.05
 # Multiples of the linearised answer from which a fit may start.
@@ -149,21 +151,31 @@ class Refit:
         """The effects in one run."""
         return [law.effect(x, run) for law, x in zip(self.laws, self.x, strict=True)]
 
-    def covariance(self) -> np.ndarray:
-        """Of all coordinates together."""
+    def covariance(self, robust: bool = True) -> np.ndarray:
+        """Of all coordinates together.
+
+        A robust one is larger where what is left stays alike for a while, as where the model of an effect is not
+        exact: as large as sums over blocks say (the sandwich of White, Econometrica 48 (1980) 817).
+        """
         size = np.linalg.norm(self.tangent, axis=0)
         scale = np.where(size > 0, size, 1.0)
         value, vector = np.linalg.eigh((self.tangent / scale).T @ (self.tangent / scale))
         # What the runs do not show may be anything.
         spread = vector / np.sqrt(np.maximum(value, _UNSEEN**2)) / scale[:, None]
-        return np.where((size > 0)[:, None] & (size > 0), spread @ spread.T, np.diag(np.full(len(size), _ANYTHING)))
+        plain = spread @ spread.T
+        sums = np.add.reduceat(self.tangent * self.residual[:, None], np.arange(0, len(self.residual), _BLOCK))
+        spread_out = np.sum((sums @ plain) ** 2, axis=0)
+        wider = np.sqrt(np.maximum(spread_out / np.maximum(np.diagonal(plain), 1e-300), 1.0))
+        seen = size > 0
+        scaled = plain * wider * wider[:, None] if robust else plain
+        return np.where(seen[:, None] & seen, scaled, np.diag(np.where(seen, 0.0, _ANYTHING)))
 
     def determined(self) -> bool:
         """Whether the data determine the strength of the last effect, in some run at least."""
         law, x = self.laws[-1], self.x[-1]
         if not law.form.strength:
             return True
-        covariance = self.covariance()[-law.size :, -law.size :]
+        covariance = self.covariance(robust=False)[-law.size :, -law.size :]
         found = False
         for run in range(len(law.maps) if law.each.any() else 1):
             here = _strength(law, x, run)

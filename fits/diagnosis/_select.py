@@ -16,6 +16,8 @@ from microid import EFFECTS
 _LEADERS, _FORMS = 5, 2
 # Causes that are sought, at most, and laws in all, as some causes come several times.
 _MOST, _LAWS = 4, 6
+# Effects that every piezo has.
+_USUAL = ("creep",)
 # Differences of the criterion, and standard deviations after projecting one effect off another, within which two
 # effects are not told apart.
 _SAME, _APART = 10.0, 4.0
@@ -156,6 +158,11 @@ def select(
         first, beside = _leader(bench, projector, probes, model, fitted, best_of(open_))
         drop = model.cost - first.refit.cost
         rivals = _rivals(first, fitted, max(drop, 0.0))
+        usual = next((rival for rival in rivals if rival.name in _USUAL and first.name not in _USUAL), None)
+        if usual is not None:
+            # Of effects that these records cannot tell apart, the one that every rig has.
+            rivals = (replace(first, apart=usual.apart), *(rival for rival in rivals if rival is not usual))
+            first, beside = usual, settled(bench, projector, usual.refit)
         if not beside[-1].determined() or model.cost - beside[-1].cost < _REAL * drop:
             # Its strength is anybody's guess, or what it explains is out of reach where all is fitted together.
             refused.add(first.name)
