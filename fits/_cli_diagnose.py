@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fits._atomic import atomic_path, write_csv
-from fits._cli_files import fraction_or_files, keep_inputs, progress_to_stderr
+from fits._cli_files import bar_to_stderr, fraction_or_files, keep_inputs
 from fits._cli_jax import start_jax
 from fits._errors import DataError
 from fits._read_csv import read_csv, read_runs
@@ -25,6 +25,16 @@ if TYPE_CHECKING:
 _REPORT, _JSON, _BASELINE, _EXTENDED = "report.html", "diagnosis.json", "baseline.json", "extended.json"
 _PROGRAM = "next_experiment.csv"
 _LONGEST_s = 1e5
+# What the stages of the work are announced with.
+_STAGES = (
+    "fitting the plain stage",
+    "reading the noise",
+    "simulating every effect",
+    "learning how rough",
+    "asking for every effect",
+    "extending the stage",
+    "writing",
+)
 _FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
 
 
@@ -52,7 +62,7 @@ def run_diagnose(
     # Before the work, so that a place that cannot be written to is refused before the wait.
     _check_folder(out)
     start_jax()
-    progress = progress_to_stderr(quiet)
+    progress = bar_to_stderr(quiet, _STAGES)
     records = read_runs(runs, mapping)
     aside = [read_csv(file, mapping) for file in files]
     # Not before the files are read: this takes as long as all that.

@@ -1,6 +1,7 @@
 """What the commands share: the files they read and write, and what they tell meanwhile."""
 
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,6 +22,28 @@ def progress_to_stderr(quiet: bool) -> Callable[[str], None]:
     def tell(sentence: str) -> None:
         if not quiet:
             click.echo(f"{time.monotonic() - began:6.1f} s  {sentence}", err=True)
+
+    return tell
+
+
+def bar_to_stderr(quiet: bool, stages: Sequence[str]) -> Callable[[str], None]:
+    """Make what draws on stderr how far the work has come, a step for each stage that a sentence begins with.
+
+    On a terminal the bar stays in its line; elsewhere each sentence has its own.
+    """
+    began, at = time.monotonic(), 0
+
+    def tell(sentence: str) -> None:
+        nonlocal at
+        if quiet:
+            return
+        at = max(at, *(k for k, stage in enumerate(stages, 1) if sentence.startswith(stage)), 0)
+        bar = "#" * at + "." * (len(stages) - at)
+        line = f"[{bar}] {time.monotonic() - began:6.1f} s  {sentence}"
+        if sys.stderr.isatty():
+            click.echo(f"\r\033[K{line}", nl=at == len(stages), err=True)
+        else:
+            click.echo(line, err=True)
 
     return tell
 

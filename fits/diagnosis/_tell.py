@@ -36,10 +36,12 @@ def causes_of(
     faults: Sequence[Fault],
     noise: Faults,
 ) -> tuple[FoundCause, ...]:
-    """Describe the causes, the most important first."""
+    """Describe the causes, the most important first: by the misfit that each removes."""
     found: list[FoundCause] = []
+    weight: dict[str, float] = {}
     told: dict[str, int] = {}
     covariance, at = model.covariance(), 0
+    total = float(np.mean([n.total_um**2 for n in projector.noise]))
     runs = len(bench.prepared)
     for cause, law, x in zip(causes, model.laws, model.x, strict=True):
         own = covariance[at : at + law.size, at : at + law.size]
@@ -51,6 +53,7 @@ def causes_of(
         seen = float(np.linalg.norm(projector.off(joined)) / max(float(np.linalg.norm(joined)), 1e-300))
         rms = seen * _rms(alone, projector)
         told[cause.name] = count = told.get(cause.name, 0) + 1
+        weight[cause.name] = weight.get(cause.name, 0.0) + cause.drop / projector.count * total
         if count > 1:
             again = next(k for k, one in enumerate(found) if one.name == cause.name)
             found[again] = _joined(found[again], _parameters(law, x, own), count, cause.drop / misfit, rms)
@@ -74,6 +77,7 @@ def causes_of(
     total = float(np.mean([n.total_um**2 for n in noise.noise]))
     for fault in faults:
         form = by_name[fault.name]
+        weight[fault.name] = fault.variance_um2
         parameters = tuple(
             EffectParameter(name, value, sd, unit, value - _TWO_SIDED * sd, value + _TWO_SIDED * sd)
             for name, value, sd, unit in fault.parameters
@@ -93,7 +97,7 @@ def causes_of(
                 form.source,
             )
         )
-    return tuple(sorted(found, key=lambda cause: -cause.rms_um))
+    return tuple(sorted(found, key=lambda cause: -weight[cause.name]))
 
 
 def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:
