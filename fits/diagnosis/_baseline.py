@@ -29,7 +29,7 @@ _FINEST = 32
 _COARSE = 4
 # Steps between samples in which the plain stage is simulated where those of its fit are off by more than this, in
 # all samples together, in noise.
-_FINE, _OFF = 16, 1.0
+_FINE, _FINE_STEPS, _OFF = 16, 64, 1.0
 
 
 class Fixed(eqx.Module):
@@ -138,7 +138,9 @@ def fit_baseline(
             _prepared(aside, range_V, initial, 0.0, many, hold),
         )
 
-    (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, _FINE))
+    # What a step starts is over soon, and slow runs sample it sparsely.
+    many = _FINE if hold == "first" else _FINE_STEPS
+    (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, many))
     return Baseline(
         found.chain,
         found.solved.z,
