@@ -49,7 +49,7 @@ def command_V():
     """Steps of two heights, then a chirp about half of the range."""
     time = INTERVAL_S * np.arange(SAMPLES)
     wave = 50 + 25 * signal.chirp(time, 20, time[-1], 300)
-    return np.where(time < 0.01, 0.0, np.where(time < 0.03, 98.0, np.where(time < 0.05, 30.0, wave)))
+    return np.where(time < 0.01, 0.0, np.where(time < 0.03, 100.0, np.where(time < 0.05, 30.0, wave)))
 
 
 def columns():
