@@ -32,6 +32,7 @@ GAINS = ("proportional_V_per_um", "integral_V_per_um_s", "derivative_V_s_per_um"
 # Resonators take up an error over so many of their periods, and a table holds this share of the reference's voltage.
 _PERIODS = 3.0
 _TABLE = 0.5
+_LEARNING = 0.1
 _MOST_PEAK = 4.0
 
 
@@ -155,8 +156,9 @@ class Maker:
         fastest = float(np.abs(np.diff(ready.reference_um)).max()) / ready.interval_s
         limit = _TABLE * max(float(np.ptp(ready.static_V)), 1e-6)
         pad = 0.02 * max(high - low, 1e-9)
-        numbers = (low - pad, high + pad, 1.02 * fastest + 1e-9)
-        return CMACPID(pid, *map(jnp.asarray, numbers), learning_rate=0.1, limit_V=limit), tuning, more
+        ends = low - pad, high + pad, 1.02 * fastest + 1e-9
+        lower, upper, rate, learning, most = (jnp.asarray(x) for x in (*ends, _LEARNING, limit))
+        return CMACPID(pid, lower, upper, rate, learning, most), tuning, more
 
     def _tuned(self, controller: Any) -> Tuning[Any]:
         ready = self.loop.ready

@@ -4,7 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from fits._control_make import Loop
 from fits._tune_result import Tuning
@@ -13,6 +16,8 @@ from microid import (
     ControlledRun,
     Coordinates,
     Margins,
+    Stage,
+    Start,
     parameter_table,
     step_metrics,
     tracking_errors,
@@ -47,7 +52,7 @@ def control_json(
     said = list(remarks)
     if 0 < rms < loop.noise_um:
         said.append(
-            f"the error, {rms:.3g} um rms, is that of the model's own displacement and below the noise of the sensor, "
+            f"the error, {rms:.3g} um rms, is that of the model's own displacement and below the sensor's noise, "
             f"{loop.noise_um:.3g} um: a bench cannot show it in single readings"
         )
     every = loop.margins(controller)
@@ -114,7 +119,7 @@ def _tuning(found: Tuning[Any]) -> dict[str, Any]:
 
 def _tracking(wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any]:
     error = wanted_um - moved_um
-    shares = tracking_errors(wanted_um, moved_um)
+    shares = tracking_errors(jnp.asarray(wanted_um), jnp.asarray(moved_um))
     return {
         "error_rms_um": float(np.sqrt(np.mean(error**2))),
         "error_max_um": float(np.abs(error).max()),
@@ -129,9 +134,16 @@ def _without(loop: Loop, wanted_um: np.ndarray, kept: slice) -> dict[str, Any] |
     if ready.feedforward_V is None:
         return None
     stage = loop.plants[0]
-    command = np.clip(ready.feedforward_V, *ready.limits_V)
-    moved = np.asarray(stage(np.asarray(ready.interval_s), command, ready.start))
+    command = jnp.asarray(np.clip(ready.feedforward_V, *ready.limits_V))
+    moved = np.asarray(_respond(stage, jnp.asarray(ready.interval_s), command, ready.start))
     return _tracking(wanted_um[kept], moved[kept])
+
+
+@eqx.filter_jit
+def _respond(
+    stage: Stage, interval_s: Float[Array, ""], voltage_V: Float[Array, " t"], start: Start
+) -> Float[Array, " t"]:
+    return stage(interval_s, voltage_V, start)
 
 
 def _step(time_s: np.ndarray, wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any] | None:
@@ -140,7 +152,9 @@ def _step(time_s: np.ndarray, wanted_um: np.ndarray, moved_um: np.ndarray) -> di
     if len(turns) != 1:
         return None
     first = int(turns[0]) + 1
-    found = step_metrics(time_s[first:], moved_um[first:], float(wanted_um[-1]), float(moved_um[first]))
+    found = step_metrics(
+        jnp.asarray(time_s[first:]), jnp.asarray(moved_um[first:]), float(wanted_um[-1]), float(moved_um[first])
+    )
     return {name: _finite(value) for name, value in vars(found).items()}
 
 
