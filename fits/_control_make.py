@@ -129,16 +129,15 @@ class Maker:
             See `tune_controller`.
         """
         loop, ready = self.loop, self.loop.ready
-        limits = dict(zip(("lower_V", "upper_V"), ready.limits_V, strict=True))
         tuning: Tuning[Any] | None = None
         if gains is None:
             self.tell("start by Ziegler and Nichols")
             begin = relay_start(loop.plants, ready.interval_s, delay=loop.delay)
-            begin = eqx.tree_at(lambda p: (p.lower_V, p.upper_V), begin, tuple(map(jnp.asarray, ready.limits_V)))
-            tuning = self._tuned(begin)
+            tuning = self._tuned(_limited(begin, ready.limits_V))
             pid = tuning.controller
         else:
-            pid = PID(*(jnp.asarray(gains[name]) for name in GAINS), ready.interval_s, **limits)
+            kp, ki, kd, interval = (jnp.asarray(x) for x in (*(gains[name] for name in GAINS), ready.interval_s))
+            pid = _limited(PID(kp, ki, kd, interval), ready.limits_V)
         more = [] if tuning is None else list(tuning.remarks)
         if kind == "pid":
             return pid, tuning, more
@@ -208,6 +207,10 @@ class Maker:
         tuning = self._tuned(found)
         said = [*more, *(remark for remark in tuning.remarks if remark not in more)]
         return tuning.controller, tuning, said
+
+
+def _limited(pid: PID, limits_V: tuple[float, float]) -> PID:
+    return eqx.tree_at(lambda p: (p.lower_V, p.upper_V), pid, tuple(jnp.asarray(x) for x in limits_V))
 
 
 def _strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float:

@@ -113,7 +113,7 @@ def setup(
         np.asarray(reference.displacement_um),
         ahead,
         range_of(stage) if limits_V is None else limits_V,
-        Start(rest_V, memory),
+        Start(jnp.asarray(rest_V), memory),
         found.voltage_V,
         tuple(remarks),
     )
@@ -133,7 +133,7 @@ def _linear(
     feedforward: Feedforward,
     limits_V: tuple[float, float] | None,
 ) -> Setup:
-    gain, offset = float(stage.static_gain), float(sampled.init(Start(0.0))[1])
+    gain, offset = float(stage.static_gain), float(sampled.init(Start(jnp.asarray(0.0)))[1])
     if not (np.isfinite(gain) and gain > 0):
         raise DataError(f"the stage gives {gain:g} um/V at rest, expected a positive one; turn the sign of a column")
     wanted = np.asarray(reference.displacement_um)
@@ -150,7 +150,7 @@ def _linear(
         remarks.append("the feedforward was cut to the limits")
         ahead = np.clip(ahead, *limits)
     rest_V = float(np.clip(static[0] if ahead is None else ahead[0], *limits))
-    return Setup(stage, interval_s, wanted, ahead, limits, Start(rest_V), static, tuple(remarks))
+    return Setup(stage, interval_s, wanted, ahead, limits, Start(jnp.asarray(rest_V)), static, tuple(remarks))
 
 
 def _interval_s(reference: Reference) -> float:

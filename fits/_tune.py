@@ -240,7 +240,7 @@ def _search(problem: Problem, y: Any, plants: int) -> _End:
     multipliers = {name: jnp.zeros_like(share) for name, share in over.items()}
     weight, worst, settled = _FIRST_WEIGHT, np.inf, False
     for _ in range(_ROUNDS):
-        moved, gradient = descend(problem, y, multipliers, jnp.asarray(weight))
+        moved, gradient = descend(problem, y, over, multipliers, jnp.asarray(weight))
         figures, over, cost = judge(problem, moved)
         distance, y = float(jnp.max(jnp.abs(moved - y))), moved
         now = _worst(over)[0]

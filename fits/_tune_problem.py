@@ -25,7 +25,7 @@ from microid import (
 # Every gain is searched for within `exp` of this of its start, to either side.
 REACH = 6.0
 # What stands for the cost of a loop that overflows.
-_ABSURD = 1e3
+_ABSURD = 1e9
 # Roots have no derivative at zero; a picometre is nothing.
 _TINY_um2 = 1e-12
 _RTOL = _ATOL = 1e-4
@@ -262,7 +262,7 @@ def excess(problem: Problem, found: Figures) -> dict[str, Float[Array, "..."]]:
         "gain_margin_min": lambda least: least / m.gain_margin - 1,
         "phase_margin_min_deg": lambda least: 1 - jnp.minimum(m.phase_margin_deg, 180) / least,
         "sensitivity_peak_max": lambda most: m.sensitivity_peak / most - 1,
-        "overshoot_max_pct": lambda most: (found.overshoot_pct - most) / jnp.maximum(most, 1),
+        "overshoot_max_pct": lambda most: jnp.log((found.overshoot_pct + 1) / (most + 1)),
         "command_min_V": lambda least: (least - found.command_min_V) / problem.command_width_V,
         "command_max_V": lambda most: (found.command_max_V - most) / problem.command_width_V,
         "command_step_max_V": lambda most: found.command_step_V / most - 1,
@@ -276,9 +276,11 @@ def excess(problem: Problem, found: Figures) -> dict[str, Float[Array, "..."]]:
     return out
 
 
-def _merit(y: Float[Array, " n"], args: tuple[Problem, dict[str, Array], Float[Array, ""]]) -> Float[Array, ""]:
+def _merit(
+    y: Float[Array, " n"], args: tuple[Problem, dict[str, Array], Float[Array, ""], Float[Array, ""]]
+) -> Float[Array, ""]:
     """Logarithm of the cost, and the augmented Lagrangian of the limits (Nocedal and Wright 2006, section 17.4)."""
-    problem, multipliers, weight = args
+    problem, multipliers, weight, scale = args
     found = figures(problem, problem.controller(y))
     over = excess(problem, found)
     total = jnp.log(cost_um(problem, found))
@@ -286,7 +288,7 @@ def _merit(y: Float[Array, " n"], args: tuple[Problem, dict[str, Array], Float[A
         push = jnp.maximum(share + multipliers[name] / weight, 0)
         total = total + jnp.sum(weight / 2 * push**2 - multipliers[name] ** 2 / (2 * weight))
     # Where nothing is finite, only the value is looked at: no line search stops there.
-    return jnp.where(jnp.isfinite(total), jnp.minimum(total, _ABSURD), _ABSURD)
+    return scale * jnp.where(jnp.isfinite(total), total, _ABSURD)
 
 
 @eqx.filter_jit
@@ -298,21 +300,28 @@ def judge(problem: Problem, y: Float[Array, " n"]) -> tuple[Figures, dict[str, A
 
 @eqx.filter_jit
 def descend(
-    problem: Problem, y: Float[Array, " n"], multipliers: dict[str, Array], weight: Float[Array, ""]
+    problem: Problem,
+    y: Float[Array, " n"],
+    over: dict[str, Array],
+    multipliers: dict[str, Array],
+    weight: Float[Array, ""],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Minimise the augmented Lagrangian from a place on: the place found, and the gradient there."""
+    """Minimise the augmented Lagrangian from a place on, whose excess is known: the place, and the gradient there."""
+    # The first step is as long as the gradient: where limits are far passed, it must not leap over everything.
+    pushed = [jnp.sum(jnp.maximum(weight * over[name] + multipliers[name], 0)) for name in over]
+    scale = 1 / (1 + sum(pushed, start=jnp.zeros(())))
     solver: Any = optx.BFGS(rtol=_RTOL, atol=_ATOL)
     solution: Any = optx.minimise(
         _merit,
         solver,
         y,
-        args=(problem, multipliers, weight),
+        args=(problem, multipliers, weight, scale),
         # A handful of gains and thousands of samples: forwards nothing has to be kept.
         options={"autodiff_mode": "fwd"},
         max_steps=_STEPS,
         throw=False,
     )
-    return solution.value, solution.state.f_info.grad
+    return solution.value, solution.state.f_info.grad / scale
 
 
 @eqx.filter_jit
