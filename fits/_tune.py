@@ -263,7 +263,9 @@ def _worst(over: dict[str, Any]) -> tuple[float, str]:
 
 def _said(over: dict[str, Any]) -> str:
     share, name = _worst(over)
-    return "within all limits" if share <= _TOLERANCE else f"{name} passed by {100 * share:.3g} %"
+    # That of the overshoot is a logarithm.
+    passed = np.expm1(share) if name == "overshoot_max_pct" else share
+    return "within all limits" if share <= _TOLERANCE else f"{name} passed by {100 * passed:.3g} %"
 
 
 def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> list[str]:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
@@ -322,13 +321,3 @@ def descend(
         throw=False,
     )
     return solution.value, solution.state.f_info.grad / scale
-
-
-@eqx.filter_jit
-def cost_and_slope(problem: Problem, y: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, " n"]]:
-    """Cost in um, and its derivatives along the search."""
-
-    def cost(y: Float[Array, " n"]) -> Float[Array, ""]:
-        return cost_um(problem, figures(problem, problem.controller(y)))
-
-    return cost(y), jax.jacfwd(cost)(y)

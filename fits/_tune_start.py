@@ -17,7 +17,7 @@ _POINTS = 4001
 # Each narrows the bracket of a crossing by the number of points.
 _ZOOMS = 3
 # Voltages per level on which the slope of a hysteresis is looked at.
-_FINE = 8
+_FINE = 64
 # The start keeps at least this gain margin; ever smaller gains reach it on any stage that is stable by itself.
 _MARGIN = 2.0
 _HALVINGS = 60
