@@ -100,6 +100,12 @@ def run_control(
             made, tuning, more = tune.make(controller, given, frequency)
         except FitError as error:
             raise DataError(f"{model}: {error}.") from error
+        every = loop.margins(made)
+        if not all(bool(one.stable) for one in every):
+            raise DataError(
+                f"{model}: the loop is unstable with these gains, its largest pole has modulus "
+                f"{max(float(one.radius) for one in every):.6g}; lower --gains, or leave them out to have them tuned."
+            )
         tell("run")
         run = loop.run(made, rng.normal(0, noise, len(wanted)) if noise else None, resolution_voltage)
         if not np.all(np.isfinite(run.error_um)):

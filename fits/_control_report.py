@@ -10,15 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits._control_make import Loop
+from fits._tune import parameter_values
 from fits._tune_result import Tuning
 from microid import (
     AbstractController,
     ControlledRun,
-    Coordinates,
     Margins,
     Stage,
     Start,
-    parameter_table,
     step_metrics,
     tracking_errors,
 )
@@ -56,8 +55,6 @@ def control_json(
             f"{loop.noise_um:.3g} um: a bench cannot show it in single readings"
         )
     every = loop.margins(controller)
-    if not all(bool(one.stable) for one in every):
-        said.append("the linearised loop is unstable at the steepest slope of the hysteresis: lower the gains")
     return {
         "schema": SCHEMA,
         **about,
@@ -78,13 +75,7 @@ def control_json(
 
 
 def _gains(controller: AbstractController) -> dict[str, Any]:
-    coordinates: Coordinates[Any] = Coordinates(controller)
-    flat, place, out = np.asarray(coordinates.values(coordinates.of(controller))), 0, {}
-    for row in parameter_table(controller):
-        size = math.prod(row.shape)
-        out[row.path] = np.reshape(flat[place : place + size], row.shape).tolist()
-        place += size
-    return out
+    return {path: value.tolist() for path, value in parameter_values(controller).items()}
 
 
 def _finite(value: Any) -> float | None:

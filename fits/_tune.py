@@ -144,9 +144,8 @@ def tune_controller(
         remarks.append("the search stopped before the slope of the cost was nothing: other starts may do better")
     remarks += _remarks(problem, best, ends)
     tuned = problem.controller(best.y)
-    table = problem.coordinates.table
-    before, after = (_by_path(table, problem, y) for y in (origin, best.y))
-    gains = {path: (before[path], after[path]) for path in before}
+    before, after = parameter_values(controller), parameter_values(tuned)
+    gains = {row.path: (before[row.path], after[row.path]) for row in problem.coordinates.table}
     return Tuning(tuned, float(cost), best.cost_um, best.converged, reports(best.figures), gains, tuple(remarks))
 
 
@@ -177,7 +176,7 @@ def _problem(
         given[name] = signal
     if not 0 <= skip < reference.shape[1]:
         raise DataError(f"skip: expected a number of samples below {reference.shape[1]}, found {skip}")
-    values = {row.path: value for row, value in zip(*_values(controller), strict=True)}
+    values = parameter_values(controller)
     coordinates = Coordinates(controller, lambda row: _moves(row, values[row.path], free))
     for name in free or ():
         if not any(_below(row.path, name) for row in coordinates.table):
@@ -206,11 +205,11 @@ def _problem(
     )
 
 
-def _values(controller: Any) -> tuple[tuple[ParameterInfo, ...], list[np.ndarray]]:
-    rows = parameter_table(controller)
-    flat = np.asarray(Coordinates(controller).values(Coordinates(controller).of(controller)))
-    ends = np.cumsum([int(np.prod(row.shape)) for row in rows])
-    return rows, np.split(flat, ends[:-1])
+def parameter_values(controller: Any) -> dict[str, np.ndarray]:
+    """The parameters of a controller by their path, in their units."""
+    leaves = jax.tree_util.tree_flatten_with_path(controller)[0]
+    found = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
+    return {row.path: np.asarray(found[row.path]) for row in parameter_table(controller)}
 
 
 def _moves(row: ParameterInfo, value: np.ndarray, free: Sequence[str] | None) -> bool:
@@ -283,12 +282,3 @@ def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> list[str]:
     if pressing:
         out.append(f"at its limit: {', '.join(pressing)}")
     return out
-
-
-def _by_path(table: Sequence[ParameterInfo], problem: Problem, y: Any) -> dict[str, np.ndarray]:
-    rows, values = _values(problem.controller(y))
-    return {
-        row.path: value.reshape(row.shape)
-        for row, value in zip(rows, values, strict=True)
-        if row.path in {one.path for one in table}
-    }
