@@ -14,7 +14,7 @@ from fits._errors import DataError
 from fits._tune import tune_controller
 from fits._tune_problem import Goal, linear_part
 from fits._tune_result import Tuning
-from fits._tune_start import relay_start, steepest_slope
+from fits._tune_start import relay_start, slope_array, steepest_slope
 from microid import (
     BPPID,
     CMACPID,
@@ -81,7 +81,7 @@ class Loop:
     def margins(self, controller: AbstractController) -> list[Margins]:
         """Margins of every plant, at the steepest slope of its hysteresis."""
         return [
-            margins(linear_part(controller), one, delay=self.delay, slope_um_per_V=steepest_slope(one))
+            margins(linear_part(controller), one, delay=self.delay, slope_um_per_V=slope_array(one))
             for one in self.plants
         ]
 
@@ -196,7 +196,7 @@ class Maker:
             jnp.asarray(own),
             min(own) / _PERIODS,
             delay=self.loop.delay,
-            slope_um_per_V=steepest_slope(stage),
+            slope_um_per_V=slope_array(stage),
         )
         if before is None:
             return found, None, more

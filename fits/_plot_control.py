@@ -9,7 +9,7 @@ import numpy as np
 
 from fits._plot_style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned
 from fits._tune_problem import linear_part
-from fits._tune_start import steepest_slope
+from fits._tune_start import slope_array
 from microid import AbstractController, ControlledRun, Stage, loop_gain
 
 _FREQUENCIES = 600
@@ -77,7 +77,7 @@ def plot_control(
     size, turn, peak = picture.subplots(3, 1, sharex=True)
     for k, plant in reversed(list(enumerate(plants))):
         gain = np.asarray(
-            loop_gain(linear, plant, jnp.asarray(frequency), delay=delay, slope_um_per_V=steepest_slope(plant))
+            loop_gain(linear, plant, jnp.asarray(frequency), delay=delay, slope_um_per_V=slope_array(plant))
         )
         style = MODEL | {"linewidth": 0.9} if k == 0 else {"color": LIGHT, "linewidth": 0.7}
         words = {0: "the model", 1: "within its uncertainty"}.get(k, "")

@@ -80,6 +80,12 @@ def _respond(law: Preisach, voltage_V: Float[Array, " n"]) -> Float[Array, " n"]
     return law(voltage_V)
 
 
+def slope_array(stage: Stage) -> Float[Array, ""] | None:
+    """The same as an array: compiled functions take a bare number for a constant, and are made again for each."""
+    slope = steepest_slope(stage)
+    return None if slope is None else jnp.asarray(slope)
+
+
 def ultimate_point(stage: Stage, interval_s: float, *, delay: int = 0) -> UltimatePoint:
     """Find the ultimate point of a stage: where its sampled response, delay included, is real and most negative.
 
@@ -97,7 +103,7 @@ def ultimate_point(stage: Stage, interval_s: float, *, delay: int = 0) -> Ultima
     DataError
         If the stage moves down for a voltage that goes up, or does not move at all.
     """
-    unit, slope = PID.from_times(1.0, jnp.inf, 0.0, interval_s), steepest_slope(stage)
+    unit, slope = PID.from_times(1.0, jnp.inf, 0.0, interval_s), slope_array(stage)
 
     def response(frequency_Hz: np.ndarray) -> np.ndarray:
         found = loop_gain(unit, stage, jnp.asarray(frequency_Hz), delay=delay, slope_um_per_V=slope)
@@ -154,7 +160,7 @@ def relay_start(plants: Stage | Sequence[Stage], interval_s: float, *, delay: in
     """
     stages = [plants] if isinstance(plants, Stage) else list(plants)
     point = ultimate_point(stages[0], interval_s, delay=delay)
-    slopes = [steepest_slope(stage) for stage in stages]
+    slopes = [slope_array(stage) for stage in stages]
     gain = 0.6 * point.gain_V_per_um
     for _ in range(_HALVINGS):
         integral_s, derivative_s = point.period_s / 2, point.period_s / 8

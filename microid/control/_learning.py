@@ -89,7 +89,8 @@ def learn_once(
         See `margins`.
     """
     numbers = (_as_inexact(x) for x in (command_V, error_um, interval_s, bandwidth_Hz, share))
-    return _corrected(stage, controller, delay, slope_um_per_V, *numbers)
+    slope = None if slope_um_per_V is None else _as_inexact(slope_um_per_V)
+    return _corrected(stage, controller, delay, slope, *numbers)
 
 
 @eqx.filter_jit

@@ -89,7 +89,8 @@ class ResonantPID(AbstractLinearController):
         """
         frequency = jnp.atleast_1d(_as_inexact(frequency_Hz))
         unit = PID.from_times(1.0, math.inf, 0.0, pid.interval_s)
-        plant = loop_gain(unit, stage, frequency, delay=delay, slope_um_per_V=slope_um_per_V)
+        slope = None if slope_um_per_V is None else _as_inexact(slope_um_per_V)
+        plant = loop_gain(unit, stage, frequency, delay=delay, slope_um_per_V=slope)
         turn = 2 * jnp.pi * frequency * pid.interval_s
         path = plant / (1 + pid.transfer(lax.complex(jnp.cos(turn), jnp.sin(turn))) * plant)
         return cls(pid, frequency, 2 * rate_per_s / jnp.abs(path), -jnp.rad2deg(jnp.angle(path)))

@@ -79,7 +79,8 @@ def two_degrees(
         See `invert_stage`.
     """
     reference, interval = _as_inexact(reference_um), _as_inexact(interval_s)
-    return _design(stage, interval, reference, memory, _as_inexact(lag_s), limits_V)
+    limits = None if limits_V is None else (_as_inexact(limits_V[0]), _as_inexact(limits_V[1]))
+    return _design(stage, interval, reference, memory, _as_inexact(lag_s), limits)
 
 
 @eqx.filter_jit
