@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _control_rows import control as control_rows
 from _frequency_rows import frequency as frequency_rows
 from _inputs import BENCH, Case, SLOPE_um_per_V, model_of, random_path, shared_case, smooth_density, synthetic_case
 from _inverse_rows import inverse as inverse_rows
@@ -270,6 +271,11 @@ def sensitivity(settings: Settings, table: Table) -> None:
     sensitivity_rows(10 * settings.samples, settings.repeats, settings.seed, table)
 
 
+def control(settings: Settings, table: Table) -> None:
+    """Many closed loops at once, against NumPy."""
+    control_rows(settings.samples, 256, settings.repeats, settings.seed, table)
+
+
 ROWS = {
     "forward": forward,
     "gradient": gradient,
@@ -280,5 +286,6 @@ ROWS = {
     "inverse": inverse,
     "frequency": frequency,
     "sensitivity": sensitivity,
+    "control": control,
     "cold": cold,
 }

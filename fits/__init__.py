@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fits._budget_report import describe_budget as describe_budget
     from fits._compensate import Compensation as Compensation
     from fits._compensate import compensate as compensate
+    from fits._draw_plants import draw_plants as draw_plants
     from fits._errors import DataError as DataError
     from fits._export_c import export_c as export_c
     from fits._fit import LADDER as LADDER
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from fits._paper_claims import sign_change_guides as sign_change_guides
     from fits._plot_budget import plot_budget as plot_budget
     from fits._plot_compensation import plot_compensation as plot_compensation
+    from fits._plot_control import plot_control as plot_control
     from fits._plot_idle import plot_idle as plot_idle
     from fits._plot_sensitivity import plot_sensitivity as plot_sensitivity
     from fits._plot_stage import plot_stage as plot_stage
@@ -95,6 +97,14 @@ if TYPE_CHECKING:
     from fits._stage_toml import read_design as read_design
     from fits._stage_toml import write_design as write_design
     from fits._stage_uncertainty import StageUncertainty as StageUncertainty
+    from fits._tune import tune_controller as tune_controller
+    from fits._tune_problem import Goal as Goal
+    from fits._tune_result import LoopReport as LoopReport
+    from fits._tune_result import Tuning as Tuning
+    from fits._tune_start import UltimatePoint as UltimatePoint
+    from fits._tune_start import relay_start as relay_start
+    from fits._tune_start import steepest_slope as steepest_slope
+    from fits._tune_start import ultimate_point as ultimate_point
     from fits._uncertainty import Uncertainty as Uncertainty
     from fits.diagnosis._diagnose import diagnose as diagnose
     from fits.diagnosis._json import diagnosis_json as diagnosis_json
@@ -132,9 +142,11 @@ _HOMES = {
     "FitStatus": "_result",
     "FoundCause": "diagnosis._result",
     "Gain": "diagnosis._result",
+    "Goal": "_tune_problem",
     "IdleNoise": "_idle",
     "LADDER": "_fit",
     "LevelTrial": "_result",
+    "LoopReport": "_tune_result",
     "ModalFit": "_modal_fit",
     "ModelFile": "_model_file",
     "MonteCarlo": "_monte_carlo",
@@ -155,6 +167,8 @@ _HOMES = {
     "StageFit": "_stage_result",
     "StageUncertainty": "_stage_uncertainty",
     "Together": "_stage_design",
+    "Tuning": "_tune_result",
+    "UltimatePoint": "_tune_start",
     "Uncertainty": "_uncertainty",
     "allocate": "_allocate",
     "budget": "_budget",
@@ -169,6 +183,7 @@ _HOMES = {
     "diagnose": "diagnosis._diagnose",
     "diagnosis_json": "diagnosis._json",
     "diagnosis_schema": "diagnosis._json",
+    "draw_plants": "_draw_plants",
     "errors": "_metrics",
     "estimate_response": "_frequency",
     "export_c": "_export_c",
@@ -186,6 +201,7 @@ _HOMES = {
     "paper_design": "_stage_design",
     "plot_budget": "_plot_budget",
     "plot_compensation": "_plot_compensation",
+    "plot_control": "_plot_control",
     "plot_fit": "_plots",
     "plot_idle": "_plot_idle",
     "plot_sensitivity": "_plot_sensitivity",
@@ -201,6 +217,7 @@ _HOMES = {
     "read_response": "_read_response",
     "read_runs": "_read_csv",
     "relative_error": "_modal_fit",
+    "relay_start": "_tune_start",
     "report_html": "diagnosis._report",
     "sample_posterior": "_posterior",
     "save_model": "_model_file",
@@ -210,6 +227,9 @@ _HOMES = {
     "sign_change_guides": "_paper_claims",
     "sobol": "_sobol",
     "stage_report": "_stage_report",
+    "steepest_slope": "_tune_start",
+    "tune_controller": "_tune",
+    "ultimate_point": "_tune_start",
     "write_design": "_stage_toml",
 }
 

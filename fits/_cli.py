@@ -5,6 +5,7 @@ Only the standard library and click are imported before a command runs.
 
 import click
 
+from fits._cli_commands_control import control
 from fits._cli_commands_diagnosis import diagnose
 from fits._cli_commands_model import compensate, export, fit, info, simulate, synth
 from fits._cli_commands_stage import budget, sensitivity
@@ -35,7 +36,7 @@ def cli() -> None:
     """
 
 
-for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose):
+for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose, control):
     cli.add_command(_command)
 
 

@@ -20,6 +20,8 @@ class FitStatus(enum.Enum):
     CONVERGED = "the optimality conditions hold"
     MAX_STEPS = "the solver ran out of steps: fit a simpler model (fewer levels, parameters or modes)"
     NONFINITE = "the solver met a number that is not finite: look for absurd values in the data"
+    UNSTABLE = "the closed loop is unstable: start from lower gains, as those of relay_start"
+    LIMITS = "no gains were found that keep all limits: relax them, start elsewhere, or try a slower reference"
     NOT_STATIONARY = "the solver stopped where the cost still falls: try another model, or other values to start from"
 
 
@@ -32,8 +34,8 @@ class FitError(RuntimeError):
         Why, and what to do.
     """
 
-    def __init__(self, status: FitStatus):
-        super().__init__(f"the fit failed: {status.value}")
+    def __init__(self, status: FitStatus, detail: str = ""):
+        super().__init__(f"the fit failed: {status.value}{f' ({detail})' if detail else ''}")
         self.status = status
 
 

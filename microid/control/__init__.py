@@ -1,6 +1,7 @@
 """Controllers for a stage, the closed loop, and its figures of merit (Sections 3.3 and 4.3-4.4)."""
 
 from microid.control._base import AbstractController as AbstractController
+from microid.control._base import AbstractLinearController as AbstractLinearController
 from microid.control._bp_pid import BPPID as BPPID
 from microid.control._bp_pid import GainNetwork as GainNetwork
 from microid.control._cmac_pid import CMACPID as CMACPID
@@ -8,6 +9,9 @@ from microid.control._errors import StepMetrics as StepMetrics
 from microid.control._errors import TrackingErrors as TrackingErrors
 from microid.control._errors import step_metrics as step_metrics
 from microid.control._errors import tracking_errors as tracking_errors
+from microid.control._learning import Learnt as Learnt
+from microid.control._learning import iterative_learning as iterative_learning
+from microid.control._learning import learn_once as learn_once
 from microid.control._loop import ControlledRun as ControlledRun
 from microid.control._loop import simulate_loop as simulate_loop
 from microid.control._margins import Margins as Margins
@@ -15,5 +19,8 @@ from microid.control._margins import loop_gain as loop_gain
 from microid.control._margins import margins as margins
 from microid.control._margins import require_stable as require_stable
 from microid.control._pid import PID as PID
+from microid.control._resonant_pid import ResonantPID as ResonantPID
 from microid.control._sampled import AbstractPlant as AbstractPlant
 from microid.control._sampled import SampledStage as SampledStage
+from microid.control._two_degrees import TwoDegrees as TwoDegrees
+from microid.control._two_degrees import two_degrees as two_degrees

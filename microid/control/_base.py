@@ -1,10 +1,10 @@
 """What a feedback controller is: a state, and one step per sample."""
 
 import abc
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 
 class AbstractController(eqx.Module):
@@ -62,3 +62,19 @@ class AbstractController(eqx.Module):
         state, command_V
             The next state, and the whole command, feedforward included.
         """
+
+
+class AbstractLinearController(AbstractController):
+    """A controller that is linear but for its limits, so that the loop has margins."""
+
+    @abc.abstractmethod
+    def transfer(self, z: Complex[Array, "..."]) -> Complex[Array, "..."]:
+        """Feedback per error, in V/um, at points of the z-plane; without limits."""
+
+    @abc.abstractmethod
+    def _unlimited(self) -> Self:
+        """The same without limits."""
+
+    @abc.abstractmethod
+    def _driven(self, state: Any) -> Any:
+        """State in which what nothing is ever added to is zero: it is a constant, and no pole of the loop."""

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Complex, Float
 from microid._part import AbstractHysteresis, AbstractLinear, _complex
 from microid._plant import Piezo
 from microid._stage import Stage, Start
+from microid.control._base import AbstractLinearController
 from microid.control._loop import _Channel, _once, _rest
-from microid.control._pid import PID
 from microid.control._sampled import SampledStage, _LinearStep
 
 _Scalar = Float[Array, ""] | float
@@ -60,12 +60,12 @@ class Margins(eqx.Module):
 
 
 class _LoopGain(eqx.Module):
-    pid: PID
+    pid: AbstractLinearController
     plant: SampledStage
     delay: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, pid: PID, stage: Stage, delay: int, slope_um_per_V: _Scalar | None) -> Self:
+    def of(cls, pid: AbstractLinearController, stage: Stage, delay: int, slope_um_per_V: _Scalar | None) -> Self:
         for name, part in zip(stage.names, stage.parts, strict=True):
             if isinstance(part, AbstractHysteresis) and slope_um_per_V is not None:
                 stage = stage.swap(name, Piezo(jnp.asarray(slope_um_per_V)))
@@ -73,8 +73,7 @@ class _LoopGain(eqx.Module):
                 raise ValueError(f"{name!r} is not linear: give the slope_um_per_V that stands for a hysteresis")
         if delay < 0:
             raise ValueError(f"delay must be a number of samples, 0 or more, got {delay}")
-        free = eqx.tree_at(lambda pid: (pid.lower_V, pid.upper_V), pid, (-jnp.inf, jnp.inf))
-        return cls(free, SampledStage(stage.with_substeps(1), pid.interval_s), delay)
+        return cls(pid._unlimited(), SampledStage(stage.with_substeps(1), pid.interval_s), delay)
 
     def __call__(self, frequency_Hz: Float[Array, " f"]) -> Complex[Array, " f"]:
         turn = 2 * jnp.pi * frequency_Hz * self.pid.interval_s
@@ -112,7 +111,7 @@ def _fraction(link: _LinearStep) -> tuple[list[Array], list[Array]]:
 
 @eqx.filter_jit
 def loop_gain(
-    pid: PID,
+    pid: AbstractLinearController,
     stage: Stage,
     frequency_Hz: Float[Array, " f"],
     *,
@@ -146,13 +145,16 @@ def loop_gain(
 
 
 @eqx.filter_jit
-def margins(pid: PID, stage: Stage, *, delay: int = 0, slope_um_per_V: _Scalar | None = None) -> Margins:
+def margins(
+    pid: AbstractLinearController, stage: Stage, *, delay: int = 0, slope_um_per_V: _Scalar | None = None
+) -> Margins:
     """Find the margins of a loop, differentiable in the controller and the stage.
 
     Parameters
     ----------
     pid
-        Linear: its limits are not looked at. For `BPPID` see its `pid`, for `CMACPID` that within it.
+        A `PID` or a `ResonantPID`: its limits are not looked at. For `BPPID` see its `pid`, for `CMACPID` that within
+        it.
     stage
         Of linear parts, and of at most one hysteresis.
     delay
@@ -225,9 +227,7 @@ def _closed(loop: _LoopGain) -> tuple[Array, Array, Array, Array]:
 
     def once(state: Float[Array, " n"], noise: Float[Array, ""]) -> tuple[Array, Array]:
         after, (displacement, _, command) = _once(loop.pid, loop.plant, channel, restore(state), zero, zero, noise)
-        # An integral to which nothing is ever added is a constant, and no pole on the unit circle.
-        integral = jnp.where(loop.pid.integral_V_per_um_s == 0, 0, after[0].integral_V)
-        after = eqx.tree_at(lambda after: after[0].integral_V, after, integral)
+        after = (loop.pid._driven(after[0]), *after[1:])
         return ravel_pytree(after)[0], jnp.stack([displacement, command])
 
     (closed, driven), (reads, direct) = jax.jacfwd(once, argnums=(0, 1))(flat, zero)

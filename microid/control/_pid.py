@@ -9,7 +9,7 @@ from jaxtyping import Array, Complex, Float
 
 from microid._param import _as_inexact, array, param
 from microid._part import _complex
-from microid.control._base import AbstractController
+from microid.control._base import AbstractLinearController
 
 _Scalar = Float[Array, ""] | float
 
@@ -20,7 +20,7 @@ class _State(eqx.Module):
     before_um: Float[Array, ""]
 
 
-class PID(AbstractController):
+class PID(AbstractLinearController):
     r"""PID controller with a filtered derivative, limits and anti-windup by back-calculation.
 
     .. math:: u = u_{ff} + K_p (b r - y) + K_i \int (r - y)\, dt + \frac{K_d s}{T_f s + 1} (c r - y)
@@ -109,3 +109,10 @@ class PID(AbstractController):
             )
         )
         return p + i * t * z / (z - 1) + d * (z - 1) / ((f + t) * z - f)
+
+    def _unlimited(self) -> Self:
+        return eqx.tree_at(lambda pid: (pid.lower_V, pid.upper_V), self, (-jnp.inf, jnp.inf))
+
+    def _driven(self, state: _State) -> _State:
+        integral = jnp.where(self.integral_V_per_um_s == 0, 0, state.integral_V)
+        return _State(integral, state.derivative_V, state.before_um)

@@ -1,0 +1,323 @@
+"""What tuning minimises: figures of many closed loops at once, their cost, and how far they are from their limits."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from microid import (
+    BPPID,
+    CMACPID,
+    AbstractController,
+    AbstractLinearController,
+    Coordinates,
+    Margins,
+    Stage,
+    Start,
+    margins,
+    simulate_loop,
+)
+
+# Every gain is searched for within `exp` of this of its start, to either side.
+REACH = 6.0
+# What stands for the cost of a loop that overflows.
+_ABSURD = 1e9
+# Roots have no derivative at zero; a picometre is nothing.
+_TINY_um2 = 1e-12
+_RTOL = _ATOL = 1e-4
+_FAR = 1e9
+_STEPS = 80
+
+
+@dataclass(frozen=True)
+class Goal:
+    r"""What a controller is tuned for: the least cost within the limits, of every plant and every reference.
+
+    .. math:: J = \mathrm{rms}(e) + w_u\, \mathrm{rms}(u - u_{ff}) + w_{\Delta}\, \mathrm{rms}(u_k - u_{k-1})
+
+    in um, each over all plants, references and samples that count. A limit of None is none.
+
+    Attributes
+    ----------
+    effort_um_per_V
+        Weight `w_u` of what the feedback adds to the feedforward, or to the command before the first sample.
+    rate_um_per_V
+        Weight `w_Δ` of the change of the command between samples.
+    gain_margin_min, phase_margin_min_deg, sensitivity_peak_max
+        Of the linearised loop of every plant; see `microid.Margins`.
+    overshoot_max_pct
+        Displacement beyond the range that the reference and the rest before it span, in percent of that range.
+    command_max_V, command_min_V
+        Limits of the command, short of where the controller cuts it off.
+    command_step_max_V
+        Largest change of the command between two samples.
+    """
+
+    effort_um_per_V: float = 0.0
+    rate_um_per_V: float = 0.0
+    gain_margin_min: float | None = 2.0
+    phase_margin_min_deg: float | None = 30.0
+    sensitivity_peak_max: float | None = 2.0
+    overshoot_max_pct: float | None = None
+    command_min_V: float | None = None
+    command_max_V: float | None = None
+    command_step_max_V: float | None = None
+
+    def limits(self) -> dict[str, float]:
+        """All limits by name, far away where there is none: so one program does for all of them."""
+        none = {
+            "gain_margin_min": 0.0,
+            "phase_margin_min_deg": 1e-3,
+            "sensitivity_peak_max": _FAR,
+            "overshoot_max_pct": _FAR,
+            "command_min_V": -_FAR,
+            "command_max_V": _FAR,
+            "command_step_max_V": _FAR,
+        }
+        return {
+            name: far if getattr(self, name) is None else float(getattr(self, name)) for name, far in none.items()
+        }
+
+    def command_width_V(self) -> float:
+        """What the excess of a command is counted in."""
+        low, high = self.command_min_V, self.command_max_V
+        if low is not None and high is not None:
+            return float(high - low)
+        return max(1.0, *(abs(float(x)) for x in (low, high) if x is not None), 1.0)
+
+
+class Problem(eqx.Module):
+    """A controller in the coordinates of its search, and all loops it is to close.
+
+    Attributes
+    ----------
+    coordinates
+        Of the controller.
+    origin, stretch
+        Where the search begins, and by how much a coordinate changes its parameter e-fold there, shape `(n,)`.
+    plants
+        Stages with `p` values in every leaf.
+    slope_um_per_V
+        Of their hysteresis, shape `(p,)`; None without one.
+    reference_um, feedforward_V, noise_um
+        Shape `(r, t)`; None where there is none.
+    counts
+        Which samples count, shape `(t,)`.
+    start
+        How all stages stand before.
+    weights_um_per_V
+        Of effort and rate.
+    limits
+        By their names in `Goal`.
+    command_width_V
+        What the excess of a command is counted in.
+    resolution_um
+        Of the sensor.
+    delay
+        Of the reading, in samples.
+    """
+
+    coordinates: Coordinates[Any]
+    origin: Float[Array, " n"]
+    stretch: Float[Array, " n"]
+    plants: Stage
+    slope_um_per_V: Float[Array, " p"] | None
+    reference_um: Float[Array, "r t"]
+    feedforward_V: Float[Array, "r t"] | None
+    noise_um: Float[Array, "r t"] | None
+    counts: Float[Array, " t"]
+    start: Start
+    weights_um_per_V: tuple[Float[Array, ""], Float[Array, ""]]
+    limits: dict[str, Float[Array, ""]]
+    command_width_V: Float[Array, ""]
+    resolution_um: Float[Array, ""] | None
+    delay: int = eqx.field(static=True)
+
+    def controller(self, y: Float[Array, " n"]) -> Any:
+        """The controller at a place of the search."""
+        return self.coordinates(self.origin + self.stretch * REACH * jnp.tanh(y / REACH))
+
+
+class Figures(eqx.Module):
+    """What loops do, for `p` plants and `r` references.
+
+    Attributes
+    ----------
+    margins
+        Shape `(p,)` each.
+    error_um2, effort_V2, rate_V2
+        Mean squares, shape `(p, r)`.
+    error_max_um, overshoot_pct, command_min_V, command_max_V, command_step_V
+        Extremes, shape `(p, r)`.
+    """
+
+    margins: Margins
+    error_um2: Float[Array, "p r"]
+    effort_V2: Float[Array, "p r"]
+    rate_V2: Float[Array, "p r"]
+    error_max_um: Float[Array, "p r"]
+    overshoot_pct: Float[Array, "p r"]
+    command_min_V: Float[Array, "p r"]
+    command_max_V: Float[Array, "p r"]
+    command_step_V: Float[Array, "p r"]
+
+    @property
+    def stable(self) -> Bool[Array, " p"]:
+        """Whether the linearised loop of each plant is stable, and none of its runs overflows."""
+        return self.margins.stable & jnp.all(jnp.isfinite(self.error_um2), axis=1)
+
+
+def linear_part(controller: AbstractController) -> AbstractLinearController:
+    """The linear controller that a controller is at first, for its margins.
+
+    Raises
+    ------
+    ValueError
+        If it is of a kind that has none.
+    """
+    if isinstance(controller, AbstractLinearController):
+        return controller
+    if isinstance(controller, CMACPID):
+        return controller.pid
+    if isinstance(controller, BPPID):
+        return controller.pid(controller.init())
+    raise ValueError(f"a {type(controller).__name__} has no linear part, and so no margins to be tuned for")
+
+
+def figures(problem: Problem, controller: Any) -> Figures:
+    """Close all loops."""
+    linear = linear_part(controller)
+
+    def around(plant: Stage, slope: Float[Array, ""] | None) -> tuple[Margins, tuple[Array, ...]]:
+        def along(reference: Array, ahead: Array | None, noise: Array | None) -> tuple[Array, ...]:
+            return _run(problem, controller, plant, reference, ahead, noise)
+
+        given = problem.reference_um, problem.feedforward_V, problem.noise_um
+        found = eqx.filter_vmap(along, in_axes=(0, *(None if x is None else 0 for x in given[1:])))(*given)
+        return margins(linear, plant, delay=problem.delay, slope_um_per_V=slope), found
+
+    slopes = problem.slope_um_per_V
+    found, runs = eqx.filter_vmap(around, in_axes=(eqx.if_array(0), None if slopes is None else 0))(
+        problem.plants, slopes
+    )
+    return Figures(found, *runs)
+
+
+def _run(
+    problem: Problem,
+    controller: Any,
+    plant: Stage,
+    reference: Float[Array, " t"],
+    ahead: Float[Array, " t"] | None,
+    noise: Float[Array, " t"] | None,
+) -> tuple[Array, ...]:
+    run = simulate_loop(
+        controller,
+        plant,
+        reference,
+        feedforward_V=ahead,
+        noise_um=noise,
+        delay=problem.delay,
+        resolution_um=problem.resolution_um,
+        start=problem.start,
+    )
+    rest = jnp.zeros((), reference.dtype) if problem.start.rest_V is None else problem.start.rest_V
+    effort = run.command_V - (rest if ahead is None else ahead)
+    # The first change is from the command before.
+    before = rest if ahead is None else ahead[0]
+    rate = jnp.diff(run.command_V, prepend=before)
+    count = jnp.sum(problem.counts)
+    squares = (jnp.sum(problem.counts * x**2) / count for x in (run.error_um, effort, rate))
+    low = jnp.minimum(jnp.min(reference), run.displacement_um[0])
+    high = jnp.maximum(jnp.max(reference), run.displacement_um[0])
+    beyond = jnp.maximum(run.displacement_um - high, low - run.displacement_um)
+    extremes = (
+        jnp.max(problem.counts * jnp.abs(run.error_um)),
+        100 * jnp.maximum(jnp.max(beyond), 0) / (high - low),
+        jnp.min(run.command_V),
+        jnp.max(run.command_V),
+        jnp.max(jnp.abs(rate)),
+    )
+    return (*squares, *extremes)
+
+
+def cost_um(problem: Problem, found: Figures) -> Float[Array, ""]:
+    """The cost that `Goal` states."""
+    effort, rate = problem.weights_um_per_V
+    each = (found.error_um2, found.effort_V2, found.rate_V2)
+    roots = [jnp.sqrt(jnp.mean(x) + _TINY_um2) for x in each]
+    return roots[0] + effort * roots[1] + rate * roots[2]
+
+
+def excess(problem: Problem, found: Figures) -> dict[str, Float[Array, "..."]]:
+    """How far every limit is passed, as a share of it; negative within. Of each, one per plant or plant and run."""
+    m, limits = found.margins, problem.limits
+    # By how many e-folds an unstable motion grows over the record.
+    out = {"stability": problem.counts.shape[0] * jnp.log(jnp.maximum(m.radius, 1e-3))}
+    shares = {
+        "gain_margin_min": lambda least: least / m.gain_margin - 1,
+        "phase_margin_min_deg": lambda least: 1 - jnp.minimum(m.phase_margin_deg, 180) / least,
+        "sensitivity_peak_max": lambda most: m.sensitivity_peak / most - 1,
+        "overshoot_max_pct": lambda most: jnp.log((found.overshoot_pct + 1) / (most + 1)),
+        "command_min_V": lambda least: (least - found.command_min_V) / problem.command_width_V,
+        "command_max_V": lambda most: (found.command_max_V - most) / problem.command_width_V,
+        "command_step_max_V": lambda most: found.command_step_V / most - 1,
+    }
+    for name, limit in limits.items():
+        share = shares[name](limit)
+        if name in ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max"):
+            # Of an unstable loop the margins mean nothing.
+            share = jnp.where(m.stable, share, 1)
+        out[name] = share
+    return out
+
+
+def _merit(
+    y: Float[Array, " n"], args: tuple[Problem, dict[str, Array], Float[Array, ""], Float[Array, ""]]
+) -> Float[Array, ""]:
+    """Logarithm of the cost, and the augmented Lagrangian of the limits (Nocedal and Wright 2006, section 17.4)."""
+    problem, multipliers, weight, scale = args
+    found = figures(problem, problem.controller(y))
+    over = excess(problem, found)
+    total = jnp.log(cost_um(problem, found))
+    for name, share in over.items():
+        push = jnp.maximum(share + multipliers[name] / weight, 0)
+        total = total + jnp.sum(weight / 2 * push**2 - multipliers[name] ** 2 / (2 * weight))
+    # Where nothing is finite, only the value is looked at: no line search stops there.
+    return scale * jnp.where(jnp.isfinite(total), total, _ABSURD)
+
+
+@eqx.filter_jit
+def judge(problem: Problem, y: Float[Array, " n"]) -> tuple[Figures, dict[str, Array], Float[Array, ""]]:
+    """Figures at a place of the search, their excess over the limits, and the cost in um."""
+    found = figures(problem, problem.controller(y))
+    return found, excess(problem, found), cost_um(problem, found)
+
+
+@eqx.filter_jit
+def descend(
+    problem: Problem,
+    y: Float[Array, " n"],
+    over: dict[str, Array],
+    multipliers: dict[str, Array],
+    weight: Float[Array, ""],
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Minimise the augmented Lagrangian from a place on, whose excess is known: the place, and the gradient there."""
+    # The first step is as long as the gradient: where limits are far passed, it must not leap over everything.
+    pushed = [jnp.sum(jnp.maximum(weight * over[name] + multipliers[name], 0)) for name in over]
+    scale = 1 / (1 + sum(pushed, start=jnp.zeros(())))
+    solver: Any = optx.BFGS(rtol=_RTOL, atol=_ATOL)
+    solution: Any = optx.minimise(
+        _merit,
+        solver,
+        y,
+        args=(problem, multipliers, weight, scale),
+        # A handful of gains and thousands of samples: forwards nothing has to be kept.
+        options={"autodiff_mode": "fwd"},
+        max_steps=_STEPS,
+        throw=False,
+    )
+    return solution.value, solution.state.f_info.grad / scale

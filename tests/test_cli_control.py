@@ -1,0 +1,190 @@
+"""The command that closes a loop around a model, end to end, and what it refuses."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _command import files, refused, run
+from matplotlib.image import imread
+from scipy.signal import cont2discrete, lfilter
+
+import microid as m
+from fits import save_model
+
+T = 1e-3
+SAMPLES = 120
+TAU_s, NATURAL_Hz, DAMPING, GAIN, OFFSET = 2e-3, 60.0, 0.3, 0.12, 1.5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_fast():
+    """These programs run for a second, and take much longer to optimise."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+def write(path, time_s, displacement_um):
+    rows = [f"{t!r},{x!r}" for t, x in zip(time_s.tolist(), displacement_um.tolist(), strict=True)]
+    path.write_text("\n".join(["time_s,displacement_um", *rows]) + "\n")
+
+
+def read(path):
+    header, *rows = path.read_text().splitlines()
+    return dict(zip(header.split(","), np.array([row.split(",") for row in rows], dtype=float).T, strict=True))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A linear model, a hysteresis, and references: a step, a sine, and uneven times."""
+    place = tmp_path_factory.mktemp("control")
+    linear = m.Stage.of(
+        driver=m.Driver(TAU_s), piezo=m.Piezo(GAIN, OFFSET), mechanics=m.Mechanics(NATURAL_Hz, DAMPING)
+    )
+    save_model(place / "linear.json", linear, None, {})
+    density = m.GridDensity(np.linspace(0.2, 0.8, 15), 0.0, 100.0)
+    law = m.Preisach(density, m.Reversible(jnp.full(5, 0.05), 0.0, 100.0), jnp.asarray(2.0))
+    save_model(place / "loop.json", law, None, {})
+    save_model(place / "dahl.json", m.Stage.of(law=m.Dahl(0.1, 0.05, 1.0, 1.0)), None, {})
+    at = T * np.arange(SAMPLES)
+    write(place / "step.csv", at, 5.0 + 2 * (at > 0.0195))
+    write(place / "sine.csv", at, 7.0 - 2 * np.cos(2 * np.pi * 25 * at))
+    write(place / "uneven.csv", at + 2e-4 * (np.arange(SAMPLES) == 40), at)
+    write(place / "short.csv", at[:9], at[:9])
+    return place
+
+
+def closed_by_scipy(gains, reference, start):
+    """Displacement of the loop from rest, by the polynomials of controller and sampled plant."""
+    kp, ki, kd = gains
+    rate = 2 * np.pi * NATURAL_Hz
+    bottom = np.polymul([TAU_s, 1], [1 / rate**2, 2 * DAMPING / rate, 1])
+    above, below, _ = cont2discrete(([GAIN], bottom), T, method="zoh")
+    pid = np.polyadd([kp, -kp, 0], np.polyadd([ki * T, 0, 0], np.array([1, -2, 1]) * kd / T))
+    whole = np.polyadd(np.polymul(np.polymul([1, -1, 0], below), [1]), np.polymul(pid, above[0]))
+    top = np.polymul(pid, above[0])
+    padded = np.append(np.zeros(len(whole) - len(top)), top)
+    return start + lfilter(padded, whole, reference - start)
+
+
+def test_given_gains_are_run_as_scipy_runs_them(folder, tmp_path):
+    gains = (0.5, 80.0, 1e-3)
+    given = ",".join(map(str, gains))
+    result = run(
+        *("control", folder / "linear.json", folder / "step.csv", "--out", tmp_path / "r.csv", "--gains", given),
+        *("--feedforward", "none", "--json", "--plots", tmp_path / "plots"),
+    )
+    assert result.exit_code == 0, result.output
+    told, out = json.loads(result.stdout), read(tmp_path / "r.csv")
+    assert list(out) == ["time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um"]
+    reference = 5.0 + 2 * (out["time_s"] > 0.0195)
+    expected = closed_by_scipy(gains, reference, 5.0)
+    np.testing.assert_allclose(out["reference_um"], reference, atol=1e-12)
+    np.testing.assert_allclose(out["displacement_um"], expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(out["error_um"], reference - expected, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(out["measured_um"], out["displacement_um"])
+    error = reference - expected
+    assert told["tracking"]["e_max_pct"] == pytest.approx(100 * np.abs(error).max() / 2)
+    assert told["tracking"]["error_rms_um"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert told["step"]["overshoot_pct"] >= 0
+    assert told["schema"] == "microid.control/1"
+    assert told["tuning"] is told["without_feedback"] is None
+    assert told["gains"]["integral_V_per_um_s"] == 80.0
+    assert told["margins"]["stable"] is True
+    assert [path.name for path in sorted((tmp_path / "plots").iterdir())] == ["margins.png", "run.png"]
+    for place in told["plots"]:
+        assert imread(place)[..., :3].mean(axis=-1).std() > 0.02
+    # What --json printed is taken as gains again.
+    (tmp_path / "gains.json").write_text(result.stdout)
+    again = run(
+        *("control", folder / "linear.json", folder / "step.csv", "--out", tmp_path / "again.csv"),
+        *("--gains", tmp_path / "gains.json", "--feedforward", "none"),
+    )
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "again.csv").read_text() == (tmp_path / "r.csv").read_text()
+    assert "margins     1 plants" in again.stdout
+
+
+def test_a_tuned_loop_follows_better_than_its_start_and_says_what_noise_hides(folder, tmp_path):
+    options = ["--noise", "0.5", "--delay", "1", "--resolution", "0.001", "--skip", "0.02", "--starts", "1"]
+    result = run(
+        *("control", folder / "linear.json", folder / "sine.csv", "--out", tmp_path / "r.csv", "--json"),
+        *(*options, "--feedforward", "dynamic", "--effort", "0.01"),
+    )
+    assert result.exit_code == 0, result.output
+    told, out = json.loads(result.stdout), read(tmp_path / "r.csv")
+    assert told["tuning"]["cost_after_um"] < told["tuning"]["cost_before_um"]
+    assert told["margins_worst"]["gain_margin"] is None or told["margins_worst"]["gain_margin"] > 1.99
+    kept = slice(20, None)
+    error = out["reference_um"] - out["displacement_um"]
+    assert told["tracking"]["error_max_um"] == pytest.approx(np.abs(error[kept]).max())
+    # Readings are late by one sample, noisy and rounded.
+    noise = out["measured_um"][1:] - out["displacement_um"][:-1]
+    assert 0.4 < noise.std() < 0.6
+    np.testing.assert_allclose(out["measured_um"][1:], np.round(out["measured_um"][1:], 3), atol=1e-9)
+    assert any("below the sensor's noise" in remark for remark in told["remarks"])
+    assert told["without_feedback"]["error_rms_um"] < 0.1
+    words = [line for line in result.stderr.splitlines() if "cost" in line]
+    assert len(words) == 2
+
+
+@pytest.mark.parametrize("kind", ["bp-pid", "cmac-pid", "resonant"])
+def test_the_other_controllers_run_on_a_hysteresis(folder, tmp_path, kind):
+    result = run(
+        *("control", folder / "loop.json", folder / "sine.csv", "--out", tmp_path / "r.csv", "--json", "--quiet"),
+        *("--controller", kind, "--gains", "0.2,300,1e-5"),
+    )
+    assert result.exit_code == 0, result.output
+    told, out = json.loads(result.stdout), read(tmp_path / "r.csv")
+    assert told["controller"] == kind
+    assert np.all((out["command_V"] >= 0) & (out["command_V"] <= 100))
+    assert told["tracking"]["e_rms_pct"] < 60
+    if kind == "resonant":
+        assert told["gains"]["resonant_V_per_um_s"][0] > 0
+        (remark,) = [remark for remark in told["remarks"] if "resonator is at" in remark]
+        assert float(remark.split("at ")[1].split(" Hz")[0]) == pytest.approx(25, abs=0.5)
+    else:
+        assert any("before it learns" in remark for remark in told["remarks"])
+
+
+@pytest.mark.parametrize(
+    ("model", "reference", "options", "words"),
+    [
+        ("linear.json", "uneven.csv", [], ["even times"]),
+        ("linear.json", "short.csv", [], ["16 samples"]),
+        ("linear.json", "none.csv", [], ["no such file"]),
+        ("none.json", "step.csv", [], ["none.json"]),
+        ("dahl.json", "step.csv", [], ["Dahl", "no form for single samples"]),
+        ("loop.json", "sine.csv", ["--feedforward", "dynamic"], ["dynamic", "hysteresis alone"]),
+        ("loop.json", "sine.csv", ["--limits", "0,500"], ["--limits"]),
+        ("linear.json", "step.csv", ["--noise", "-1"], ["--noise"]),
+        ("linear.json", "step.csv", ["--resolution", "0"], ["--resolution"]),
+        ("linear.json", "step.csv", ["--gain-margin", "0.5"], ["--gain-margin"]),
+        ("linear.json", "step.csv", ["--frequency", "5"], ["--frequency", "resonant"]),
+        ("linear.json", "step.csv", ["--gains", "1,2"], ["--gains", "three numbers"]),
+        ("linear.json", "step.csv", ["--gains", "1,2,-3"], ["--gains", "0 or more"]),
+        ("linear.json", "step.csv", ["--gains", "gone.json"], ["--gains", "gone.json"]),
+        ("linear.json", "step.csv", ["--gains", "50,5000,1"], ["unstable"]),
+        ("linear.json", "step.csv", ["--skip", "7"], ["--skip"]),
+        ("linear.json", "step.csv", ["--plants", "3"], ["uncertainty"]),
+        (
+            "linear.json",
+            "sine.csv",
+            ["--controller", "resonant", "--gains", "1,1,0", "--frequency", "900"],
+            ["--frequency", "500 Hz"],
+        ),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_one_sentence(folder, tmp_path, model, reference, options, words):
+    places = ["control", folder / model, folder / reference, "--out", tmp_path / "r.csv"]
+    refused(run(*places, "--plots", tmp_path / "plots", *options), *words)
+    assert files(tmp_path) == []
+
+
+def test_inputs_are_not_overwritten(folder):
+    before = (folder / "step.csv").read_text()
+    refused(run("control", folder / "linear.json", folder / "step.csv", "--out", folder / "step.csv"), "overwrite")
+    assert (folder / "step.csv").read_text() == before
