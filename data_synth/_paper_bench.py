@@ -30,7 +30,7 @@ class PaperSensor:
 
     noise_um: float = 0.0318
     resolution_um: float = 0.1
-    rate_Hz: float = 1e4
+    rate_Hz: float = 2e4
 
     def read(self, displacement_um: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Mean of the readings along the last axis of displacements in um, which is one sample."""
@@ -67,15 +67,17 @@ class PaperAxis:
     damping_ratio: float = 0.1305
 
 
+_NODES = 5
+_PERIODS = 2
 _ARM_mm = 40.0
 """Where the sensor reads a rotation: the distance between the tilt axis and the leaf that lifts the platform."""
 
 PAPER_AXES: Mapping[str, PaperAxis] = MappingProxyType(
     {
-        "x": PaperAxis(6.613, -0.0278, 3.587),
-        "z": PaperAxis(9.148, 0.0520, 1.386),
-        "alpha": PaperAxis(0.10244 * _ARM_mm, -0.1791, 0.748, "urad", 1e3 / _ARM_mm),
-        "gamma": PaperAxis(0.50085 * _ARM_mm, -0.4545, 1.434, "urad", 1e3 / _ARM_mm),
+        "x": PaperAxis(6.613, -0.0278, 3.577),
+        "z": PaperAxis(9.148, 0.0516, 1.383),
+        "alpha": PaperAxis(0.10244 * _ARM_mm, -0.1786, 0.745, "urad", 1e3 / _ARM_mm),
+        "gamma": PaperAxis(0.50085 * _ARM_mm, -0.4549, 1.434, "urad", 1e3 / _ARM_mm),
     }
 )
 """The axes of Tables 3 and 4; y is as x, and beta as alpha.
@@ -93,28 +95,32 @@ piezo:
   at most as it is in the root mean square, and the paper's are 1.9 to 2.7 times as large: its records hold rests.
 """
 
-SWING_um = 2.0
+PAPER_BIAS_V = 20.0
+"""Under which the axes rest and work. At 0 V a feedback could not push both ways."""
+PAPER_SWING_um = 2.0
 """Peak to peak of a tracking run; the paper gives it for x only."""
-PERIOD_s = 2.0
-PERIODS = 2
-STEP_um = 6.613
+PAPER_PERIOD_s = 2.0
+"""Of a tracking run, which is at 0.5 Hz."""
+PAPER_STEP_um = 6.613
 """Table 2's target: 1 um of the piezo, by erratum 44."""
 
 
 def paper_reference_um(axis: PaperAxis, interval_s: float) -> FloatArray:
     """A tracking run at 0.5 Hz from rest to rest, shape `(n,)`, in um at the sensor."""
-    time_s = np.arange(round((2 * axis.rest_s + PERIODS * PERIOD_s) / interval_s)) * interval_s
-    phase = 2 * np.pi * np.clip((time_s - axis.rest_s) / PERIOD_s, 0, PERIODS)
-    return SWING_um / 2 * (1 - np.cos(phase))
+    time_s = np.arange(round((2 * axis.rest_s + _PERIODS * PAPER_PERIOD_s) / interval_s)) * interval_s
+    phase = 2 * np.pi * np.clip((time_s - axis.rest_s) / PAPER_PERIOD_s, 0, _PERIODS)
+    return PAPER_SWING_um / 2 * (1 - np.cos(phase))
 
 
 @dataclass(eq=False)
 class PaperBench:
-    """Driver, piezo, amplifier and slow mode of one axis, several times side by side, at rest under 0 V.
+    """Driver, piezo, amplifier and slow mode of one axis, several times side by side, at rest under a bias.
+
+    The bias is reached by a full sweep from above, and there the sensor is zeroed.
 
     The command is held between samples and cut to the amplifier's range. The driver is an RC, in closed form. Its
-    voltage, which runs one way between two samples, plays the piezo's hysteresis at the instants of the sensor's
-    readings; between these the mode is exact for an elongation in lines.
+    voltage, which runs one way between two samples, plays the piezo's hysteresis at a few instants; between these the
+    elongation runs in lines, for which the mode is exact.
 
     Attributes
     ----------
@@ -146,16 +152,16 @@ class PaperBench:
                 f"benches must be 1 or more and interval_s {1 / self.sensor.rate_Hz:g} s or more, "
                 f"got {self.benches} and {self.interval_s}"
             )
-        ends_s = self.interval_s / self._readings * np.arange(1, self._readings + 1)
+        ends_s = self.interval_s / _NODES * np.arange(1, _NODES + 1)
         self._decay = np.exp(-ends_s / self.time_constant_s)
         self._kernel = self._mode(self.interval_s / self._readings)
         self._gain = self.axis.amplification * (1 + self.axis.gain_error)
         self.reset()
 
     def _mode(self, step_s: float) -> FloatArray:
-        """From state and static displacements to the displacement at each reading, and the speed after the last.
+        """From state and static displacements at the nodes to the displacement at each reading, and the last speed.
 
-        Shape `(2 + readings + 1, readings + 1)`; the speed is counted in the natural frequency.
+        Shape `(2 + nodes + 1, readings + 1)`; the speed is counted in the natural frequency.
         """
         omega, zeta, count = self.axis.natural_rad_per_s, self.axis.damping_ratio, self._readings
         block = np.zeros((4, 4))
@@ -170,13 +176,17 @@ class PaperBench:
             state[:, 2 + k] += moved[:2, 2] - moved[:2, 3]
             state[:, 3 + k] += moved[:2, 3]
             rows.append(state[0])
-        return np.array([*rows, state[1]]).T
+        share = np.linspace(0, _NODES, count + 1)[:, None] - np.arange(_NODES + 1)
+        lines = np.maximum(1 - np.abs(share), 0)
+        fine = np.array([*rows, state[1]])
+        return np.concatenate([fine[:, :2], fine[:, 2:] @ lines], axis=1).T
 
     def reset(self) -> tuple[FloatArray, FloatArray]:
-        """Bring everything to rest under 0 V; displacements and readings in um, shape `(benches,)`."""
-        self._play_V = np.tile(self.piezo.saturated_V, (self.benches, 1))
-        self._voltage_V = np.zeros(self.benches)
-        self._inputs = np.zeros((self.benches, 3 + self._readings))
+        """Bring everything to rest under the bias; displacements and readings in um, shape `(benches,)`."""
+        self._rest_um, play_V = self.piezo.rest(PAPER_BIAS_V)
+        self._play_V = np.tile(play_V, (self.benches, 1))
+        self._voltage_V = np.full(self.benches, PAPER_BIAS_V)
+        self._inputs = np.zeros((self.benches, 3 + _NODES))
         rest = np.zeros((self.benches, self._readings))
         return rest[:, -1], self._read(rest)
 
@@ -188,7 +198,7 @@ class PaperBench:
         elongation_um, self._play_V = self.piezo.glide(voltage_V, self._play_V)
         inputs = self._inputs
         inputs[:, 2] = inputs[:, -1]
-        inputs[:, 3:] = self._gain * elongation_um
+        inputs[:, 3:] = self._gain * (elongation_um - self._rest_um)
         found = inputs @ self._kernel
         inputs[:, :2] = found[:, -2:]
         return found[:, -2], self._read(found[:, :-1])

@@ -27,7 +27,7 @@ class PaperPiezo:
     reversible_share
         Part of the stroke that the curve without memory makes up.
     quadratic
-        Of that curve, `x + quadratic x²` over the share `x` of the range: the steeper at first, the more negative it is.
+        Of that curve, `x + quadratic x²` over the share `x` of the range: the more negative, the steeper at first.
     plays
         Number of plays.
     """
@@ -35,13 +35,13 @@ class PaperPiezo:
     upper_V: float = 120.0
     stroke_um: float = 40.7
     loop_width: float = 0.1283
-    reversible_share: float = 0.65
-    quadratic: float = -0.2218
+    reversible_share: float = 0.66
+    quadratic: float = -0.286
     plays: int = 40
 
     @functools.cached_property
     def radii_V(self) -> FloatArray:
-        """Half of each play's backlash, shape `(plays,)`; close together at small radii, where loops are small too."""
+        """Half of each play's backlash, shape `(plays,)`; close together at small radii, for small loops."""
         return 0.49 * self.upper_V * ((np.arange(self.plays) + 0.5) / self.plays) ** 2
 
     @functools.cached_property
@@ -66,14 +66,18 @@ class PaperPiezo:
 
         if not excess(100.0) < 0 < excess(-10.0):
             raise ValueError(
-                f"plays of {1 - self.reversible_share:g} of the stroke have no loop as wide as {self.loop_width:g} of it"
+                f"plays of {1 - self.reversible_share:g} of the stroke have no loop of {self.loop_width:g} of it"
             )
         return weights(float(brentq(excess, -10.0, 100.0, xtol=1e-10)))
 
-    @property
-    def saturated_V(self) -> FloatArray:
-        """States of the plays after a full sweep down to 0 V, shape `(plays,)`."""
-        return self.radii_V
+    def rest(self, voltage_V: float) -> tuple[float, FloatArray]:
+        """Elongation in um and states of the plays, shape `(plays,)`, at a voltage after a full sweep from above.
+
+        There a loop upwards closes where it began.
+        """
+        _, play_V = self.glide(np.array([self.upper_V]), self.radii_V)
+        rest_um, play_V = self.glide(np.array([voltage_V]), play_V)
+        return float(rest_um[-1]), play_V
 
     def glide(self, voltage_V: FloatArray, play_V: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Follow voltages that only rise or only fall, also from the ones before.
@@ -88,10 +92,13 @@ class PaperPiezo:
         Returns
         -------
         tuple
-            Elongations in um, shape `(..., n)`, zero at 0 V after a full sweep down; and the states after the last.
+            Elongations in um, shape `(..., n)`, zero at 0 V after a full sweep down, where the states are `radii_V`;
+            and the states after the last.
         """
         line_V, radii_V = voltage_V[..., None], self.radii_V
         plays_V = np.minimum(np.maximum(play_V[..., None, :], line_V - radii_V), line_V + radii_V)
         share = voltage_V / self.upper_V
-        curve_um = self.stroke_um * self.reversible_share / (1 + self.quadratic) * share * (1 + self.quadratic * share)
+        curve_um = (
+            self.stroke_um * self.reversible_share / (1 + self.quadratic) * share * (1 + self.quadratic * share)
+        )
         return curve_um + (plays_V - radii_V) @ self.weights_um_per_V, plays_V[..., -1, :]

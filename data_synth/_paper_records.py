@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from data_synth._paper_bench import PaperAxis, PaperBench, PaperSensor
+from data_synth._paper_bench import PAPER_BIAS_V, PaperAxis, PaperBench, PaperSensor
 from data_synth._paper_piezo import PaperPiezo
 from data_synth._plant import monotone_runs
 from data_synth._programs import forc, multisine, nested, ramp, triangle
@@ -10,7 +10,7 @@ from data_synth._types import FloatArray
 
 _LOOP_RATE_Hz = 100.0
 _RESPONSE_RATE_Hz = 1000.0
-_BIAS_V, _SWING_V = 1.5, 0.75
+_ABOVE_V, _SWING_V = 1.5, 0.75
 _LOWEST_Hz, _HIGHEST_Hz, _PERIOD_s = 0.5, 20.0, 2.0
 _REALIZATIONS, _PERIODS = 2, 2
 
@@ -37,11 +37,11 @@ def paper_loops(piezo: PaperPiezo, sensor: PaperSensor, rng: np.random.Generator
         forc(0.0, side="below", reversals_V=turns_V[1:].tolist(), **ends, **pace),
         nested(0.0, biases_V=[60.0], amplitude_V=60.0, loops=10, **pace),
     ]
-    pieces.append(ramp(float(pieces[-1][-1]), to_V=0.0, **pace))
-    # The lower end, where steps and tracking runs are, once more and slowly.
+    pieces.append(ramp(float(pieces[-1][-1]), to_V=top_V, **pace))
+    # Where steps and tracking runs are, once more and slowly.
     pieces += [triangle(0.0, lower_V=0.0, upper_V=12.0, cycles=8, **slow)]
     voltage_V = np.concatenate([np.zeros(1), *pieces])
-    elongation_um, states = [], piezo.saturated_V
+    elongation_um, states = [], piezo.radii_V
     for run_V in monotone_runs(voltage_V, 0.0):
         part_um, states = piezo.glide(run_V, states)
         elongation_um.append(part_um)
@@ -66,7 +66,7 @@ def paper_responses(
     phases = np.random.default_rng(0)  # a program, and no noise
     waves = [
         multisine(
-            _BIAS_V,
+            PAPER_BIAS_V + _ABOVE_V,
             amplitude_V=_SWING_V,
             low_Hz=_LOWEST_Hz,
             high_Hz=_HIGHEST_Hz,
@@ -77,7 +77,7 @@ def paper_responses(
         )
         for _ in range(_REALIZATIONS)
     ]
-    voltage_V = np.concatenate([ramp(0.0, to_V=_BIAS_V, **pace), *waves])
+    voltage_V = np.concatenate([ramp(PAPER_BIAS_V, to_V=PAPER_BIAS_V + _ABOVE_V, **pace), *waves])
     bench = PaperBench(axis, piezo, sensor, rng, count, 1 / _RESPONSE_RATE_Hz)
     _, reading_um = bench.run(np.tile(voltage_V, (count, 1)))
     samples = round(_PERIOD_s * _RESPONSE_RATE_Hz)

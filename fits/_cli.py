@@ -7,6 +7,7 @@ import click
 
 from fits._cli_commands_diagnosis import diagnose
 from fits._cli_commands_model import compensate, export, fit, info, simulate, synth
+from fits._cli_commands_paper import paper
 from fits._cli_commands_stage import budget, sensitivity
 
 
@@ -35,7 +36,7 @@ def cli() -> None:
     """
 
 
-for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose):
+for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose, paper):
     cli.add_command(_command)
 
 
