@@ -88,7 +88,7 @@ piezo:
 
 - the damping ratio: Table 2's overshoot under feedforward, 66.12 % (`exp(-pi zeta / sqrt(1 - zeta^2))`);
 - the natural frequency: its settling time, 0.84 s into a band of 2 %;
-- the gain error of x: its positioning error, 2.78 %, which is what tolerances of 0.02 mm make of this axis at worst;
+- the gain error of x: its positioning error, 2.78 %, about what tolerances of 0.02 mm do to this axis at worst;
 - the piezo's `quadratic`: e_max of Table 3's open loop, 18.22 %;
 - the gain errors of the other axes: e_max of Table 4's open loops;
 - the rests: e_rms of the open loops. The error of a loop that is run through from its lower end is 1.6 times as large

@@ -16,11 +16,10 @@ from fits._cli_jax import start_jax
 from fits._cli_paper_gains import INTERVAL_s
 from fits._cli_paper_loop import PaperRun
 from fits._cli_paper_runs import (
-    FEEDBACK,
-    LEAD_s,
     LEVELS,
-    TRAINING_PERIODS,
+    TRAINING_RUNS,
     Identified,
+    LEAD_s,
     PaperStand,
     compensated,
     identify,
@@ -208,22 +207,24 @@ def _assumed() -> list[str]:
         f"Table 3's OPEN, and the other gains ({gains}) to Table 4's OPEN: whatever one piezo's hysteresis does not "
         "explain of an open loop is an error of the gain. For the rotations that is far beyond what tolerances of "
         "0.02 mm do (3 %), and HC, which knows nothing of it, is left with it.",
-        f"Tracking runs hold rests before and after two periods ({rests}): the paper's e_max of the open loops is 1.9 "
-        "to 2.7 times its e_rms, which no steady tracking of a sine gives. Errors are counted over the whole record.",
+        f"Tracking runs hold rests before and after two periods ({rests}): the paper's e_max of the open loops is "
+        "1.9 to 2.7 times its e_rms, which no steady tracking of a sine gives. Errors are counted over the whole "
+        "record.",
         f"A reading of the sensor has a white noise of {1e3 * sensor.noise_um:g} nm rms and a last digit of "
         f"{1e3 * sensor.resolution_um:g} nm; there are {sensor.rate_Hz:g} readings in a second, and a controller at "
         "1 kHz is given the mean of those since its last sample. The paper gives no rate: averaging is why true "
         "errors can be smaller than a reading's.",
-        "The piezo's sensor is the same; each of its 100 readings in a second is the mean of those while the voltage "
-        "is held.",
-        f"The hysteresis is `fits.fit` with {LEVELS} levels, the mode `fits.fit_response`; both from CSVs alone. HC is "
-        "the static inverse of the hysteresis with the nominal amplification: the piezo is measured, not the stage.",
+        "The piezo's sensor is the same; each of the 100 samples a second of its CSV is the mean of the readings "
+        "while the voltage is held.",
+        f"The hysteresis is `fits.fit` with {LEVELS} levels, the mode `fits.fit_response`; both from CSVs alone. HC "
+        "is the static inverse of the hysteresis with the nominal amplification: the piezo is measured, not the "
+        "stage.",
         f"Axes rest and work at {data_synth.PAPER_BIAS_V:g} V, reached from above. Rotations are read as the "
         "displacement of a point 40 mm from the axis; the swing of 2 um is the paper's for X, Y and assumed for the "
         "others.",
-        "Gains follow from the identified mode by placing the loop's poles: for tracking at 30 rad/s (25 rad/s beside "
-        "the CMAC), for steps at 86, 86 and 27 rad/s. BP-PID starts from the gains of PID. For steps the reference "
-        "has weights in the controller.",
-        f"Loops are closed {LEAD_s:g} s before a run, and the CMAC's table has learnt for {TRAINING_PERIODS} periods "
-        "of the same sine before a tracking run; for steps it begins empty.",
+        "Gains follow from the identified mode by placing the loop's poles, for all axes alike: for tracking at "
+        "30 rad/s (25 rad/s beside the CMAC), for steps at 86, 86 and 27 rad/s. BP-PID starts from the gains of PID, "
+        "and its network keeps them within a factor of 1.5. For steps the reference has weights in the controller.",
+        f"Loops are closed {LEAD_s:g} s before a run. For tracking, the CMAC's table has learnt from {TRAINING_RUNS} "
+        "shorter runs of the same kind right before; for steps it begins empty.",
     ]

@@ -48,8 +48,8 @@ class PaperRun:
 
     def last(self, samples: int) -> "PaperRun":
         """The end of it."""
-        cut = self.reference_um[-samples:], *(x[:, -samples:] for x in (self.displacement_um, self.reading_um))
-        return PaperRun(*cut, self.command_V[:, -samples:])
+        runs = self.displacement_um, self.reading_um, self.command_V
+        return PaperRun(self.reference_um[-samples:], *(values[:, -samples:] for values in runs))
 
 
 @functools.cache

@@ -26,7 +26,8 @@ FEEDBACK = ("HC+PID", "HC+BP-PID", "HC+CMAC-PID")
 LEVELS = 23
 # Loops are closed this long before a run begins, so that the noise they carry has found its level.
 LEAD_s = 1.0
-TRAINING_PERIODS = 6
+# What a table learns from before a tracking run: two periods and a rest each.
+TRAINING_RUNS = 3
 _STEP_s = 3.0
 
 
@@ -59,7 +60,7 @@ class Identified:
         The amplification is the nominal one: of its error, nothing is known ahead.
         """
         wanted_um = self.rest_um + np.append(0.0, reference_um) / axis.amplification
-        time_s = INTERVAL_s * np.arange(len(wanted_um))
+        time_s = np.arange(len(wanted_um), dtype=float) * INTERVAL_s
         found = compensate(self.fit.model, Reference(time_s, wanted_um, source="reference"), "positive", clip=True)
         return found.voltage_V[1:]
 
@@ -139,7 +140,7 @@ class PaperStand:
         begin = round(self.axis.rest_s / INTERVAL_s)
         period = np.arange(begin, begin + round(data_synth.PAPER_PERIOD_s / INTERVAL_s))
         rest = np.zeros(round(LEAD_s / INTERVAL_s), dtype=int)
-        training = [*[period] * TRAINING_PERIODS, rest] if scheme == "HC+CMAC-PID" else []
+        training = [period, period, rest] * TRAINING_RUNS if scheme == "HC+CMAC-PID" else []
         order = np.concatenate([rest, *training, np.arange(len(reference_um))])
         controllers = stacked(
             lambda k: paper_controller(scheme, self.modes[k], k, data_synth.PAPER_SWING_um, False), len(self.modes)
@@ -170,7 +171,7 @@ def compensated(one: Identified, piezo: data_synth.PaperPiezo) -> tuple[np.ndarr
     lowest_um = float(model.offset_um)
     ramp_um = np.linspace(lowest_um, lowest_um + piezo.stroke_um, 1501)
     wanted_um = np.concatenate([ramp_um, ramp_um[-2::-1]])
-    reference = Reference(0.02 * np.arange(len(wanted_um)), wanted_um, source="reference")
+    reference = Reference(np.arange(len(wanted_um), dtype=float) * 0.02, wanted_um, source="reference")
     voltage_V = compensate(model, reference, "negative", clip=True).voltage_V
     reached, states = [], piezo.radii_V
     for value in voltage_V.tolist():

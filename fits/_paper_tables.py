@@ -92,6 +92,11 @@ class Measured:
         """Median over the paper's; None where that is zero."""
         return None if self.median is None or self.paper == 0 else self.median / self.paper
 
+    @property
+    def worse(self) -> bool:
+        """Whether the median, to the two digits after the point that the paper prints, is above the paper's."""
+        return self.median is None or round(self.median, 2) > self.paper
+
     def json(self) -> dict[str, float | None]:
         """The figure in JSON values."""
         return {"paper": self.paper, "ours": self.median, "spread": self.spread}
@@ -124,13 +129,11 @@ class PaperResult:
         ]
 
     def worse(self) -> list[str]:
-        """Rows in which ours is larger than the paper's, calibrated ones and settling values apart."""
+        """Rows in which ours is worse than the paper's, calibrated ones and settling values apart."""
         return [
             f"{_PLACES[place]}, {scheme}: {name}"
             for place, scheme, name, figure in self.rows()
-            if (place, scheme) not in CALIBRATED
-            and name != "settling_value_um"
-            and (figure.median is None or figure.median > figure.paper)
+            if (place, scheme) not in CALIBRATED and name != "settling_value_um" and figure.worse
         ]
 
 
@@ -172,10 +175,10 @@ def paper_page(result: PaperResult, pictures: Sequence[tuple[str, str]]) -> str:
     lines = [
         "# The paper's tables and figures, and ours",
         "",
-        f"Ours is the median over {result.seeds} seeds, and the spread is the largest less the smallest; a seed is new "
-        "noise in all that is measured: the CSV the hysteresis is identified from, the CSV of the response, and every "
-        "reading of the runs. Errors are of the true displacement, which a bench knows and an experiment does not; "
-        "beside them stand those of the sensor's readings. Rows marked *calibrated* are what the bench was made to "
+        f"Ours is the median over {result.seeds} seeds, and the spread is the largest less the smallest; a seed is "
+        "new noise in all that is measured: the CSV the hysteresis is identified from, the CSV of the response, and "
+        "every reading of the runs. Errors are of the true displacement, which a bench knows and an experiment does "
+        "not; beside them stand those of the sensor's readings. Rows marked *calibrated* are what the bench was made to "
         "show; all others are results.",
         "",
         "## Table 2: a step of 6.613 um along X, Y",
@@ -227,7 +230,7 @@ def _verdict(place: str, scheme: str, name: str, figure: Measured) -> str:
         return "calibrated"
     if name == "settling_value_um":
         return ""
-    return "worse" if figure.median is None or figure.median > figure.paper else "no worse"
+    return "worse" if figure.worse else "no worse"
 
 
 def _figures(figures: Mapping[str, Mapping[str, Measured]]) -> list[str]:
@@ -243,4 +246,4 @@ _NAMES = TRACK_UNITS | {"loop_width_pct": "width of the loop (%)"}
 
 
 def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4g}" if abs(value) >= 1e-3 or value == 0 else "<0.001"
+    return "-" if value is None else f"{value:.4g}" if abs(value) >= 1e-3 or value == 0 else "<0.001"
