@@ -113,7 +113,7 @@ _tracking_errors = eqx.filter_jit(tracking_errors)
 
 
 def _steps(run: PaperRun, noisy: PaperRun, said: dict[str, float]) -> dict[str, Measured]:
-    time_s = jnp.arange(len(run.reference_um)) * INTERVAL_s
+    time_s = jnp.asarray(np.arange(len(run.reference_um)) * INTERVAL_s)
     target_um = jnp.asarray(run.reference_um[-1])
     found = [
         [_step_metrics(time_s, jnp.asarray(one), target_um) for one in each.displacement_um] for each in (run, noisy)

@@ -178,8 +178,8 @@ def paper_page(result: PaperResult, pictures: Sequence[tuple[str, str]]) -> str:
         f"Ours is the median over {result.seeds} seeds, and the spread is the largest less the smallest; a seed is "
         "new noise in all that is measured: the CSV the hysteresis is identified from, the CSV of the response, and "
         "every reading of the runs. Errors are of the true displacement, which a bench knows and an experiment does "
-        "not; beside them stand those of the sensor's readings. Rows marked *calibrated* are what the bench was made to "
-        "show; all others are results.",
+        "not; beside them stand those of the sensor's readings. Rows marked *calibrated* are what the bench was made "
+        "to show; all others are results.",
         "",
         "## Table 2: a step of 6.613 um along X, Y",
         "",

@@ -81,8 +81,8 @@ def test_the_loop_of_the_piezo_is_as_wide_as_the_papers():
     assert 100 * (down_um - up_um).max() / both_um.max() == pytest.approx(12.83, rel=1e-3)
     assert both_um.max() == pytest.approx(40.7, rel=1e-9)
     assert np.all(np.diff(up_um) > 0)
-    with pytest.raises(ValueError, match="no loop of 0.4"):
-        ds.PaperPiezo(loop_width=0.4).weights_um_per_V  # noqa: B018
+    with pytest.raises(ValueError, match=r"no loop of 0\.4"):
+        ds.PaperPiezo(loop_width=0.4).weights_um_per_V
 
 
 def open_loop_pct(axis):
