@@ -15,6 +15,18 @@ from data_synth._environment import TemperatureSettings as TemperatureSettings
 from data_synth._errors import ScenarioError as ScenarioError
 from data_synth._hidden import hidden as hidden
 from data_synth._history import initial_history as initial_history
+from data_synth._paper_bench import PAPER_AXES as PAPER_AXES
+from data_synth._paper_bench import PAPER_BIAS_V as PAPER_BIAS_V
+from data_synth._paper_bench import PAPER_PERIOD_s as PAPER_PERIOD_s
+from data_synth._paper_bench import PAPER_STEP_um as PAPER_STEP_um
+from data_synth._paper_bench import PAPER_SWING_um as PAPER_SWING_um
+from data_synth._paper_bench import PaperAxis as PaperAxis
+from data_synth._paper_bench import PaperBench as PaperBench
+from data_synth._paper_bench import PaperSensor as PaperSensor
+from data_synth._paper_bench import paper_reference_um as paper_reference_um
+from data_synth._paper_piezo import PaperPiezo as PaperPiezo
+from data_synth._paper_records import paper_loops as paper_loops
+from data_synth._paper_records import paper_responses as paper_responses
 from data_synth._plant import Plant as Plant
 from data_synth._plant import random_plant as random_plant
 from data_synth._plays import PlayShape as PlayShape
@@ -55,12 +67,21 @@ from data_synth.effects import OUTSIDE as OUTSIDE
 __all__ = [
     "EFFECTS",
     "OUTSIDE",
+    "PAPER_AXES",
+    "PAPER_BIAS_V",
     "Bench",
     "Bump",
     "Density",
     "EffectSettings",
     "HiddenEffect",
     "OtherAxisSettings",
+    "PAPER_PERIOD_s",
+    "PAPER_STEP_um",
+    "PAPER_SWING_um",
+    "PaperAxis",
+    "PaperBench",
+    "PaperPiezo",
+    "PaperSensor",
     "Plant",
     "PlantSettings",
     "PlayShape",
@@ -85,6 +106,9 @@ __all__ = [
     "load_scenario",
     "multisine",
     "nested",
+    "paper_loops",
+    "paper_reference_um",
+    "paper_responses",
     "parse_scenario",
     "plain_relays",
     "ramp",

@@ -8,6 +8,7 @@ import click
 from fits._cli_commands_control import control
 from fits._cli_commands_diagnosis import diagnose
 from fits._cli_commands_model import compensate, export, fit, info, simulate, synth
+from fits._cli_commands_paper import paper
 from fits._cli_commands_stage import budget, sensitivity
 
 
@@ -36,7 +37,7 @@ def cli() -> None:
     """
 
 
-for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose, control):
+for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose, control, paper):
     cli.add_command(_command)
 
 

@@ -75,7 +75,7 @@ def keep_inputs(out: str, inputs: Iterable[str]) -> None:
 
 
 @contextmanager
-def new_folder(path: str | None) -> Iterator[Callable[[], Path] | None]:
+def new_folder(path: str | None, option: str = "--plots", what: str = "plots") -> Iterator[Callable[[], Path] | None]:
     """Yield a function that makes a temporary folder; what is in it moves to `path` at the end, or nowhere."""
     if path is None:
         yield None
@@ -83,7 +83,7 @@ def new_folder(path: str | None) -> Iterator[Callable[[], Path] | None]:
     target = Path(os.path.realpath(path))
     anchor = next(place for place in (target, *target.parents) if place.exists())
     if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
-        raise DataError(f"{path}: expected a folder that can be written to; choose another for --plots.")
+        raise DataError(f"{path}: expected a folder that can be written to; choose another for {option}.")
     made: list[Path] = []
     with ExitStack() as stack:
 
@@ -99,5 +99,5 @@ def new_folder(path: str | None) -> Iterator[Callable[[], Path] | None]:
         except OSError as error:
             reason = error.strerror or error
             raise DataError(
-                f"{path}: the plots cannot be put there ({reason}); choose another for --plots."
+                f"{path}: the {what} cannot be put there ({reason}); choose another for {option}."
             ) from error
