@@ -8,6 +8,7 @@ import click
 from fits._cli_commands_diagnosis import diagnose
 from fits._cli_commands_model import compensate, export, fit, info, simulate, synth
 from fits._cli_commands_stage import budget, sensitivity
+from fits._cli_commands_sweep import sweep
 
 
 def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -35,7 +36,7 @@ def cli() -> None:
     """
 
 
-for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose):
+for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose, sweep):
     cli.add_command(_command)
 
 
