@@ -119,14 +119,18 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
         )
     factor = _factor(entry.get("unit"), "1" if relative else parameter.unit, f"{place}.unit", parameter.name)
     found = _values(entry, place, factor)
-    axis = Axis(parameter.name, relative)
+    if relative and math.isfinite(parameter.nominal):
+        # Factors of single numbers become values at once; only those of arrays stay factors.
+        if parameter.nominal == 0:
+            raise DataError(f"{place}.relative: {parameter.name} is 0, which no factor changes; give values.")
+        relative, nominal = False, parameter.nominal
+        found = found * nominal if isinstance(found, np.ndarray) else _scaled(*found, nominal)
     if isinstance(found, np.ndarray):
         return Axis(parameter.name, relative, tuple(found.tolist())), found
     distribution, first, second = found
     axis = Axis(parameter.name, relative, None, distribution, first, second)
-    scale = parameter.nominal if relative and math.isfinite(parameter.nominal) else 1.0
-    ends = [first * scale, second * scale]
-    if distribution != "normal" and (min(ends) > parameter.upper or max(ends) < parameter.lower):
+    ends = [first, second]
+    if not relative and distribution != "normal" and (min(ends) > parameter.upper or max(ends) < parameter.lower):
         raise DataError(
             f"{place}: all values lie outside the bounds of {parameter.name}, {parameter.lower:g} to "
             f"{parameter.upper:g} {parameter.unit}; correct them."
@@ -168,6 +172,15 @@ def _values(entry: Mapping[str, Any], place: str, factor: float) -> np.ndarray |
     return np.geomspace(low, high, count) if spacing == "log" else np.linspace(low, high, count)
 
 
+def _scaled(distribution: str, first: float, second: float, nominal: float) -> tuple[str, float, float]:
+    if distribution == "normal":
+        return distribution, first * nominal, second * abs(nominal)
+    if nominal < 0 and distribution == "log":
+        raise DataError(f"axis.relative: a logarithmic axis needs a positive parameter, found {nominal:g}.")
+    ends = sorted((first * nominal, second * nominal))
+    return distribution, ends[0], ends[1]
+
+
 def _factor(unit: Any, wanted: str, place: str, name: str) -> float:
     """What takes a unit to the parameter's own."""
     if unit is None or unit == wanted:
@@ -178,7 +191,12 @@ def _factor(unit: Any, wanted: str, place: str, name: str) -> float:
     for mine, power in _PREFIXES.items():
         for other, wanted_power in _PREFIXES.items():
             same = plain.removeprefix(mine) == wanted.removeprefix(other) and plain.removeprefix(mine)
-            if same and plain.startswith(mine) and wanted.startswith(other) and same in ("s", "V", "m", "Hz", "Pa"):
+            if (
+                same
+                and plain.startswith(mine)
+                and wanted.startswith(other)
+                and same in ("s", "V", "m", "Hz", "Pa", "rad")
+            ):
                 return float(10.0 ** (power - wanted_power))
     raise DataError(f"{place}: {name} is in {wanted}, found {unit!r}; convert the values.")
 

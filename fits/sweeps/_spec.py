@@ -54,7 +54,7 @@ class Sweep:
     @property
     def digest(self) -> str:
         """SHA-256 of the text, all files and the names of all sources: what the rows depend on."""
-        parts = [self.text.encode(), *self.facts.sources]
+        parts: list[str | bytes] = [self.text, *self.facts.sources]
         parts += [part for name in sorted(self.inputs) for part in (name, self.inputs[name])]
         sums = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
         return hashlib.sha256("".join(sums).encode()).hexdigest()
@@ -136,6 +136,9 @@ def _sweep(
     job = KINDS[kind].make(Request(table, names, relative, load, folder))
     facts = job.facts
     plan = read_plan(table, facts.parameters, max(1, len(facts.sources)), seed, load)
+    factors = tuple(axis.parameter for axis in plan.axes if axis.relative)
+    if set(factors) != set(relative):
+        job = KINDS[kind].make(Request(table, names, factors, load, folder))
     return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows)
 
 
@@ -172,15 +175,14 @@ def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, n
     parameters = {parameter.name: parameter for parameter in sweep.facts.parameters}
     for axis in sweep.plan.axes:
         parameter = parameters[axis.parameter]
-        scale = parameter.nominal if axis.relative and math.isfinite(parameter.nominal) else 1.0
-        value = values[axis.parameter] * scale
-        wrong = ~((value >= parameter.lower) & (value <= parameter.upper))
+        value = values[axis.parameter]
+        lower, upper = (0.0, math.inf) if axis.relative else (parameter.lower, parameter.upper)
+        wrong = ~((value >= lower) & (value <= upper))
         if wrong.any():
-            inside = parameter.nominal if math.isfinite(parameter.nominal) else 1.0
-            kept[axis.parameter] = np.where(wrong, 1.0 if axis.relative else inside, values[axis.parameter])
+            kept[axis.parameter] = np.where(wrong, 1.0 if axis.relative else parameter.nominal, value)
             for k in np.flatnonzero(wrong):
                 reasons[k] = reasons[k] or (
-                    f"{parameter.name} = {value[k]:.6g} lies outside its bounds, {parameter.lower:g} to "
-                    f"{parameter.upper:g} {parameter.unit}"
+                    f"{parameter.name} = {value[k]:.6g} lies outside its bounds, {lower:g} to {upper:g} "
+                    f"{'times its own' if axis.relative else parameter.unit}"
                 )
     return kept, reasons
