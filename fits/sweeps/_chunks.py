@@ -9,7 +9,8 @@ from fits.sweeps._spec import Sweep, outside
 from fits.sweeps._types import DONE, FAILED, Output, Rows
 
 # A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
-_PARTS, _LARGEST = 16, 65536
+# Rows that go one by one are slow ones, of which few are to be lost.
+_PARTS, _LARGEST, _LARGEST_SLOW = 16, 65536, 4
 
 
 def chunk_rows(sweep: Sweep) -> int:
@@ -19,7 +20,7 @@ def chunk_rows(sweep: Sweep) -> int:
         return block * -(-sweep.chunk_rows // block)
     per_row = max(1, bytes_per_row(sweep))
     fit = int(sweep.memory_MB * 1e6 / per_row)
-    wanted = min(fit, _LARGEST, max(1, rows // _PARTS))
+    wanted = min(fit, _LARGEST if block > 1 else _LARGEST_SLOW, max(1, rows // _PARTS))
     return block * max(1, min(wanted, rows) // block if wanted >= block else 1)
 
 

@@ -104,7 +104,7 @@ def _all(
     )
     waiting, banned, losses = list(reversed(chunks)), dict[str, str](), dict[int, int]()
     futures: dict[Any, int] = {}
-    results = distributed.as_completed()
+    results = distributed.as_completed(loop=client.loop)
     while waiting or futures:
         workers = {
             name: about

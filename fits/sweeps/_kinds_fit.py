@@ -152,7 +152,11 @@ class FitJob(AbstractJob):
             levels,
             jnp.asarray(branch_table(levels)),
             roughness(levels),
-            *(jnp.asarray(array) for array in (voltage, displacement, fitted, limits, smoothness)),
+            jnp.asarray(voltage),
+            jnp.asarray(displacement),
+            jnp.asarray(fitted),
+            jnp.asarray(limits),
+            jnp.asarray(smoothness),
             Staircase(jnp.asarray(extremes), jnp.asarray(used)),
         )
         areas = node_areas(levels)[np.tril_indices(levels)]

@@ -16,6 +16,7 @@ from fits.sweeps._types import Parameter
 
 _KEYS = ("parameter", "unit", "relative", "values", "low", "high", "count", "spacing", "mean", "sd", "zip")
 _PREFIXES = {"": 0, "k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
+_BASES = ("s", "V", "m", "Hz", "Pa", "rad")
 _MOST = 2**62
 
 
@@ -190,13 +191,9 @@ def _factor(unit: Any, wanted: str, place: str, name: str) -> float:
     plain = unit.replace("µ", "u").replace("μ", "u")
     for mine, power in _PREFIXES.items():
         for other, wanted_power in _PREFIXES.items():
-            same = plain.removeprefix(mine) == wanted.removeprefix(other) and plain.removeprefix(mine)
-            if (
-                same
-                and plain.startswith(mine)
-                and wanted.startswith(other)
-                and same in ("s", "V", "m", "Hz", "Pa", "rad")
-            ):
+            base = plain.removeprefix(mine)
+            prefixed = plain.startswith(mine) and wanted == other + base
+            if prefixed and base in _BASES:
                 return float(10.0 ** (power - wanted_power))
     raise DataError(f"{place}: {name} is in {wanted}, found {unit!r}; convert the values.")
 
