@@ -138,7 +138,7 @@ class Drawn(AbstractGroup):
     def _piece(self, piece: int) -> FloatArray:
         dimensions = len(self._axes)
         if self._method == "sobol":
-            sampler = qmc.Sobol(dimensions, scramble=True, bits=53, rng=np.random.default_rng(self._seed))
+            sampler = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(self._seed))
             if piece:
                 sampler.fast_forward(piece * _PIECE)
             return np.asarray(sampler.random(_PIECE))
