@@ -19,6 +19,7 @@ from _peers import fit_lsq_linear, fit_nnls, numpy_relays, relay_design, scan_re
 from _plant_fit_rows import fit_own, plant_fit
 from _plant_rows import plant as plant_rows
 from _sensitivity_rows import sensitivity as sensitivity_rows
+from _sweep_rows import sweep as sweep_rows
 from _timing import Line, Table, cpu_seconds, seconds, side_by_side
 
 import fits
@@ -270,6 +271,11 @@ def sensitivity(settings: Settings, table: Table) -> None:
     sensitivity_rows(10 * settings.samples, settings.repeats, settings.seed, table)
 
 
+def sweep(settings: Settings, table: Table) -> None:
+    """Many simulations and many fits at once, over one by one."""
+    sweep_rows(1000, settings.repeats, settings.seed, table)
+
+
 ROWS = {
     "forward": forward,
     "gradient": gradient,
@@ -280,5 +286,6 @@ ROWS = {
     "inverse": inverse,
     "frequency": frequency,
     "sensitivity": sensitivity,
+    "sweep": sweep,
     "cold": cold,
 }

@@ -13,14 +13,14 @@ from fits._cli_jax import start_jax
 def run_sweep(*, file: str, out: str, resume: bool, cluster: str | None, as_json: bool, quiet: bool) -> None:
     """Do `microid sweep SWEEP.toml`; the options are the command's."""
     start_jax()
-    from fits.sweeps._run import run
+    from fits.sweeps._run import run_sweep as run_all
     from fits.sweeps._spec import read_sweep
     from fits.sweeps._store import RESULTS, TABLE
 
     progress = progress_to_stderr(quiet)
     sweep = read_sweep(file)
     try:
-        outcome = run(sweep, out, resume=resume, cluster=cluster, progress=progress)
+        outcome = run_all(sweep, out, resume=resume, cluster=cluster, progress=progress)
     except KeyboardInterrupt:
         click.echo("Interrupted: what was computed is kept; go on with --resume.", err=True)
         sys.exit(130)

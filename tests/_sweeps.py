@@ -44,25 +44,28 @@ def small(seed, rows=600, chunk=256):
     return SMALL.format(seed=seed, rows=rows, chunk=chunk)
 
 
-def relays_um(stage, voltage_V, cells=400):
-    """Output of a Preisach operator whose relays are counted one by one, from negative saturation."""
-    preisach = stage["hysteresis"]
-    low, high = float(preisach.density.lower_V), float(preisach.density.upper_V)
-    centre = low + (np.arange(cells) + 0.5) * (high - low) / cells
-    alpha, beta = np.meshgrid(centre, centre, indexing="ij")
-    keep = alpha >= beta
-    alpha, beta = alpha[keep], beta[keep]
-    area = ((high - low) / cells) ** 2 * np.where(alpha == beta, 0.5, 1.0)
-    weight = np.asarray(preisach.density(alpha, beta)) * area
-    state, found = np.zeros(len(alpha), dtype=bool), []
-    for value in voltage_V:
-        state = np.where(value >= alpha, True, np.where(value <= beta, False, state))
-        found.append(weight[state].sum())
-    slope = np.asarray(preisach.reversible.slope_um_per_V)
-    levels = np.linspace(low, high, len(slope))
-    fine = np.linspace(low, high, 20001)
-    curve = np.concatenate([[0.0], np.cumsum(np.interp((fine[1:] + fine[:-1]) / 2, levels, slope) * np.diff(fine))])
-    return np.array(found) + np.interp(voltage_V, fine, curve) + float(preisach.offset_um)
+class Relays:
+    """A Preisach operator whose relays are counted one by one, from negative saturation."""
+
+    def __init__(self, stage, cells=400):
+        preisach = stage["hysteresis"]
+        low, high = float(preisach.density.lower_V), float(preisach.density.upper_V)
+        centre = low + (np.arange(cells) + 0.5) * (high - low) / cells
+        alpha, beta = np.meshgrid(centre, centre, indexing="ij")
+        keep = alpha >= beta
+        self.alpha, self.beta = alpha[keep], beta[keep]
+        area = ((high - low) / cells) ** 2 * np.where(self.alpha == self.beta, 0.5, 1.0)
+        self.weight = np.asarray(preisach.density(self.alpha, self.beta)) * area
+        self.state = np.zeros(len(self.alpha), dtype=bool)
+        slope = np.asarray(preisach.reversible.slope_um_per_V)
+        self.fine = np.linspace(low, high, 20001)
+        middle = (self.fine[1:] + self.fine[:-1]) / 2
+        rises = np.interp(middle, np.linspace(low, high, len(slope)), slope) * np.diff(self.fine)
+        self.curve = np.concatenate([[0.0], np.cumsum(rises)]) + float(preisach.offset_um)
+
+    def __call__(self, value):
+        self.state = np.where(value >= self.alpha, True, np.where(value <= self.beta, False, self.state))
+        return float(self.weight[self.state].sum() + np.interp(value, self.fine, self.curve))
 
 
 def stage_um(stage, values, time_s, voltage_V):
@@ -71,7 +74,9 @@ def stage_um(stage, values, time_s, voltage_V):
     rate = 2 * np.pi * values.get("mechanics.natural_frequency_Hz", float(stage["mechanics"].natural_frequency_Hz))
     damping = values.get("mechanics.damping_ratio", float(stage["mechanics"].damping_ratio))
     _, driven, _ = lsim(StateSpace([[-1 / tau]], [[1 / tau]], [[1.0]], [[0.0]]), voltage_V, time_s, X0=[voltage_V[0]])
-    loaded = relays_um(stage, np.concatenate([voltage_V[:1], driven]))[1:]
+    relays = Relays(stage)
+    relays(voltage_V[0])
+    loaded = np.array([relays(value) for value in driven])
     matrix = [[0.0, 1.0], [-(rate**2), -2 * damping * rate]]
     plant = StateSpace(matrix, [[0.0], [rate**2]], [[1.0, 0.0]], [[0.0]])
     return lsim(plant, loaded, time_s, X0=[loaded[0], 0.0])[1]

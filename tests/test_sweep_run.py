@@ -20,7 +20,7 @@ from fits import DataError
 from fits.sweeps import _store
 from fits.sweeps._chunks import chunk_count
 from fits.sweeps._kinds_simulate import _simulate
-from fits.sweeps._run import run as run_sweep
+from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep, summarise
 from fits.sweeps._spec import read_sweep
 from fits.sweeps._stages import memory_before, nominal_stage
@@ -77,14 +77,12 @@ def test_the_kernel_for_a_cpu_agrees_with_the_stage_itself(rng):
     values = np.stack(
         [rng.uniform(0.01, 0.3, 8), rng.uniform(0.5, 1.1, 8), rng.uniform(0, 2, 8), rng.uniform(1, 90, 8)]
     )
-    for initial in ("negative", "positive", "demagnetised"):
-        memory = memory_before(stage, initial)
-        both = [
-            _simulate(stage, values.T, names, ("hysteresis.density.packed_um",), program, None, memory, 0, 1, cpu)
-            for cpu in (True, False)
-        ]
-        fast, slow = (np.asarray(found["displacement_um"]) for found in both)
-        assert np.abs(fast - slow).max() < 1e-12 * np.abs(slow).max()
+    # One of three, as compiling takes long.
+    memory = memory_before(stage, str(rng.choice(["negative", "positive", "demagnetised"])))
+    relative = ("hysteresis.density.packed_um",)
+    both = [_simulate(stage, values.T, names, relative, program, None, memory, 0, 1, cpu) for cpu in (True, False)]
+    fast, slow = (np.asarray(found["displacement_um"]) for found in both)
+    assert np.abs(fast - slow).max() < 1e-12 * np.abs(slow).max()
 
 
 def test_rows_do_not_depend_on_chunks(finished, tmp_path):
@@ -167,7 +165,7 @@ def start(folder):
     child = os.fork()
     if child == 0:
         try:
-            _run.run(_spec.read_sweep(toml), folder, resume=os.path.exists(folder + "/about.json"))
+            _run.run_sweep(_spec.read_sweep(toml), folder, resume=os.path.exists(folder + "/about.json"))
         finally:
             os._exit(0)
     return child
@@ -207,6 +205,10 @@ def test_killed_at_ten_random_moments_no_row_is_lost_or_doubled(finished, tmp_pa
         assert table(folder).equals(table(whole))
 
 
+class _DiedError(Exception):
+    """What no code of ours knows of."""
+
+
 @pytest.mark.parametrize("at", range(1, 60, 9))
 def test_stopped_between_any_two_writes_it_goes_on(finished, tmp_path, monkeypatch, at):
     """Every file that is put in its place is a moment at which a process may die."""
@@ -215,14 +217,14 @@ def test_stopped_between_any_two_writes_it_goes_on(finished, tmp_path, monkeypat
 
     def dying(*arguments, **keywords):
         if left[0] == 0:
-            raise KeyboardInterrupt
+            raise _DiedError
         left[0] -= 1
         return replace(*arguments, **keywords)
 
     out = tmp_path / "out"
     monkeypatch.setattr("os.replace", dying)
     monkeypatch.setattr("fits.sweeps._run.compute_chunk", lambda sweep, chunk, tell: rows_from(sweep, whole, chunk))
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(_DiedError):
         run_sweep(sweep, str(out))
     monkeypatch.setattr("os.replace", replace)
     run_sweep(sweep, str(out), resume=(out / "about.json").exists())

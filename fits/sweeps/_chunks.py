@@ -29,6 +29,11 @@ def bytes_per_row(sweep: Sweep) -> int:
     return sum(output.bytes_per_row for output in sweep.facts.outputs) + 8 * len(sweep.plan.axes) + 1
 
 
+def source_of(sweep: Sweep) -> Output:
+    """The variable that says which source a row has, as wide as the longest name."""
+    return Output("source", "1", "file of the row", dtype=f"U{max(map(len, sweep.facts.sources), default=1)}")
+
+
 def chunk_count(sweep: Sweep) -> int:
     """How many chunks there are."""
     return -(-len(sweep.plan) // chunk_rows(sweep))
@@ -74,6 +79,9 @@ def _block(sweep: Sweep, rows: NDArray[np.int64]) -> Rows:
     failed = np.array([bool(reason) for reason in reasons])
     outputs = {output.name: _kept(found, output, failed, len(rows)) for output in sweep.facts.outputs}
     outputs |= {name: value[: len(rows)] for name, value in values.items()}
+    if sweep.facts.sources:
+        names = [sweep.facts.sources[k] for k in sweep.plan.repeat_of(rows)]
+        outputs["source"] = np.array(names, dtype=source_of(sweep).dtype)
     outputs["status"] = np.where(failed, FAILED, DONE).astype("i1")
     return Rows(outputs, reasons)
 

@@ -114,7 +114,7 @@ class Simulated:
             noise = np.random.default_rng([seed, int(row)]).normal(0.0, 1.0, len(w))
             fine = np.all(np.isfinite(w))
             found.append(
-                Record(time_s, v, np.asarray(w + spread * noise, dtype=np.float64), source=f"row {row}")
+                Record(np.asarray(time_s, dtype=np.float64), v, w + spread * noise, source=f"row {row}")
                 if fine
                 else "the simulated displacement is not finite"
             )

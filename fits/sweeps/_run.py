@@ -62,7 +62,7 @@ class _Progress:
             self._tell(f"[{bar}] {self._done:,} of {self._rows:,} rows, {rate:.3g} rows/s, {left} left")
 
 
-def run(
+def run_sweep(
     sweep: Sweep,
     out: str,
     *,

@@ -19,7 +19,7 @@ import numpy as np
 
 from fits._atomic import atomic_write_text
 from fits._errors import DataError
-from fits.sweeps._chunks import bytes_per_row, chunk_count, chunk_rows, rows_of
+from fits.sweeps._chunks import bytes_per_row, chunk_count, chunk_rows, rows_of, source_of
 from fits.sweeps._extra import need
 from fits.sweeps._spec import Sweep
 from fits.sweeps._types import STATUS_WORDS, Output, Rows
@@ -50,7 +50,8 @@ class Store:
             Output(axis.parameter, "1" if axis.relative else units[axis.parameter], "swept")
             for axis in self.sweep.plan.axes
         ]
-        return (*swept, *self.sweep.facts.outputs, _STATUS, _REASON)
+        sources = (source_of(self.sweep),) if self.sweep.facts.sources else ()
+        return (*swept, *sources, *self.sweep.facts.outputs, _STATUS, _REASON)
 
     def create(self) -> None:
         """Write the empty store and what is known of the sweep."""
@@ -75,9 +76,6 @@ class Store:
                 array.attrs.update(attributes | {"_ARRAY_DIMENSIONS": ["row", *(name for name, _ in variable.dims)]})
             for name, (axis, unit, values) in self.sweep.facts.coordinates.items():
                 self._coordinate(group, name, axis, unit, np.asarray(values))
-            if self.sweep.facts.sources:
-                sources = np.array(self.sweep.facts.sources)
-                self._coordinate(group, "source_name", "source", "1", sources)
             swept = [axis.parameter for axis in self.sweep.plan.axes]
             group.attrs.update(self._about() | ({"coordinates": " ".join(swept)} if swept else {}))
             zarr.consolidate_metadata(group.store)
