@@ -1,5 +1,6 @@
 """Running a sweep: what is missing is computed, kept chunk by chunk, and put into a table at the end."""
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -64,7 +65,7 @@ class _Progress:
 
 def run_sweep(
     sweep: Sweep,
-    out: str,
+    out: str | os.PathLike[str],
     *,
     resume: bool = False,
     cluster: str | None = None,
@@ -97,7 +98,7 @@ def run_sweep(
         raise RuntimeError('sweeps need float64: jax.config.update("jax_enable_x64", True)')
     began = time.monotonic()
     need("pyarrow")
-    with opened(sweep, out, resume) as store:
+    with opened(sweep, os.fspath(out), resume) as store:
         chunks = range(chunk_count(sweep))
         done = {chunk for chunk in chunks if store.whole(chunk)} if resume else set()
         again = sum(store.noted(chunk) for chunk in chunks if chunk not in done) if resume else 0
