@@ -20,6 +20,7 @@ from _peers import fit_lsq_linear, fit_nnls, numpy_relays, relay_design, scan_re
 from _plant_fit_rows import fit_own, plant_fit
 from _plant_rows import plant as plant_rows
 from _sensitivity_rows import sensitivity as sensitivity_rows
+from _sweep_rows import sweep as sweep_rows
 from _timing import Line, Table, cpu_seconds, seconds, side_by_side
 
 import fits
@@ -276,6 +277,11 @@ def control(settings: Settings, table: Table) -> None:
     control_rows(settings.samples, 256, settings.repeats, settings.seed, table)
 
 
+def sweep(settings: Settings, table: Table) -> None:
+    """Many simulations and many fits at once, over one by one."""
+    sweep_rows(1000, settings.repeats, settings.seed, table)
+
+
 ROWS = {
     "forward": forward,
     "gradient": gradient,
@@ -287,5 +293,6 @@ ROWS = {
     "frequency": frequency,
     "sensitivity": sensitivity,
     "control": control,
+    "sweep": sweep,
     "cold": cold,
 }

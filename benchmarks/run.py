@@ -1,9 +1,9 @@
 """Speed of `microid` as ratios to plain peers, measured side by side in one process.
 
 Usage: `python benchmarks/run.py [--quick] [--markdown] [--seed S] [ROW ...]`, with rows `forward`, `gradient`,
-`levels`, `fit`, `record`, `plant`, `inverse`, `frequency`, `sensitivity`, `control` and `cold`; all by default. Times
-are CPU seconds on one thread. The absolute ones depend on the machine and what else it does; the ratios are medians
-of measurements that took turns.
+`levels`, `fit`, `record`, `plant`, `inverse`, `frequency`, `sensitivity`, `control`, `sweep` and `cold`; all by
+default. Times are CPU seconds on one thread. The absolute ones depend on the machine and what else it does; the
+ratios are medians of measurements that took turns.
 """
 
 import argparse

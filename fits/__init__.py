@@ -116,6 +116,12 @@ if TYPE_CHECKING:
     from fits.diagnosis._result import Experiment as Experiment
     from fits.diagnosis._result import FoundCause as FoundCause
     from fits.diagnosis._result import Gain as Gain
+    from fits.sweeps._run import Outcome as Outcome
+    from fits.sweeps._run import run_sweep as run_sweep
+    from fits.sweeps._show import open_sweep as open_sweep
+    from fits.sweeps._show import plot_sweep as plot_sweep
+    from fits.sweeps._spec import Sweep as Sweep
+    from fits.sweeps._spec import read_sweep as read_sweep
 
 # Names are looked up when first used, so that the command's help does not wait for JAX and pandas.
 _HOMES = {
@@ -154,6 +160,7 @@ _HOMES = {
     "NetworkInverse": "_network_inverse",
     "NoiseBand": "_noise_spectrum",
     "NoiseLine": "_noise_spectrum",
+    "Outcome": "sweeps._run",
     "ParameterEstimate": "_stage_result",
     "Prediction": "_result",
     "Profile": "_profile",
@@ -166,6 +173,7 @@ _HOMES = {
     "SobolIndices": "_sobol",
     "StageFit": "_stage_result",
     "StageUncertainty": "_stage_uncertainty",
+    "Sweep": "sweeps._spec",
     "Together": "_stage_design",
     "Tuning": "_tune_result",
     "UltimatePoint": "_tune_start",
@@ -199,6 +207,7 @@ _HOMES = {
     "monte_carlo": "_monte_carlo",
     "paper_claims": "_paper_claims",
     "paper_design": "_stage_design",
+    "open_sweep": "sweeps._show",
     "plot_budget": "_plot_budget",
     "plot_compensation": "_plot_compensation",
     "plot_control": "_plot_control",
@@ -206,6 +215,7 @@ _HOMES = {
     "plot_idle": "_plot_idle",
     "plot_sensitivity": "_plot_sensitivity",
     "plot_stage": "_plot_stage",
+    "plot_sweep": "sweeps._show",
     "predict": "_result",
     "predict_stage": "_stage_result",
     "profile_stage": "_profile",
@@ -216,9 +226,11 @@ _HOMES = {
     "read_reference": "_read_csv",
     "read_response": "_read_response",
     "read_runs": "_read_csv",
+    "read_sweep": "sweeps._spec",
     "relative_error": "_modal_fit",
     "relay_start": "_tune_start",
     "report_html": "diagnosis._report",
+    "run_sweep": "sweeps._run",
     "sample_posterior": "_posterior",
     "save_model": "_model_file",
     "second_order": "_second_order",

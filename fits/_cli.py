@@ -10,6 +10,7 @@ from fits._cli_commands_diagnosis import diagnose
 from fits._cli_commands_model import compensate, export, fit, info, simulate, synth
 from fits._cli_commands_paper import paper
 from fits._cli_commands_stage import budget, sensitivity
+from fits._cli_commands_sweep import sweep
 
 
 def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -37,7 +38,20 @@ def cli() -> None:
     """
 
 
-for _command in (fit, simulate, compensate, export, synth, info, sensitivity, budget, diagnose, control, paper):
+for _command in (
+    fit,
+    simulate,
+    compensate,
+    export,
+    synth,
+    info,
+    sensitivity,
+    budget,
+    diagnose,
+    control,
+    paper,
+    sweep,
+):
     cli.add_command(_command)
 
 

@@ -1,0 +1,59 @@
+"""The command `microid sweep`: the work."""
+
+import json
+import sys
+from pathlib import Path
+
+import click
+
+from fits._cli_files import new_folder, progress_to_stderr
+from fits._cli_jax import start_jax
+
+
+def run_sweep(*, file: str, out: str, resume: bool, cluster: str | None, as_json: bool, quiet: bool) -> None:
+    """Do `microid sweep SWEEP.toml`; the options are the command's."""
+    start_jax()
+    from fits.sweeps._run import run_sweep as run_all
+    from fits.sweeps._spec import read_sweep
+    from fits.sweeps._store import RESULTS, TABLE
+
+    progress = progress_to_stderr(quiet)
+    sweep = read_sweep(file)
+    try:
+        outcome = run_all(sweep, out, resume=resume, cluster=cluster, progress=progress)
+    except KeyboardInterrupt:
+        click.echo("Interrupted: what was computed is kept; go on with --resume.", err=True)
+        sys.exit(130)
+    files = [str(Path(out) / name) for name in (RESULTS, TABLE)]
+    if as_json:
+        content = {
+            "out": out,
+            "rows": outcome.rows,
+            "failed": outcome.failed,
+            "computed": outcome.computed,
+            "chunks_computed_again": outcome.again,
+            "seconds": outcome.seconds,
+            "files": files,
+        }
+        click.echo(json.dumps(content, indent=1, allow_nan=False))
+        return
+    failed = f", {outcome.failed:,} of them failed" if outcome.failed else ""
+    click.echo(f"{outcome.rows:,} rows{failed}; {outcome.computed:,} computed in {outcome.seconds:.1f} s")
+    click.echo("\n".join(f"results  {name}" for name in files))
+
+
+def show_sweep(*, folder: str, best: str | None, largest: bool, plots: str | None, as_json: bool) -> None:
+    """Do `microid sweep show`; the options are the command's."""
+    from fits.sweeps._show import describe, summarise
+
+    summary = summarise(folder, best, largest)
+    drawn: list[Path] = []
+    with new_folder(plots) as drawings:
+        if drawings is not None:
+            from fits.sweeps._show import plot_sweep
+
+            drawn = plot_sweep(folder, drawings(), best)
+    if as_json:
+        click.echo(json.dumps(summary, indent=1, allow_nan=False))
+        return
+    click.echo("\n".join([describe(summary), *(f"plot  {Path(plots or '') / path.name}" for path in drawn)]))

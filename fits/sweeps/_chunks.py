@@ -1,0 +1,94 @@
+"""Rows in chunks that are computed and kept one at a time, and in blocks within them."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.sweeps._spec import Sweep, outside
+from fits.sweeps._types import DONE, FAILED, Output, Rows
+
+# A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
+# Rows that go one by one are slow ones, of which few are to be lost.
+_PARTS, _LARGEST, _LARGEST_SLOW = 16, 65536, 4
+
+
+def chunk_rows(sweep: Sweep) -> int:
+    """Rows of a chunk: whole blocks, as many as the memory allows."""
+    block, rows = sweep.facts.block, len(sweep.plan)
+    if sweep.chunk_rows is not None:
+        return block * -(-sweep.chunk_rows // block)
+    per_row = max(1, bytes_per_row(sweep))
+    fit = int(sweep.memory_MB * 1e6 / per_row)
+    wanted = min(fit, _LARGEST if block > 1 else _LARGEST_SLOW, max(1, rows // _PARTS))
+    return block * max(1, min(wanted, rows) // block if wanted >= block else 1)
+
+
+def bytes_per_row(sweep: Sweep) -> int:
+    """What a row takes on disk and in a chunk, before compression."""
+    return sum(output.bytes_per_row for output in sweep.facts.outputs) + 8 * len(sweep.plan.axes) + 1
+
+
+def source_of(sweep: Sweep) -> Output:
+    """The variable that says which source a row has, as wide as the longest name."""
+    return Output("source", "1", "file of the row", dtype=f"U{max(map(len, sweep.facts.sources), default=1)}")
+
+
+def chunk_count(sweep: Sweep) -> int:
+    """How many chunks there are."""
+    return -(-len(sweep.plan) // chunk_rows(sweep))
+
+
+def rows_of(sweep: Sweep, chunk: int) -> NDArray[np.int64]:
+    """Numbers of the rows of a chunk."""
+    size = chunk_rows(sweep)
+    return np.arange(chunk * size, min(len(sweep.plan), (chunk + 1) * size), dtype=np.int64)
+
+
+def compute_chunk(sweep: Sweep, chunk: int, tell: Callable[[int], None] = lambda _: None) -> Rows:
+    """Compute a chunk block by block, the last one filled up with its last row.
+
+    Parameters
+    ----------
+    sweep, chunk
+        Which.
+    tell
+        Called with the number of rows that a block has added.
+
+    Returns
+    -------
+    Rows
+        With the swept values beside the outputs, and `status`.
+    """
+    rows, block = rows_of(sweep, chunk), sweep.facts.block
+    parts = []
+    for first in range(0, len(rows), block):
+        piece = rows[first : first + block]
+        parts.append(_block(sweep, piece))
+        tell(len(piece))
+    outputs = {name: np.concatenate([part.outputs[name] for part in parts]) for name in parts[0].outputs}
+    return Rows(outputs, tuple(reason for part in parts for reason in part.reasons))
+
+
+def _block(sweep: Sweep, rows: NDArray[np.int64]) -> Rows:
+    padded = np.pad(rows, (0, sweep.facts.block - len(rows)), mode="edge")
+    values = sweep.plan.values(padded)
+    inside, refused = outside(sweep, values) if values else (values, [""] * len(padded))
+    found = sweep.job.compute(inside, padded, sweep.plan.repeat_of(padded), sweep.seed)
+    reasons = tuple((why or reason)[:200] for why, reason in zip(refused, found.reasons, strict=True))[: len(rows)]
+    failed = np.array([bool(reason) for reason in reasons])
+    outputs = {output.name: _kept(found, output, failed, len(rows)) for output in sweep.facts.outputs}
+    outputs |= {name: value[: len(rows)] for name, value in values.items()}
+    if sweep.facts.sources:
+        names = [sweep.facts.sources[k] for k in sweep.plan.repeat_of(rows)]
+        outputs["source"] = np.array(names, dtype=source_of(sweep).dtype)
+    outputs["status"] = np.where(failed, FAILED, DONE).astype("i1")
+    return Rows(outputs, reasons)
+
+
+def _kept(found: Rows, output: Output, failed: NDArray[np.bool_], count: int) -> NDArray[np.generic]:
+    value = np.asarray(found.outputs[output.name])[:count].astype(output.dtype)
+    if value.dtype.kind == "f":
+        value = value.copy()
+        value[failed] = np.nan
+    return value

@@ -1,0 +1,133 @@
+"""Many small loop fits at once: the regression of `fits.fit` on one grid, for all rows of a block.
+
+The smoothness is stated, not found from the data as `fits.fit` does; the noise level is found.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax import lax
+from jaxtyping import Array, Float
+
+from fits._design import Grid, design
+from fits._evidence import effective, posterior, renew_noise
+from fits._moments import Moments
+from fits._nonnegative import BlockPivoting
+from fits._prior import Hyper, Roughness
+from microid import Staircase
+
+_ATOL, _STEPS = 1e-6, 500
+# The noise is found from that start, in squared strokes, in a few rounds of a fixed point.
+_NOISE, _ROUNDS = 1e-6, 4
+
+
+class BatchFit(eqx.Module):
+    """What a batch of fits gives, one row each.
+
+    Attributes
+    ----------
+    columns_um
+        Densities and slopes as in `Grid`, shape `(n, D)`.
+    offset_um, noise_um
+        Sensor offset, and standard deviation of the noise, shape `(n,)`.
+    predicted_um
+        At all samples, shape `(n, t)`.
+    success
+        Whether the regression met its conditions.
+    """
+
+    columns_um: Float[Array, "n D"]
+    offset_um: Float[Array, " n"]
+    noise_um: Float[Array, " n"]
+    predicted_um: Float[Array, "n t"]
+    success: Array
+
+
+@eqx.filter_jit
+def fit_batch(
+    levels: int,
+    table: Float[Array, "4 k D"],
+    rough: Roughness,
+    voltage_V: Float[Array, "n t"],
+    displacement_um: Float[Array, "n t"],
+    weight: Float[Array, "n t"],
+    limits_V: Float[Array, "n 2"],
+    smoothness: Float[Array, " n"],
+    starts: Staircase,
+) -> BatchFit:
+    """Fit all rows.
+
+    Parameters
+    ----------
+    levels, table, rough
+        Of the grid: their number, `branch_table` and `roughness`.
+    voltage_V, displacement_um
+        Shape `(n, t)`.
+    weight
+        1 for samples that are fitted, 0 for others, shape `(n, t)`.
+    limits_V
+        Range of the levels, shape `(n, 2)`.
+    smoothness
+        Weight of the curvature of density and slopes, see `Hyper`, shape `(n,)`.
+    starts
+        Memory before each row.
+    """
+
+    def responses(row: tuple[Array, Array, Staircase]) -> Float[Array, "t D"]:
+        voltage, limits, start = row
+        return design(Grid(limits[0], limits[1], levels), table, voltage, start)[0]
+
+    # Row by row: what a hysteresis remembers is found fastest by a loop of scalars.
+    columns = lax.map(responses, (voltage_V, limits_V, starts))
+    found = jax.vmap(lambda *row: _one(rough, *row))(columns, displacement_um, weight, smoothness)
+    return BatchFit(*found)
+
+
+def _one(
+    rough: Roughness,
+    columns: Float[Array, "t D"],
+    displacement: Float[Array, " t"],
+    weight: Float[Array, " t"],
+    smoothness: Float[Array, ""],
+) -> tuple[Array, ...]:
+    count = jnp.maximum(jnp.sum(weight), 1.0)
+    stroke = jnp.max(jnp.where(weight > 0, displacement, -jnp.inf)) - jnp.min(
+        jnp.where(weight > 0, displacement, jnp.inf)
+    )
+    mean_column, mean = weight @ columns / count, weight @ displacement / count
+    left, right = (columns - mean_column[None, :]) * weight[:, None], (displacement - mean) * weight / stroke
+    moments = Moments(left.T @ left, left.T @ right, right @ right, count)
+    weight_of = jnp.log(smoothness)
+    hyper = Hyper(weight_of, weight_of, weight_of, jnp.log(jnp.asarray(_NOISE)))
+
+    def renew(_: int, hyper: Hyper) -> Hyper:
+        belief = posterior(moments, rough, hyper)
+        return renew_noise(moments, hyper, belief, effective(rough, hyper, belief))
+
+    hyper = lax.fori_loop(0, _ROUNDS, renew, hyper)
+    belief = posterior(moments, rough, hyper)
+    scale = jnp.sqrt(jnp.diagonal(belief.precision))
+    solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
+    precision = belief.precision / (scale[:, None] * scale[None, :])
+    solution: Any = optx.minimise(
+        _distance,
+        solver,
+        jnp.maximum(belief.mean * scale, 0),
+        args=(precision, belief.mean * scale),
+        options={"hessian": precision},
+        max_steps=_STEPS,
+        throw=False,
+    )
+    found = solution.value / scale * stroke
+    offset = mean - mean_column @ found
+    noise = jnp.exp(hyper.log_variance / 2) * stroke
+    return found, offset, noise, columns @ found + offset, solution.result == optx.RESULTS.successful
+
+
+def _distance(y: Float[Array, " k"], args: tuple[Float[Array, "k k"], Float[Array, " k"]]) -> Float[Array, ""]:
+    precision, mean = args
+    off = y - mean
+    return off @ (precision @ off) / 2

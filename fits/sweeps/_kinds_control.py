@@ -1,0 +1,175 @@
+"""The job `control`: a stage in closed loop with a PID controller, and its figures of merit."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from fits._errors import DataError
+from fits._stage_design import nearest
+from fits.sweeps._devices import device_of
+from fits.sweeps._jobs import Request
+from fits.sweeps._kinds_simulate import block_rows, drive, table_of
+from fits.sweeps._programs import Program, number, read_program
+from fits.sweeps._stages import memory_before, range_of, requested_stage, stage_parameters, varied
+from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Rows
+from microid import PID, Stage, Start, parameter_table, simulate_loop, step_metrics
+
+_SHAPES = ("step", "sine", "triangle", "decay", "chirp", "file")
+_OUTPUTS = (
+    Output("e_rms_pct", "%", "root mean square of the tracking error, of the reference's range"),
+    Output("e_max_pct", "%", "largest tracking error, of the reference's range"),
+    Output("error_rms_um", "um", "root mean square of the tracking error"),
+    Output("error_final_um", "um", "error at the last sample"),
+    Output("command_min_V", "V", "smallest command"),
+    Output("command_max_V", "V", "largest command"),
+)
+_STEP = (
+    Output("settling_time_s", "s", "from the step until the displacement stays within 2 %; inf if it does not"),
+    Output("overshoot_pct", "%", "beyond the final value, of the way to it"),
+)
+# A loop whose error grows beyond this share of the reference's range is not a loop that anybody wants.
+_LOST_PCT = 1e4
+
+
+class ControlJob(AbstractJob):
+    """Closed loops of a stage."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        pid: PID,
+        reference: Program,
+        initial: str,
+        names: tuple[str, ...],
+        relative: tuple[str, ...],
+        delay: int,
+    ):
+        """Prepare the job.
+
+        Parameters
+        ----------
+        stage, pid, reference
+            The loop and what it follows.
+        initial
+            Memory before each row.
+        names, relative
+            Parameters that vary, and which of them as factors.
+        delay
+            Samples by which readings are late.
+        """
+        self._stage, self._pid, self._reference = stage, pid, reference
+        self._start = Start(None, memory_before(stage, initial))
+        self._names, self._relative, self._delay = names, relative, delay
+        self._given = None if reference.given is None else jnp.asarray(reference.given)
+
+    @property
+    def facts(self) -> Facts:
+        """What is known before it runs."""
+        parameters = (*_pid_parameters(self._pid), *stage_parameters(self._stage), *self._reference.parameters)
+        outputs = (*_OUTPUTS, *_STEP) if self._reference.shape == "step" else _OUTPUTS
+        samples = self._reference.samples
+        return Facts(parameters, outputs, block_rows(samples), 8 * 8 * samples)
+
+    def compute(
+        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
+    ) -> Rows:
+        """Run one block of loops; see `AbstractJob.compute`."""
+        del sources, seed
+        with jax.default_device(device_of(rows)):
+            table = jnp.asarray(table_of(values, self._names, len(rows)))
+            wanted = drive(table, self._names, self._reference, self._given)
+            found = _control(
+                self._stage,
+                self._pid,
+                table,
+                self._names,
+                self._relative,
+                wanted,
+                self._start,
+                self._delay,
+                self._reference.shape == "step",
+            )
+            outputs = {name: np.asarray(value) for name, value in found.items()}
+        with np.errstate(invalid="ignore"):
+            kept = outputs["e_max_pct"] < _LOST_PCT
+        reasons = tuple("" if good else "the loop is unstable: its error grows without end" for good in kept)
+        return Rows(outputs, reasons)
+
+
+def make(request: Request) -> ControlJob:
+    """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
+    stage, initial = requested_stage(request)
+    reference = read_program(request.table.get("reference", {"shape": "step"}), "reference", "um", request.load)
+    given = request.table.get("controller", {})
+    fields = {
+        "proportional_V_per_um": 0.0,
+        "integral_V_per_um_s": 100.0,
+        "derivative_V_s_per_um": 0.0,
+        "filter_s": 0.0,
+        "reference_weight": 1.0,
+        "derivative_weight": 1.0,
+    }
+    limits = range_of(stage) or (-1e3, 1e3)
+    others = {"lower_V": limits[0], "upper_V": limits[1]}
+    for key in given:
+        known = [*fields, *others, "delay_samples"]
+        if key not in known:
+            raise DataError(f"controller.{key}: expected a known key, found '{key}'; {nearest(key, known)}")
+    stated = {key: number(value, f"controller.{key}") for key, value in given.items() if key != "delay_samples"}
+    delay = given.get("delay_samples", 0)
+    if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= 100:
+        raise DataError(f"controller.delay_samples: expected a number from 0 to 100, found {delay!r}; correct it.")
+    pid = PID(interval_s=jnp.asarray(reference.interval_s), **(fields | others | stated))
+    return ControlJob(stage, pid, reference, initial, request.names, request.relative, delay)
+
+
+def _pid_parameters(pid: PID) -> tuple[Parameter, ...]:
+    return tuple(
+        Parameter(f"controller.{info.path}", info.spec.unit, float(getattr(pid, info.path)), info.spec.lower)
+        for info in parameter_table(pid)
+    )
+
+
+@eqx.filter_jit
+def _control(
+    stage: Stage,
+    pid: PID,
+    table: Float[Array, "n k"],
+    names: tuple[str, ...],
+    relative: tuple[str, ...],
+    wanted: Float[Array, "n t"],
+    start: Start,
+    delay: int,
+    step: bool,
+) -> dict[str, Float[Array, " n"]]:
+    def one(row: Float[Array, " k"], reference: Float[Array, " t"]) -> dict[str, Float[Array, ""]]:
+        values = dict(zip(names, row, strict=True))
+        own = [name for name in names if name.startswith("controller.")]
+        fields = [name.removeprefix("controller.") for name in own]
+        old = [getattr(pid, field) for field in fields]
+        new = [v * values[name] if name in relative else values[name] for v, name in zip(old, own, strict=True)]
+        controller = eqx.tree_at(lambda p: [getattr(p, field) for field in fields], pid, new) if own else pid
+        run = simulate_loop(controller, varied(stage, values, relative), reference, delay=delay, start=start)
+        # A step at the first sample is none within the record, but from where the stage stood.
+        way = jnp.append(reference, run.displacement_um[0])
+        share = 100 / jnp.ptp(way)
+        found = {
+            "e_rms_pct": share * jnp.sqrt(jnp.mean(run.error_um**2)),
+            "e_max_pct": share * jnp.max(jnp.abs(run.error_um)),
+            "error_rms_um": jnp.sqrt(jnp.mean(run.error_um**2)),
+            "error_final_um": run.error_um[-1],
+            "command_min_V": jnp.min(run.command_V),
+            "command_max_V": jnp.max(run.command_V),
+        }
+        if step:
+            answer = step_metrics(run.time_s, run.displacement_um, reference[-1], run.displacement_um[0])
+            waited = run.time_s[jnp.argmax(reference == reference[-1])]
+            found |= {"settling_time_s": answer.settling_time_s - waited, "overshoot_pct": answer.overshoot_pct}
+        return found
+
+    return jax.vmap(one)(table, wanted)

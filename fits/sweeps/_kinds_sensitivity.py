@@ -1,0 +1,153 @@
+"""The job `sensitivity`: gains, strokes and resonances of a stage of other dimensions, and what its tolerances do."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+import microid as m
+from fits._errors import DataError
+from fits._stage_design import Design, paper_design
+from fits._stage_toml import read_design
+from fits.sweeps._devices import device_of
+from fits.sweeps._files import in_a_file
+from fits.sweeps._jobs import Request
+from fits.sweeps._kinds_simulate import table_of
+from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Rows
+
+_BLOCK, _BYTES = 256, 200_000
+# So short a stroke that all motions are in proportion to it, to the last digit.
+_SHORT_UM = 1e-6
+# Beyond it a bridge has no inclination left.
+_LARGEST_ANGLE_RAD = 1.5
+
+
+class SensitivityJob(AbstractJob):
+    """Axes of a stage as its dimensions vary."""
+
+    def __init__(self, design: Design, axes: tuple[m.Axis, ...], names: tuple[str, ...], relative: tuple[str, ...]):
+        """Take a design, the axes that are looked at, what varies, and which of it as factors."""
+        self._design, self._axes, self._names, self._relative = design, axes, names, relative
+
+    @property
+    def facts(self) -> Facts:
+        """What is known before it runs."""
+        outputs = []
+        for axis in self._axes:
+            unit = m.MOTIONS[axis].unit
+            outputs += [
+                Output(f"{axis}_gain_{unit}_per_um", f"{unit}/um", f"{axis} per elongation of the piezo"),
+                Output(f"{axis}_stroke_{unit}", unit, f"{axis} at the highest voltage"),
+                Output(f"{axis}_resonance_Hz", "Hz", f"first resonance of {axis}"),
+                Output(f"{axis}_spread_pct", "%", f"root sum of squares of what the tolerances do to {axis}"),
+            ]
+        return Facts(_parameters(self._design), tuple(outputs), _BLOCK, _BYTES)
+
+    def compute(
+        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
+    ) -> Rows:
+        """Evaluate one block of stages; see `AbstractJob.compute`."""
+        del sources, seed
+        design = self._design
+        outputs: dict[str, np.ndarray] = {}
+        with jax.default_device(device_of(rows)):
+            table = jnp.asarray(table_of(values, self._names, len(rows)))
+            for axis in self._axes:
+                names = m.MOTIONS[axis].dimensions
+                tolerance = jnp.asarray([design.tolerance[name] for name in names])
+                together = jnp.asarray(design.correlation(names))
+                nominal = jnp.asarray(design.youngs_modulus_GPa), jnp.asarray(design.guides)
+                found = _evaluate(
+                    design.geometry,
+                    design.actuation,
+                    nominal,
+                    table,
+                    tolerance,
+                    together,
+                    self._names,
+                    self._relative,
+                    axis,
+                    design.level,
+                )
+                unit = m.MOTIONS[axis].unit
+                ends = (f"gain_{unit}_per_um", f"stroke_{unit}", "resonance_Hz", "spread_pct")
+                outputs |= {f"{axis}_{end}": np.asarray(value) for end, value in zip(ends, found, strict=True)}
+        good = np.all([np.isfinite(value) for value in outputs.values()], axis=0)
+        reasons = tuple("" if each else "no finite number comes out: such a stage cannot be built" for each in good)
+        return Rows(outputs, reasons)
+
+
+def make(request: Request) -> SensitivityJob:
+    """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
+    name = request.table.get("stage", "paper")
+    if not isinstance(name, str):
+        raise DataError(f'stage: expected "paper" or the name of the TOML of a stage, found {name!r}; give one.')
+    design = paper_design() if name == "paper" else in_a_file(request.load(name), name, read_design)
+    options = request.table.get("sensitivity", {})
+    for key in options:
+        if key != "axes":
+            raise DataError(f"sensitivity.{key}: expected a known key, found '{key}'; use axes.")
+    axes = options.get("axes", ["x", "z"])
+    if not isinstance(axes, list) or not axes or any(axis not in m.AXES for axis in axes):
+        raise DataError(f"sensitivity.axes: expected some of {', '.join(m.AXES)} in a list, found {axes!r}.")
+    return SensitivityJob(design, tuple(dict.fromkeys(axes)), request.names, request.relative)
+
+
+def _parameters(design: Design) -> tuple[Parameter, ...]:
+    found = []
+    for name, dimension in m.DIMENSIONS.items():
+        upper = _LARGEST_ANGLE_RAD if dimension.unit == "rad" else np.inf
+        found.append(
+            Parameter(f"geometry.{dimension.field}", dimension.unit, float(design.geometry[name]), 1e-9, float(upper))
+        )
+    for info in m.parameter_table(design.actuation):
+        value = float(getattr(design.actuation, info.path))
+        found.append(Parameter(f"actuation.{info.path}", info.spec.unit, value, 1e-9))
+    found.append(Parameter("material.youngs_modulus_GPa", "GPa", float(design.youngs_modulus_GPa), 1e-9))
+    found.append(Parameter("material.guides", "1", float(design.guides), 0.0))
+    return tuple(found)
+
+
+@eqx.filter_jit
+def _evaluate(
+    geometry: m.Geometry,
+    actuation: m.Actuation,
+    material: tuple[Float[Array, ""], Float[Array, ""]],
+    table: Float[Array, "n k"],
+    tolerance: Float[Array, " d"],
+    together: Float[Array, "d d"],
+    names: tuple[str, ...],
+    relative: tuple[str, ...],
+    axis: m.Axis,
+    level: int,
+) -> tuple[Float[Array, " n"], ...]:
+    def set_in(tree: m.Geometry | m.Actuation, start: str, values: dict[str, Array]) -> m.Geometry | m.Actuation:
+        own = [name for name in names if name.startswith(f"{start}.")]
+        if not own:
+            return tree
+        fields = [name.removeprefix(f"{start}.") for name in own]
+        new = [getattr(tree, f) * values[n] if n in relative else values[n] for f, n in zip(fields, own, strict=True)]
+        return eqx.tree_at(lambda t: [getattr(t, field) for field in fields], tree, new)
+
+    def one(row: Float[Array, " k"]) -> tuple[Float[Array, ""], ...]:
+        values = dict(zip(names, row, strict=True))
+        changed, piezos = set_in(geometry, "geometry", values), set_in(actuation, "actuation", values)
+        assert isinstance(changed, m.Geometry)
+        assert isinstance(piezos, m.Actuation)
+        modulus, guides = (
+            nominal * values[name] if name in relative else values.get(name, nominal)
+            for name, nominal in zip(("material.youngs_modulus_GPa", "material.guides"), material, strict=True)
+        )
+        constants = m.constants_of(changed, level, 1e3 * modulus, guides)
+        stage = m.stage_constants(axis, changed, constants, piezos)
+        slopes = m.sensitivity(axis, changed, jnp.asarray(_SHORT_UM), constants).dimensions
+        dimensions = m.MOTIONS[axis].dimensions
+        changes = jnp.stack([slopes[name] for name in dimensions]) / _SHORT_UM * tolerance / stage.gain
+        spread = 100 * jnp.sqrt(jnp.maximum(changes @ together @ changes, 0))
+        return stage.gain, stage.stroke, stage.resonance_Hz, spread
+
+    return jax.vmap(one)(table)

@@ -1,0 +1,162 @@
+"""Signals that a sweep drives with: a shape, and its parameters per row."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits._errors import DataError
+from fits._read_csv import read_csv, read_reference
+from fits._stage_design import nearest
+from fits.sweeps._files import in_a_file
+from fits.sweeps._types import FloatArray, Parameter
+
+# Parameters of each shape beside offset and amplitude.
+SHAPES: dict[str, tuple[str, ...]] = {
+    "sine": ("frequency_Hz", "phase_rad"),
+    "triangle": ("frequency_Hz", "phase_rad"),
+    "decay": ("frequency_Hz", "phase_rad"),
+    "chirp": ("frequency_Hz", "frequency_end_Hz", "phase_rad"),
+    "step": ("step_s",),
+    "file": (),
+}
+_DEFAULTS = {"frequency_Hz": 10.0, "frequency_end_Hz": 100.0, "phase_rad": 0.0, "step_s": 0.0}
+_UNITS = {"frequency_Hz": "Hz", "frequency_end_Hz": "Hz", "phase_rad": "rad", "step_s": "s"}
+_SAMPLES = 10_000_000
+# Samples that differ by less from even intervals, as a fraction of one, count as even.
+_EVEN = 1e-3
+
+
+@dataclass(frozen=True)
+class Program:
+    """A signal over evenly spaced times.
+
+    Attributes
+    ----------
+    table, unit
+        `program` and `V`, or `reference` and `um`.
+    shape
+        One of `SHAPES`: a sine, a triangle, a sine that decays to nothing, a chirp, a step, or a file.
+    samples, interval_s
+        How many, and the time between two.
+    nominal
+        Values of the parameters, each with its name without the table.
+    given
+        The signal of a file, shape `(samples,)`.
+    """
+
+    table: str
+    unit: str
+    shape: str
+    samples: int
+    interval_s: float
+    nominal: tuple[tuple[str, float], ...]
+    given: FloatArray | None = field(default=None, compare=False)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What may be varied."""
+        names = (f"offset_{self.unit}", f"amplitude_{self.unit}", *SHAPES[self.shape])
+        if self.shape == "file":
+            names = (f"offset_{self.unit}", "gain")
+        lower = {"frequency_Hz": 0.0, "frequency_end_Hz": 0.0}
+        return tuple(
+            Parameter(
+                f"{self.table}.{name}",
+                _UNITS.get(name, "1" if name == "gain" else self.unit),
+                dict(self.nominal)[name],
+                lower.get(name, -math.inf),
+            )
+            for name in names
+        )
+
+    def signal(self, values: Mapping[str, Float[Array, ""]], given: Float[Array, " t"] | None) -> Float[Array, " t"]:
+        """The signal of one row, shape `(samples,)`; parameters that are not given have their nominal values."""
+        at = {name: jnp.asarray(value) for name, value in self.nominal}
+        at |= {name: values[f"{self.table}.{name}"] for name in at if f"{self.table}.{name}" in values}
+        offset = at[f"offset_{self.unit}"]
+        if given is not None:
+            return offset + at["gain"] * given
+        time = jnp.arange(self.samples, dtype=float) * self.interval_s
+        return offset + at[f"amplitude_{self.unit}"] * self._unit_shape(time, at)
+
+    def _unit_shape(self, time: Float[Array, " t"], at: Mapping[str, Float[Array, ""]]) -> Float[Array, " t"]:
+        if self.shape == "step":
+            return (time >= at["step_s"]).astype(time.dtype)
+        turns = at["frequency_Hz"] * time + at["phase_rad"] / (2 * math.pi)
+        if self.shape == "triangle":
+            return 1 - 4 * jnp.abs((turns + 0.25) % 1 - 0.5)
+        whole = self.samples * self.interval_s
+        if self.shape == "chirp":
+            turns = turns + (at["frequency_end_Hz"] - at["frequency_Hz"]) * time**2 / (2 * whole)
+        wave = jnp.sin(2 * math.pi * turns)
+        return wave * (1 - time / whole) if self.shape == "decay" else wave
+
+
+def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes]) -> Program:
+    """Read the table `[program]` or `[reference]` of a sweep.
+
+    Raises
+    ------
+    DataError
+        For the first thing that is not as it should be.
+    """
+    if not isinstance(table, dict):
+        raise DataError(f"{name}: expected a table, found {table!r}; write [{name}] and its keys below.")
+    shape = table.get("shape", "file" if "file" in table else None)
+    if shape not in SHAPES:
+        raise DataError(f"{name}.shape: expected one of {', '.join(SHAPES)}, found {shape!r}; choose one.")
+    own = [f"offset_{unit}", f"amplitude_{unit}", *SHAPES[shape]]
+    known = ["shape", "samples", "interval_s", *own]
+    if shape == "file":
+        known = ["shape", "file", f"offset_{unit}", "gain"]
+    for key in table:
+        if key not in known:
+            raise DataError(f"{name}.{key}: expected a known key, found '{key}'; {nearest(key, known)}")
+    if shape == "file":
+        return _from_file(table, name, unit, load)
+    nominal = {f"offset_{unit}": 0.0, f"amplitude_{unit}": 1.0} | {key: _DEFAULTS[key] for key in SHAPES[shape]}
+    nominal |= {key: number(table[key], f"{name}.{key}") for key in nominal if key in table}
+    samples = table.get("samples", 1000)
+    if isinstance(samples, bool) or not isinstance(samples, int) or not 3 <= samples <= _SAMPLES:
+        raise DataError(f"{name}.samples: expected a number from 3 to {_SAMPLES:,}, found {samples!r}; correct it.")
+    interval = number(table.get("interval_s", 1e-4), f"{name}.interval_s")
+    if not interval > 0:
+        raise DataError(f"{name}.interval_s: expected a time above 0, found {interval:g}; correct it.")
+    return Program(name, unit, shape, samples, interval, tuple(nominal.items()))
+
+
+def _from_file(table: Mapping[str, Any], name: str, unit: str, load: Callable[[str], bytes]) -> Program:
+    path = table.get("file")
+    if not isinstance(path, str):
+        raise DataError(f"{name}.file: expected the name of a CSV file, found {path!r}; give one.")
+    time_s, given = in_a_file(load(path), path, _read_voltage if unit == "V" else _read_displacement)
+    interval = np.diff(time_s)
+    if np.ptp(interval) > _EVEN * np.mean(interval):
+        raise DataError(f"{name}.file: {path} is not sampled evenly, which a sweep needs; resample it.")
+    nominal = {f"offset_{unit}": 0.0, "gain": 1.0}
+    nominal |= {key: number(table[key], f"{name}.{key}") for key in nominal if key in table}
+    return Program(name, unit, "file", len(given), float(np.mean(interval)), tuple(nominal.items()), given)
+
+
+def _read_voltage(path: Path) -> tuple[FloatArray, FloatArray]:
+    record = read_csv(path, required=("time_s", "voltage_V"))
+    return record.time_s, record.voltage_V
+
+
+def _read_displacement(path: Path) -> tuple[FloatArray, FloatArray]:
+    reference = read_reference(path)
+    return reference.time_s, reference.displacement_um
+
+
+def number(found: Any, place: str) -> float:
+    """A finite number, or a `DataError` that begins with its place."""
+    value = float(found) if isinstance(found, int | float) and not isinstance(found, bool) else math.nan
+    if not math.isfinite(value):
+        raise DataError(f"{place}: expected a finite number, found {found!r}; give one without quotes.")
+    return value

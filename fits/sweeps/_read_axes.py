@@ -1,0 +1,238 @@
+"""The axes of a sweep as its TOML states them, checked against the parameters there are."""
+
+import csv
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from fits._errors import DataError
+from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
+from fits.sweeps._programs import number
+from fits.sweeps._types import Parameter
+
+_KEYS = ("parameter", "unit", "relative", "values", "low", "high", "count", "spacing", "mean", "sd", "zip")
+_PREFIXES = {"": 0, "k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
+_BASES = ("s", "V", "m", "Hz", "Pa", "rad")
+_MOST = 2**62
+
+
+def read_plan(
+    table: Mapping[str, Any],
+    parameters: Sequence[Parameter],
+    repeats: int,
+    seed: int,
+    load: Callable[[str], bytes],
+) -> Plan:
+    """Read `[[axis]]`, `[design]` and `[list]` of a sweep.
+
+    Parameters
+    ----------
+    table
+        The sweep.
+    parameters
+        Those that may be varied.
+    repeats
+        Rows there are by themselves.
+    seed
+        Of what is drawn.
+    load
+        Gives the content of a file by its name.
+
+    Raises
+    ------
+    DataError
+        For the first thing that is not as it should be.
+    """
+    known = {parameter.name: parameter for parameter in parameters}
+    listed: dict[str, list[tuple[Axis, np.ndarray]]] = {}
+    drawn: list[Axis] = []
+    for k, entry in enumerate(_tables(table, "axis")):
+        axis, values = _axis(entry, f"axis[{k}]", known)
+        if values is None:
+            drawn.append(axis)
+        else:
+            label = entry.get("zip")
+            if label is not None and not isinstance(label, str):
+                raise DataError(f"axis[{k}].zip: expected a name that zipped axes share, found {label!r}.")
+            listed.setdefault(f"{k}" if label is None else f"zip {label}", []).append((axis, values))
+    groups: list[AbstractGroup] = []
+    for label, members in listed.items():
+        lengths = {len(values) for _, values in members}
+        if len(lengths) > 1:
+            raise DataError(
+                f"axis.zip: the axes of {label[4:]!r} have {' and '.join(map(str, sorted(lengths)))} values; zipped "
+                "axes need as many each."
+            )
+        groups.append(Listed([axis for axis, _ in members], np.stack([values for _, values in members])))
+    if "list" in table:
+        groups.append(_list(table["list"], known, load))
+    design = table.get("design")
+    if drawn:
+        groups.append(_drawn(design, drawn, seed))
+    elif design is not None:
+        raise DataError("design: expected axes to draw, found none; give axes low and high without a count.")
+    names = [axis.parameter for group in groups for axis in group.axes]
+    for name in names:
+        if names.count(name) > 1:
+            raise DataError(f"axis.parameter: {name} is varied twice; keep one of the two.")
+    if not groups and repeats == 1:
+        raise DataError("axis: expected at least one axis, found none; add [[axis]].")
+    plan = Plan(tuple(groups), repeats)
+    if math.prod(len(group) for group in groups) * repeats > _MOST:
+        raise DataError("axis: these are more rows than can be counted; leave out some.")
+    return plan
+
+
+def _tables(table: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
+    found = table.get(name, [])
+    if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
+        raise DataError(f"{name}: expected tables [[{name}]], found something else; double the brackets.")
+    return found
+
+
+def _parameter(name: Any, place: str, known: Mapping[str, Parameter]) -> Parameter:
+    if not isinstance(name, str) or name not in known:
+        close = get_close_matches(str(name), [*known], n=3, cutoff=0.4)
+        meant = f"did you mean {' or '.join(close)}?" if close else f"use one of {', '.join(known)}."
+        raise DataError(f"{place}.parameter: there is no parameter {name!r}; {meant}")
+    return known[name]
+
+
+def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) -> tuple[Axis, np.ndarray | None]:
+    for key in entry:
+        if key not in _KEYS:
+            close = get_close_matches(key, _KEYS, n=1, cutoff=0.5)
+            meant = f"did you mean {close[0]}?" if close else f"use some of {', '.join(_KEYS)}."
+            raise DataError(f"{place}.{key}: expected a known key, found '{key}'; {meant}")
+    if "parameter" not in entry:
+        raise DataError(f"{place}.parameter: expected the name of what varies, found none; add it.")
+    parameter = _parameter(entry["parameter"], place, known)
+    relative = entry.get("relative", False)
+    if not isinstance(relative, bool):
+        raise DataError(f"{place}.relative: expected true or false, found {relative!r}; correct it.")
+    if not relative and math.isnan(parameter.nominal):
+        raise DataError(
+            f"{place}.parameter: {parameter.name} is an array, varied relative to itself; add relative = true."
+        )
+    factor = _factor(entry.get("unit"), "1" if relative else parameter.unit, f"{place}.unit", parameter.name)
+    found = _values(entry, place, factor)
+    if relative and math.isfinite(parameter.nominal):
+        # Factors of single numbers become values at once; only those of arrays stay factors.
+        if parameter.nominal == 0:
+            raise DataError(f"{place}.relative: {parameter.name} is 0, which no factor changes; give values.")
+        relative, nominal = False, parameter.nominal
+        found = found * nominal if isinstance(found, np.ndarray) else _scaled(*found, nominal)
+    if isinstance(found, np.ndarray):
+        return Axis(parameter.name, relative, tuple(found.tolist())), found
+    distribution, first, second = found
+    axis = Axis(parameter.name, relative, None, distribution, first, second)
+    ends = [first, second]
+    if not relative and distribution != "normal" and (min(ends) > parameter.upper or max(ends) < parameter.lower):
+        raise DataError(
+            f"{place}: all values lie outside the bounds of {parameter.name}, {parameter.lower:g} to "
+            f"{parameter.upper:g} {parameter.unit}; correct them."
+        )
+    return axis, None
+
+
+def _values(entry: Mapping[str, Any], place: str, factor: float) -> np.ndarray | tuple[str, float, float]:
+    """Values of a list or grid, or the distribution to draw from with its two numbers."""
+    ways = [way for way in ("values", "low", "mean") if way in entry]
+    if len(ways) != 1:
+        raise DataError(
+            f"{place}: expected one of values, low and high, or mean and sd, found {' and '.join(ways) or 'none'}."
+        )
+    if ways[0] == "values":
+        values = entry["values"]
+        if not isinstance(values, list):
+            raise DataError(f"{place}.values: expected a list of numbers, found {values!r}.")
+        if not values:
+            raise DataError(f"{place}.values: the axis is empty; give at least one value.")
+        return factor * np.array([number(value, f"{place}.values") for value in values])
+    if ways[0] == "mean":
+        mean, sd = (number(entry.get(key), f"{place}.{key}") * factor for key in ("mean", "sd"))
+        if not sd > 0:
+            raise DataError(f"{place}.sd: expected a standard deviation above 0, found {sd:g}; correct it.")
+        return "normal", mean, sd
+    low, high = (number(entry.get(key), f"{place}.{key}") * factor for key in ("low", "high"))
+    spacing = entry.get("spacing", "linear")
+    if spacing not in ("linear", "log"):
+        raise DataError(f"{place}.spacing: expected linear or log, found {spacing!r}; choose one.")
+    if not low <= high or (spacing == "log" and not low > 0):
+        above = " above 0" if spacing == "log" else ""
+        raise DataError(f"{place}: expected low{above} and no higher than high, found {low:g} and {high:g}.")
+    if "count" not in entry:
+        return ("log" if spacing == "log" else "uniform"), low, high
+    count = entry["count"]
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {count!r}.")
+    return np.geomspace(low, high, count) if spacing == "log" else np.linspace(low, high, count)
+
+
+def _scaled(distribution: str, first: float, second: float, nominal: float) -> tuple[str, float, float]:
+    if distribution == "normal":
+        return distribution, first * nominal, second * abs(nominal)
+    if nominal < 0 and distribution == "log":
+        raise DataError(f"axis.relative: a logarithmic axis needs a positive parameter, found {nominal:g}.")
+    ends = sorted((first * nominal, second * nominal))
+    return distribution, ends[0], ends[1]
+
+
+def _factor(unit: Any, wanted: str, place: str, name: str) -> float:
+    """What takes a unit to the parameter's own."""
+    if unit is None or unit == wanted:
+        return 1.0
+    if not isinstance(unit, str):
+        raise DataError(f"{place}: expected a unit in quotes, found {unit!r}.")
+    plain = unit.replace("µ", "u").replace("μ", "u")
+    for mine, power in _PREFIXES.items():
+        for other, wanted_power in _PREFIXES.items():
+            base = plain.removeprefix(mine)
+            prefixed = plain.startswith(mine) and wanted == other + base
+            if prefixed and base in _BASES:
+                return float(10.0 ** (power - wanted_power))
+    raise DataError(f"{place}: {name} is in {wanted}, found {unit!r}; convert the values.")
+
+
+def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:
+    known = ("method", "rows")
+    if not isinstance(design, dict):
+        raise DataError("design: expected how axes without a count are drawn; add [design] with method and rows.")
+    for key in design:
+        if key not in known:
+            raise DataError(f"design.{key}: expected a known key, found '{key}'; use {' and '.join(known)}.")
+    method, rows = design.get("method"), design.get("rows")
+    if method not in SAMPLERS:
+        raise DataError(f"design.method: expected one of {', '.join(SAMPLERS)}, found {method!r}; choose one.")
+    if isinstance(rows, bool) or not isinstance(rows, int) or rows < 1:
+        raise DataError(f"design.rows: expected a number of 1 or more, found {rows!r}; correct it.")
+    return Drawn(axes, method, rows, seed)
+
+
+def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], bytes]) -> Listed:
+    if not isinstance(entry, dict) or set(entry) != {"file"} or not isinstance(entry["file"], str):
+        raise DataError("list: expected the one key file, the name of a CSV with a column per parameter.")
+    name = entry["file"]
+    lines = list(csv.reader(io.StringIO(load(name).decode("utf-8-sig", errors="replace"))))
+    lines = [line for line in lines if line]
+    if len(lines) < 2:
+        raise DataError(f"{name}: the list is empty: expected a header and at least one row.")
+    axes = [Axis(_parameter(column.strip(), f"{name}: list", known).name) for column in lines[0]]
+    for axis in axes:
+        if math.isnan(known[axis.parameter].nominal):
+            raise DataError(f"{name}: {axis.parameter} is an array; vary it by [[axis]] with relative = true.")
+    table = np.empty((len(axes), len(lines) - 1))
+    for k, line in enumerate(lines[1:]):
+        try:
+            table[:, k] = [float(cell) for cell in line]
+        except ValueError:
+            raise DataError(
+                f"{name}, line {k + 2}: expected {len(axes)} numbers, found {', '.join(line)!r}; correct it."
+            ) from None
+    if not np.all(np.isfinite(table)):
+        raise DataError(f"{name}: expected finite numbers, found others; correct them.")
+    return Listed(axes, table)

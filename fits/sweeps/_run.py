@@ -1,0 +1,158 @@
+"""Running a sweep: what is missing is computed, kept chunk by chunk, and put into a table at the end."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from fits._atomic import atomic_path
+from fits.sweeps._chunks import chunk_count, compute_chunk, rows_of
+from fits.sweeps._extra import need
+from fits.sweeps._spec import Sweep
+from fits.sweeps._store import TABLE, Store, opened
+from fits.sweeps._types import FAILED, Rows
+
+_EVERY_s = 1.0
+_BAR = 24
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run did.
+
+    Attributes
+    ----------
+    rows, failed
+        Of the whole sweep.
+    computed
+        Rows that this run added.
+    again
+        Chunks that were kept but broken, and were computed again.
+    seconds
+        That it took.
+    """
+
+    rows: int
+    failed: int
+    computed: int
+    again: int
+    seconds: float
+
+
+class _Progress:
+    """Tells how far a sweep is, its rate, and the time that is left."""
+
+    def __init__(self, tell: Callable[[str], None], rows: int, done: int):
+        self._tell, self._rows, self._done, self._new = tell, rows, done, 0
+        self._began = self._told = time.monotonic()
+
+    def __call__(self, rows: int) -> None:
+        """Count rows."""
+        self._done, self._new = self._done + rows, self._new + rows
+        now = time.monotonic()
+        if now - self._told >= _EVERY_s or self._done == self._rows:
+            self._told = now
+            rate = self._new / max(now - self._began, 1e-9)
+            full = _BAR * self._done // self._rows
+            left = _duration((self._rows - self._done) / rate)
+            bar = "#" * full + "." * (_BAR - full)
+            self._tell(f"[{bar}] {self._done:,} of {self._rows:,} rows, {rate:.3g} rows/s, {left} left")
+
+
+def run_sweep(
+    sweep: Sweep,
+    out: str | os.PathLike[str],
+    *,
+    resume: bool = False,
+    cluster: str | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Outcome:
+    """Run a sweep, or what is missing of it.
+
+    Parameters
+    ----------
+    sweep
+        From `read_sweep`.
+    out
+        Folder for the results.
+    resume
+        Go on with the sweep that is in the folder.
+    cluster
+        Address of a Dask scheduler, or `local:N` for N processes of this machine; None computes in this process.
+    progress
+        Told how far it is, a sentence at a time.
+
+    Raises
+    ------
+    DataError
+        If the folder, the disk or the cluster does not allow it; the sentence says what to do. Rows that fail do
+        not raise: they are kept with their reason.
+    RuntimeError
+        If JAX computes in single precision.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError('sweeps need float64: jax.config.update("jax_enable_x64", True)')
+    began = time.monotonic()
+    need("pyarrow")
+    with opened(sweep, os.fspath(out), resume) as store:
+        chunks = range(chunk_count(sweep))
+        done = {chunk for chunk in chunks if store.whole(chunk)} if resume else set()
+        again = sum(store.noted(chunk) for chunk in chunks if chunk not in done) if resume else 0
+        if resume:
+            progress(f"{len(done)} of {len(chunks)} chunks are there" + (f", {again} broken" if again else ""))
+        left = [chunk for chunk in chunks if chunk not in done]
+        tell = _Progress(progress, len(sweep.plan), sum(len(rows_of(sweep, chunk)) for chunk in done))
+        for chunk, rows in _computed(sweep, left, cluster, tell, progress):
+            store.write(chunk, rows)
+        progress("writing the table")
+        failed = _table(store)
+    computed = sum(len(rows_of(sweep, chunk)) for chunk in left)
+    return Outcome(len(sweep.plan), failed, computed, again, time.monotonic() - began)
+
+
+def _computed(
+    sweep: Sweep,
+    chunks: list[int],
+    cluster: str | None,
+    tell: Callable[[int], None],
+    progress: Callable[[str], None],
+) -> Iterator[tuple[int, Rows]]:
+    """Chunks as they come."""
+    if cluster is None:
+        for chunk in chunks:
+            yield chunk, compute_chunk(sweep, chunk, tell)
+        return
+    from fits.sweeps._cluster import on_cluster
+
+    for chunk, rows in on_cluster(sweep, chunks, cluster, progress):
+        tell(len(rows.reasons))
+        yield chunk, rows
+
+
+def _table(store: Store) -> int:
+    """Write all rows but their traces as one Parquet file, chunk by chunk; the number of failed ones comes back."""
+    arrow, parquet = need("pyarrow"), need("pyarrow.parquet")
+    flat = [variable for variable in store.variables if not variable.dims]
+    fields = [arrow.field("row", arrow.int64(), metadata={"unit": "1"})]
+    for variable in flat:
+        kind = arrow.string() if np.dtype(variable.dtype).kind == "U" else arrow.from_numpy_dtype(variable.dtype)
+        fields.append(arrow.field(variable.name, kind, metadata={"unit": variable.unit}))
+    schema = arrow.schema(fields, metadata={"sweep": store.sweep.text})
+    failed = 0
+    with atomic_path(store.folder / TABLE) as unfinished, parquet.ParquetWriter(unfinished, schema) as writer:
+        for chunk in range(chunk_count(store.sweep)):
+            arrays: dict[str, Any] = {"row": rows_of(store.sweep, chunk), **store.read(chunk)}
+            failed += int(np.sum(arrays["status"] == FAILED))
+            columns = [arrow.array(arrays[field.name], type=field.type) for field in fields]
+            writer.write_table(arrow.Table.from_arrays(columns, schema=schema))
+    return failed
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

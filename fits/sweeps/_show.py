@@ -1,0 +1,204 @@
+"""What a sweep's folder holds: how far it is, figures of its outputs, the best rows, and pictures."""
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fits._atomic import atomic_path
+from fits._errors import DataError
+from fits._plot_style import figure, label
+from fits.sweeps._extra import need
+from fits.sweeps._store import ABOUT, LEDGER, RESULTS
+from fits.sweeps._store import SCHEMA as RESULTS_SCHEMA
+from fits.sweeps._types import DONE, FAILED
+
+SCHEMA = "microid.sweep.summary/1"
+_CELLS = 12
+# More lines than this do not show.
+_LINES = 400
+_WIDE_in, _HIGH_in = 7.09, 2.6
+
+
+def open_sweep(folder: str | os.PathLike[str]) -> Any:
+    """Open the results of a sweep, finished or not.
+
+    Parameters
+    ----------
+    folder
+        What the sweep was given by `--out`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Along `row`; swept parameters are coordinates. Rows that are not there yet are NaN with a status of 0.
+
+    Raises
+    ------
+    DataError
+        If the folder holds no sweep, or xarray and zarr are not installed.
+    """
+    about_of(folder)
+    need("zarr")
+    found = need("xarray").open_zarr(os.path.join(folder, RESULTS), chunks=None)
+    return found.assign_coords(row=np.arange(found.sizes["row"]))
+
+
+def about_of(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read what is known of a sweep; a `DataError` says why it cannot be read."""
+    shown = os.fspath(folder)
+    try:
+        about = json.loads((Path(folder) / ABOUT).read_text(encoding="utf-8"))
+    except OSError:
+        raise DataError(f"{shown}: there is no sweep in this folder; give what --out named.") from None
+    except ValueError as error:
+        raise DataError(f"{shown}: {ABOUT} is broken ({error}); run the sweep again in another folder.") from None
+    if not isinstance(about, dict) or about.get("schema") != RESULTS_SCHEMA:
+        raise DataError(f"{shown}: expected results of the format {RESULTS_SCHEMA}; run the sweep again.")
+    return about
+
+
+def summarise(folder: str | os.PathLike[str], by: str | None = None, largest: bool = False) -> dict[str, Any]:
+    """Sum up a sweep as JSON values.
+
+    Parameters
+    ----------
+    folder
+        Of the sweep.
+    by, largest
+        Output by which rows are ranked, the first by default, and whether large is good.
+    """
+    about = about_of(folder)
+    data = open_sweep(folder)
+    status = data["status"].values
+    done = status == DONE
+    noted = len(list((Path(folder) / LEDGER).glob("*.json")))
+    numbers = [name for name in about["outputs"] if data[name].dims == ("row",) and data[name].dtype.kind == "f"]
+    if by is not None and by not in numbers:
+        raise DataError(f"--best: there is no output {by!r}; choose one of {', '.join(numbers)}.")
+    by = by or (numbers[0] if numbers else None)
+    reasons: dict[str, int] = {}
+    for reason in data["reason"].values[status == FAILED]:
+        kind = str(reason).partition(" = ")[0]
+        reasons[kind] = reasons.get(kind, 0) + 1
+    return {
+        "schema": SCHEMA,
+        "kind": about["kind"],
+        "rows": about["rows"],
+        "done": int(done.sum()),
+        "failed": int((status == FAILED).sum()),
+        "left": int(about["rows"] - np.sum(status > 0)),
+        "chunks": about["chunks"],
+        "chunks_done": noted,
+        "reasons": dict(sorted(reasons.items(), key=lambda item: -item[1])[:10]),
+        "outputs": {name: _figures(data[name].values[done], data[name].attrs.get("units", "1")) for name in numbers},
+        "best": {"by": by, "largest": largest, "rows": _best(data, about, done, by, largest)},
+        "versions": about["versions"],
+    }
+
+
+def _figures(values: np.ndarray, unit: str) -> dict[str, Any]:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return {"unit": unit, "count": 0}
+    low, middle, high = np.percentile(values, (5, 50, 95)).tolist()
+    return {
+        "unit": unit,
+        "count": len(values),
+        "min": float(values.min()),
+        "p5": low,
+        "median": middle,
+        "p95": high,
+        "max": float(values.max()),
+        "mean": float(values.mean()),
+        "sd": float(values.std()),
+    }
+
+
+def _best(data: Any, about: dict[str, Any], done: np.ndarray, by: str | None, largest: bool) -> list[dict[str, Any]]:
+    if by is None:
+        return []
+    values = np.where(done, data[by].values, np.nan)
+    order = np.argsort(-values if largest else values, kind="stable")[: int(min(5, np.isfinite(values).sum()))]
+    names = [*about["parameters"], by]
+    return [{"row": int(row)} | {name: float(data[name].values[row]) for name in names} for row in order]
+
+
+def describe(summary: dict[str, Any]) -> str:
+    """Put a summary into words."""
+    lines = [
+        f"{summary['kind']}: {summary['done']:,} of {summary['rows']:,} rows done, {summary['failed']:,} failed, "
+        f"{summary['left']:,} left"
+    ]
+    lines += [f"  {count:,} rows: {reason}" for reason, count in summary["reasons"].items()]
+    filled = {name: each for name, each in summary["outputs"].items() if each["count"]}
+    if filled:
+        lines += ["", f"{'output':28} {'min':>10} {'5 %':>10} {'median':>10} {'95 %':>10} {'max':>10}"]
+        lines += [
+            f"{name:28} " + " ".join(f"{each[key]:10.4g}" for key in ("min", "p5", "median", "p95", "max"))
+            for name, each in filled.items()
+        ]
+    best = summary["best"]
+    if best["rows"]:
+        lines += ["", f"{'largest' if best['largest'] else 'smallest'} {best['by']}"]
+        for row in best["rows"]:
+            place = ", ".join(f"{name} {value:.5g}" for name, value in row.items() if name not in ("row", best["by"]))
+            lines.append(f"  row {row['row']}: {row[best['by']]:.6g} at {place}")
+    return "\n".join(lines)
+
+
+def plot_sweep(folder: str | os.PathLike[str], out: Path, by: str | None = None) -> list[Path]:
+    """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back."""
+    about, data = about_of(folder), open_sweep(folder)
+    done = data["status"].values == DONE
+    by = by or summarise(folder)["best"]["by"]
+    names = about["parameters"]
+    if by is None or not names or done.sum() < 2:
+        return []
+    values = data[by].values[done]
+    swept = {name: data[name].values[done] for name in names}
+    made = [_parallel(out / "parallel.svg", swept, by, values)]
+    pairs = [(one, other) for k, one in enumerate(names) for other in names[k + 1 :]][:6]
+    made += [_heat(out / f"heat_{k}.svg", swept, pair, by, values) for k, pair in enumerate(pairs)]
+    return made
+
+
+def _parallel(path: Path, swept: dict[str, np.ndarray], by: str, values: np.ndarray) -> Path:
+    every = max(1, -(-len(values) // _LINES))
+    columns = np.stack([*swept.values(), values], axis=1)[::every]
+    low, high = columns.min(axis=0), columns.max(axis=0)
+    scaled = (columns - low) / np.where(high > low, high - low, 1)
+    picture = figure(_WIDE_in, _HIGH_in)
+    axes = picture.add_subplot()
+    colours = np.argsort(np.argsort(columns[:, -1])) / max(1, len(columns) - 1)
+    for line, colour in zip(scaled, colours, strict=True):
+        axes.plot(line, color=(colour, 0.25, 1 - colour), linewidth=0.4, alpha=0.6)
+    ticks = [f"{name}\n{a:.3g} to {b:.3g}" for name, a, b in zip([*swept, by], low, high, strict=True)]
+    axes.set_xticks(range(len(ticks)), ticks, fontsize=6)
+    axes.set_yticks([])
+    label(axes)
+    return _saved(picture, path)
+
+
+def _heat(path: Path, swept: dict[str, np.ndarray], pair: tuple[str, str], by: str, values: np.ndarray) -> Path:
+    edges = [np.histogram_bin_edges(swept[name], min(_CELLS, len(np.unique(swept[name])))) for name in pair]
+    x, y = (swept[name] for name in pair)
+    count, *_ = np.histogram2d(x, y, bins=edges)
+    total, *_ = np.histogram2d(x, y, bins=edges, weights=np.nan_to_num(values))
+    with np.errstate(invalid="ignore"):
+        mean = np.where(count > 0, total / np.maximum(count, 1), math.nan)
+    picture = figure(_WIDE_in / 2, _HIGH_in)
+    axes = picture.add_subplot()
+    drawn = axes.pcolormesh(edges[0], edges[1], mean.T, cmap="viridis")
+    picture.colorbar(drawn, label=f"mean {by}")
+    label(axes, *pair)
+    return _saved(picture, path)
+
+
+def _saved(picture: Any, path: Path) -> Path:
+    with atomic_path(path) as unfinished:
+        picture.savefig(unfinished)
+    return path

@@ -1,0 +1,188 @@
+"""A sweep as a TOML file describes it, checked before anything runs."""
+
+import hashlib
+import math
+import os
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fits._errors import DataError
+from fits.sweeps._axes import Plan
+from fits.sweeps._jobs import KINDS, Request
+from fits.sweeps._read_axes import read_plan
+from fits.sweeps._types import SCHEMA, AbstractJob, Facts
+
+_COMMON = ("schema", "kind", "title", "seed", "axis", "design", "list", "run")
+_RUN = ("memory_MB", "chunk_rows")
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep that can run.
+
+    Attributes
+    ----------
+    text, name
+        The TOML, and where it is from.
+    inputs
+        Contents of the files it names.
+    kind, seed
+        As stated.
+    plan, job, facts
+        Its rows, and what is done with each.
+    memory_MB, chunk_rows
+        What a chunk may take, and the rows of one if they are stated.
+    """
+
+    text: str
+    name: str
+    inputs: dict[str, bytes]
+    kind: str
+    seed: int
+    plan: Plan
+    job: AbstractJob
+    facts: Facts
+    memory_MB: float
+    chunk_rows: int | None
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the text, all files and the names of all sources: what the rows depend on."""
+        parts: list[str | bytes] = [self.text, *self.facts.sources]
+        parts += [part for name in sorted(self.inputs) for part in (name, self.inputs[name])]
+        sums = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
+        return hashlib.sha256("".join(sums).encode()).hexdigest()
+
+
+def read_sweep(path: str | os.PathLike[str]) -> Sweep:
+    """Read a sweep and all files it names.
+
+    Raises
+    ------
+    DataError
+        For the first thing that is not as it should be.
+    """
+    name = os.fspath(path)
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise DataError(
+            f"{name}: cannot be read ({error.strerror or error}); give the TOML of a sweep, such as "
+            "'microid sweep --example simulate' prints."
+        ) from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{name}: expected TOML, found no UTF-8 text; give the TOML of a sweep.") from error
+    folder = Path(path).resolve().parent
+
+    def load(file: str) -> bytes:
+        try:
+            return (folder / file).read_bytes()
+        except OSError as error:
+            raise DataError(f"{file}: cannot be read ({error.strerror or error}); correct its name.") from error
+
+    return parse_sweep(text, name, load, folder)
+
+
+def parse_sweep(text: str, name: str, load: Callable[[str], bytes], folder: Path | None = None) -> Sweep:
+    """Make a sweep of its text; files come through `load`, and patterns of names stand for files in `folder`."""
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{name}: expected TOML, found a mistake: {error}; correct it.") from None
+    inputs: dict[str, bytes] = {}
+
+    def kept(file: str) -> bytes:
+        if file not in inputs:
+            inputs[file] = load(file)
+        return inputs[file]
+
+    try:
+        return _sweep(table, text, name, inputs, kept, folder)
+    except DataError as error:
+        raise DataError(f"{name}: {error}") from None
+
+
+def _sweep(
+    table: Mapping[str, Any],
+    text: str,
+    name: str,
+    inputs: dict[str, bytes],
+    load: Callable[[str], bytes],
+    folder: Path | None,
+) -> Sweep:
+    if table.get("schema") != SCHEMA:
+        raise DataError(f'schema: expected "{SCHEMA}", found {table.get("schema")!r}; give that, or another file.')
+    kind = table.get("kind")
+    if kind not in KINDS:
+        raise DataError(f"kind: expected one of {', '.join(KINDS)}, found {kind!r}; choose one.")
+    tables = KINDS[kind].tables
+    for key in table:
+        known = [*_COMMON, *tables]
+        if key not in known:
+            close = get_close_matches(key, known, n=1, cutoff=0.5)
+            meant = f"did you mean {close[0]}?" if close else f"use some of {', '.join(known)}."
+            raise DataError(f"{key}: expected a known key, found '{key}'; {meant}")
+    seed = table.get("seed", 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise DataError(f"seed: expected a whole number of 0 or more, found {seed!r}; correct it.")
+    memory, chunk_rows = _run_options(table.get("run", {}))
+    names, relative = _names(table, load)
+    job = KINDS[kind].make(Request(table, names, relative, load, folder))
+    facts = job.facts
+    plan = read_plan(table, facts.parameters, max(1, len(facts.sources)), seed, load)
+    factors = tuple(axis.parameter for axis in plan.axes if axis.relative)
+    if set(factors) != set(relative):
+        job = KINDS[kind].make(Request(table, names, factors, load, folder))
+    return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows)
+
+
+def _run_options(table: Any) -> tuple[float, int | None]:
+    if not isinstance(table, dict):
+        raise DataError("run: expected a table; write [run] and its keys below.")
+    for key in table:
+        if key not in _RUN:
+            raise DataError(f"run.{key}: expected a known key, found '{key}'; use {' and '.join(_RUN)}.")
+    memory, rows = table.get("memory_MB", 256), table.get("chunk_rows")
+    if isinstance(memory, bool) or not isinstance(memory, int | float) or not 1 <= memory < math.inf:
+        raise DataError(f"run.memory_MB: expected a number of 1 or more, found {memory!r}; correct it.")
+    if rows is not None and (isinstance(rows, bool) or not isinstance(rows, int) or rows < 1):
+        raise DataError(f"run.chunk_rows: expected a number of 1 or more, found {rows!r}; correct it.")
+    return float(memory), rows
+
+
+def _names(table: Mapping[str, Any], load: Callable[[str], bytes]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of what varies, in the order of the plan, and those that vary relatively, as far as they can be read."""
+    entries = [entry for entry in table.get("axis", []) if isinstance(entry, dict)] if table.get("axis") else []
+    names = [str(entry.get("parameter")) for entry in entries]
+    relative = [str(entry.get("parameter")) for entry in entries if entry.get("relative") is True]
+    listing = table.get("list")
+    if isinstance(listing, dict) and isinstance(listing.get("file"), str):
+        header = load(listing["file"]).decode("utf-8-sig", errors="replace").splitlines()
+        names += [cell.strip() for cell in header[0].split(",")] if header else []
+    return tuple(names), tuple(relative)
+
+
+def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Replace rows outside the bounds by something harmless, and say why they fail."""
+    reasons = [""] * len(next(iter(values.values()), np.zeros(0)))
+    kept = dict(values)
+    parameters = {parameter.name: parameter for parameter in sweep.facts.parameters}
+    for axis in sweep.plan.axes:
+        parameter = parameters[axis.parameter]
+        value = values[axis.parameter]
+        lower, upper = (0.0, math.inf) if axis.relative else (parameter.lower, parameter.upper)
+        wrong = ~((value >= lower) & (value <= upper))
+        if wrong.any():
+            kept[axis.parameter] = np.where(wrong, 1.0 if axis.relative else parameter.nominal, value)
+            for k in np.flatnonzero(wrong):
+                reasons[k] = reasons[k] or (
+                    f"{parameter.name} = {value[k]:.6g} lies outside its bounds, {lower:g} to {upper:g} "
+                    f"{'times its own' if axis.relative else parameter.unit}"
+                )
+    return kept, reasons

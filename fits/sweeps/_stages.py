@@ -1,0 +1,134 @@
+"""The stage that a sweep simulates: a model file or a nominal one, and how its parameters are named and set."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits._errors import DataError
+from fits._model_file import load_model
+from fits.sweeps._files import in_a_file
+from fits.sweeps._jobs import Request
+from fits.sweeps._types import Parameter
+from microid import (
+    Driver,
+    GridDensity,
+    Mechanics,
+    Preisach,
+    Reversible,
+    Stage,
+    Staircase,
+    demagnetised,
+    negative_saturation,
+    node_areas,
+    parameter_table,
+    positive_saturation,
+)
+
+NOMINAL = "nominal"
+INITIAL = ("negative", "positive", "demagnetised")
+_LEVELS, _RANGE_V, _LOOPS_um, _SLOPE_um_per_V = 16, (0.0, 120.0), 5.0, 0.1
+# Share of the range over which the density of relays falls by e away from the diagonal.
+_NEAR = 0.2
+_EXTREMES = 16
+
+
+def nominal_stage() -> Stage:
+    """A stage of common size: 0 to 120 V, 17 um, loops of some 15 %, 1 ms, 200 Hz and a damping ratio of 0.03."""
+    lower, upper = (jnp.asarray(value) for value in _RANGE_V)
+    i, j = np.tril_indices(_LEVELS)
+    density = np.exp(-(i - j) / (_LEVELS - 1) / _NEAR) * node_areas(_LEVELS)[i, j]
+    grid = GridDensity(jnp.asarray(_LOOPS_um * density / density.sum()), lower, upper)
+    slope = Reversible(jnp.full(_LEVELS, _SLOPE_um_per_V), lower, upper)
+    return Stage.of(
+        driver=Driver(jnp.asarray(1e-3)),
+        hysteresis=Preisach(grid, slope, jnp.asarray(0.0)),
+        mechanics=Mechanics(jnp.asarray(200.0), jnp.asarray(0.03)),
+    )
+
+
+def stage_from(text: bytes | None, name: str) -> Stage:
+    """Read a stage from the content of a model file, or make the nominal one where there is none.
+
+    Raises
+    ------
+    DataError
+        As `load_model`, or if the file holds something else than a stage or a `Preisach`.
+    """
+    if text is None:
+        return nominal_stage()
+    model = in_a_file(text, name, load_model).model
+    if isinstance(model, Preisach):
+        return Stage.of(hysteresis=model)
+    if isinstance(model, Stage):
+        return model
+    raise DataError(f"{name}: expected a stage or a Preisach model, found a {type(model).__name__}; fit one first.")
+
+
+def requested_stage(request: Request) -> tuple[Stage, str]:
+    """The stage and the initial memory that a sweep names by `model` and `initial`."""
+    name, initial = request.table.get("model", NOMINAL), request.table.get("initial", INITIAL[0])
+    if not isinstance(name, str):
+        raise DataError(f'model: expected "{NOMINAL}" or the name of a model file, found {name!r}; give one.')
+    if initial not in INITIAL:
+        raise DataError(f"initial: expected one of {', '.join(INITIAL)}, found {initial!r}; choose one.")
+    return stage_from(None if name == NOMINAL else request.load(name), name), initial
+
+
+def stage_parameters(stage: Stage) -> tuple[Parameter, ...]:
+    """Everything about a stage that can be varied, by its name in the stage."""
+    leaves = _leaves(stage)
+    found = []
+    for info in parameter_table(stage):
+        value = leaves[info.path]
+        nominal = float(value) if info.shape == () else math.nan
+        spec = info.spec
+        found.append(Parameter(stage.named(info.path), spec.unit, nominal, spec.lower, spec.upper))
+    return tuple(found)
+
+
+def varied(stage: Stage, values: Mapping[str, Float[Array, ""]], relative: Sequence[str]) -> Stage:
+    """Return a stage with other values of some parameters; those that are relative are multiplied by theirs."""
+    paths = [info.path for info in parameter_table(stage) if stage.named(info.path) in values]
+    if not paths:
+        return stage
+    leaves, treedef = jax.tree_util.tree_flatten_with_path(stage)
+    changed = []
+    for path, leaf in leaves:
+        name = jax.tree_util.keystr(path).lstrip(".")
+        if name in paths:
+            value = values[stage.named(name)]
+            changed.append(leaf * value if stage.named(name) in relative else jnp.asarray(value, leaf.dtype))
+        else:
+            changed.append(leaf)
+    found: Stage = jax.tree_util.tree_unflatten(treedef, changed)
+    return found
+
+
+def range_of(stage: Stage) -> tuple[float, float] | None:
+    """Range of the hysteresis in V, None where there is none."""
+    for part in stage.parts:
+        if isinstance(part, Preisach):
+            return float(part.density.lower_V), float(part.density.upper_V)
+    return None
+
+
+def memory_before(stage: Stage, initial: str) -> Staircase | None:
+    """Memory of the hysteresis before a row, None where the stage has none of Preisach's."""
+    limits = range_of(stage)
+    if limits is None:
+        return None
+    if initial == "negative":
+        return negative_saturation(limits[0], 1)
+    if initial == "positive":
+        return positive_saturation(*limits, 2)
+    return demagnetised(*limits, size=_EXTREMES)
+
+
+def _leaves(stage: Stage) -> dict[str, Array]:
+    found, _ = jax.tree_util.tree_flatten_with_path(stage)
+    return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in found if eqx.is_inexact_array(leaf)}

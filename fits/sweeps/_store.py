@@ -1,0 +1,254 @@
+"""Where the rows of a sweep are kept: a Zarr store, and a ledger that says which chunks are whole.
+
+A chunk goes into its own files of the store first and into the ledger, with the SHA-256 of its numbers, last. A
+process that dies at any moment leaves a chunk either in the ledger or not done; one that is done again is written to
+the same place with the same numbers. What the ledger says is checked against the numbers before a sweep goes on.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fits._atomic import atomic_write_text
+from fits._errors import DataError
+from fits.sweeps._chunks import bytes_per_row, chunk_count, chunk_rows, rows_of, source_of
+from fits.sweeps._extra import need
+from fits.sweeps._spec import Sweep
+from fits.sweeps._types import STATUS_WORDS, Output, Rows
+from fits.sweeps._versions import versions
+
+SCHEMA = "microid.sweep.results/1"
+ABOUT, RESULTS, LEDGER, TEXT, TABLE = "about.json", "results.zarr", "ledger", "sweep.toml", "results.parquet"
+_REASON = Output("reason", "1", "why the row failed", dtype="U200")
+_STATUS = Output("status", "1", "of the row: 0 pending, 1 done, 2 failed", dtype="i1")
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+# A disk that is nearly full is full for others.
+_SHARE = 0.9
+
+
+class Store:
+    """The folder of one sweep, held by one process at a time."""
+
+    def __init__(self, sweep: Sweep, folder: Path):
+        """Take a sweep and its folder, which `opened` has checked."""
+        self.sweep, self.folder = sweep, folder
+        self._group: Any = None
+
+    @property
+    def variables(self) -> tuple[Output, ...]:
+        """Everything that is kept per row."""
+        units = {parameter.name: parameter.unit for parameter in self.sweep.facts.parameters}
+        swept = [
+            Output(axis.parameter, "1" if axis.relative else units[axis.parameter], "swept")
+            for axis in self.sweep.plan.axes
+        ]
+        sources = (source_of(self.sweep),) if self.sweep.facts.sources else ()
+        return (*swept, *sources, *self.sweep.facts.outputs, _STATUS, _REASON)
+
+    def create(self) -> None:
+        """Write the empty store and what is known of the sweep."""
+        zarr = need("zarr")
+        with _sentences(self.folder):
+            (self.folder / LEDGER).mkdir(parents=True, exist_ok=True)
+            group = zarr.open_group(str(self.folder / RESULTS), mode="w", zarr_format=2)
+            rows, size = len(self.sweep.plan), chunk_rows(self.sweep)
+            for variable in self.variables:
+                kind = np.dtype(variable.dtype).kind
+                array = group.create_array(
+                    variable.name,
+                    shape=(rows, *variable.shape),
+                    chunks=(size, *variable.shape),
+                    dtype=variable.dtype,
+                    # Without one xarray leaves whole numbers as they are.
+                    fill_value={"f": float("nan"), "U": ""}.get(kind),
+                )
+                attributes: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
+                if variable is _STATUS:
+                    attributes |= {"flag_values": [0, 1, 2], "flag_meanings": " ".join(STATUS_WORDS)}
+                array.attrs.update(attributes | {"_ARRAY_DIMENSIONS": ["row", *(name for name, _ in variable.dims)]})
+            for name, (axis, unit, values) in self.sweep.facts.coordinates.items():
+                self._coordinate(group, name, axis, unit, np.asarray(values))
+            swept = [axis.parameter for axis in self.sweep.plan.axes]
+            group.attrs.update(self._about() | ({"coordinates": " ".join(swept)} if swept else {}))
+            zarr.consolidate_metadata(group.store)
+            atomic_write_text(self.folder / TEXT, self.sweep.text)
+            # Last: a folder without it holds no sweep yet.
+            atomic_write_text(self.folder / ABOUT, json.dumps(self._about(), indent=1) + "\n")
+
+    def _coordinate(self, group: Any, name: str, axis: str, unit: str, values: np.ndarray) -> None:
+        array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype)
+        array[:] = values
+        array.attrs.update({"units": unit, "_ARRAY_DIMENSIONS": [axis]})
+
+    def _about(self) -> dict[str, Any]:
+        return {
+            "schema": SCHEMA,
+            "kind": self.sweep.kind,
+            "rows": len(self.sweep.plan),
+            "chunk_rows": chunk_rows(self.sweep),
+            "chunks": chunk_count(self.sweep),
+            "seed": self.sweep.seed,
+            "parameters": [axis.parameter for axis in self.sweep.plan.axes],
+            "relative": [axis.parameter for axis in self.sweep.plan.axes if axis.relative],
+            "outputs": [output.name for output in self.sweep.facts.outputs],
+            "digest": self.sweep.digest,
+            "versions": versions(),
+            "sweep": self.sweep.text,
+        }
+
+    def _open(self) -> Any:
+        if self._group is None:
+            self._group = need("zarr").open_group(str(self.folder / RESULTS), mode="r+", zarr_format=2)
+        return self._group
+
+    def write(self, chunk: int, rows: Rows) -> None:
+        """Keep a chunk, then say so in the ledger.
+
+        Raises
+        ------
+        DataError
+            If the disk is full or cannot be written to; all chunks before are kept.
+        """
+        arrays = dict(rows.outputs) | {"reason": np.array(rows.reasons, dtype=_REASON.dtype)}
+        with _sentences(self.folder):
+            group = self._open()
+            start = chunk * chunk_rows(self.sweep)
+            for variable in self.variables:
+                array = np.ascontiguousarray(arrays[variable.name], dtype=variable.dtype)
+                group[variable.name][start : start + len(array)] = array
+            entry = {"sha256": self._sum(arrays), "failed": sum(map(bool, rows.reasons)), "rows": len(rows.reasons)}
+            atomic_write_text(self.folder / LEDGER / f"{chunk:08d}.json", json.dumps(entry) + "\n")
+
+    def read(self, chunk: int) -> dict[str, np.ndarray]:
+        """Read all variables of a chunk."""
+        rows, group = rows_of(self.sweep, chunk), self._open()
+        return {
+            variable.name: np.asarray(group[variable.name][int(rows[0]) : int(rows[-1]) + 1])
+            for variable in self.variables
+        }
+
+    def whole(self, chunk: int) -> bool:
+        """Whether a chunk is in the ledger and what is kept of it has the sum that is written there."""
+        try:
+            entry = json.loads((self.folder / LEDGER / f"{chunk:08d}.json").read_text(encoding="utf-8"))
+            return bool(entry["sha256"] == self._sum(self.read(chunk)))
+        except Exception:
+            # Whatever a broken file makes a decoder say, the chunk is not whole.
+            return False
+
+    def noted(self, chunk: int) -> bool:
+        """Whether a chunk is in the ledger."""
+        return (self.folder / LEDGER / f"{chunk:08d}.json").exists()
+
+    def _sum(self, arrays: dict[str, np.ndarray]) -> str:
+        total = hashlib.sha256()
+        for variable in self.variables:
+            total.update(np.ascontiguousarray(arrays[variable.name], dtype=variable.dtype).tobytes())
+        return total.hexdigest()
+
+
+@contextmanager
+def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
+    """Open the folder of a sweep, new or to go on with, and keep other processes out of it.
+
+    Raises
+    ------
+    DataError
+        If it cannot be written to, holds another sweep, or one that was begun with other versions, or the results
+        would not fit on the disk.
+    """
+    folder = Path(os.path.realpath(out))
+    anchor = next(place for place in (folder, *folder.parents) if place.exists())
+    if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
+        raise DataError(f"{out}: expected a folder that can be written to; choose another for --out.")
+    need("zarr")
+    begun = (folder / ABOUT).exists()
+    if begun and not resume:
+        raise DataError(
+            f"{out}: there is a sweep in this folder; add --resume to go on, or choose another for --out."
+        )
+    if (
+        folder.exists()
+        and not begun
+        and any(name.name not in (RESULTS, LEDGER, TEXT, ".lock") for name in folder.iterdir())
+    ):
+        raise DataError(f"{out}: the folder holds other files; choose another for --out.")
+    if not begun:
+        _check_size(sweep, out, anchor)
+    with _sentences(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with _locked(folder, out):
+        store = Store(sweep, folder)
+        if begun:
+            _check_same(sweep, out, folder)
+        else:
+            store.create()
+        yield store
+
+
+def _check_size(sweep: Sweep, out: str, anchor: Path) -> None:
+    # The table holds all but the traces once more.
+    needed = len(sweep.plan) * 2 * bytes_per_row(sweep)
+    free = shutil.disk_usage(anchor).free
+    if needed > _SHARE * free:
+        raise DataError(
+            f"{out}: {len(sweep.plan):,} rows would take about {needed / 1e9:.3g} GB, and the disk has "
+            f"{free / 1e9:.3g} GB; keep fewer rows or no traces, or choose another disk."
+        )
+
+
+def _check_same(sweep: Sweep, out: str, folder: Path) -> None:
+    try:
+        about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
+        digest, before, size = about["digest"], about["versions"], about["chunk_rows"]
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(f"{out}: {ABOUT} cannot be read ({error}); choose another folder for --out.") from None
+    for name, version in versions().items():
+        if before.get(name) != version:
+            raise DataError(
+                f"{out}: the sweep was begun with {name} {before.get(name)}, and this is {version}; go on with that "
+                "version, or begin anew in another folder."
+            )
+    if digest != sweep.digest or size != chunk_rows(sweep):
+        raise DataError(
+            f"{out}: the folder holds the results of another sweep or other files; give the one that is in its "
+            f"{TEXT}, or choose another folder for --out."
+        )
+
+
+@contextmanager
+def _locked(folder: Path, out: str) -> Iterator[None]:
+    """Keep a second process out; the lock goes with the process that holds it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows: nothing keeps a second process out.
+        yield
+        return
+    with open(folder / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise DataError(f"{out}: another process works on this sweep; wait for it, or stop it first.") from None
+        yield
+
+
+@contextmanager
+def _sentences(folder: Path) -> Iterator[None]:
+    """Turn what a disk complains of into one sentence."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _FULL | {errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR}:
+            raise
+        raise DataError(
+            f"{folder}: cannot be written ({error.strerror or error}); what was done before is kept: free the disk "
+            "or correct the permissions, then go on with --resume."
+        ) from error

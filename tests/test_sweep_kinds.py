@@ -1,0 +1,201 @@
+"""The other kinds of jobs, each against something that shares no code with it, and workers of a cluster."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from _gain_formulas import gains, sizes
+from _sweeps import Relays, parsed, small
+from scipy.signal import StateSpace, lsim
+
+from fits import DataError
+from fits.sweeps._chunks import compute_chunk
+from fits.sweeps._run import run_sweep
+from fits.sweeps._stages import nominal_stage
+
+CONTROL = """
+schema = "microid.sweep/1"
+kind = "control"
+[reference]
+shape = "step"
+samples = 80
+interval_s = 1e-3
+amplitude_um = 5.0
+[controller]
+delay_samples = 1
+[[axis]]
+parameter = "controller.integral_V_per_um_s"
+values = {integral}
+zip = "gains"
+[[axis]]
+parameter = "controller.proportional_V_per_um"
+values = {proportional}
+zip = "gains"
+"""
+
+FIT = """
+schema = "microid.sweep/1"
+kind = "fit"
+seed = {seed}
+[fit]
+method = "{method}"
+levels = 8
+[records]
+noise_um = 0.02
+[program]
+shape = "decay"
+samples = 300
+interval_s = 0.02
+offset_V = 60.0
+amplitude_V = 60.0
+frequency_Hz = 0.8
+[[axis]]
+parameter = "hysteresis.density.packed_um"
+relative = true
+values = [0.7, 1.0, 1.3]
+"""
+
+
+def closed_loop(stage, integral, proportional, samples, interval_s, wanted_um):
+    """A PI controller, late by a sample, around driver, relays and mechanics, step by step with SciPy."""
+    keep = np.exp(-interval_s / float(stage["driver"].time_constant_s))
+    rate = 2 * np.pi * float(stage["mechanics"].natural_frequency_Hz)
+    matrix = [[0.0, 1.0], [-(rate**2), -2 * float(stage["mechanics"].damping_ratio) * rate]]
+    plant, relays = StateSpace(matrix, [[0.0], [rate**2]], np.eye(2), np.zeros((2, 1))), Relays(stage)
+    voltage, loaded = 0.0, relays(0.0)
+    state, late, total, errors = np.array([loaded, 0.0]), loaded, 0.0, []
+    for _ in range(samples):
+        displacement = state[0]
+        errors.append(wanted_um - displacement)
+        measured, late = late, displacement
+        wanted = total + integral * interval_s * (wanted_um - measured) + proportional * (wanted_um - measured)
+        command = np.clip(wanted, 0.0, 120.0)
+        total += integral * interval_s * (wanted_um - measured) + command - wanted
+        voltage = keep * voltage + (1 - keep) * command
+        before, loaded = loaded, relays(voltage)
+        state = lsim(plant, [before, loaded], [0.0, interval_s], X0=state)[1][-1]
+    return np.array(errors)
+
+
+def test_closed_loops_agree_with_a_loop_of_scipy_and_relays(rng):
+    chosen = rng.uniform(20, 200, 3), rng.uniform(0, 0.5, 3)
+    sweep = parsed(CONTROL.format(integral=chosen[0].tolist(), proportional=chosen[1].tolist()))
+    found = compute_chunk(sweep, 0).outputs
+    for row, (integral, proportional) in enumerate(zip(*chosen, strict=True)):
+        errors = closed_loop(nominal_stage(), integral, proportional, 80, 1e-3, 5.0)
+        assert found["error_rms_um"][row] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=5e-3)
+        assert found["error_final_um"][row] == pytest.approx(errors[-1], abs=0.03)
+
+
+def test_an_unstable_loop_is_a_failed_row_or_a_large_error():
+    sweep = parsed(CONTROL.format(integral=[100.0, 1e6], proportional=[0.0, 1e3]))
+    rows = compute_chunk(sweep, 0)
+    assert rows.reasons[0] == ""
+    assert rows.reasons[1] or rows.outputs["e_rms_pct"][1] > 20 * rows.outputs["e_rms_pct"][0]
+
+
+def test_dimensions_agree_with_formulas_and_with_the_design_one_by_one(rng):
+    import fits
+
+    factors, modulus = rng.uniform(0.9, 1.1, 3), rng.uniform(60, 250, 3)
+    text = (
+        'schema = "microid.sweep/1"\nkind = "sensitivity"\n[sensitivity]\naxes = ["x"]\n'
+        f'[[axis]]\nparameter = "geometry.t1_mm"\nrelative = true\nvalues = {factors.tolist()}\nzip = "a"\n'
+        f'[[axis]]\nparameter = "material.youngs_modulus_GPa"\nvalues = {modulus.tolist()}\nzip = "a"\n'
+    )
+    found = compute_chunk(parsed(text), 0).outputs
+    for row in range(3):
+        design = fits.paper_design()
+        thick = dataclasses.replace(design.geometry, t1_mm=design.geometry.t1_mm * factors[row])
+        design = dataclasses.replace(design, geometry=thick, youngs_modulus_GPa=modulus[row])
+        report = fits.sensitivities(design, ("x",))["x"]
+        expected = gains("x", sizes(t1=0.8 * factors[row]))
+        assert found["x_gain_um_per_um"][row] == pytest.approx(expected, rel=1e-10)
+        assert found["x_stroke_um"][row] == pytest.approx(report.stroke, rel=1e-10)
+        assert found["x_spread_pct"][row] == pytest.approx(report.rss_pct, rel=1e-6)
+
+
+def test_a_batch_of_fits_agrees_with_fits_one_by_one(seed):
+    batch = compute_chunk(parsed(FIT.format(seed=seed, method="batch")), 0)
+    alone = [compute_chunk(parsed(FIT.format(seed=seed, method="one_by_one")), chunk).outputs for chunk in range(3)]
+    assert set(batch.reasons) == {""}
+    for row, one in enumerate(alone):
+        # What is left is the noise, in both ways alike.
+        assert batch.outputs["noise_um"][row] == pytest.approx(0.02, rel=0.3)
+        assert batch.outputs["heldout_e_rms_pct"][row] == pytest.approx(one["heldout_e_rms_pct"][0], rel=0.3)
+        assert batch.outputs["offset_um"][row] == pytest.approx(one["offset_um"][0], abs=0.05)
+    assert np.all(np.diff(batch.outputs["loops_um"]) > 0.5)
+
+
+def test_files_are_rows_and_a_broken_one_fails_alone(tmp_path, rng):
+    time_s = np.arange(200) * 0.01
+    for k in range(3):
+        voltage = 50 + 50 * np.sin(2 * np.pi * time_s + k)
+        frame = pd.DataFrame({"time_s": time_s, "voltage_V": voltage, "displacement_um": np.roll(voltage, 3) / 10})
+        frame["displacement_um"] += rng.normal(0, 0.01, 200)
+        frame.to_csv(tmp_path / f"day{k}.csv", index=False)
+    (tmp_path / "day1.csv").write_text("time_s,voltage_V\n1,2\n")
+    file = tmp_path / "sweep.toml"
+    file.write_text('schema = "microid.sweep/1"\nkind = "fit"\n[records]\nfiles = "day*.csv"\n[fit]\nsamples = 256\n')
+    from fits.sweeps._spec import read_sweep
+
+    outcome = run_sweep(read_sweep(file), str(tmp_path / "out"))
+    assert (outcome.rows, outcome.failed) == (3, 1)
+    found = pd.read_parquet(tmp_path / "out" / "results.parquet")
+    assert found["status"].tolist() == [1, 2, 1]
+    assert found["reason"][1].startswith("day1.csv")
+    assert found["source"].tolist() == ["day0.csv", "day1.csv", "day2.csv"]
+
+
+def test_diagnoses_go_one_by_one_and_a_refused_record_fails_alone(monkeypatch, seed):
+    text = FIT.replace('method = "{method}"\nlevels = 8\n', "").replace("[fit]", "[diagnose]")
+    text = text.replace('kind = "fit"', 'kind = "diagnose"').format(seed=seed)
+    asked = []
+
+    def diagnose(records, **options):
+        asked.append((records[0], options))
+        if len(asked) == 2:
+            raise DataError("the voltage stands still")
+        gain = SimpleNamespace(heldout_rms_before_um=2.0, heldout_rms_after_um=1.0)
+        return SimpleNamespace(
+            causes=[SimpleNamespace(name="creep", z=9.0)],
+            noise_um=0.1,
+            unexplained_rms_um=0.0,
+            gain=gain,
+            verdict="effect_found",
+        )
+
+    monkeypatch.setattr("fits.diagnosis._diagnose.diagnose", diagnose)
+    sweep = parsed(text)
+    found = [compute_chunk(sweep, chunk) for chunk in range(3)]
+    assert [rows.reasons for rows in found] == [("",), ("the voltage stands still",), ("",)]
+    assert found[0].outputs["first_cause"] == ["creep"]
+    assert found[0].outputs["verdict"] == ["effect_found"]
+    strokes = [np.ptp(record.displacement_um) for record, _ in asked]
+    assert strokes == sorted(strokes)
+
+
+def test_two_workers_give_the_same_bits(tmp_path, seed):
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    sweep = parsed(small(seed, rows=300))
+    run_sweep(sweep, str(tmp_path / "here"))
+    run_sweep(sweep, str(tmp_path / "there"), cluster="local:2")
+    here, there = (pd.read_parquet(tmp_path / name / "results.parquet") for name in ("here", "there"))
+    assert here.equals(there)
+
+
+def test_workers_with_other_versions_or_none_are_refused(tmp_path, monkeypatch, seed):
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    sweep = parsed(small(seed, rows=10))
+    with pytest.raises(DataError, match="does not answer"):
+        run_sweep(sweep, str(tmp_path / "a"), cluster="nowhere")
+    from fits.sweeps import _cluster
+
+    real = _cluster.versions()
+    payload = _cluster._Payload("", "", {}, "", "", real | {"numpy": "0.1"})
+    monkeypatch.setattr("distributed.get_worker", lambda: SimpleNamespace(name="w", address="tcp://w:1"))
+    answer = _cluster.work(payload, 0)
+    assert answer.rows is None
+    assert f"numpy {real['numpy']}, and 0.1 is needed" in answer.refused
