@@ -1,5 +1,7 @@
 """Running the `microid` command in tests."""
 
+import re
+
 from click.testing import CliRunner
 
 from fits._cli import cli
@@ -18,7 +20,8 @@ def files(folder):
 def refused(result, *words):
     assert result.exit_code == 2
     assert result.stdout == ""
-    lines = [line for line in result.stderr.splitlines() if " s  " not in line[:12]]  # but for the progress
+    progress = re.compile(r"(\[[#.]+\])? +\d+\.\d s  ")
+    lines = [line for line in result.stderr.splitlines() if not progress.match(line)]
     assert len(lines) == 1
     for word in words:
         assert word in lines[0]
