@@ -89,13 +89,6 @@ def test_closed_loops_agree_with_a_loop_of_scipy_and_relays(rng):
         assert found["error_final_um"][row] == pytest.approx(errors[-1], abs=0.03)
 
 
-def test_an_unstable_loop_is_a_failed_row_or_a_large_error():
-    sweep = parsed(CONTROL.format(integral=[100.0, 1e6], proportional=[0.0, 1e3]))
-    rows = compute_chunk(sweep, 0)
-    assert rows.reasons[0] == ""
-    assert rows.reasons[1] or rows.outputs["e_rms_pct"][1] > 20 * rows.outputs["e_rms_pct"][0]
-
-
 def test_dimensions_agree_with_formulas_and_with_the_design_one_by_one(rng):
     import fits
 
@@ -117,16 +110,25 @@ def test_dimensions_agree_with_formulas_and_with_the_design_one_by_one(rng):
         assert found["x_spread_pct"][row] == pytest.approx(report.rss_pct, rel=1e-6)
 
 
+def test_a_batch_of_fits_finds_the_noise_and_the_loops(seed):
+    found = compute_chunk(parsed(FIT.format(seed=seed, method="batch")), 0)
+    assert set(found.reasons) == {""}
+    # The standard error of a standard deviation from 300 samples is some 4 %.
+    np.testing.assert_allclose(found.outputs["noise_um"], 0.02, rtol=0.25)
+    # What is left in the small loops that were not fitted is that noise, and little more.
+    stroke_um = 0.02 / found.outputs["heldout_e_rms_pct"] * 100
+    assert np.all((stroke_um > 6) & (stroke_um < 30))
+    # The nominal stage has 5 um of loops; weights on so coarse a grid and a smooth density trade with the slope.
+    np.testing.assert_allclose(np.diff(found.outputs["loops_um"]), 0.3 * 5, rtol=0.2)
+
+
+@pytest.mark.slow
 def test_a_batch_of_fits_agrees_with_fits_one_by_one(seed):
-    batch = compute_chunk(parsed(FIT.format(seed=seed, method="batch")), 0)
-    alone = [compute_chunk(parsed(FIT.format(seed=seed, method="one_by_one")), chunk).outputs for chunk in range(3)]
-    assert set(batch.reasons) == {""}
-    for row, one in enumerate(alone):
-        # What is left is the noise, in both ways alike.
-        assert batch.outputs["noise_um"][row] == pytest.approx(0.02, rel=0.3)
-        assert batch.outputs["heldout_e_rms_pct"][row] == pytest.approx(one["heldout_e_rms_pct"][0], rel=0.3)
-        assert batch.outputs["offset_um"][row] == pytest.approx(one["offset_um"][0], abs=0.05)
-    assert np.all(np.diff(batch.outputs["loops_um"]) > 0.5)
+    batch = compute_chunk(parsed(FIT.format(seed=seed, method="batch")), 0).outputs
+    alone = compute_chunk(parsed(FIT.format(seed=seed, method="one_by_one")), 0).outputs
+    assert batch["heldout_e_rms_pct"][0] == pytest.approx(alone["heldout_e_rms_pct"][0], rel=0.3)
+    assert batch["noise_um"][0] == pytest.approx(alone["noise_um"][0], rel=0.3)
+    assert batch["offset_um"][0] == pytest.approx(alone["offset_um"][0], abs=0.1)
 
 
 def test_files_are_rows_and_a_broken_one_fails_alone(tmp_path, rng):

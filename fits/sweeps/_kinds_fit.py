@@ -188,7 +188,7 @@ class FitJob(AbstractJob):
 
 
 def _errors(measured: FloatArray, predicted: FloatArray, samples: Any, known: Any) -> tuple[float, float]:
-    if not samples.any() or np.ptp(measured[known]) == 0:
+    if not (samples.any() and known.any()) or np.ptp(measured[known]) == 0:
         return np.nan, np.nan
     figures = errors(measured[samples], predicted[samples], float(np.ptp(measured[known])))
     return figures.e_rms_pct, figures.e_max_pct

@@ -1,0 +1,27 @@
+"""What is said where a package of an extra is missing."""
+
+import sys
+
+import pytest
+from _command import refused, run
+from _sweeps import small
+
+from fits import DataError
+from fits.sweeps._extra import need
+
+
+@pytest.mark.parametrize(
+    ("package", "extras"), [("zarr", "[sweep]"), ("pyarrow", "[sweep]"), ("distributed", "[sweep,cluster]")]
+)
+def test_a_missing_package_is_one_sentence(monkeypatch, package, extras):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(DataError) as missing:
+        need(package)
+    assert f'pip install "microid{extras}"' in str(missing.value)
+
+
+def test_the_command_says_it_before_it_computes(monkeypatch, tmp_path, seed):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    (tmp_path / "sweep.toml").write_text(small(seed))
+    refused(run("sweep", tmp_path / "sweep.toml", "--out", tmp_path / "out"), 'pip install "microid[sweep]"')
+    assert not (tmp_path / "out").exists()
