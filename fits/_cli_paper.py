@@ -197,6 +197,7 @@ def _draw_tracks(tracks: dict[str, dict[str, PaperRun]], path: Path) -> Path:
 
 def _assumed() -> list[str]:
     sensor, axes = data_synth.PaperSensor(), data_synth.PAPER_AXES
+    rotation = list(axes.values())[-1]
     gains = ", ".join(f"{name} {100 * axis.gain_error:+.2f} %" for name, axis in axes.items())
     rests = ", ".join(f"{name} {axis.rest_s:g} s" for name, axis in axes.items())
     return [
@@ -221,7 +222,7 @@ def _assumed() -> list[str]:
         "stage.",
         f"Axes rest and work at {data_synth.PAPER_BIAS_V:g} V, reached from above. Rotations are read as the "
         "displacement of a point 40 mm from the axis; the swing of 2 um is the paper's for X, Y and assumed for the "
-        "others.",
+        f"others: {data_synth.PAPER_SWING_um * rotation.per_um:g} {rotation.unit} of a rotation.",
         "Gains follow from the identified mode by placing the loop's poles, for all axes alike: for tracking at "
         "30 rad/s (25 rad/s beside the CMAC), for steps at 86, 86 and 27 rad/s. BP-PID starts from the gains of PID, "
         "and its network keeps them within a factor of 1.5. For steps the reference has weights in the controller.",

@@ -27,7 +27,7 @@ def plot_loop(voltage_V: np.ndarray, measured_um: np.ndarray, model_um: np.ndarr
     loop.plot(voltage_V, measured_um, label="measured", **MEASURED)
     loop.plot(voltage_V, model_um, label="model", **MODEL)
     label(loop, "voltage (V)", "elongation (µm)")
-    error.plot(voltage_V, 1e3 * (measured_um - model_um), **MODEL)
+    error.plot(voltage_V, 1e3 * (measured_um - model_um), ".", color="0.0", markersize=0.8, markeredgewidth=0)
     label(error, "voltage (V)", "measured less model (nm)")
     legend(picture, [loop])
     return save(picture, path)
