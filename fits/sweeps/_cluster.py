@@ -1,5 +1,6 @@
 """The chunks of a sweep on Dask distributed: workers may die, join late, or be refused for their versions."""
 
+import logging
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -62,6 +63,8 @@ def on_cluster(
         If there is no scheduler, it is lost, or no worker has the versions of this process.
     """
     distributed = need("distributed")
+    # What it tells of a lost scheduler is told here in a sentence.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if not chunks:
         return
     with ExitStack() as stack:
