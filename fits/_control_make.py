@@ -143,7 +143,8 @@ class Maker:
             return pid, tuning, more
         if kind == "resonant":
             return self._resonant(pid, tuning, frequency_Hz, more)
-        more.append("only its PID controller was tuned; margins are those of that controller, before it learns")
+        which = "margins are" if tuning is None else "what was tuned, and margins, are"
+        more.append(f"{which} those of its PID controller, before it learns")
         low, high = float(ready.reference_um.min()), float(ready.reference_um.max())
         stage = loop.plants[0]
         if kind == "bp-pid":
