@@ -1,10 +1,12 @@
 """Rows in chunks that are computed and kept one at a time, and in blocks within them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.sweeps._devices import device_count
 from fits.sweeps._spec import Sweep, outside
 from fits.sweeps._types import DONE, FAILED, Output, Rows
 
@@ -61,13 +63,22 @@ def compute_chunk(sweep: Sweep, chunk: int, tell: Callable[[int], None] = lambda
         With the swept values beside the outputs, and `status`.
     """
     rows, block = rows_of(sweep, chunk), sweep.facts.block
+    pieces = [rows[first : first + block] for first in range(0, len(rows), block)]
     parts = []
-    for first in range(0, len(rows), block):
-        piece = rows[first : first + block]
-        parts.append(_block(sweep, piece))
+    for piece, part in zip(pieces, _blocks(sweep, pieces), strict=True):
+        parts.append(part)
         tell(len(piece))
     outputs = {name: np.concatenate([part.outputs[name] for part in parts]) for name in parts[0].outputs}
     return Rows(outputs, tuple(reason for part in parts for reason in part.reasons))
+
+
+def _blocks(sweep: Sweep, pieces: list[NDArray[np.int64]]) -> Iterator[Rows]:
+    """Blocks in their order; where there are several devices, each has a thread that waits for it."""
+    if device_count() == 1:
+        yield from (_block(sweep, piece) for piece in pieces)
+        return
+    with ThreadPoolExecutor(device_count()) as pool:
+        yield from pool.map(lambda piece: _block(sweep, piece), pieces)
 
 
 def _block(sweep: Sweep, rows: NDArray[np.int64]) -> Rows:

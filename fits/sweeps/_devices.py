@@ -12,6 +12,11 @@ def on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
+def device_count() -> int:
+    """Number of local devices."""
+    return jax.local_device_count()
+
+
 def device_of(rows: NDArray[np.int64]) -> Any:
     """The local device that computes a block, which its first row chooses."""
     devices = jax.local_devices()
