@@ -189,8 +189,8 @@ spacing = "log"
 _DIAGNOSE = (
     _HEAD
     + """\
-# Each row takes a minute or more: run it with --cluster, or with fewer rows first. Runs as smooth as these do not show
-# the stage's dynamics to the plain fit, and their lag is what is named.
+# Each row takes a minute or more: run it with --cluster, or with fewer rows first. Runs as smooth as these do not
+# show the stage's dynamics to the plain fit, and their lag is what is named.
 kind = "diagnose"
 title = "What is named in runs that are too smooth to show the dynamics"
 seed = 1
