@@ -159,8 +159,8 @@ def select(
         drop = model.cost - first.refit.cost
         rivals = _rivals(first, fitted, max(drop, 0.0))
         usual = next((rival for rival in rivals if rival.name in _USUAL and first.name not in _USUAL), None)
-        if usual is not None:
-            # Of effects that these records cannot tell apart, the one that every rig has.
+        if usual is not None and not any(run.held_out.any() for run in bench.baseline.runs):
+            # Of effects that these records cannot tell apart, and nothing else can, the one that every rig has.
             rivals = (replace(first, apart=usual.apart), *(rival for rival in rivals if rival is not usual))
             first, beside = usual, settled(bench, projector, usual.refit)
         if not beside[-1].determined() or model.cost - beside[-1].cost < _REAL * drop:
