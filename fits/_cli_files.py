@@ -85,10 +85,19 @@ def new_folder(path: str | None, option: str = "--plots", what: str = "plots") -
     if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
         raise DataError(f"{path}: expected a folder that can be written to; choose another for {option}.")
     made: list[Path] = []
+
+    def refused(error: OSError) -> DataError:
+        reason = error.strerror or error
+        return DataError(f"{path}: the {what} cannot be put there ({reason}); choose another for {option}.")
+
     with ExitStack() as stack:
 
         def make() -> Path:
-            made.append(Path(stack.enter_context(tempfile.TemporaryDirectory(dir=anchor, prefix=".microid-"))))
+            try:
+                place = stack.enter_context(tempfile.TemporaryDirectory(dir=anchor, prefix=".microid-"))
+            except OSError as error:
+                raise refused(error) from error
+            made.append(Path(place))
             return made[-1]
 
         yield make
@@ -97,7 +106,4 @@ def new_folder(path: str | None, option: str = "--plots", what: str = "plots") -
             for file in sorted(file for folder in made for file in folder.iterdir()):
                 os.replace(file, target / file.name)
         except OSError as error:
-            reason = error.strerror or error
-            raise DataError(
-                f"{path}: the {what} cannot be put there ({reason}); choose another for {option}."
-            ) from error
+            raise refused(error) from error

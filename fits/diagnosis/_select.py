@@ -264,12 +264,23 @@ def _contest(
             # What does not stand out of the rest of the misfit must show in what was kept aside.
             plain = one.sure > (_SURE if one.z > 2 * _INEXACT * explained else 2 * _SURE)
             most = _WORSE if plain else _BETTER
-            if bare.ahead(found.change_um) > most * before or not found.determined():
+            if bare.ahead(found.change_um) > most * before or not found.determined() or not _whole(bench, found):
                 continue
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
     order = sorted(fitted, key=lambda name: fitted[name].criterion(projector.count))
     return [Rival(name, fitted[name], fitted[name].criterion(projector.count), 0.0) for name in order]
+
+
+def _whole(bench: Bench, model: Refit) -> bool:
+    """Whether what is counted in sampling intervals is nearer to one than to none in some run, for the last law."""
+    law, x = model.laws[-1], model.x[-1]
+    found = not law.form.counted
+    for run, one in enumerate(bench.prepared):
+        interval_s = float(np.median(np.diff(one.run.record.time_s)))
+        effect = law.effect(x, run)
+        found = found or any(abs(float(getattr(effect, name))) > interval_s / 2 for name in law.form.counted)
+    return found
 
 
 def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Refit) -> tuple[list[Cause], Refit]:

@@ -84,6 +84,8 @@ class AbstractEffect(AbstractPart):
         Whether it must be tried at its full size, because at zero it has no derivative, or none that says much.
     repeats
         Whether there may be several of them in a record.
+    counted
+        Names of the fields that are whole sampling intervals.
     fingerprint
         What it leaves in the residual of the plain stage, one sentence.
     confusions
@@ -108,6 +110,7 @@ class AbstractEffect(AbstractPart):
     per_run: ClassVar[bool] = False
     finite: ClassVar[bool] = False
     repeats: ClassVar[bool] = False
+    counted: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     @abc.abstractmethod

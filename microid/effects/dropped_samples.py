@@ -36,6 +36,7 @@ class DroppedSamples(AbstractEffect):
     finite: ClassVar[bool] = True
     per_run: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
+    counted: ClassVar[tuple[str, ...]] = ("dropped_s",)
     fingerprint: ClassVar[str] = (
         "The residual is the velocity times a factor that jumps by whole intervals between samples."
     )
