@@ -53,9 +53,9 @@ from fits._cli_common import columns, in_sentences, json_output, limits, quiet
     help="Models drawn from the uncertainty of the fit, all to be controlled (default 4, or 1 without one).",
 )
 @click.option("--overshoot", type=float, metavar="PCT", help="Largest overshoot, in percent of the range.")
-@click.option("--gain-margin", type=float, show_default="2", help="Least gain margin.")
-@click.option("--phase-margin", type=float, show_default="30", help="Least phase margin, in degrees.")
-@click.option("--peak", type=float, show_default="2", help="Largest peak of the sensitivity.")
+@click.option("--gain-margin", type=float, help="Least gain margin (default 2).")
+@click.option("--phase-margin", type=float, help="Least phase margin, in degrees (default 30).")
+@click.option("--peak", type=float, help="Largest peak of the sensitivity (default 2).")
 @click.option("--effort", type=float, default=0.0, metavar="UM/V", help="Weight of the feedback in the cost.")
 @click.option("--rate", type=float, default=0.0, metavar="UM/V", help="Weight of the command's steps in the cost.")
 @click.option("--skip", type=float, default=0.0, metavar="S", help="Time at the beginning that does not count, in s.")

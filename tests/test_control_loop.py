@@ -321,7 +321,9 @@ def test_what_has_not_settled_overshoots_its_target_and_not_the_mean_of_its_end(
     assert float(found.settling_time_s) == np.inf
     assert float(found.overshoot_pct) == pytest.approx(100 * 2 / 3, rel=1e-9)
     creeping = c.step_metrics(at, 4 * at / 10.2, 5.0)
-    assert (float(creeping.settling_time_s), float(creeping.overshoot_pct)) == (np.inf, 0)
+    still = c.step_metrics(at, np.full_like(at, 1.0), 5.0, 1.0)
+    for one in (creeping, still):
+        assert (float(one.settling_time_s), float(one.overshoot_pct)) == (np.inf, 0)
 
 
 def test_positioning_errors_are_those_of_table_2():

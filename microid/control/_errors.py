@@ -41,7 +41,7 @@ class StepMetrics(eqx.Module):
     ----------
     settling_time_s
         From the step to the first sample from which on the displacement stays within the band; `inf` if the last
-        sample is outside.
+        sample is outside, or nothing has moved.
     overshoot_pct
         Largest displacement beyond the settling value, in percent of the way to it; where it has not settled, beyond
         the target, in percent of the step: the mean over the end of a motion that goes on is no place to count from.
@@ -90,7 +90,8 @@ def step_metrics(
     way, step = settled - start_um, target_um - start_um
     beyond = (displacement_um - settled) / way
     past_target = (displacement_um - target_um) / step
-    outside = jnp.abs(beyond) > band_pct / 100
+    # Without a way there is no quotient, and no band to be within.
+    outside = ~(jnp.abs(beyond) <= band_pct / 100)
     index = jnp.arange(outside.shape[0], dtype=jnp.int32)
     first = jnp.max(jnp.where(outside, index + 1, 0))
     last = time_s[jnp.minimum(first, index[-1])] - time_s[0]
