@@ -22,7 +22,8 @@ from fits._cli_common import columns, in_sentences, json_output, limits, quiet
 @click.option(
     "--gains",
     metavar="KP,KI,KD|FILE",
-    help="Gains in V/um, V/(um s) and V s/um, or what --json printed; tuned by default.",
+    help="Gains in V/um, V/(um s) and V s/um, or what --json printed; tuned by default. Limits stated beside them "
+    "are checked, default ones remarked on.",
 )
 @click.option(
     "--feedforward",
@@ -35,7 +36,7 @@ from fits._cli_common import columns, in_sentences, json_output, limits, quiet
     "--frequency", type=float, multiple=True, metavar="HZ", help="Of a resonator; the reference's own by default."
 )
 @click.option("--noise", type=float, default=0.0, metavar="UM", help="Standard deviation of sensor noise, in um.")
-@click.option("--delay", type=click.IntRange(min=0), default=0, metavar="SAMPLES", help="Age of a reading.")
+@click.option("--delay", type=click.IntRange(0, 100), default=0, metavar="SAMPLES", help="Age of a reading.")
 @click.option("--resolution", type=float, metavar="UM", help="Steps of the sensor, in um.")
 @click.option("--resolution-voltage", type=float, metavar="V", help="Steps of the amplifier's command, in V.")
 @limits
@@ -52,14 +53,14 @@ from fits._cli_common import columns, in_sentences, json_output, limits, quiet
     help="Models drawn from the uncertainty of the fit, all to be controlled (default 4, or 1 without one).",
 )
 @click.option("--overshoot", type=float, metavar="PCT", help="Largest overshoot, in percent of the range.")
-@click.option("--gain-margin", type=float, default=2.0, show_default=True, help="Least gain margin.")
-@click.option("--phase-margin", type=float, default=30.0, show_default=True, help="Least phase margin, in degrees.")
-@click.option("--peak", type=float, default=2.0, show_default=True, help="Largest peak of the sensitivity.")
+@click.option("--gain-margin", type=float, help="Least gain margin (default 2).")
+@click.option("--phase-margin", type=float, help="Least phase margin, in degrees (default 30).")
+@click.option("--peak", type=float, help="Largest peak of the sensitivity (default 2).")
 @click.option("--effort", type=float, default=0.0, metavar="UM/V", help="Weight of the feedback in the cost.")
 @click.option("--rate", type=float, default=0.0, metavar="UM/V", help="Weight of the command's steps in the cost.")
 @click.option("--skip", type=float, default=0.0, metavar="S", help="Time at the beginning that does not count, in s.")
 @click.option("--starts", type=click.IntRange(min=1), default=2, show_default=True, help="Places to tune from.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, help="Of noise, plants and starts (default 0).")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Of noise, plants and starts (default 0).")
 @columns
 @json_output
 @quiet
@@ -69,7 +70,8 @@ def control(**options: Any) -> None:
 
     REFERENCE.csv needs the columns time_s, in even steps, and displacement_um: what the sensor is to read, its offset
     included. The run has time_s, reference_um, displacement_um, measured_um, command_V and error_um. The least error
-    is sought within all limits, for every plant; a loop that is unstable or beyond a limit is refused.
+    is sought within all limits, for every plant; a loop that is unstable or beyond a limit is refused. What --json
+    prints makes the same controller again with --gains, for the same model, reference and seed.
     """
     from fits._cli_control import run_control
 

@@ -12,7 +12,9 @@ from fits._cli_common import in_sentences, quiet
 @click.option(
     "--seeds", type=click.IntRange(1, 100), default=10, show_default=True, help="How many noises to go through."
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Where all randomness starts.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Where all randomness starts."
+)
 @quiet
 @in_sentences
 def paper(**options: Any) -> None:

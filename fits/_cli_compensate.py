@@ -1,6 +1,7 @@
 """The commands `microid compensate` and `microid export`: the work."""
 
 import json
+import math
 from pathlib import Path
 
 import click
@@ -135,4 +136,8 @@ def _limits(text: str | None) -> tuple[float, float] | None:
         raise DataError(
             f"--limits: expected two voltages such as 0,100, found '{text}'; write LOW,HIGH in V."
         ) from None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise DataError(
+            f"--limits: expected two finite voltages, the lower one first, found '{text}'; write LOW,HIGH in V."
+        )
     return low, high

@@ -14,7 +14,9 @@ from fits._cli_compensate import _limits
 from fits._cli_files import keep_inputs, new_folder, progress_to_stderr
 from fits._cli_jax import start_jax
 from fits._cli_work import preisach_of
-from fits._control_make import GAINS, Loop, Maker
+from fits._control_gains import read_gains
+from fits._control_limits import passed_limits
+from fits._control_make import Loop, Maker
 from fits._control_report import control_json, describe_control
 from fits._control_setup import Setup, setup
 from fits._draw_plants import draw_plants
@@ -28,6 +30,10 @@ from fits._units import parse_columns
 from microid import Stage
 
 _PLANTS = 4
+# Finer steps, of um or V, are none.
+_FINEST = 1e-9
+# In the order of the options that are looked at.
+_LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "overshoot_max_pct")
 
 
 def run_control(
@@ -48,9 +54,9 @@ def run_control(
     initial: str,
     plants: int | None,
     overshoot: float | None,
-    gain_margin: float,
-    phase_margin: float,
-    peak: float,
+    gain_margin: float | None,
+    phase_margin: float | None,
+    peak: float | None,
     effort: float,
     rate: float,
     skip: float,
@@ -65,19 +71,19 @@ def run_control(
         if not (math.isfinite(value) and value >= 0):
             raise DataError(f"{option}: expected a number that is not negative, found {value:g}.")
     for option, step in {"--resolution": resolution, "--resolution-voltage": resolution_voltage}.items():
-        if step is not None and not (math.isfinite(step) and step > 0):
-            raise DataError(f"{option}: expected a number above 0, found {step:g}; leave it out for none.")
-    bounds = {"--gain-margin": gain_margin, "--phase-margin": phase_margin, "--peak": peak, "--overshoot": overshoot}
-    for option, bound in bounds.items():
+        if step is not None and not (math.isfinite(step) and step >= _FINEST):
+            raise DataError(f"{option}: expected {_FINEST:g} or more, found {step:g}; leave it out for none.")
+    stated = {"--gain-margin": gain_margin, "--phase-margin": phase_margin, "--peak": peak, "--overshoot": overshoot}
+    for option, bound in stated.items():
         least = 0.0 if option == "--overshoot" else 1.0
         if bound is not None and not (math.isfinite(bound) and bound >= least):
             raise DataError(f"{option}: expected a number of {least:g} or more, found {bound:g}.")
     if frequency and controller != "resonant":
         raise DataError(f"--frequency: expected --controller resonant with it, found {controller}; leave it out.")
     start_jax()
-    keep_inputs(out, [model, reference])
+    keep_inputs(out, [model, reference] if gains is None else [model, reference, gains])
     tell = progress_to_stderr(quiet)
-    given = None if gains is None else _given_gains(gains)
+    given = None if gains is None else read_gains(gains)
     loaded = load_model(model)
     known = loaded.uncertainty is not None
     plant = loaded.model if isinstance(loaded.model, Stage) else preisach_of(model, loaded)
@@ -87,29 +93,38 @@ def run_control(
         try:
             ready = setup(plant, wanted, feedforward, initial=initial, limits_V=_limits(limits))
         except DataError as error:
+            # What the reference or an option is to blame for says so itself.
+            if str(error).startswith(("--", f"{wanted.source}:")):
+                raise
             raise DataError(f"{model}: {error}") from error
         skipped = _skipped(wanted, ready, skip)
         count = plants or (_PLANTS if known else 1)
         held = _held(plant) if isinstance(plant, Stage) else plant
         stages = draw_plants(held, loaded.uncertainty, count, seed=seed)
-        goal = Goal(effort, rate, gain_margin, phase_margin, peak, overshoot)
+        limits_of = {name: x for name, x in zip(_LIMITS, stated.values(), strict=True) if x is not None}
+        goal = Goal(effort, rate, **limits_of)
         rng = np.random.default_rng(seed)
         loop = Loop(ready, [_held(one) for one in stages], noise, delay, resolution, skipped)
         tune = Maker(loop, goal, starts, seed, rng.normal(0, noise, len(wanted)) if noise else None, tell)
         try:
-            made, tuning, more = tune.make(controller, given, frequency)
+            made = tune.make(controller, given, frequency)
         except FitError as error:
             raise DataError(f"{model}: {error}.") from error
-        every = loop.margins(made)
+        every = loop.margins(made.controller)
         if not all(bool(one.stable) for one in every):
             raise DataError(
                 f"{model}: the loop is unstable with these gains, its largest pole has modulus "
                 f"{max(float(one.radius) for one in every):.6g}; lower --gains, or leave them out to have them tuned."
             )
         tell("run")
-        run = loop.run(made, rng.normal(0, noise, len(wanted)) if noise else None, resolution_voltage)
-        if not np.all(np.isfinite(run.error_um)):
+        heard = rng.normal(0, noise, len(wanted)) if noise else None
+        asked = 1 if overshoot is None else len(loop.plants)
+        runs = [loop.run(made.controller, heard, resolution_voltage, k) for k in range(asked)]
+        run = runs[0]
+        if not all(np.all(np.isfinite(one.error_um)) for one in runs):
             raise DataError(f"{model}: the loop is unstable, its displacement has no bounds; lower --gains.")
+        passed = passed_limits(goal, every, runs)
+        more = [*made.remarks, *_judged(passed, stated, controller, given is not None)]
         names = ("time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um")
         table = {name: np.asarray(getattr(run, name)) for name in names}
         write_csv(unfinished, table | {"time_s": wanted.time_s})
@@ -117,12 +132,29 @@ def run_control(
         if drawings is not None:
             from fits._plot_control import plot_control
 
-            drawn = plot_control(run, made, loop.plants, drawings(), delay=delay)
-    places = [str(Path(plots) / path.name) for path in drawn] if plots else []
-    remarks = [*wanted.warnings, *ready.remarks, *more]
-    about = {"controller": controller, "out": out, "plots": places}
-    summary = control_json(loop, made, tuning, run, about, remarks)
-    click.echo(json.dumps(summary, indent=1, allow_nan=False) if as_json else describe_control(summary))
+            drawn = plot_control(run, made.controller, loop.plants, drawings(), delay=delay)
+        places = [str(Path(plots) / path.name) for path in drawn] if plots else []
+        about = {"controller": controller, "out": out, "plots": places}
+        # Before the file is in its place: what cannot be told is not left behind either.
+        summary = control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
+        told = json.dumps(summary, indent=1, allow_nan=False) if as_json else describe_control(summary)
+    click.echo(told)
+
+
+def _judged(passed: dict[str, str], stated: dict[str, float | None], kind: str, given: bool) -> list[str]:
+    """What is said of limits that are passed; those that were asked for are not."""
+    remarks = []
+    for option, words in passed.items():
+        if stated[option] is None:
+            remarks.append(f"a limit that tuning keeps by default is passed: {words} ({option})")
+        elif given:
+            raise DataError(f"{option}: {words}; choose other --gains, or leave them out to have them tuned.")
+        elif kind in ("bp-pid", "cmac-pid"):
+            raise DataError(f"{option}: {words} while {kind} learns; relax it, or choose pid.")
+        else:
+            # Tuning kept it under the noise it heard.
+            remarks.append(f"in this run, under fresh noise, a limit is passed: {words} ({option})")
+    return remarks
 
 
 def _held(stage: Stage) -> Stage:
@@ -134,33 +166,3 @@ def _skipped(reference: Reference, ready: Setup, skip_s: float) -> int:
     if count > len(reference) - 2:
         raise DataError(f"--skip: expected less than the reference's {reference.time_s[-1]:g} s, found {skip_s:g} s.")
     return count
-
-
-def _given_gains(text: str) -> dict[str, float]:
-    """Gains from the command line, or from a JSON file."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) == len(GAINS):
-        found = dict(zip(GAINS, values, strict=True))
-    elif values:
-        raise DataError(f"--gains: expected three numbers KP,KI,KD or a file, found {len(values)}: '{text}'.")
-    else:
-        try:
-            content = json.loads(Path(text).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise DataError(
-                f"--gains: expected KP,KI,KD or a JSON file of gains, found '{text}' ({error}); write three numbers."
-            ) from error
-        content = content.get("gains", content) if isinstance(content, dict) else {}
-        found = {}
-        for name in GAINS:
-            value = content.get(name, content.get(f"pid.{name}"))
-            if not isinstance(value, int | float) or isinstance(value, bool):
-                raise DataError(f"{text}: expected the key {name} with a number, found {value!r}; add it.")
-            found[name] = float(value)
-    for name, value in found.items():
-        if not (math.isfinite(value) and value >= 0):
-            raise DataError(f"--gains: expected {name} of 0 or more, found {value:g}.")
-    return found

@@ -1,7 +1,7 @@
 """How the controllers of `microid paper` are set, from what was identified: the one place to change it.
 
 Gains are closed formulas of the identified mode; only the places of the poles, the filters and what the networks
-learn by were chosen, on the bench, for each scheme and each kind of run once and for all axes.
+learn by were chosen, for each scheme and each kind of run once and for all axes: on the bench that also judges them.
 """
 
 from dataclasses import dataclass

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fits._control_gains import GAINS, Given
 from fits._control_setup import Setup
 from fits._errors import DataError
 from fits._tune import tune_controller
@@ -28,12 +29,13 @@ from microid import (
     simulate_loop,
 )
 
-GAINS = ("proportional_V_per_um", "integral_V_per_um_s", "derivative_V_s_per_um")
 # Resonators take up an error over so many of their periods, and a table holds this share of the reference's voltage.
 _PERIODS = 3.0
 _TABLE = 0.5
 _LEARNING = 0.1
 _MOST_PEAK = 4.0
+# Resonators that are nearer to each other than this share of their frequency fight.
+_ALIKE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -62,12 +64,16 @@ class Loop:
     skip: int
 
     def run(
-        self, controller: AbstractController, noise_um: np.ndarray | None, resolution_V: float | None = None
+        self,
+        controller: AbstractController,
+        noise_um: np.ndarray | None,
+        resolution_V: float | None = None,
+        plant: int = 0,
     ) -> ControlledRun:
-        """Run a controller on the first plant."""
+        """Run a controller on one of the plants."""
         return simulate_loop(
             controller,
-            self.plants[0],
+            self.plants[plant],
             jnp.asarray(self.ready.reference_um),
             feedforward_V=None if self.ready.feedforward_V is None else jnp.asarray(self.ready.feedforward_V),
             noise_um=None if noise_um is None else jnp.asarray(noise_um),
@@ -84,6 +90,28 @@ class Loop:
             margins(linear_part(controller), one, delay=self.delay, slope_um_per_V=slope_array(one))
             for one in self.plants
         ]
+
+
+@dataclass(frozen=True)
+class Made:
+    """A controller that was made.
+
+    Attributes
+    ----------
+    controller
+        For the loop.
+    pid
+        The PID controller that it is, or was made around.
+    tuning
+        None where gains were given.
+    remarks
+        One sentence each.
+    """
+
+    controller: AbstractController
+    pid: PID
+    tuning: Tuning[Any] | None
+    remarks: list[str]
 
 
 @dataclass(frozen=True)
@@ -107,19 +135,17 @@ class Maker:
     noise_um: np.ndarray | None
     tell: Callable[[str], None]
 
-    def make(
-        self, kind: str, gains: dict[str, float] | None, frequency_Hz: Sequence[float]
-    ) -> tuple[AbstractController, Tuning[Any] | None, list[str]]:
+    def make(self, kind: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
         """Make a controller of a kind, with its tuning and what is to be said of it.
 
         Parameters
         ----------
         kind
             `"pid"`, `"bp-pid"`, `"cmac-pid"` or `"resonant"`.
-        gains
-            Of the PID controller, by field; tuned if None.
+        given
+            Gains; tuned if None.
         frequency_Hz
-            Of resonators; the strongest in the reference if there are none.
+            Of resonators; if there are none, those that are given, or the strongest in the reference.
 
         Raises
         ------
@@ -130,35 +156,39 @@ class Maker:
         """
         loop, ready = self.loop, self.loop.ready
         tuning: Tuning[Any] | None = None
-        if gains is None:
+        if given is None:
             self.tell("start by Ziegler and Nichols")
             begin = relay_start(loop.plants, ready.interval_s, delay=loop.delay)
             tuning = self._tuned(_limited(begin, ready.limits_V))
             pid = tuning.controller
         else:
-            kp, ki, kd, interval = (jnp.asarray(x) for x in (*(gains[name] for name in GAINS), ready.interval_s))
-            pid = _limited(PID(kp, ki, kd, interval), ready.limits_V)
+            pid = _limited(given.make_pid(ready.interval_s), ready.limits_V)
         more = [] if tuning is None else list(tuning.remarks)
         if kind == "pid":
-            return pid, tuning, more
+            return Made(pid, pid, tuning, more)
         if kind == "resonant":
-            return self._resonant(pid, tuning, frequency_Hz, more)
+            return self._resonant(pid, tuning, given, frequency_Hz, more)
         which = "margins are" if tuning is None else "what was tuned, and margins, are"
         more.append(f"{which} those of its PID controller, before it learns")
+        learner = self._learner(kind, pid)
+        return Made(learner if given is None else given.put_into(kind, learner), pid, tuning, more)
+
+    def _learner(self, kind: str, pid: PID) -> BPPID | CMACPID:
+        ready = self.loop.ready
         low, high = float(ready.reference_um.min()), float(ready.reference_um.max())
-        stage = loop.plants[0]
+        stage = self.loop.plants[0]
         if kind == "bp-pid":
             slope = float(stage.static_gain) * (steepest_slope(stage) or 1.0)
             if min(float(getattr(pid, name)) for name in GAINS) <= 0:
                 raise DataError("bp-pid: expected three gains above 0 to learn around, found one of 0; choose pid.")
             scale = max(high - low, 1e-9) / 10
-            return BPPID.around(pid, jax.random.key(self.seed), slope_um_per_V=slope, scale_um=scale), tuning, more
+            return BPPID.around(pid, jax.random.key(self.seed), slope_um_per_V=slope, scale_um=scale)
         fastest = float(np.abs(np.diff(ready.reference_um)).max()) / ready.interval_s
         limit = _TABLE * max(float(np.ptp(ready.static_V)), 1e-6)
         pad = 0.02 * max(high - low, 1e-9)
         ends = low - pad, high + pad, 1.02 * fastest + 1e-9
         lower, upper, rate, learning, most = (jnp.asarray(x) for x in (*ends, _LEARNING, limit))
-        return CMACPID(pid, lower, upper, rate, learning, most), tuning, more
+        return CMACPID(pid, lower, upper, rate, learning, most)
 
     def _tuned(self, controller: Any) -> Tuning[Any]:
         ready = self.loop.ready
@@ -179,17 +209,35 @@ class Maker:
         )
 
     def _resonant(
-        self, pid: PID, before: Tuning[Any] | None, frequency_Hz: Sequence[float], more: list[str]
-    ) -> tuple[AbstractController, Tuning[Any] | None, list[str]]:
+        self,
+        pid: PID,
+        before: Tuning[Any] | None,
+        given: Given | None,
+        frequency_Hz: Sequence[float],
+        more: list[str],
+    ) -> Made:
         ready = self.loop.ready
-        own = list(frequency_Hz) or [_strongest_Hz(ready.reference_um, ready.interval_s)]
+        held = None if given is None else given.resonators()
+        kept = held is not None and (not frequency_Hz or np.array_equal(np.sort(held[0]), np.sort(frequency_Hz)))
+        own = list(frequency_Hz)
+        if held is not None and kept:
+            own = held[0].tolist()
+        elif held is not None:
+            more.append("the resonators of --gains are at other frequencies than --frequency, and made anew")
+        elif not own:
+            own = [_strongest_Hz(ready.reference_um, ready.interval_s)]
+            more.append(f"the resonator is at {own[0]:.6g} Hz, the strongest in the reference")
         bad = [f for f in own if not 0 < f < 0.5 / ready.interval_s]
         if bad:
             raise DataError(
                 f"--frequency: expected one between 0 and {0.5 / ready.interval_s:g} Hz, found {bad[0]:g} Hz."
             )
-        if not frequency_Hz:
-            more.append(f"the resonator is at {own[0]:.6g} Hz, the strongest in the reference")
+        near = np.sort(own)
+        if np.any(np.diff(near) <= _ALIKE * near[1:]):
+            raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
+        if held is not None and kept:
+            found = ResonantPID(pid, *(jnp.asarray(x) for x in held))
+            return Made(found, pid, None, more)
         stage = self.loop.plants[0]
         found = ResonantPID.around(
             pid,
@@ -200,14 +248,14 @@ class Maker:
             slope_um_per_V=slope_array(stage),
         )
         if before is None:
-            return found, None, more
+            return Made(found, pid, None, more)
         for _ in range(20):
             if all(bool(one.stable) and float(one.sensitivity_peak) < _MOST_PEAK for one in self.loop.margins(found)):
                 break
             found = eqx.tree_at(lambda x: x.resonant_V_per_um_s, found, found.resonant_V_per_um_s / 2)
         tuning = self._tuned(found)
         said = [*more, *(remark for remark in tuning.remarks if remark not in more)]
-        return tuning.controller, tuning, said
+        return Made(tuning.controller, tuning.controller.pid, tuning, said)
 
 
 def _limited(pid: PID, limits_V: tuple[float, float]) -> PID:

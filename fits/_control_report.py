@@ -5,15 +5,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._control_make import Loop
-from fits._tune import parameter_values
+from fits._control_gains import printed_gains
+from fits._control_make import Loop, Made
 from fits._tune_result import Tuning
 from microid import (
-    AbstractController,
     ControlledRun,
     Margins,
     Stage,
@@ -27,8 +27,7 @@ SCHEMA = "microid.control/1"
 
 def control_json(
     loop: Loop,
-    controller: AbstractController,
-    tuning: Tuning[Any] | None,
+    made: Made,
     run: ControlledRun,
     about: Mapping[str, Any],
     remarks: Sequence[str],
@@ -37,8 +36,8 @@ def control_json(
 
     Parameters
     ----------
-    loop, controller, tuning, run
-        Tuning is None where gains were given.
+    loop, made, run
+        What was closed, by which controller, and what came of it.
     about
         More to put in front.
     remarks
@@ -47,39 +46,49 @@ def control_json(
     kept = slice(loop.skip, None)
     wanted, moved, command = (np.asarray(x) for x in (run.reference_um, run.displacement_um, run.command_V))
     error = np.asarray(run.error_um)[kept]
-    rms = float(np.sqrt(np.mean(error**2)))
+    rms = _rms(error)
+    sensor = {"noise": loop.noise_um, "resolution": loop.resolution_um or 0.0}
     said = list(remarks)
-    if 0 < rms < loop.noise_um:
+    below = [f"{name}, {size:.3g} um" for name, size in sensor.items() if 0 < rms < size]
+    if below:
         said.append(
-            f"the error, {rms:.3g} um rms, is that of the model's own displacement and below the sensor's noise, "
-            f"{loop.noise_um:.3g} um: a bench cannot show it in single readings"
+            f"the error, {rms:.3g} um rms, is that of the model's own displacement and below the sensor's "
+            f"{' and its '.join(below)}: a bench cannot show it in single readings"
         )
-    every = loop.margins(controller)
+    every = loop.margins(made.controller)
     return {
         "schema": SCHEMA,
         **about,
         "samples": len(wanted),
         "interval_s": loop.ready.interval_s,
-        "gains": _gains(controller),
-        "tuning": None if tuning is None else _tuning(tuning),
+        "gains": _gains(made),
+        "tuning": None if made.tuning is None else _tuning(made.tuning),
         "margins": _margins(every[0]),
         "margins_worst": _worst(every),
         "tracking": _tracking(wanted[kept], moved[kept]),
         "without_feedback": _without(loop, wanted, kept),
         "step": _step(np.asarray(run.time_s), wanted, moved),
-        "command_min_V": float(command.min()),
-        "command_max_V": float(command.max()),
+        "command_min_V": _finite(command.min()),
+        "command_max_V": _finite(command.max()),
         "noise_um": loop.noise_um,
+        "resolution_um": loop.resolution_um,
         "remarks": said,
     }
 
 
-def _gains(controller: AbstractController) -> dict[str, Any]:
-    return {path: value.tolist() for path, value in parameter_values(controller).items()}
+def _gains(made: Made) -> dict[str, Any]:
+    values = printed_gains(made.controller, made.pid)
+    return {path: jax.tree.map(_finite, value.tolist()) for path, value in values.items()}
 
 
 def _finite(value: Any) -> float | None:
     return float(value) if math.isfinite(float(value)) else None
+
+
+def _rms(values: np.ndarray) -> float:
+    """Root mean square, of numbers whose squares overflow, too."""
+    largest = float(np.abs(values).max())
+    return largest * float(np.sqrt(np.mean((values / largest) ** 2))) if 0 < largest < math.inf else largest
 
 
 def _margins(found: Margins) -> dict[str, Any]:
@@ -100,11 +109,11 @@ def _worst(every: Sequence[Margins]) -> dict[str, Any]:
 def _tuning(found: Tuning[Any]) -> dict[str, Any]:
     return {
         "converged": found.converged,
-        "cost_before_um": found.cost_before_um,
-        "cost_after_um": found.cost_after_um,
+        "cost_before_um": _finite(found.cost_before_um),
+        "cost_after_um": _finite(found.cost_after_um),
         "plants": len(found.plants),
-        "error_rms_um": [one.error_rms_um for one in found.plants],
-        "overshoot_pct": [one.overshoot_pct for one in found.plants],
+        "error_rms_um": [_finite(one.error_rms_um) for one in found.plants],
+        "overshoot_pct": [_finite(one.overshoot_pct) for one in found.plants],
     }
 
 
@@ -112,8 +121,8 @@ def _tracking(wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any]:
     error = wanted_um - moved_um
     shares = tracking_errors(jnp.asarray(wanted_um), jnp.asarray(moved_um))
     return {
-        "error_rms_um": float(np.sqrt(np.mean(error**2))),
-        "error_max_um": float(np.abs(error).max()),
+        "error_rms_um": _finite(_rms(error)),
+        "error_max_um": _finite(np.abs(error).max()),
         "e_rms_pct": _finite(shares.e_rms_pct),
         "e_max_pct": _finite(shares.e_max_pct),
     }
@@ -160,7 +169,7 @@ def describe_control(summary: Mapping[str, Any]) -> str:
         tuning = summary["tuning"]
         how = "converged" if tuning["converged"] else "not converged"
         lines.append(
-            f"tuning      cost {tuning['cost_before_um']:.4g} to {tuning['cost_after_um']:.4g} um over "
+            f"tuning      cost {_said(tuning['cost_before_um'])} to {_said(tuning['cost_after_um'])} um over "
             f"{tuning['plants']} plants, {how}"
         )
     lines.append(
@@ -172,22 +181,23 @@ def describe_control(summary: Mapping[str, Any]) -> str:
         lines.append(f"  without   {_tracked(summary['without_feedback'])}")
     if summary["step"] is not None:
         step = summary["step"]
+        time_s = step["settling_time_s"]
+        settled = "not settled within the record" if time_s is None else f"settled in {time_s:.4g} s"
         lines.append(
-            f"step        settled in {_said(step['settling_time_s'])} s, overshoot {_said(step['overshoot_pct'])} %, "
+            f"step        {settled}, overshoot {_said(step['overshoot_pct'])} %, "
             f"positioning error {_said(step['positioning_error_pct'])} %"
         )
-    lines.append(f"command     {summary['command_min_V']:.5g} to {summary['command_max_V']:.5g} V")
+    lines.append(f"command     {_said(summary['command_min_V'])} to {_said(summary['command_max_V'])} V")
     lines += [f"Note: {remark}" for remark in summary["remarks"]]
     lines += [f"run         {summary['out']}", *(f"plot        {place}" for place in summary["plots"])]
     return "\n".join(lines)
 
 
 def _tracked(found: Mapping[str, Any]) -> str:
-    return (
-        f"rms {found['error_rms_um']:.4g} um ({_said(found['e_rms_pct'])} %), at most {found['error_max_um']:.4g} um "
-        f"({_said(found['e_max_pct'])} %)"
-    )
+    # A reference that stands still has no range to count in.
+    shares = ["" if found[name] is None else f" ({found[name]:.4g} %)" for name in ("e_rms_pct", "e_max_pct")]
+    return f"rms {_said(found['error_rms_um'])} um{shares[0]}, at most {_said(found['error_max_um'])} um{shares[1]}"
 
 
 def _said(value: float | None) -> str:
-    return "unlimited" if value is None else f"{value:.4g}"
+    return "unlimited" if value is None else f"{value:.5g}"

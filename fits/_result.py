@@ -26,7 +26,7 @@ class FitStatus(enum.Enum):
 
 
 class FitError(RuntimeError):
-    """A fit failed; it has no answer to give.
+    """A fit, or a tuning, failed; it has no answer to give.
 
     Attributes
     ----------
@@ -34,8 +34,8 @@ class FitError(RuntimeError):
         Why, and what to do.
     """
 
-    def __init__(self, status: FitStatus, detail: str = ""):
-        super().__init__(f"the fit failed: {status.value}{f' ({detail})' if detail else ''}")
+    def __init__(self, status: FitStatus, detail: str = "", what: str = "fit"):
+        super().__init__(f"the {what} failed: {status.value}{f' ({detail})' if detail else ''}")
         self.status = status
 
 

@@ -120,7 +120,8 @@ def tune_controller(
     figures, over, cost = judge(problem, origin)
     if not np.all(np.asarray(figures.stable)):
         which = np.flatnonzero(~np.asarray(figures.stable)) + 1
-        raise FitError(FitStatus.UNSTABLE, f"at the start, with plant {', '.join(map(str, which))} of {len(stages)}")
+        detail = f"at the start, with plant {', '.join(map(str, which))} of {len(stages)}"
+        raise FitError(FitStatus.UNSTABLE, detail, "tuning")
     progress(f"start: cost {float(cost):.4g} um, {_said(over)}")
     first = _worst(over)
     rng, ends = np.random.default_rng(seed), []
@@ -131,14 +132,15 @@ def tune_controller(
     kept = [end for end in ends if end.kept]
     if not kept:
         nearest = min(ends, key=lambda end: _worst(end.over)[0])
-        raise FitError(FitStatus.LIMITS, _said(nearest.over))
+        raise FitError(FitStatus.LIMITS, _said(nearest.over), "tuning")
     best = min(kept, key=lambda end: end.cost_um)
     remarks = []
     if first[0] > _TOLERANCE:
         remarks.append(f"the controller at the start was beyond a limit ({_said(over)}), so its cost is no bound")
     elif best.cost_um > float(cost) * (1 - 1e-9) or float(jnp.max(jnp.abs(best.y))) < _TOLERANCE:
         if not best.converged or best.cost_um > float(cost) * (1 + _TOLERANCE):
-            raise FitError(FitStatus.NOT_STATIONARY, "no search found better gains than those at the start")
+            detail = "no search found better gains than those at the start"
+            raise FitError(FitStatus.NOT_STATIONARY, detail, "tuning")
         remarks.append("the gains at the start were already as good as any near them")
     if not best.converged:
         remarks.append("the search stopped before the slope of the cost was nothing: other starts may do better")

@@ -27,6 +27,8 @@ REACH = 6.0
 _ABSURD = 1e9
 # Roots have no derivative at zero; a picometre is nothing.
 _TINY_um2 = 1e-12
+# A reference that covers less than this stands still.
+NO_RANGE_um = 1e-6
 _RTOL = _ATOL = 1e-4
 _FAR = 1e9
 _STEPS = 80
@@ -49,7 +51,8 @@ class Goal:
     gain_margin_min, phase_margin_min_deg, sensitivity_peak_max
         Of the linearised loop of every plant; see `microid.Margins`.
     overshoot_max_pct
-        Displacement beyond the range that the reference and the rest before it span, in percent of that range.
+        Displacement beyond the range that the reference and the rest before it span, in percent of that range; none
+        where they span nothing.
     command_max_V, command_min_V
         Limits of the command, short of where the controller cuts it off.
     command_step_max_V
@@ -234,9 +237,12 @@ def _run(
     low = jnp.minimum(jnp.min(reference), run.displacement_um[0])
     high = jnp.maximum(jnp.max(reference), run.displacement_um[0])
     beyond = jnp.maximum(run.displacement_um - high, low - run.displacement_um)
+    moves = high - low > NO_RANGE_um
+    # Both arms are finite: a quotient by zero would leave no derivative, whichever arm is taken.
+    overshoot = jnp.where(moves, 100 * jnp.maximum(jnp.max(beyond), 0) / jnp.where(moves, high - low, 1), 0)
     extremes = (
         jnp.max(problem.counts * jnp.abs(run.error_um)),
-        100 * jnp.maximum(jnp.max(beyond), 0) / (high - low),
+        overshoot,
         jnp.min(run.command_V),
         jnp.max(run.command_V),
         jnp.max(jnp.abs(rate)),

@@ -27,6 +27,10 @@ def compiled_fast():
     jax.config.update("jax_disable_most_optimizations", before)
 
 
+GIVEN = ("--gains", "0.5,80,1e-3")
+LIVELY = ("--gains", "0.5,1700,1e-3", "--feedforward", "none")
+
+
 def write(path, time_s, displacement_um):
     rows = [f"{t!r},{x!r}" for t, x in zip(time_s.tolist(), displacement_um.tolist(), strict=True)]
     path.write_text("\n".join(["time_s,displacement_um", *rows]) + "\n")
@@ -129,6 +133,17 @@ def test_a_tuned_loop_follows_better_than_its_start_and_says_what_noise_hides(fo
     assert told["without_feedback"]["error_rms_um"] < 0.1
     words = [line for line in result.stderr.splitlines() if "cost" in line]
     assert len(words) == 2
+    # The tuned controller, its filter included, is what --json printed.
+    assert told["gains"]["filter_s"] > 0
+    (tmp_path / "gains.json").write_text(result.stdout)
+    again = run(
+        *("control", folder / "linear.json", folder / "sine.csv", "--out", tmp_path / "again.csv", "--json"),
+        *(*options, "--feedforward", "dynamic", "--gains", tmp_path / "gains.json"),
+    )
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "again.csv").read_text() == (tmp_path / "r.csv").read_text()
+    assert json.loads(again.stdout)["gains"] == told["gains"]
+    assert json.loads(again.stdout)["margins"] == told["margins"]
 
 
 @pytest.mark.parametrize("kind", ["bp-pid", "cmac-pid", "resonant"])
@@ -148,6 +163,22 @@ def test_the_other_controllers_run_on_a_hysteresis(folder, tmp_path, kind):
         assert float(remark.split("at ")[1].split(" Hz")[0]) == pytest.approx(25, abs=0.5)
     else:
         assert any("before it learns" in remark for remark in told["remarks"])
+    # What is printed, changed here and there, is what runs and is printed again.
+    assert told["gains"]["pid.proportional_V_per_um"] == 0.2
+    own = {"resonant": "lead_deg", "bp-pid": "network.hidden_weight", "cmac-pid": "learning_rate"}[kind]
+    changed = np.asarray(told["gains"][own]) * 0.9
+    told["gains"] |= {"pid.filter_s": 2e-3, own: changed.tolist()} | ({"filter_s": 2e-3} if kind == "bp-pid" else {})
+    (tmp_path / "gains.json").write_text(json.dumps(told))
+    for name in ("second", "third"):
+        result = run(
+            *("control", folder / "loop.json", folder / "sine.csv", "--out", tmp_path / f"{name}.csv", "--json"),
+            *("--controller", kind, "--gains", tmp_path / "gains.json"),
+        )
+        assert result.exit_code == 0, result.output
+        assert json.loads(result.stdout)["gains"] == told["gains"]
+        (tmp_path / "gains.json").write_text(result.stdout)
+    assert (tmp_path / "second.csv").read_text() == (tmp_path / "third.csv").read_text()
+    assert (tmp_path / "second.csv").read_text() != (tmp_path / "r.csv").read_text()
 
 
 @pytest.mark.parametrize(
@@ -160,6 +191,13 @@ def test_the_other_controllers_run_on_a_hysteresis(folder, tmp_path, kind):
         ("dahl.json", "step.csv", [], ["Dahl", "no form for single samples"]),
         ("loop.json", "sine.csv", ["--feedforward", "dynamic"], ["dynamic", "hysteresis alone"]),
         ("loop.json", "sine.csv", ["--limits", "0,500"], ["--limits"]),
+        ("linear.json", "step.csv", ["--limits", "60,10"], ["--limits: expected", "60,10"]),
+        ("linear.json", "step.csv", ["--limits", "nan,60"], ["--limits: expected", "nan,60"]),
+        ("linear.json", "step.csv", ["--resolution", "1e-320"], ["--resolution"]),
+        ("linear.json", "step.csv", [*GIVEN, "--gain-margin", "90"], ["--gain-margin: expected a gain margin of 90"]),
+        ("linear.json", "step.csv", [*GIVEN, "--peak", "1.01"], ["--peak: expected a peak"]),
+        ("linear.json", "step.csv", [*GIVEN, "--phase-margin", "170"], ["--phase-margin: expected a phase margin"]),
+        ("linear.json", "step.csv", [*LIVELY, "--overshoot", "1"], ["--overshoot: expected an overshoot of 1 %"]),
         ("linear.json", "step.csv", ["--noise", "-1"], ["--noise"]),
         ("linear.json", "step.csv", ["--resolution", "0"], ["--resolution"]),
         ("linear.json", "step.csv", ["--gain-margin", "0.5"], ["--gain-margin"]),
@@ -176,6 +214,12 @@ def test_the_other_controllers_run_on_a_hysteresis(folder, tmp_path, kind):
             ["--controller", "resonant", "--gains", "1,1,0", "--frequency", "900"],
             ["--frequency", "500 Hz"],
         ),
+        (
+            "linear.json",
+            "sine.csv",
+            ["--controller", "resonant", "--gains", "1,1,0", "--frequency", "25", "--frequency", "25"],
+            ["--frequency", "alike"],
+        ),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_one_sentence(folder, tmp_path, model, reference, options, words):
@@ -188,3 +232,64 @@ def test_inputs_are_not_overwritten(folder):
     before = (folder / "step.csv").read_text()
     refused(run("control", folder / "linear.json", folder / "step.csv", "--out", folder / "step.csv"), "overwrite")
     assert (folder / "step.csv").read_text() == before
+
+
+def test_gains_are_not_overwritten_either(folder, tmp_path):
+    (tmp_path / "pid.json").write_text('{"proportional_V_per_um": 1, "integral_V_per_um_s": 1}')
+    places = ["control", folder / "linear.json", folder / "step.csv", "--gains", tmp_path / "pid.json"]
+    refused(run(*places, "--out", tmp_path / "pid.json"), "overwrite")
+    assert "proportional" in (tmp_path / "pid.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("more", "word"),
+    [
+        ({}, "derivative_V_s_per_um"),
+        ({"derivative_V_s_per_um": True}, "with numbers"),
+        ({"derivative_V_s_per_um": [1, 2]}, "one number"),
+        ({"derivative_V_s_per_um": 0, "filter": 1e-3}, "filter is no parameter"),
+        ({"derivative_V_s_per_um": 0, "filter_s": -1e-3}, "filter_s of 0 or more"),
+        ({"derivative_V_s_per_um": 0, "frequency_Hz": [25]}, "resonant_V_per_um_s"),
+    ],
+)
+def test_files_of_gains_are_read_with_care(folder, tmp_path, more, word):
+    gains = {"proportional_V_per_um": 0.5, "integral_V_per_um_s": 1} | more
+    (tmp_path / "pid.json").write_text(json.dumps({"gains": gains}))
+    places = ["control", folder / "linear.json", folder / "sine.csv", "--gains", tmp_path / "pid.json"]
+    refused(run(*places, "--controller", "resonant", "--out", tmp_path / "r.csv"), word)
+
+
+def test_what_is_to_blame_comes_first(folder, tmp_path):
+    for more, first in ((["--limits", "9,1"], "--limits"), ([], "uneven.csv")):
+        result = run("control", folder / "linear.json", folder / "uneven.csv", "--out", tmp_path / "r.csv", *more)
+        assert result.stderr.startswith(f"{first}:")
+
+
+@pytest.mark.parametrize("options", [["--delay", "1500"], ["--seed", "9" * 26]])
+def test_numbers_that_are_far_too_large_are_refused(folder, tmp_path, options):
+    result = run("control", folder / "linear.json", folder / "step.csv", "--out", tmp_path / "r.csv", *options)
+    assert result.exit_code == 2
+    assert options[0] in result.stderr
+
+
+def test_a_default_limit_that_given_gains_pass_is_said(folder, tmp_path):
+    places = ["control", folder / "linear.json", folder / "step.csv", "--out", tmp_path / "r.csv"]
+    result = run(*places, *LIVELY, "--resolution", "1e6")
+    assert result.exit_code == 0, result.output
+    assert "passed: expected a gain margin of 2 or more" in result.stdout
+    assert "not settled within the record" in result.stdout
+    assert "unlimited s" not in result.stdout
+    assert "below the sensor's resolution" in result.stdout
+
+
+def test_references_that_stand_still_or_overflow_are_told_of(folder, tmp_path):
+    at = T * np.arange(SAMPLES)
+    write(tmp_path / "still.csv", at, np.full(SAMPLES, 5.0))
+    write(tmp_path / "huge.csv", at, 1e300 * np.sin(2 * np.pi * 25 * at))
+    still = run("control", folder / "linear.json", tmp_path / "still.csv", "--out", tmp_path / "r.csv", *GIVEN)
+    assert still.exit_code == 0, still.output
+    assert "(unlimited" not in still.stdout
+    for more in ([], ["--json"]):
+        places = ["control", folder / "linear.json", tmp_path / "huge.csv", "--out", tmp_path / "r.csv"]
+        huge = run(*places, *GIVEN, *more)
+        assert huge.exit_code == 0, huge.output

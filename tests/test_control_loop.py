@@ -314,6 +314,18 @@ def test_step_metrics_are_those_of_a_second_order_system(rng):
     assert float(c.step_metrics(at[:100], curve[:100], 1.0, band_pct=1e-9).settling_time_s) == np.inf
 
 
+def test_what_has_not_settled_overshoots_its_target_and_not_the_mean_of_its_end():
+    """A sine about 5 that ends above its band: beyond a target of 4, from 1 on, is 2 of 3 um."""
+    at = np.linspace(0, 10.2, 1021)
+    found = c.step_metrics(at, 5 + np.sin(2 * np.pi * at), 4.0, 1.0)
+    assert float(found.settling_time_s) == np.inf
+    assert float(found.overshoot_pct) == pytest.approx(100 * 2 / 3, rel=1e-9)
+    creeping = c.step_metrics(at, 4 * at / 10.2, 5.0)
+    still = c.step_metrics(at, np.full_like(at, 1.0), 5.0, 1.0)
+    for one in (creeping, still):
+        assert (float(one.settling_time_s), float(one.overshoot_pct)) == (np.inf, 0)
+
+
 def test_positioning_errors_are_those_of_table_2():
     for value, pct in ((6.429, 2.78), (6.488, 1.89), (6.542, 1.07), (6.601, 0.18)):
         found = c.step_metrics(np.arange(9.0), np.full(9, value), 6.613)

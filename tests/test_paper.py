@@ -120,20 +120,24 @@ def test_tables_by_hand():
     result = PaperResult(seed=3, seeds=3, assumed=["Nothing."])
     result.table3 = {
         "OPEN": {"e_max_pct": Measured(18.22, np.array([19.0, 18.9, 18.8]))},
-        "HC": {"e_max_pct": Measured(5.46, np.array([5.0, 6.0, 5.5]), np.array([7.0, 8.0, 9.0]))},
+        "HC": {"e_max_pct": Measured(5.46, np.array([5.0, 6.0, 5.5]), np.array([7.0, 8.0, 9.0]), True)},
         "HC+PID": {"e_max_pct": Measured(2.91, np.array([1.0, 2.914, 4.0]))},
     }
     result.table2 = {"HC+PID": {"settling_time_s": Measured(0.68, np.array([np.inf, np.inf, 0.1]))}}
     content = paper_json(result)
-    assert content["table3"]["HC"]["e_max_pct"] == {"paper": 5.46, "ours": 5.5, "spread": 1.0}
-    assert content["table2"]["HC+PID"]["settling_time_s"] == {"paper": 0.68, "ours": None, "spread": None}
+    assert content["table3"]["HC"]["e_max_pct"] == {
+        **{"paper": 5.46, "ours": 5.5, "spread": 1.0},
+        "below_sensor": True,
+    }
+    settling = {"paper": 0.68, "ours": None, "spread": None, "below_sensor": False}
+    assert content["table2"]["HC+PID"]["settling_time_s"] == settling
     assert content["worse_than_paper"] == ["Table 2, HC+PID: settling_time_s", "Table 3, HC: e_max_pct"]
     assert content["beside"] == [{"where": "Table 3", "scheme": "HC", "figure": "e_max_pct", "ours": 8.0}]
     json.dumps(content, allow_nan=False)
     page = paper_page(result, [("A loop", "loop.png")])
-    assert "| HC | e_max (%) | 5.46 | 5.5 | 1 | 1.007 | 8 | worse |" in page
-    assert "| OPEN | e_max (%) | 18.22 | 18.9 | 0.2 | 1.037 |  | calibrated |" in page
-    assert "| HC+PID | e_max (%) | 2.91 | 2.914 | 3 | 1.001 |  | no worse |" in page
+    assert "| HC | e_max (%) | 5.46 | 5.5 | 1 | 1.007 | 8 | worse | yes |" in page
+    assert "| OPEN | e_max (%) | 18.22 | 18.9 | 0.2 | 1.037 |  | calibrated |  |" in page
+    assert "| HC+PID | e_max (%) | 2.91 | 2.914 | 3 | 1.001 |  | no worse |  |" in page
     assert "![A loop](loop.png)" in page
     assert "- Nothing." in page
 
@@ -198,13 +202,35 @@ def test_the_file_has_the_schema(short):
         name: list(row) for name, row in SHORT["table2"].items()
     }
     figures = [figure for table in ("table2", "table3") for row in content[table].values() for figure in row.values()]
-    assert all(set(figure) == {"paper", "ours", "spread"} for figure in figures)
+    assert all(set(figure) == {"paper", "ours", "spread", "below_sensor"} for figure in figures)
     assert content["seeds"] == 2
     names = files(out)
     assert {"paper.md", "paper.json", "fig6.png", "fig9.png", "fig10.png", "fig11.png", "fig12.png"} == set(names)
     page = (out / "paper.md").read_text()
     assert set(re.findall(r"\]\((.*?)\)", page)) == {name for name in names if name.endswith(".png")}
     assert "tracking along x, HC+CMAC-PID" in result.stderr
+
+
+def test_errors_below_the_sensors_last_digit_say_so(short):
+    """100 nm are 5 % of 2 um, and 1.51 % of a step of 6.613 um."""
+    _, _, content = short
+    flags = {
+        (table, scheme, name): (figure["ours"], figure["below_sensor"])
+        for table in ("table2", "table3")
+        for scheme, row in content[table].items()
+        for name, figure in row.items()
+    }
+    for (table, scheme, name), (ours, below) in flags.items():
+        if name == "settling_time_s":
+            expected = False
+        elif name == "settling_value_um":
+            expected = abs(ours - 6.613) < 0.1
+        else:
+            expected = ours < (0.1 / 6.613 * 100 if table == "table2" else 5)
+        assert below is expected, (table, scheme, name)
+    assert flags["table3", "HC+CMAC-PID", "e_max_pct"][1]
+    assert not flags["table3", "OPEN", "e_rms_pct"][1]
+    assert not flags["table2", "HC", "overshoot_pct"][1]
 
 
 def test_rows_are_called_worse_that_are(short):
@@ -228,6 +254,7 @@ def test_rows_are_called_worse_that_are(short):
         (["--out", "taken.txt/below"], "--out"),
         (["--out", "new", "--seeds", "0"], "--seeds"),
         (["--out", "new", "--seed", "-1"], "--seed"),
+        (["--out", "new", "--seed", "9" * 26], "--seed"),
         ([], "--out"),
     ],
 )
@@ -254,3 +281,32 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
     result = run("paper", "--out", tmp_path / "out", "--quiet")
     assert (result.exit_code, result.stdout) == (130, "")
     assert files(tmp_path) == []
+
+
+@pytest.mark.slow
+def test_all_of_it_is_no_worse_than_the_paper_but_where_it_is_known_to_be(tmp_path, seed):
+    """Each scheme, axis and picture once, against what the paper prints."""
+    result = run("paper", "--out", tmp_path / "out", "--seeds", 1, "--seed", seed % 2**32, "--quiet")
+    assert result.exit_code == 0, result.stderr
+    content = json.loads((tmp_path / "out" / "paper.json").read_text())
+    known = {f"Table 4, gamma, HC: {name}" for name in ("e_max_pct", "e_rms_pct")}
+    # In single seeds the CMAC's largest error along X, Y is 0.5 to 0.8 %, about the paper's.
+    near = {"Table 3, HC+CMAC-PID: e_max_pct"}
+    assert set(content["worse_than_paper"]) <= known | near
+    assert "Table 4, gamma, HC: e_max_pct" in content["worse_than_paper"]
+    printed = {"z": (1.77, 0.95), "alpha": (6.97, 3.06), "gamma": (19.02, 7.32)}
+    rows = {axis: content["table4"][axis]["HC+CMAC-PID"] for axis in printed}
+    for axis, (most, rms) in printed.items():
+        assert rows[axis]["e_max_pct"]["ours"] < most / 1.5
+        assert rows[axis]["e_rms_pct"]["ours"] < rms / 2
+        assert content["table4"][axis]["OPEN"]["e_max_pct"]["ours"] == pytest.approx(
+            PAPER["table4"][axis]["OPEN"]["e_max_pct"], rel=0.05
+        )
+    network = content["table2"]["HC+BP-PID"]
+    assert network["settling_time_s"]["ours"] < 0.46
+    assert network["overshoot_pct"]["ours"] < 0.005
+    assert network["positioning_error_pct"]["ours"] < 1.07
+    assert content["table3"]["HC+BP-PID"]["e_max_pct"]["ours"] < 1.07
+    assert content["table3"]["HC+BP-PID"]["e_rms_pct"]["ours"] < 0.62
+    # What the table has learnt in the runs before is what the other controllers lack.
+    assert content["table3"]["HC+CMAC-PID"]["e_rms_pct"]["ours"] < content["table3"]["HC+PID"]["e_rms_pct"]["ours"]

@@ -209,12 +209,12 @@ def test_loops_that_are_unstable_and_limits_that_cannot_be_kept_are_refused(tune
     plants, reference, noise, pid, _, result, _ = tuned
     stages = [stage_of(*one) for one in plants]
     wild = eqx.tree_at(lambda p: p.integral_V_per_um_s, pid, 100 * pid.integral_V_per_um_s)
-    with pytest.raises(fits.FitError, match="at the start, with plant 1, 2, 3 of 3") as caught:
+    with pytest.raises(fits.FitError, match=r"^the tuning failed: .*at the start, with plant 1, 2, 3 of 3") as caught:
         fits.tune_controller(wild, stages, reference, noise_um=noise)
     assert caught.value.status is fits.FitStatus.UNSTABLE
     # Every run begins with a command of next to nothing.
     goal = Goal(command_min_V=50.0, command_max_V=60.0)
-    with pytest.raises(fits.FitError) as caught:
+    with pytest.raises(fits.FitError, match=r"^the tuning failed") as caught:
         fits.tune_controller(result.controller, stages, reference, goal=goal, noise_um=noise, starts=1)
     assert caught.value.status is fits.FitStatus.LIMITS
     for words, change in (
@@ -240,6 +240,17 @@ def test_an_integral_controller_of_a_gain_is_that_of_the_closed_form(rng):
     assert result.converged
     assert any("gain_margin_min" in remark for remark in result.remarks)
     assert set(result.gains) == {"integral_V_per_um_s"}
+
+
+def test_a_reference_that_stands_still_can_be_tuned_for(rng):
+    """It has no range to overshoot; what is left of the error is the noise that the controller lets through."""
+    stage, noise = m.Stage.of(piezo=m.Piezo(0.2)), rng.normal(0, 0.1, 60)
+    pid = c.PID(0.0, 0.5 / (T * 0.2), 0.0, T)
+    result = fits.tune_controller(
+        pid, stage, np.zeros(60), goal=Goal(overshoot_max_pct=1.0), noise_um=noise, starts=1
+    )
+    assert result.cost_after_um < result.cost_before_um
+    assert result.plants[0].overshoot_pct == 0
 
 
 def test_plants_are_drawn_with_the_covariance_of_the_fit(rng):

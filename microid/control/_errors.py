@@ -41,9 +41,10 @@ class StepMetrics(eqx.Module):
     ----------
     settling_time_s
         From the step to the first sample from which on the displacement stays within the band; `inf` if the last
-        sample is outside.
+        sample is outside, or nothing has moved.
     overshoot_pct
-        Largest displacement beyond the settling value, in percent of the way to it.
+        Largest displacement beyond the settling value, in percent of the way to it; where it has not settled, beyond
+        the target, in percent of the step: the mean over the end of a motion that goes on is no place to count from.
     settling_value_um
         Mean over the end of the record.
     positioning_error_pct
@@ -88,13 +89,15 @@ def step_metrics(
     settled = jnp.mean(displacement_um[-count:])
     way, step = settled - start_um, target_um - start_um
     beyond = (displacement_um - settled) / way
-    outside = jnp.abs(beyond) > band_pct / 100
+    past_target = (displacement_um - target_um) / step
+    # Without a way there is no quotient, and no band to be within.
+    outside = ~(jnp.abs(beyond) <= band_pct / 100)
     index = jnp.arange(outside.shape[0], dtype=jnp.int32)
     first = jnp.max(jnp.where(outside, index + 1, 0))
     last = time_s[jnp.minimum(first, index[-1])] - time_s[0]
     return StepMetrics(
         jnp.where(outside[-1], jnp.inf, last),
-        100 * jnp.maximum(jnp.max(beyond), 0),
+        100 * jnp.maximum(jnp.max(jnp.where(outside[-1], past_target, beyond)), 0),
         settled,
         100 * jnp.abs(target_um - settled) / jnp.abs(step),
     )
