@@ -109,7 +109,7 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
     if not isinstance(table, dict):
         raise DataError(f"{name}: expected a table, found {table!r}; write [{name}] and its keys below.")
     shape = table.get("shape", "file" if "file" in table else None)
-    if shape not in SHAPES:
+    if not isinstance(shape, str) or shape not in SHAPES:
         raise DataError(f"{name}.shape: expected one of {', '.join(SHAPES)}, found {shape!r}; choose one.")
     own = [f"offset_{unit}", f"amplitude_{unit}", *SHAPES[shape]]
     known = ["shape", "samples", "interval_s", *own]
@@ -156,7 +156,10 @@ def _read_displacement(path: Path) -> tuple[FloatArray, FloatArray]:
 
 def number(found: Any, place: str) -> float:
     """A finite number, or a `DataError` that begins with its place."""
-    value = float(found) if isinstance(found, int | float) and not isinstance(found, bool) else math.nan
+    try:
+        value = float(found) if isinstance(found, int | float) and not isinstance(found, bool) else math.nan
+    except OverflowError:
+        value = math.inf
     if not math.isfinite(value):
         raise DataError(f"{place}: expected a finite number, found {found!r}; give one without quotes.")
     return value
