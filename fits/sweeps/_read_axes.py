@@ -181,7 +181,7 @@ def _values(entry: Mapping[str, Any], place: str, factor: float) -> np.ndarray |
         raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {count!r}.")
     if count > _LONGEST:
         raise DataError(
-            f"{place}.count: expected up to {_LONGEST:,} values, found more; leave out count and draw them by [design]."
+            f"{place}.count: expected up to {_LONGEST:,} values, found more; leave out count and add [design]."
         )
     return np.geomspace(low, high, count) if spacing == "log" else np.linspace(low, high, count)
 

@@ -41,6 +41,8 @@ class Sweep:
         Its rows, and what is done with each.
     memory_MB, chunk_rows
         What a chunk may take, and the rows of one if they are stated.
+    folder
+        Where its sources are.
     """
 
     text: str
@@ -53,11 +55,17 @@ class Sweep:
     facts: Facts
     memory_MB: float
     chunk_rows: int | None
+    folder: Path | None = None
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the text, all files and the names of all sources: what the rows depend on."""
-        parts: list[str | bytes] = [self.text, *self.facts.sources]
+        """SHA-256 of the text, all files, and the names and contents of all sources: what the rows depend on.
+
+        It is made anew each time, as sources may have changed; one that cannot be read counts as such.
+        """
+        parts: list[str | bytes] = [self.text]
+        for source in self.facts.sources:
+            parts += [source, _sum_of((self.folder or Path()) / source)]
         parts += [part for name in sorted(self.inputs) for part in (name, self.inputs[name])]
         sums = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
         return hashlib.sha256("".join(sums).encode()).hexdigest()
@@ -146,7 +154,15 @@ def _sweep(
     factors = tuple(axis.parameter for axis in plan.axes if axis.relative)
     if set(factors) != set(relative):
         job = KINDS[kind].make(Request(table, names, factors, load, folder))
-    return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows)
+    return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows, folder)
+
+
+def _sum_of(path: Path) -> str:
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return "unreadable"
 
 
 def _run_options(table: Any) -> tuple[float, int | None]:
