@@ -238,3 +238,20 @@ def test_changed_records_are_noticed(tmp_path, monkeypatch):
     (tmp_path / "b.csv").write_text("time_s,voltage_V,displacement_um\n0,1,3\n")
     with pytest.raises(DataError, match="other files"), opened(sweep, str(out), True):
         pass
+
+
+def test_a_checkout_is_told_from_others(monkeypatch):
+    from importlib.metadata import PackageNotFoundError
+
+    from fits.sweeps import _versions
+
+    def version(name):
+        if name == "microid":
+            raise PackageNotFoundError(name)
+        return "1"
+
+    monkeypatch.setattr(_versions, "version", version)
+    before = _versions.versions.__wrapped__()["microid"]
+    assert before.startswith("checkout ")
+    monkeypatch.setattr(_versions.Path, "read_bytes", lambda path: b"other")
+    assert _versions.versions.__wrapped__()["microid"] != before

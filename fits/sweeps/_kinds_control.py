@@ -100,7 +100,8 @@ class ControlJob(AbstractJob):
         """Run one block of loops; see `AbstractJob.compute`."""
         del sources, seed
         with jax.default_device(device_of(rows)):
-            table = jnp.asarray(table_of(values, self._names, len(rows)))
+            settings = table_of(values, self._names, len(rows))
+            table = jnp.asarray(settings)
             wanted = drive(table, self._names, self._reference, self._given)
             found = _control(
                 self._stage,
@@ -117,7 +118,7 @@ class ControlJob(AbstractJob):
         # Eigenvalues of general matrices are found on CPUs.
         with jax.default_device(jax.local_devices(backend="cpu")[0]):
             outputs["pole_radius"] = np.asarray(
-                _radius(self._stage, self._pid, np.asarray(table), self._names, self._relative, self._delay)
+                _radius(self._stage, self._pid, jnp.asarray(settings), self._names, self._relative, self._delay)
             )
         moved = np.ptp(np.asarray(wanted), axis=1)
         way = np.maximum(moved, np.abs(outputs.pop("from_um")))
