@@ -180,9 +180,9 @@ def _all(
         usable = workers.usable()
         while waiting and len(futures) < _AHEAD * sum(usable.values()):
             chunk = waiting.pop()
-            future = client.submit(
-                work, payload, chunk, pure=False, workers=[*usable] if workers.banned else None, retries=0
-            )
+            # Should all of them die, others may have it: those that are refused give it back.
+            chosen = {"workers": [*usable], "allow_other_workers": True} if workers.banned else {}
+            future = client.submit(work, payload, chunk, pure=False, retries=0, **chosen)
             futures[future] = chunk
             results.add(future)
         asked = time.monotonic()

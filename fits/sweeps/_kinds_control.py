@@ -129,7 +129,7 @@ def _why_not(way_um: float, radius: float, error_pct: float) -> str:
     if not way_um > _STILL_um:
         return "the reference does not move"
     if radius >= 1:
-        return f"the loop is unstable: its largest pole has modulus {radius:.6g} at the hysteresis' steepest slope"
+        return f"the loop is unstable where the hysteresis is steepest: modulus of its largest pole = {radius:.6g}"
     if not error_pct < _LOST_PCT:
         return "the loop is unstable: its error grows without end"
     return ""
