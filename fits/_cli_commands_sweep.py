@@ -10,13 +10,11 @@ from fits._cli_common import in_sentences, json_output, quiet
 class _Sweep(click.Group):
     """A group whose first word may also be a file."""
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Take what is no command for the file of a sweep."""
-        if args and args[0] not in self.commands:
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Take what is no command and no option of the group for the file of a sweep and its options."""
+        if args and args[0] not in self.commands and args[0].partition("=")[0] not in ("--example", "--help", "-h"):
             args = ["run", *args]
-        return super().resolve_command(ctx, args)
+        return super().parse_args(ctx, args)
 
 
 @click.group(cls=_Sweep, invoke_without_command=True, subcommand_metavar="SWEEP.toml | show DIR [OPTIONS]")

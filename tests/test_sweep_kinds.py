@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from _gain_formulas import gains, sizes
 from _sweeps import Relays, parsed, small
-from scipy.signal import StateSpace, lsim
+from scipy.signal import StateSpace, cont2discrete, lsim
 
 from fits import DataError
 from fits.sweeps._chunks import compute_chunk
@@ -87,6 +87,50 @@ def test_closed_loops_agree_with_a_loop_of_scipy_and_relays(rng):
         errors = closed_loop(nominal_stage(), integral, proportional, 80, 1e-3, 5.0)
         assert found["error_rms_um"][row] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=5e-3)
         assert found["error_final_um"][row] == pytest.approx(errors[-1], abs=0.03)
+
+
+def largest_pole(stage, integral, proportional, interval_s, slope_um_per_V):
+    """Of the loop of `closed_loop` with a slope in place of the relays, as a matrix from sample to sample."""
+    time_constant_s = float(stage["driver"].time_constant_s)
+    rate = 2 * np.pi * float(stage["mechanics"].natural_frequency_Hz)
+    damping = float(stage["mechanics"].damping_ratio)
+    plant = [
+        [-1 / time_constant_s, 0, 0],
+        [0, 0, 1],
+        [rate**2 * slope_um_per_V, -(rate**2), -2 * damping * rate],
+    ]
+    drive = np.array([[1 / time_constant_s], [0], [0]])
+    step, push, *_ = cont2discrete((np.array(plant), drive, np.eye(3), np.zeros((3, 1))), interval_s)
+    grow = integral * interval_s
+    # Three states of the plant, the late reading, the integral.
+    loop = np.zeros((5, 5))
+    loop[:3, :3], loop[:3, 3], loop[:3, 4] = step, -(grow + proportional) * push[:, 0], push[:, 0]
+    loop[3, 1], loop[4, 3], loop[4, 4] = 1, -grow, 1
+    return np.abs(np.linalg.eigvals(loop)).max()
+
+
+def test_loops_whose_largest_pole_is_outside_fail_and_others_do_not(rng):
+    import fits
+
+    stage = nominal_stage()
+    integral, proportional = rng.uniform(20, 4000, 8), rng.uniform(0, 3, 8)
+    integral[:2], proportional[:2] = (50, 3000), (0.1, 2.0)
+    found = compute_chunk(parsed(CONTROL.format(integral=integral.tolist(), proportional=proportional.tolist())), 0)
+    for row, gains_of in enumerate(zip(integral, proportional, strict=True)):
+        radius = largest_pole(stage, *gains_of, 1e-3, fits.steepest_slope(stage))
+        if radius < 1:
+            assert found.reasons[row] == ""
+            assert found.outputs["pole_radius"][row] == pytest.approx(radius, rel=1e-4)
+        else:
+            assert "unstable where the hysteresis is steepest" in found.reasons[row]
+            assert float(found.reasons[row].partition(" = ")[2]) == pytest.approx(radius, rel=1e-4)
+    assert found.outputs["status"][:2].tolist() == [1, 2]
+
+
+def test_references_that_stand_still_fail_with_that_reason():
+    text = CONTROL.format(integral=[50.0], proportional=[0.1])
+    found = compute_chunk(parsed(text.replace("amplitude_um = 5.0", "amplitude_um = 0.0")), 0)
+    assert found.reasons == ("the reference does not move",)
 
 
 def test_dimensions_agree_with_formulas_and_with_the_design_one_by_one(rng):

@@ -144,7 +144,7 @@ def test_a_corrupted_chunk_is_noticed_and_computed_again(finished, rng, how):
 
 
 KILLS = """
-import os, random, signal, sys, time, warnings
+import os, random, signal, sys, time, traceback, warnings
 import jax
 jax.config.update("jax_enable_x64", True)
 warnings.simplefilter("ignore")  # JAX warns of a fork; the children only write
@@ -155,6 +155,7 @@ toml, whole, out, seed = sys.argv[1:]
 kept, moments = pd.read_parquet(whole), random.Random(int(seed))
 
 def compute(sweep, chunk, tell):
+    time.sleep(0.05)  # so that some are killed while they compute
     part = kept.iloc[_chunks.rows_of(sweep, chunk)]
     outputs = {name: part[name].to_numpy() for name in kept.columns if name not in ("row", "reason")}
     return _chunks.Rows(outputs, tuple(part["reason"]))
@@ -166,19 +167,23 @@ def start(folder):
     if child == 0:
         try:
             _run.run_sweep(_spec.read_sweep(toml), folder, resume=os.path.exists(folder + "/about.json"))
-        finally:
-            os._exit(0)
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
     return child
 
 began = time.monotonic()
-os.waitpid(start(out + "-first"), 0)
+assert os.waitpid(start(out + "-first"), 0)[1] == 0
 longest = time.monotonic() - began
 killed = 0
 for _ in range(10):
     child = start(out)
     time.sleep(moments.uniform(0, longest))
     os.kill(child, signal.SIGKILL)
-    killed += os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    status = os.waitpid(child, 0)[1]
+    killed += os.WIFSIGNALED(status)
+    assert os.WIFSIGNALED(status) or os.WEXITSTATUS(status) == 0
 print(killed)
 """
 

@@ -13,21 +13,26 @@ from fits.sweeps._types import DONE, FAILED, Output, Rows
 # A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
 # Rows that go one by one are slow ones, of which few are to be lost.
 _PARTS, _LARGEST, _LARGEST_SLOW = 16, 65536, 4
+# More of one variable no codec takes at once.
+_LARGEST_BYTES = 2_000_000_000
+_REASON_LENGTH = 120
+REASON = Output("reason", "1", "why the row failed", dtype=f"U{_REASON_LENGTH}")
 
 
 def chunk_rows(sweep: Sweep) -> int:
-    """Rows of a chunk: whole blocks, as many as the memory allows."""
+    """Rows of a chunk: whole blocks, as many as the memory and the codec allow."""
     block, rows = sweep.facts.block, len(sweep.plan)
+    widest = max(output.bytes_per_row for output in (*sweep.facts.outputs, REASON))
+    most = max(1, min(-(-rows // block), _LARGEST_BYTES // (widest * block)))
     if sweep.chunk_rows is not None:
-        return block * -(-sweep.chunk_rows // block)
-    per_row = max(1, bytes_per_row(sweep))
-    fit = int(sweep.memory_MB * 1e6 / per_row)
-    wanted = min(fit, _LARGEST if block > 1 else _LARGEST_SLOW, max(1, rows // _PARTS))
+        return block * min(-(-sweep.chunk_rows // block), most)
+    fit = int(sweep.memory_MB * 1e6 / (bytes_per_row(sweep) + REASON.bytes_per_row))
+    wanted = min(fit, most * block, _LARGEST if block > 1 else _LARGEST_SLOW, max(1, rows // _PARTS))
     return block * max(1, min(wanted, rows) // block if wanted >= block else 1)
 
 
 def bytes_per_row(sweep: Sweep) -> int:
-    """What a row takes on disk and in a chunk, before compression."""
+    """What a row takes before compression, without the reason, of which compression leaves next to nothing."""
     return sum(output.bytes_per_row for output in sweep.facts.outputs) + 8 * len(sweep.plan.axes) + 1
 
 
@@ -86,7 +91,9 @@ def _block(sweep: Sweep, rows: NDArray[np.int64]) -> Rows:
     values = sweep.plan.values(padded)
     inside, refused = outside(sweep, values) if values else (values, [""] * len(padded))
     found = sweep.job.compute(inside, padded, sweep.plan.repeat_of(padded), sweep.seed)
-    reasons = tuple((why or reason)[:200] for why, reason in zip(refused, found.reasons, strict=True))[: len(rows)]
+    reasons = tuple((why or reason)[:_REASON_LENGTH] for why, reason in zip(refused, found.reasons, strict=True))[
+        : len(rows)
+    ]
     failed = np.array([bool(reason) for reason in reasons])
     outputs = {output.name: _kept(found, output, failed, len(rows)) for output in sweep.facts.outputs}
     outputs |= {name: value[: len(rows)] for name, value in values.items()}

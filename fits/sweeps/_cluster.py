@@ -1,9 +1,11 @@
 """The chunks of a sweep on Dask distributed: workers may die, join late, or be refused for their versions."""
 
+import importlib.util
 import logging
 import socket
+import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,9 @@ from fits.sweeps._versions import versions
 # Chunks that wait per thread of the workers, so that none is idle; and how often a chunk may lose its worker.
 _AHEAD, _LOSSES = 2, 5
 _CONNECT_s = 20
+_MOST_LOCAL = 1024
+# How long a scheduler without workers is waited for, without a word and at all; how often workers are looked for.
+_SILENT_s, _GIVE_UP_s, _LOOK_s, _PAUSE_s = 5, 600, 1.0, 0.005
 # What a worker has read stays with it.
 _SWEEPS: dict[str, Sweep] = {}
 
@@ -43,60 +48,123 @@ class _Answer:
     refused: str = ""
 
 
-def on_cluster(
-    sweep: Sweep, chunks: list[int], address: str, progress: Callable[[str], None]
-) -> Iterator[tuple[int, Rows]]:
-    """Compute chunks on the workers of a scheduler and give them back as they come.
+@contextmanager
+def connected(address: str) -> Iterator[Any]:
+    """Connect to a scheduler, and give its client.
 
     Parameters
     ----------
-    sweep, chunks
-        What is to be computed.
     address
         Of a scheduler, or `local:N` for N processes of this machine.
-    progress
-        Told of workers that are refused.
 
     Raises
     ------
     DataError
-        If there is no scheduler, it is lost, or no worker has the versions of this process.
+        If there is no scheduler.
     """
     distributed = need("distributed")
     # What it tells of a lost scheduler is told here in a sentence.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-    if not chunks:
-        return
+    count = address.removeprefix("local:")
+    if count != address and (not count.isdecimal() or not 1 <= int(count) <= _MOST_LOCAL):
+        raise DataError(f"--cluster: expected local:N with a number of processes, found {address!r}; write local:2.")
     with ExitStack() as stack:
         try:
-            client = _client(distributed, address, stack)
+            where = address
+            if count != address:
+                own = distributed.LocalCluster(
+                    n_workers=int(count), threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+                )
+                where = stack.enter_context(own).scheduler_address
+            client = stack.enter_context(distributed.Client(where, timeout=_CONNECT_s, set_as_default=False))
         except (OSError, TimeoutError, ValueError) as error:
             raise DataError(
                 f"--cluster: {address} does not answer ({error}); give the address of a Dask scheduler, such as "
                 "tcp://host:8786, or local:2."
             ) from None
-        try:
-            yield from _all(distributed, client, sweep, chunks, progress)
-        except (OSError, distributed.client.FuturesCancelledError, distributed.CancelledError) as error:
-            raise DataError(
-                f"--cluster: the scheduler {address} was lost ({type(error).__name__}); what was computed is kept: "
-                "start it again, then go on with --resume."
-            ) from None
+        yield client
 
 
-def _client(distributed: Any, address: str, stack: ExitStack) -> Any:
-    if address.startswith("local:"):
-        count = address.removeprefix("local:")
-        if not count.isdigit() or not 1 <= int(count) <= 1024:
+def on_cluster(
+    client: Any, sweep: Sweep, chunks: list[int], progress: Callable[[str], None]
+) -> Iterator[tuple[int, Rows]]:
+    """Compute chunks on the workers of a scheduler and give them back as they come.
+
+    Parameters
+    ----------
+    client
+        From `connected`.
+    sweep, chunks
+        What is to be computed.
+    progress
+        Told of workers that are refused, and if there is none.
+
+    Raises
+    ------
+    DataError
+        If the scheduler is lost, has no workers, or none with the versions of this process.
+    """
+    distributed = need("distributed")
+    if not chunks:
+        return
+    try:
+        yield from _all(distributed, client, sweep, chunks, progress)
+    except (OSError, distributed.client.FuturesCancelledError, distributed.CancelledError) as error:
+        raise DataError(
+            f"--cluster: the scheduler was lost ({type(error).__name__}); what was computed is kept: start it again, "
+            "then go on with --resume."
+        ) from None
+
+
+class _Workers:
+    """The workers that are there, and those that are refused."""
+
+    def __init__(self, client: Any, progress: Callable[[str], None]):
+        self._client, self._progress = client, progress
+        self._known: set[str] = set()
+        self._seen = self._told = time.monotonic()
+        self.banned: dict[str, str] = {}
+
+    def usable(self) -> dict[str, int]:
+        """Threads of each worker that may compute, by address.
+
+        Raises
+        ------
+        DataError
+            If all are refused, or none has been there for long.
+        """
+        found = self._client.scheduler_info(n_workers=-1)["workers"]
+        new = [address for address in found if address not in self._known]
+        if new:
+            # By value, so that it also runs where there is no microid.
+            answers = self._client.run(
+                lambda: importlib.util.find_spec("fits") is not None, workers=new, on_error="return"
+            )
+            for address in new:
+                if answers.get(address) is False:
+                    self.ban(address, f"worker {found[address].get('name', address)} at {address} has no microid")
+            self._known |= set(new)
+        usable = {address: about["nthreads"] for address, about in found.items() if address not in self.banned}
+        now = time.monotonic()
+        if usable:
+            self._seen = self._told = now
+        elif self.banned:
+            raise DataError(f"--cluster: no worker can be used: {'; '.join(self.banned.values())}.")
+        elif now - self._seen > _GIVE_UP_s:
             raise DataError(
-                f"--cluster: expected local:N with a number of processes, found {address!r}; write local:2."
+                f"--cluster: the scheduler has had no worker for {_GIVE_UP_s} s; what was computed is kept: start "
+                "workers, then go on with --resume."
             )
-        address = stack.enter_context(
-            distributed.LocalCluster(
-                n_workers=int(count), threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
-            )
-        ).scheduler_address
-    return stack.enter_context(distributed.Client(address, timeout=_CONNECT_s, set_as_default=False))
+        elif now - self._told > _SILENT_s:
+            self._told = now
+            self._progress(f"the scheduler has no worker; waiting for one, for up to {_GIVE_UP_s} s")
+        return usable
+
+    def ban(self, address: str, reason: str) -> None:
+        """Give a worker nothing more."""
+        if address not in self.banned:
+            self.banned[address] = reason
+            self._progress(f"refused: {reason}")
 
 
 def _all(
@@ -105,47 +173,47 @@ def _all(
     payload = _Payload(
         sweep.text, sweep.name, sweep.inputs, str(Path(sweep.name).resolve().parent), sweep.digest, versions()
     )
-    waiting, banned, losses = list(reversed(chunks)), dict[str, str](), dict[int, int]()
+    waiting, losses = list(reversed(chunks)), dict[int, int]()
     futures: dict[Any, int] = {}
-    results = distributed.as_completed(loop=client.loop)
+    results, workers = distributed.as_completed(loop=client.loop), _Workers(client, progress)
     while waiting or futures:
-        workers = {
-            name: about
-            for name, about in client.scheduler_info(n_workers=-1)["workers"].items()
-            if name not in banned
-        }
-        if not workers and banned:
-            raise DataError(f"--cluster: no worker can be used: {'; '.join(banned.values())}.")
-        room = _AHEAD * max(1, sum(about["nthreads"] for about in workers.values()))
-        while waiting and len(futures) < room:
+        usable = workers.usable()
+        while waiting and len(futures) < _AHEAD * sum(usable.values()):
             chunk = waiting.pop()
-            future = client.submit(
-                work, payload, chunk, pure=False, workers=[*workers] if banned else None, retries=0
-            )
+            # Should all of them die, others may have it: those that are refused give it back.
+            chosen = {"workers": [*usable], "allow_other_workers": True} if workers.banned else {}
+            future = client.submit(work, payload, chunk, pure=False, retries=0, **chosen)
             futures[future] = chunk
             results.add(future)
-        future = next(results)
-        chunk = futures.pop(future)
-        try:
-            answer: _Answer = future.result()
-        except distributed.KilledWorker:
-            losses[chunk] = losses.get(chunk, 0) + 1
-            if losses[chunk] > _LOSSES:
-                raise DataError(
-                    f"--cluster: chunk {chunk} lost its worker {_LOSSES} times, as if it took too much memory; lower "
-                    "run.memory_MB, then go on with --resume."
-                ) from None
-            waiting.append(chunk)
-            continue
-        finally:
-            future.release()
-        if answer.rows is None:
-            if answer.worker not in banned:
-                banned[answer.worker] = answer.refused
-                progress(f"refused: {answer.refused}")
-            waiting.append(chunk)
-            continue
-        yield chunk, answer.rows
+        asked = time.monotonic()
+        while not (ready := results.next_batch(block=False)) and time.monotonic() - asked < _LOOK_s:
+            time.sleep(_PAUSE_s)
+        for future in ready:
+            chunk = futures.pop(future)
+            try:
+                answer: _Answer = future.result()
+            except (distributed.KilledWorker, ImportError) as error:
+                losses[chunk] = losses.get(chunk, 0) + 1
+                if losses[chunk] > _LOSSES:
+                    raise DataError(_often(chunk, error)) from None
+                waiting.append(chunk)
+                continue
+            finally:
+                future.release()
+            if answer.rows is None:
+                workers.ban(answer.worker, answer.refused)
+                waiting.append(chunk)
+                continue
+            yield chunk, answer.rows
+
+
+def _often(chunk: int, error: Exception) -> str:
+    if isinstance(error, ImportError):
+        return f"--cluster: workers cannot import what they need ({error}); install the same microid on all of them."
+    return (
+        f"--cluster: chunk {chunk} lost its worker {_LOSSES} times, as if it took too much memory; lower "
+        "run.memory_MB, then go on with --resume."
+    )
 
 
 def work(payload: _Payload, chunk: int) -> _Answer:
@@ -159,13 +227,20 @@ def work(payload: _Payload, chunk: int) -> _Answer:
         if mine.get(package) != version:
             reason = f"{name} has {package} {mine.get(package)}, and {version} is needed"
             return _Answer(worker.address, None, reason)
+    try:
+        return _Answer(worker.address, compute_chunk(_sweep(payload), chunk))
+    except (DataError, OSError, ImportError) as error:
+        return _Answer(worker.address, None, f"{name} cannot compute ({type(error).__name__}: {error})")
+
+
+def _sweep(payload: _Payload) -> Sweep:
     if payload.digest not in _SWEEPS:
         from fits._cli_jax import start_jax
 
         start_jax()
         sweep = parse_sweep(payload.text, payload.name, payload.inputs.__getitem__, Path(payload.folder))
         if sweep.digest != payload.digest:
-            return _Answer(worker.address, None, f"{name} sees other files in {payload.folder}")
+            raise DataError(f"{payload.folder} holds other files there")
         _SWEEPS.clear()
         _SWEEPS[payload.digest] = sweep
-    return _Answer(worker.address, compute_chunk(_SWEEPS[payload.digest], chunk))
+    return _SWEEPS[payload.digest]

@@ -79,7 +79,8 @@ step_s = 0.0
 derivative_V_s_per_um = 0.0
 delay_samples = 1         # by which readings are late
 
-# Both axes have a count, so they are crossed: 32 x 32 rows.
+# Both axes have a count, so they are crossed: 32 x 32 rows. Rows whose loop is unstable where the hysteresis is
+# steepest fail, and say so.
 [[axis]]
 parameter = "controller.integral_V_per_um_s"
 low = 5.0

@@ -17,7 +17,17 @@ from fits.sweeps._kinds_simulate import block_rows, drive, table_of
 from fits.sweeps._programs import Program, number, read_program
 from fits.sweeps._stages import memory_before, range_of, requested_stage, stage_parameters, varied
 from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Rows
-from microid import PID, Stage, Start, parameter_table, simulate_loop, step_metrics
+from microid import (
+    PID,
+    AbstractLinear,
+    Preisach,
+    Stage,
+    Start,
+    margins,
+    parameter_table,
+    simulate_loop,
+    step_metrics,
+)
 
 _SHAPES = ("step", "sine", "triangle", "decay", "chirp", "file")
 _OUTPUTS = (
@@ -27,6 +37,11 @@ _OUTPUTS = (
     Output("error_final_um", "um", "error at the last sample"),
     Output("command_min_V", "V", "smallest command"),
     Output("command_max_V", "V", "largest command"),
+    Output(
+        "pole_radius",
+        "1",
+        "largest modulus of the loop's poles where the hysteresis is steepest; NaN of a nonlinear part",
+    ),
 )
 _STEP = (
     Output("settling_time_s", "s", "from the step until the displacement stays within 2 %; inf if it does not"),
@@ -34,6 +49,10 @@ _STEP = (
 )
 # A loop whose error grows beyond this share of the reference's range is not a loop that anybody wants.
 _LOST_PCT = 1e4
+# References that move by less stand still.
+_STILL_um = 1e-9
+# Voltages between two switching voltages at which the slope of a hysteresis is looked at.
+_FINE = 8
 
 
 class ControlJob(AbstractJob):
@@ -73,7 +92,7 @@ class ControlJob(AbstractJob):
         parameters = (*_pid_parameters(self._pid), *stage_parameters(self._stage), *self._reference.parameters)
         outputs = (*_OUTPUTS, *_STEP) if self._reference.shape == "step" else _OUTPUTS
         samples = self._reference.samples
-        return Facts(parameters, outputs, block_rows(samples), 8 * 8 * samples)
+        return Facts(parameters, outputs, block_rows(samples))
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
@@ -81,7 +100,8 @@ class ControlJob(AbstractJob):
         """Run one block of loops; see `AbstractJob.compute`."""
         del sources, seed
         with jax.default_device(device_of(rows)):
-            table = jnp.asarray(table_of(values, self._names, len(rows)))
+            settings = table_of(values, self._names, len(rows))
+            table = jnp.asarray(settings)
             wanted = drive(table, self._names, self._reference, self._given)
             found = _control(
                 self._stage,
@@ -95,10 +115,24 @@ class ControlJob(AbstractJob):
                 self._reference.shape == "step",
             )
             outputs = {name: np.asarray(value) for name, value in found.items()}
-        with np.errstate(invalid="ignore"):
-            kept = outputs["e_max_pct"] < _LOST_PCT
-        reasons = tuple("" if good else "the loop is unstable: its error grows without end" for good in kept)
-        return Rows(outputs, reasons)
+        # Eigenvalues of general matrices are found on CPUs.
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):
+            outputs["pole_radius"] = np.asarray(
+                _radius(self._stage, self._pid, jnp.asarray(settings), self._names, self._relative, self._delay)
+            )
+        moved = np.ptp(np.asarray(wanted), axis=1)
+        way = np.maximum(moved, np.abs(outputs.pop("from_um")))
+        return Rows(outputs, tuple(map(_why_not, way, outputs["pole_radius"], outputs["e_max_pct"])))
+
+
+def _why_not(way_um: float, radius: float, error_pct: float) -> str:
+    if not way_um > _STILL_um:
+        return "the reference does not move"
+    if radius >= 1:
+        return f"the loop is unstable where the hysteresis is steepest: modulus of its largest pole = {radius:.6g}"
+    if not error_pct < _LOST_PCT:
+        return "the loop is unstable: its error grows without end"
+    return ""
 
 
 def make(request: Request) -> ControlJob:
@@ -124,13 +158,32 @@ def make(request: Request) -> ControlJob:
     delay = given.get("delay_samples", 0)
     if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= 100:
         raise DataError(f"controller.delay_samples: expected a number from 0 to 100, found {delay!r}; correct it.")
-    pid = PID(interval_s=jnp.asarray(reference.interval_s), **(fields | others | stated))
+    values = fields | others | stated
+    pid = PID(interval_s=jnp.asarray(reference.interval_s), **values)
+    for info in parameter_table(pid):
+        value, spec = values[info.path], info.spec
+        if not spec.lower <= value <= spec.upper:
+            raise DataError(
+                f"controller.{info.path}: expected {spec.lower:g} to {spec.upper:g} {spec.unit}, found {value:g}; "
+                "correct it."
+            )
+    if not values["lower_V"] < values["upper_V"]:
+        raise DataError(
+            f"controller.lower_V: expected less than upper_V, which is {values['upper_V']:g} V, found "
+            f"{values['lower_V']:g}; correct one of them."
+        )
     return ControlJob(stage, pid, reference, initial, request.names, request.relative, delay)
 
 
 def _pid_parameters(pid: PID) -> tuple[Parameter, ...]:
     return tuple(
-        Parameter(f"controller.{info.path}", info.spec.unit, float(getattr(pid, info.path)), info.spec.lower)
+        Parameter(
+            f"controller.{info.path}",
+            info.spec.unit,
+            float(getattr(pid, info.path)),
+            info.spec.lower,
+            info.spec.upper,
+        )
         for info in parameter_table(pid)
     )
 
@@ -149,11 +202,7 @@ def _control(
 ) -> dict[str, Float[Array, " n"]]:
     def one(row: Float[Array, " k"], reference: Float[Array, " t"]) -> dict[str, Float[Array, ""]]:
         values = dict(zip(names, row, strict=True))
-        own = [name for name in names if name.startswith("controller.")]
-        fields = [name.removeprefix("controller.") for name in own]
-        old = [getattr(pid, field) for field in fields]
-        new = [v * values[name] if name in relative else values[name] for v, name in zip(old, own, strict=True)]
-        controller = eqx.tree_at(lambda p: [getattr(p, field) for field in fields], pid, new) if own else pid
+        controller = _controller(pid, values, relative)
         run = simulate_loop(controller, varied(stage, values, relative), reference, delay=delay, start=start)
         # A step at the first sample is none within the record, but from where the stage stood.
         way = jnp.append(reference, run.displacement_um[0])
@@ -165,6 +214,7 @@ def _control(
             "error_final_um": run.error_um[-1],
             "command_min_V": jnp.min(run.command_V),
             "command_max_V": jnp.max(run.command_V),
+            "from_um": reference[0] - run.displacement_um[0],
         }
         if step:
             answer = step_metrics(run.time_s, run.displacement_um, reference[-1], run.displacement_um[0])
@@ -173,3 +223,47 @@ def _control(
         return found
 
     return jax.vmap(one)(table, wanted)
+
+
+def _controller(pid: PID, values: Mapping[str, Float[Array, ""]], relative: tuple[str, ...]) -> PID:
+    own = [name for name in values if name.startswith("controller.")]
+    if not own:
+        return pid
+    fields = [name.removeprefix("controller.") for name in own]
+    old = [getattr(pid, field) for field in fields]
+    new = [v * values[name] if name in relative else values[name] for v, name in zip(old, own, strict=True)]
+    found: PID = eqx.tree_at(lambda p: [getattr(p, field) for field in fields], pid, new)
+    return found
+
+
+@eqx.filter_jit
+def _radius(
+    stage: Stage,
+    pid: PID,
+    table: Float[Array, "n k"],
+    names: tuple[str, ...],
+    relative: tuple[str, ...],
+    delay: int,
+) -> Float[Array, " n"]:
+    """Largest modulus of the poles of each loop, NaN where a part of the stage has no linear form."""
+    if not all(isinstance(part, AbstractLinear | Preisach) for part in stage.parts):
+        return jnp.full(table.shape[0], jnp.nan)
+
+    def one(row: Float[Array, " k"]) -> Float[Array, ""]:
+        values = dict(zip(names, row, strict=True))
+        changed = varied(stage, values, relative)
+        found = margins(_controller(pid, values, relative), changed, delay=delay, slope_um_per_V=_slope(changed))
+        return found.radius
+
+    return jax.vmap(one)(table)
+
+
+def _slope(stage: Stage) -> Float[Array, ""] | None:
+    """Slope in um/V of a hysteresis where it is steepest, somewhere on its major loop."""
+    for part in stage.parts:
+        if isinstance(part, Preisach):
+            lower, upper = part.density.lower_V, part.density.upper_V
+            rise = jnp.linspace(lower, upper, _FINE * part.density.levels)
+            output = part(jnp.append(rise, rise[::-1]))
+            return jnp.max(jnp.abs(jnp.diff(output))) / (rise[1] - rise[0])
+    return None

@@ -87,9 +87,8 @@ class FitJob(AbstractJob):
         parameters = (*self._records.parameters, holdout)
         if self._batch:
             parameters = (*parameters, Parameter("fit.smoothness", "1", self._smoothness, 1e-12, 1e6))
-        per_row = 8 * 4 * self._samples * (size + 64)
         block = _BLOCK if self._batch else 1
-        return Facts(parameters, tuple(outputs), block, per_row, sources)
+        return Facts(parameters, tuple(outputs), block, sources)
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int

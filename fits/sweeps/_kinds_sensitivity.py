@@ -19,7 +19,7 @@ from fits.sweeps._jobs import Request
 from fits.sweeps._kinds_simulate import table_of
 from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Rows
 
-_BLOCK, _BYTES = 256, 200_000
+_BLOCK = 256
 # So short a stroke that all motions are in proportion to it, to the last digit.
 _SHORT_UM = 1e-6
 # Beyond it a bridge has no inclination left.
@@ -45,7 +45,7 @@ class SensitivityJob(AbstractJob):
                 Output(f"{axis}_resonance_Hz", "Hz", f"first resonance of {axis}"),
                 Output(f"{axis}_spread_pct", "%", f"root sum of squares of what the tolerances do to {axis}"),
             ]
-        return Facts(_parameters(self._design), tuple(outputs), _BLOCK, _BYTES)
+        return Facts(_parameters(self._design), tuple(outputs), _BLOCK)
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int

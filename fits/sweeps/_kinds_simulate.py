@@ -76,7 +76,7 @@ class SimulateJob(AbstractJob):
             coordinates["time_s"] = ("time", "s", np.asarray(time_s, dtype=np.float64))
         parameters = (*stage_parameters(self._stage), *self._program.parameters)
         block = block_rows(samples)
-        return Facts(parameters, tuple(outputs), block, 8 * _ARRAYS * samples, coordinates=coordinates)
+        return Facts(parameters, tuple(outputs), block, coordinates=coordinates)
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int

@@ -59,18 +59,25 @@ class Program:
     given: FloatArray | None = field(default=None, compare=False)
 
     @property
+    def last_s(self) -> float:
+        """Time of the last sample."""
+        return (self.samples - 1) * self.interval_s
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """What may be varied."""
         names = (f"offset_{self.unit}", f"amplitude_{self.unit}", *SHAPES[self.shape])
         if self.shape == "file":
             names = (f"offset_{self.unit}", "gain")
         lower = {"frequency_Hz": 0.0, "frequency_end_Hz": 0.0}
+        upper = {"step_s": self.last_s}
         return tuple(
             Parameter(
                 f"{self.table}.{name}",
                 _UNITS.get(name, "1" if name == "gain" else self.unit),
                 dict(self.nominal)[name],
                 lower.get(name, -math.inf),
+                upper.get(name, math.inf),
             )
             for name in names
         )
@@ -109,7 +116,7 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
     if not isinstance(table, dict):
         raise DataError(f"{name}: expected a table, found {table!r}; write [{name}] and its keys below.")
     shape = table.get("shape", "file" if "file" in table else None)
-    if shape not in SHAPES:
+    if not isinstance(shape, str) or shape not in SHAPES:
         raise DataError(f"{name}.shape: expected one of {', '.join(SHAPES)}, found {shape!r}; choose one.")
     own = [f"offset_{unit}", f"amplitude_{unit}", *SHAPES[shape]]
     known = ["shape", "samples", "interval_s", *own]
@@ -128,7 +135,15 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
     interval = number(table.get("interval_s", 1e-4), f"{name}.interval_s")
     if not interval > 0:
         raise DataError(f"{name}.interval_s: expected a time above 0, found {interval:g}; correct it.")
-    return Program(name, unit, shape, samples, interval, tuple(nominal.items()))
+    program = Program(name, unit, shape, samples, interval, tuple(nominal.items()))
+    for parameter in program.parameters:
+        value = dict(nominal)[parameter.name.removeprefix(f"{name}.")]
+        if not parameter.lower <= value <= parameter.upper:
+            raise DataError(
+                f"{parameter.name}: expected {parameter.lower:g} to {parameter.upper:g} {parameter.unit}, found "
+                f"{value:g}; correct it."
+            )
+    return program
 
 
 def _from_file(table: Mapping[str, Any], name: str, unit: str, load: Callable[[str], bytes]) -> Program:
@@ -156,7 +171,10 @@ def _read_displacement(path: Path) -> tuple[FloatArray, FloatArray]:
 
 def number(found: Any, place: str) -> float:
     """A finite number, or a `DataError` that begins with its place."""
-    value = float(found) if isinstance(found, int | float) and not isinstance(found, bool) else math.nan
+    try:
+        value = float(found) if isinstance(found, int | float) and not isinstance(found, bool) else math.nan
+    except OverflowError:
+        value = math.inf
     if not math.isfinite(value):
         raise DataError(f"{place}: expected a finite number, found {found!r}; give one without quotes.")
     return value

@@ -18,6 +18,10 @@ _KEYS = ("parameter", "unit", "relative", "values", "low", "high", "count", "spa
 _PREFIXES = {"": 0, "k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
 _BASES = ("s", "V", "m", "Hz", "Pa", "rad")
 _MOST = 2**62
+# Values of a grid are held at once.
+_LONGEST = 1_000_000
+# Keys beside those that every axis may have, by the one that says where its values come from.
+_WAYS = {"values": ("values", "zip"), "low": ("low", "high", "count", "spacing", "zip"), "mean": ("mean", "sd")}
 
 
 def read_plan(
@@ -146,6 +150,11 @@ def _values(entry: Mapping[str, Any], place: str, factor: float) -> np.ndarray |
         raise DataError(
             f"{place}: expected one of values, low and high, or mean and sd, found {' and '.join(ways) or 'none'}."
         )
+    for key in entry:
+        if key not in ("parameter", "unit", "relative", *_WAYS[ways[0]]):
+            raise DataError(f"{place}.{key}: an axis with {ways[0]} has no {key}; leave out one of the two.")
+    if ways[0] == "low" and "zip" in entry and "count" not in entry:
+        raise DataError(f"{place}.zip: an axis that is drawn is not zipped; add count, or leave out zip.")
     if ways[0] == "values":
         values = entry["values"]
         if not isinstance(values, list):
@@ -170,6 +179,10 @@ def _values(entry: Mapping[str, Any], place: str, factor: float) -> np.ndarray |
     count = entry["count"]
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {count!r}.")
+    if count > _LONGEST:
+        raise DataError(
+            f"{place}.count: expected up to {_LONGEST:,} values, found more; leave out count and add [design]."
+        )
     return np.geomspace(low, high, count) if spacing == "log" else np.linspace(low, high, count)
 
 
@@ -208,31 +221,49 @@ def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:
     method, rows = design.get("method"), design.get("rows")
     if method not in SAMPLERS:
         raise DataError(f"design.method: expected one of {', '.join(SAMPLERS)}, found {method!r}; choose one.")
-    if isinstance(rows, bool) or not isinstance(rows, int) or rows < 1:
-        raise DataError(f"design.rows: expected a number of 1 or more, found {rows!r}; correct it.")
+    if isinstance(rows, bool) or not isinstance(rows, int) or not 1 <= rows <= _MOST:
+        raise DataError(f"design.rows: expected a number from 1 to 2^62, found {rows!r}; correct it.")
     return Drawn(axes, method, rows, seed)
+
+
+def read_list(content: bytes, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Names in the header of a CSV, and the cells of each row with the number of its line; blank lines are left out.
+
+    Raises
+    ------
+    DataError
+        If it is no CSV.
+    """
+    reader = csv.reader(io.StringIO(content.decode("utf-8-sig", errors="replace"), newline=""))
+    try:
+        lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
+    except csv.Error as error:
+        raise DataError(f"{name}, line {reader.line_num}: expected CSV ({error}); correct it.") from None
+    return [cell.strip() for cell in lines[0][1]] if lines else [], lines[1:]
 
 
 def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], bytes]) -> Listed:
     if not isinstance(entry, dict) or set(entry) != {"file"} or not isinstance(entry["file"], str):
         raise DataError("list: expected the one key file, the name of a CSV with a column per parameter.")
     name = entry["file"]
-    lines = list(csv.reader(io.StringIO(load(name).decode("utf-8-sig", errors="replace"))))
-    lines = [line for line in lines if line]
-    if len(lines) < 2:
+    header, lines = read_list(load(name), name)
+    if not lines:
         raise DataError(f"{name}: the list is empty: expected a header and at least one row.")
-    axes = [Axis(_parameter(column.strip(), f"{name}: list", known).name) for column in lines[0]]
+    axes = [Axis(_parameter(column, f"{name}: list", known).name) for column in header]
     for axis in axes:
         if math.isnan(known[axis.parameter].nominal):
             raise DataError(f"{name}: {axis.parameter} is an array; vary it by [[axis]] with relative = true.")
-    table = np.empty((len(axes), len(lines) - 1))
-    for k, line in enumerate(lines[1:]):
+    table = np.empty((len(axes), len(lines)))
+    for k, (line, cells) in enumerate(lines):
         try:
-            table[:, k] = [float(cell) for cell in line]
+            numbers = [float(cell) for cell in cells]
         except ValueError:
+            numbers = []
+        if len(numbers) != len(axes):
             raise DataError(
-                f"{name}, line {k + 2}: expected {len(axes)} numbers, found {', '.join(line)!r}; correct it."
-            ) from None
+                f"{name}, line {line}: expected {len(axes)} numbers, found {', '.join(cells)!r}; correct it."
+            )
+        table[:, k] = numbers
     if not np.all(np.isfinite(table)):
         raise DataError(f"{name}: expected finite numbers, found others; correct them.")
     return Listed(axes, table)

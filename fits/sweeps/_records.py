@@ -140,7 +140,12 @@ def requested_records(request: Request) -> Files | Simulated:
     pattern = table["files"]
     if not isinstance(pattern, str) or os.path.isabs(pattern) or request.folder is None:
         raise DataError(f"records.files: expected a pattern such as data/*.csv, found {pattern!r}; correct it.")
-    names = tuple(sorted(str(path.relative_to(request.folder)) for path in request.folder.glob(pattern)))
+    try:
+        names = tuple(sorted(str(path.relative_to(request.folder)) for path in request.folder.glob(pattern)))
+    except (ValueError, NotImplementedError, OSError) as error:
+        raise DataError(
+            f"records.files: expected a pattern such as data/*.csv, found {pattern!r} ({error}); correct it."
+        ) from None
     if not names:
         raise DataError(f"records.files: the axis is empty: no file matches {pattern}; correct the pattern.")
     return Files(request.folder, names, parse_columns(str(table.get("columns", ""))))

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from fits._atomic import atomic_path
 from fits.sweeps._chunks import chunk_count, compute_chunk, rows_of
 from fits.sweeps._extra import need
 from fits.sweeps._spec import Sweep
-from fits.sweeps._store import TABLE, Store, opened
+from fits.sweeps._store import TABLE, Store, check_folder, opened
 from fits.sweeps._types import FAILED, Rows
 
 _EVERY_s = 1.0
@@ -98,7 +99,15 @@ def run_sweep(
         raise RuntimeError('sweeps need float64: jax.config.update("jax_enable_x64", True)')
     began = time.monotonic()
     need("pyarrow")
-    with opened(sweep, os.fspath(out), resume) as store:
+    with ExitStack() as stack:
+        client = None
+        if cluster is not None:
+            from fits.sweeps._cluster import connected
+
+            # Before the folder is made, so that a mistake in the address leaves nothing behind.
+            check_folder(sweep, os.fspath(out), resume)
+            client = stack.enter_context(connected(cluster))
+        store = stack.enter_context(opened(sweep, os.fspath(out), resume))
         chunks = range(chunk_count(sweep))
         done = {chunk for chunk in chunks if store.whole(chunk)} if resume else set()
         again = sum(store.noted(chunk) for chunk in chunks if chunk not in done) if resume else 0
@@ -106,7 +115,7 @@ def run_sweep(
             progress(f"{len(done)} of {len(chunks)} chunks are there" + (f", {again} broken" if again else ""))
         left = [chunk for chunk in chunks if chunk not in done]
         tell = _Progress(progress, len(sweep.plan), sum(len(rows_of(sweep, chunk)) for chunk in done))
-        for chunk, rows in _computed(sweep, left, cluster, tell, progress):
+        for chunk, rows in _computed(sweep, left, client, tell, progress):
             store.write(chunk, rows)
         progress("writing the table")
         failed = _table(store)
@@ -117,18 +126,18 @@ def run_sweep(
 def _computed(
     sweep: Sweep,
     chunks: list[int],
-    cluster: str | None,
+    client: Any,
     tell: Callable[[int], None],
     progress: Callable[[str], None],
 ) -> Iterator[tuple[int, Rows]]:
     """Chunks as they come."""
-    if cluster is None:
+    if client is None:
         for chunk in chunks:
             yield chunk, compute_chunk(sweep, chunk, tell)
         return
     from fits.sweeps._cluster import on_cluster
 
-    for chunk, rows in on_cluster(sweep, chunks, cluster, progress):
+    for chunk, rows in on_cluster(client, sweep, chunks, progress):
         tell(len(rows.reasons))
         yield chunk, rows
 

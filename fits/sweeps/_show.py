@@ -1,8 +1,9 @@
 """What a sweep's folder holds: how far it is, figures of its outputs, the best rows, and pictures."""
 
-import json
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,9 @@ import numpy as np
 from fits._atomic import atomic_path
 from fits._errors import DataError
 from fits._plot_style import figure, label
+from fits.sweeps._about import about_of
 from fits.sweeps._extra import need
-from fits.sweeps._store import ABOUT, LEDGER, RESULTS
-from fits.sweeps._store import SCHEMA as RESULTS_SCHEMA
+from fits.sweeps._store import LEDGER, RESULTS
 from fits.sweeps._types import DONE, FAILED
 
 SCHEMA = "microid.sweep.summary/1"
@@ -39,26 +40,29 @@ def open_sweep(folder: str | os.PathLike[str]) -> Any:
     Raises
     ------
     DataError
-        If the folder holds no sweep, or xarray and zarr are not installed.
+        If the folder holds no sweep or a broken one, or xarray and zarr are not installed.
     """
     about_of(folder)
     need("zarr")
-    found = need("xarray").open_zarr(os.path.join(folder, RESULTS), chunks=None)
-    return found.assign_coords(row=np.arange(found.sizes["row"]))
+    xarray = need("xarray")
+    with _readable(folder):
+        found = xarray.open_zarr(os.path.join(folder, RESULTS), chunks=None, consolidated=True)
+        return found.assign_coords(row=np.arange(found.sizes["row"]))
 
 
-def about_of(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what is known of a sweep; a `DataError` says why it cannot be read."""
-    shown = os.fspath(folder)
+@contextmanager
+def _readable(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what decoders say of a broken file into one sentence."""
     try:
-        about = json.loads((Path(folder) / ABOUT).read_text(encoding="utf-8"))
-    except OSError:
-        raise DataError(f"{shown}: there is no sweep in this folder; give what --out named.") from None
-    except ValueError as error:
-        raise DataError(f"{shown}: {ABOUT} is broken ({error}); run the sweep again in another folder.") from None
-    if not isinstance(about, dict) or about.get("schema") != RESULTS_SCHEMA:
-        raise DataError(f"{shown}: expected results of the format {RESULTS_SCHEMA}; run the sweep again.")
-    return about
+        yield
+    except DataError:
+        raise
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(
+            f"{os.fspath(folder)}: {RESULTS} is missing or broken ({why[:200]}); run the sweep again with --resume, "
+            "which computes again what is damaged."
+        ) from None
 
 
 def summarise(folder: str | os.PathLike[str], by: str | None = None, largest: bool = False) -> dict[str, Any]:
@@ -71,11 +75,17 @@ def summarise(folder: str | os.PathLike[str], by: str | None = None, largest: bo
     by, largest
         Output by which rows are ranked, the first by default, and whether large is good.
     """
-    about = about_of(folder)
-    data = open_sweep(folder)
+    about, data = about_of(folder), open_sweep(folder)
+    with _readable(folder):
+        return _summary(folder, about, data, by, largest)
+
+
+def _summary(
+    folder: str | os.PathLike[str], about: dict[str, Any], data: Any, by: str | None, largest: bool
+) -> dict[str, Any]:
     status = data["status"].values
     done = status == DONE
-    noted = len(list((Path(folder) / LEDGER).glob("*.json")))
+    noted = len(list((Path(folder) / LEDGER).glob("[0-9]*.json")))
     numbers = [name for name in about["outputs"] if data[name].dims == ("row",) and data[name].dtype.kind == "f"]
     if by is not None and by not in numbers:
         raise DataError(f"--best: there is no output {by!r}; choose one of {', '.join(numbers)}.")
@@ -121,8 +131,9 @@ def _figures(values: np.ndarray, unit: str) -> dict[str, Any]:
 def _best(data: Any, about: dict[str, Any], done: np.ndarray, by: str | None, largest: bool) -> list[dict[str, Any]]:
     if by is None:
         return []
-    values = np.where(done, data[by].values, np.nan)
-    order = np.argsort(-values if largest else values, kind="stable")[: int(min(5, np.isfinite(values).sum()))]
+    values = data[by].values
+    there = np.flatnonzero(done & np.isfinite(values))
+    order = there[np.argsort(-values[there] if largest else values[there], kind="stable")[:5]]
     names = [*about["parameters"], by]
     return [{"row": int(row)} | {name: float(data[name].values[row]) for name in names} for row in order]
 
@@ -153,10 +164,19 @@ def describe(summary: dict[str, Any]) -> str:
 def plot_sweep(folder: str | os.PathLike[str], out: Path, by: str | None = None) -> list[Path]:
     """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back."""
     about, data = about_of(folder), open_sweep(folder)
+    with _readable(folder):
+        return _plots(folder, about, data, out, by)
+
+
+def _plots(folder: str | os.PathLike[str], about: dict[str, Any], data: Any, out: Path, by: str | None) -> list[Path]:
     done = data["status"].values == DONE
     by = by or summarise(folder)["best"]["by"]
     names = about["parameters"]
-    if by is None or not names or done.sum() < 2:
+    if by is None or not names:
+        return []
+    # What has no finite number, such as the settling time of a loop that does not settle, has no place in a mean.
+    done &= np.isfinite(data[by].values)
+    if done.sum() < 2:
         return []
     values = data[by].values[done]
     swept = {name: data[name].values[done] for name in names}
@@ -187,7 +207,7 @@ def _heat(path: Path, swept: dict[str, np.ndarray], pair: tuple[str, str], by: s
     edges = [np.histogram_bin_edges(swept[name], min(_CELLS, len(np.unique(swept[name])))) for name in pair]
     x, y = (swept[name] for name in pair)
     count, *_ = np.histogram2d(x, y, bins=edges)
-    total, *_ = np.histogram2d(x, y, bins=edges, weights=np.nan_to_num(values))
+    total, *_ = np.histogram2d(x, y, bins=edges, weights=values)
     with np.errstate(invalid="ignore"):
         mean = np.where(count > 0, total / np.maximum(count, 1), math.nan)
     picture = figure(_WIDE_in / 2, _HIGH_in)

@@ -15,11 +15,14 @@ import numpy as np
 from fits._errors import DataError
 from fits.sweeps._axes import Plan
 from fits.sweeps._jobs import KINDS, Request
-from fits.sweeps._read_axes import read_plan
+from fits.sweeps._read_axes import read_list, read_plan
 from fits.sweeps._types import SCHEMA, AbstractJob, Facts
 
 _COMMON = ("schema", "kind", "title", "seed", "axis", "design", "list", "run")
 _RUN = ("memory_MB", "chunk_rows")
+_MOST_MB = 1_000_000_000
+# Keys of kinds that are words; all others are tables.
+_NO_TABLES = ("model", "initial", "stage")
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class Sweep:
         Its rows, and what is done with each.
     memory_MB, chunk_rows
         What a chunk may take, and the rows of one if they are stated.
+    folder
+        Where its sources are.
     """
 
     text: str
@@ -50,11 +55,17 @@ class Sweep:
     facts: Facts
     memory_MB: float
     chunk_rows: int | None
+    folder: Path | None = None
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the text, all files and the names of all sources: what the rows depend on."""
-        parts: list[str | bytes] = [self.text, *self.facts.sources]
+        """SHA-256 of the text, all files, and the names and contents of all sources: what the rows depend on.
+
+        It is made anew each time, as sources may have changed; one that cannot be read counts as such.
+        """
+        parts: list[str | bytes] = [self.text]
+        for source in self.facts.sources:
+            parts += [source, _sum_of((self.folder or Path()) / source)]
         parts += [part for name in sorted(self.inputs) for part in (name, self.inputs[name])]
         sums = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
         return hashlib.sha256("".join(sums).encode()).hexdigest()
@@ -85,6 +96,8 @@ def read_sweep(path: str | os.PathLike[str]) -> Sweep:
             return (folder / file).read_bytes()
         except OSError as error:
             raise DataError(f"{file}: cannot be read ({error.strerror or error}); correct its name.") from error
+        except ValueError as error:
+            raise DataError(f"{file!r}: expected the name of a file ({error}); correct it.") from error
 
     return parse_sweep(text, name, load, folder)
 
@@ -119,7 +132,7 @@ def _sweep(
     if table.get("schema") != SCHEMA:
         raise DataError(f'schema: expected "{SCHEMA}", found {table.get("schema")!r}; give that, or another file.')
     kind = table.get("kind")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise DataError(f"kind: expected one of {', '.join(KINDS)}, found {kind!r}; choose one.")
     tables = KINDS[kind].tables
     for key in table:
@@ -128,6 +141,8 @@ def _sweep(
             close = get_close_matches(key, known, n=1, cutoff=0.5)
             meant = f"did you mean {close[0]}?" if close else f"use some of {', '.join(known)}."
             raise DataError(f"{key}: expected a known key, found '{key}'; {meant}")
+        if key in tables and key not in _NO_TABLES and not isinstance(table[key], dict):
+            raise DataError(f"{key}: expected a table, found {table[key]!r}; write [{key}] and its keys below.")
     seed = table.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise DataError(f"seed: expected a whole number of 0 or more, found {seed!r}; correct it.")
@@ -139,7 +154,15 @@ def _sweep(
     factors = tuple(axis.parameter for axis in plan.axes if axis.relative)
     if set(factors) != set(relative):
         job = KINDS[kind].make(Request(table, names, factors, load, folder))
-    return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows)
+    return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows, folder)
+
+
+def _sum_of(path: Path) -> str:
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return "unreadable"
 
 
 def _run_options(table: Any) -> tuple[float, int | None]:
@@ -149,8 +172,8 @@ def _run_options(table: Any) -> tuple[float, int | None]:
         if key not in _RUN:
             raise DataError(f"run.{key}: expected a known key, found '{key}'; use {' and '.join(_RUN)}.")
     memory, rows = table.get("memory_MB", 256), table.get("chunk_rows")
-    if isinstance(memory, bool) or not isinstance(memory, int | float) or not 1 <= memory < math.inf:
-        raise DataError(f"run.memory_MB: expected a number of 1 or more, found {memory!r}; correct it.")
+    if isinstance(memory, bool) or not isinstance(memory, int | float) or not 1 <= memory <= _MOST_MB:
+        raise DataError(f"run.memory_MB: expected a number from 1 to {_MOST_MB:,}, found {memory!r}; correct it.")
     if rows is not None and (isinstance(rows, bool) or not isinstance(rows, int) or rows < 1):
         raise DataError(f"run.chunk_rows: expected a number of 1 or more, found {rows!r}; correct it.")
     return float(memory), rows
@@ -158,13 +181,13 @@ def _run_options(table: Any) -> tuple[float, int | None]:
 
 def _names(table: Mapping[str, Any], load: Callable[[str], bytes]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of what varies, in the order of the plan, and those that vary relatively, as far as they can be read."""
-    entries = [entry for entry in table.get("axis", []) if isinstance(entry, dict)] if table.get("axis") else []
+    axes = table.get("axis")
+    entries = [entry for entry in axes if isinstance(entry, dict)] if isinstance(axes, list) else []
     names = [str(entry.get("parameter")) for entry in entries]
     relative = [str(entry.get("parameter")) for entry in entries if entry.get("relative") is True]
     listing = table.get("list")
     if isinstance(listing, dict) and isinstance(listing.get("file"), str):
-        header = load(listing["file"]).decode("utf-8-sig", errors="replace").splitlines()
-        names += [cell.strip() for cell in header[0].split(",")] if header else []
+        names += read_list(load(listing["file"]), listing["file"])[0]
     return tuple(names), tuple(relative)
 
 

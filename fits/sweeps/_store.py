@@ -9,6 +9,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,19 +20,20 @@ import numpy as np
 
 from fits._atomic import atomic_write_text
 from fits._errors import DataError
-from fits.sweeps._chunks import bytes_per_row, chunk_count, chunk_rows, rows_of, source_of
+from fits.sweeps._about import ABOUT, SCHEMA, about_of
+from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of
 from fits.sweeps._extra import need
 from fits.sweeps._spec import Sweep
 from fits.sweeps._types import STATUS_WORDS, Output, Rows
 from fits.sweeps._versions import versions
 
-SCHEMA = "microid.sweep.results/1"
-ABOUT, RESULTS, LEDGER, TEXT, TABLE = "about.json", "results.zarr", "ledger", "sweep.toml", "results.parquet"
-_REASON = Output("reason", "1", "why the row failed", dtype="U200")
+RESULTS, LEDGER, TEXT, TABLE = "results.zarr", "ledger", "sweep.toml", "results.parquet"
 _STATUS = Output("status", "1", "of the row: 0 pending, 1 done, 2 failed", dtype="i1")
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 # A disk that is nearly full is full for others.
 _SHARE = 0.9
+# What a process that was killed leaves of a file it wrote, see `atomic_path`.
+_LEFT = re.compile(r"\.[0-9a-f]{16}-.*")
 
 
 class Store:
@@ -51,7 +53,7 @@ class Store:
             for axis in self.sweep.plan.axes
         ]
         sources = (source_of(self.sweep),) if self.sweep.facts.sources else ()
-        return (*swept, *sources, *self.sweep.facts.outputs, _STATUS, _REASON)
+        return (*swept, *sources, *self.sweep.facts.outputs, _STATUS, REASON)
 
     def create(self) -> None:
         """Write the empty store and what is known of the sweep."""
@@ -67,8 +69,8 @@ class Store:
                     shape=(rows, *variable.shape),
                     chunks=(size, *variable.shape),
                     dtype=variable.dtype,
-                    # Without one xarray leaves whole numbers as they are.
-                    fill_value={"f": float("nan"), "U": ""}.get(kind),
+                    # Without one xarray leaves whole numbers and texts as they are.
+                    fill_value=float("nan") if kind == "f" else None,
                 )
                 attributes: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
                 if variable is _STATUS:
@@ -77,11 +79,12 @@ class Store:
             for name, (axis, unit, values) in self.sweep.facts.coordinates.items():
                 self._coordinate(group, name, axis, unit, np.asarray(values))
             swept = [axis.parameter for axis in self.sweep.plan.axes]
-            group.attrs.update(self._about() | ({"coordinates": " ".join(swept)} if swept else {}))
+            about = self._about()
+            group.attrs.update(about | ({"coordinates": " ".join(swept)} if swept else {}))
             zarr.consolidate_metadata(group.store)
             atomic_write_text(self.folder / TEXT, self.sweep.text)
             # Last: a folder without it holds no sweep yet.
-            atomic_write_text(self.folder / ABOUT, json.dumps(self._about(), indent=1) + "\n")
+            atomic_write_text(self.folder / ABOUT, json.dumps(about, indent=1) + "\n")
 
     def _coordinate(self, group: Any, name: str, axis: str, unit: str, values: np.ndarray) -> None:
         array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype)
@@ -109,6 +112,32 @@ class Store:
             self._group = need("zarr").open_group(str(self.folder / RESULTS), mode="r+", zarr_format=2)
         return self._group
 
+    def sound(self) -> bool:
+        """Whether the store is there, with all variables as they should be."""
+        size = chunk_rows(self.sweep)
+        try:
+            json.loads((self.folder / RESULTS / ".zmetadata").read_text(encoding="utf-8"))
+            arrays = {variable: self._open()[variable.name] for variable in self.variables}
+            return (self.folder / LEDGER).is_dir() and all(
+                (array.shape, array.chunks, array.dtype)
+                == (
+                    (len(self.sweep.plan), *variable.shape),
+                    (size, *variable.shape),
+                    np.dtype(variable.dtype),
+                )
+                for variable, array in arrays.items()
+            )
+        except Exception:
+            # Whatever a broken file makes a decoder say, the store is not sound.
+            return False
+
+    def clear(self) -> None:
+        """Delete what processes that were killed have left of files."""
+        for folder in (self.folder, self.folder / LEDGER):
+            for path in folder.iterdir() if folder.is_dir() else ():
+                if _LEFT.fullmatch(path.name):
+                    path.unlink(missing_ok=True)
+
     def write(self, chunk: int, rows: Rows) -> None:
         """Keep a chunk, then say so in the ledger.
 
@@ -117,7 +146,7 @@ class Store:
         DataError
             If the disk is full or cannot be written to; all chunks before are kept.
         """
-        arrays = dict(rows.outputs) | {"reason": np.array(rows.reasons, dtype=_REASON.dtype)}
+        arrays = dict(rows.outputs) | {"reason": np.array(rows.reasons, dtype=REASON.dtype)}
         with _sentences(self.folder):
             group = self._open()
             start = chunk * chunk_rows(self.sweep)
@@ -155,6 +184,26 @@ class Store:
         return total.hexdigest()
 
 
+def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
+    """Refuse a folder that cannot be written to, or holds something else, before anything starts; see `opened`."""
+    need("zarr")
+    folder = Path(os.path.realpath(out))
+    anchor = next(place for place in (folder, *folder.parents) if place.exists())
+    if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
+        raise DataError(f"{out}: expected a folder that can be written to; choose another for --out.")
+    if (folder / ABOUT).exists():
+        if not resume:
+            raise DataError(
+                f"{out}: there is a sweep in this folder; add --resume to go on, or choose another for --out."
+            )
+        _check_same(sweep, out)
+        return
+    own = (RESULTS, LEDGER, TEXT, ".lock")
+    if folder.exists() and any(path.name not in own and not _LEFT.fullmatch(path.name) for path in folder.iterdir()):
+        raise DataError(f"{out}: the folder holds other files; choose another for --out.")
+    _check_size(sweep, out, anchor)
+
+
 @contextmanager
 def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
     """Open the folder of a sweep, new or to go on with, and keep other processes out of it.
@@ -165,31 +214,22 @@ def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
         If it cannot be written to, holds another sweep, or one that was begun with other versions, or the results
         would not fit on the disk.
     """
+    check_folder(sweep, out, resume)
     folder = Path(os.path.realpath(out))
-    anchor = next(place for place in (folder, *folder.parents) if place.exists())
-    if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
-        raise DataError(f"{out}: expected a folder that can be written to; choose another for --out.")
-    need("zarr")
     begun = (folder / ABOUT).exists()
-    if begun and not resume:
-        raise DataError(
-            f"{out}: there is a sweep in this folder; add --resume to go on, or choose another for --out."
-        )
-    if (
-        folder.exists()
-        and not begun
-        and any(name.name not in (RESULTS, LEDGER, TEXT, ".lock") for name in folder.iterdir())
-    ):
-        raise DataError(f"{out}: the folder holds other files; choose another for --out.")
-    if not begun:
-        _check_size(sweep, out, anchor)
     with _sentences(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder, out):
+        if (folder / ABOUT).exists() != begun:
+            # Another process has begun it meanwhile.
+            check_folder(sweep, out, resume)
         store = Store(sweep, folder)
-        if begun:
-            _check_same(sweep, out, folder)
-        else:
+        with _sentences(folder):
+            store.clear()
+        if not (folder / ABOUT).exists():
+            store.create()
+        elif not store.sound():
+            store = Store(sweep, folder)
             store.create()
         yield store
 
@@ -205,12 +245,9 @@ def _check_size(sweep: Sweep, out: str, anchor: Path) -> None:
         )
 
 
-def _check_same(sweep: Sweep, out: str, folder: Path) -> None:
-    try:
-        about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
-        digest, before, size = about["digest"], about["versions"], about["chunk_rows"]
-    except (OSError, ValueError, KeyError) as error:
-        raise DataError(f"{out}: {ABOUT} cannot be read ({error}); choose another folder for --out.") from None
+def _check_same(sweep: Sweep, out: str) -> None:
+    about = about_of(out)
+    digest, before, size = about["digest"], about["versions"], about["chunk_rows"]
     for name, version in versions().items():
         if before.get(name) != version:
             raise DataError(

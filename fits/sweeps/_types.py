@@ -98,8 +98,6 @@ class Facts:
     block
         Rows that are computed together. A row's numbers may depend on its place in the block, and on nothing else
         of the rows beside it.
-    bytes_per_row
-        Memory that a row takes while it is computed.
     sources
         Names of the rows there are by themselves, such as files; without them only the axes make rows.
     coordinates
@@ -109,7 +107,6 @@ class Facts:
     parameters: tuple[Parameter, ...]
     outputs: tuple[Output, ...]
     block: int
-    bytes_per_row: int
     sources: tuple[str, ...] = ()
     coordinates: Mapping[str, tuple[str, str, FloatArray]] = field(default_factory=dict)
 

@@ -1,11 +1,15 @@
 """Versions that results depend on."""
 
+import hashlib
 import platform
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 _NAMES = ("microid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy")
 
 
+@lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
     """Version of Python and of each package that computes."""
     found = {"python": platform.python_version()}
@@ -13,5 +17,13 @@ def versions() -> dict[str, str]:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
+            found[name] = _checkout() if name == "microid" else "not installed"
     return found
+
+
+def _checkout() -> str:
+    """What tells a checkout that is not installed from others: a sum of its sources."""
+    total, root = hashlib.sha256(), Path(__file__).parents[2]
+    for path in sorted(path for package in ("fits", "microid") for path in (root / package).rglob("*.py")):
+        total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return f"checkout {total.hexdigest()[:12]}"
