@@ -45,7 +45,7 @@ _OUTPUTS = (
 )
 _STEP = (
     Output("settling_time_s", "s", "from the step until the displacement stays within 2 %; inf if it does not"),
-    Output("overshoot_pct", "%", "beyond the final value, of the way to it"),
+    Output("overshoot_pct", "%", "beyond the final value, of the way; of the target where it has not settled"),
 )
 # A loop whose error grows beyond this share of the reference's range is not a loop that anybody wants.
 _LOST_PCT = 1e4
