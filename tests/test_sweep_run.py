@@ -8,6 +8,7 @@ import secrets
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -232,6 +233,11 @@ def test_stopped_between_any_two_writes_it_goes_on(finished, tmp_path, monkeypat
     with contextlib.suppress(_DiedError):
         run_sweep(sweep, str(out))
     monkeypatch.setattr("os.replace", replace)
+    # The threads that write go on for a moment, since the process has not really died.
+    for _ in range(100):
+        if not list(out.rglob("*.partial")):
+            break
+        time.sleep(0.05)
     run_sweep(sweep, str(out), resume=(out / "about.json").exists())
     assert table(out).equals(table(whole))
 

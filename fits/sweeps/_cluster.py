@@ -73,7 +73,12 @@ def connected(address: str) -> Iterator[Any]:
             where = address
             if count != address:
                 own = distributed.LocalCluster(
-                    n_workers=int(count), threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+                    n_workers=int(count),
+                    threads_per_worker=1,
+                    processes=True,
+                    # Any port that is free: another cluster may have the usual one.
+                    dashboard_address="127.0.0.1:0",
+                    memory_limit=0,
                 )
                 where = stack.enter_context(own).scheduler_address
             client = stack.enter_context(distributed.Client(where, timeout=_CONNECT_s, set_as_default=False))
