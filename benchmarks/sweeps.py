@@ -75,6 +75,25 @@ def apart(*arguments: object) -> dict[str, float]:
     return found
 
 
+def workers(rows: int = 16384, samples: int = 4000, turns: int = 3) -> list[float]:
+    """Time of one local worker over that of two, both started and warm, in turn."""
+    from fits.sweeps._cluster import connected
+    from fits.sweeps._run import run_sweep
+    from fits.sweeps._spec import parse_sweep
+
+    sweep = parse_sweep(SWEEP.format(rows=rows, samples=samples, run="chunk_rows = 512"), "sweep.toml", lambda _: b"")
+    with tempfile.TemporaryDirectory() as folder, connected("local:1") as one, connected("local:2") as two:
+        places = {"one": one.scheduler.address, "two": two.scheduler.address}
+        taken: dict[str, list[float]] = {name: [] for name in places}
+        for turn in range(turns + 1):
+            for name, address in places.items():
+                began = time.perf_counter()
+                run_sweep(sweep, f"{folder}/{name}{turn}", cluster=address)
+                taken[name].append(time.perf_counter() - began)
+    # The first turn compiles.
+    return [alone / both for alone, both in zip(taken["one"][1:], taken["two"][1:], strict=True)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Costs of a sweep beside its kernels.")
     parser.add_argument("--rows", type=int, default=1_000_000, help="of the largest sweep (default 1e6)")
@@ -89,9 +108,11 @@ def main() -> None:
     for size in (256, 8192):
         found = apart(32768, 16, None, f"chunk_rows = {size}")
         print(f"chunks of {size}, 32768 rows of 16 samples: {found}", flush=True)
-    for cluster in (None, "local:1", "local:2"):
+    for cluster in (None, "local:1"):
         found = apart(16384, 1000, cluster, "chunk_rows = 1024")
         print(f"{cluster or 'in process'}, 16384 rows of 1000 samples: {found}", flush=True)
+    ratios = workers()
+    print(f"two workers over one, in turn: {[round(ratio, 2) for ratio in ratios]}", flush=True)
     found = apart(32768, 16, "local:1", "chunk_rows = 256")
     print(f"local:1, 128 chunks of 256 rows of 16 samples: {found}", flush=True)
 

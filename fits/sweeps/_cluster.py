@@ -74,6 +74,9 @@ def connected(address: str) -> Iterator[Any]:
             if count != address:
                 own = distributed.LocalCluster(
                     n_workers=int(count),
+                    # XLA would have as many threads as there are cores in each worker, and they would be in each
+                    # other's way.
+                    env={"NPROC": "1"},
                     threads_per_worker=1,
                     processes=True,
                     # Any port that is free: another cluster may have the usual one.

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from fits.sweeps._stages import varied
 from microid import (
     AbstractLinear,
     Everett,
@@ -33,22 +34,23 @@ _WINDOW = 3
 
 
 def respond(
-    vary: Callable[[Any], Stage],
-    variants: Any,
-    interval_s: Float[Array, ""],
+    stage: Stage,
+    table: Float[Array, "n k"],
+    names: tuple[str, ...],
+    relative: tuple[str, ...],
+    interval_s: float,
     voltage_V: Float[Array, "n t"],
     memory: Staircase | None,
     on_cpu: bool,
-    one_surface: bool = False,
 ) -> Float[Array, "n t"]:
     """Respond to commands, each row at rest under its first sample.
 
     Parameters
     ----------
-    vary
-        Makes the stage of one row.
-    variants
-        What it is made from, every leaf with a leading axis of `n`.
+    stage
+        What is simulated.
+    table, names, relative
+        Parameters that vary, one column each, their names, and those that are factors; see `varied`.
     interval_s
         Between samples.
     voltage_V
@@ -56,35 +58,68 @@ def respond(
     memory
         Of the hysteresis before all rows.
     on_cpu
-        Whether this is compiled for a CPU.
-    one_surface
-        Whether the hysteresis is the same in all rows.
+        Whether this runs on a CPU.
 
     Returns
     -------
     Array
         Displacement in um, shape `(n, t)`.
     """
-    example: Stage = eqx.filter_eval_shape(vary, jax.tree.map(lambda leaf: leaf[0], variants))
-    if not on_cpu or not _plain(example):
-        start = Start(None, memory)
-        return jax.vmap(lambda variant, voltage: vary(variant)(interval_s, voltage, start))(variants, voltage_V)
-    signal, before, hold = voltage_V, voltage_V[:, 0], example.hold
-    for first, last in _links(example):
-        if isinstance(example.parts[first], Preisach):
-            assert memory is not None
-            # One row stands for all where it is the same: its tables then stay in the cache.
-            few = jax.tree.map(lambda leaf: leaf[:1], variants) if one_surface else variants
-            surface, offset = jax.vmap(partial(_surface, vary, first))(few)
-            signal, before = _hysteresis(surface, offset, signal, before, memory)
-        else:
-            system = jax.vmap(partial(_joined, vary, first, last))(variants)
-            signal, before = _linear(system, interval_s, signal, before, hold), system.offset + system.gain * before
-            if system.rest.shape[1]:
+    interval = jnp.asarray(interval_s)
+    if not on_cpu or not _plain(stage):
+        return _mapped(stage, table, names, relative, interval, voltage_V, memory)
+    links = _links(stage)
+    # A program for each link: compiled as one, XLA computes much of it several times.
+    signal, before, hold = voltage_V, voltage_V[:, 0], stage.hold
+    for link in _pieces(stage, table, names, relative, links):
+        if isinstance(link, LinearSystem):
+            signal, before = _linear(link, interval, signal, before, hold)
+            if link.rest.shape[1]:
                 hold = "first" if hold == "zero" else "smooth"
-        # Compiled into one loop, what is computed here would be computed again for each of its uses.
-        signal, before = lax.optimization_barrier((signal, before))
+        else:
+            assert memory is not None
+            signal, before = _hysteresis(*link, signal, before, memory)
     return signal
+
+
+@eqx.filter_jit
+def _mapped(
+    stage: Stage,
+    table: Float[Array, "n k"],
+    names: tuple[str, ...],
+    relative: tuple[str, ...],
+    interval: Float[Array, ""],
+    voltage: Float[Array, "n t"],
+    memory: Staircase | None,
+) -> Float[Array, "n t"]:
+    start = Start(None, memory)
+    vary = partial(_vary, stage, names, relative)
+    return jax.vmap(lambda row, signal: vary(row)(interval, signal, start))(table, voltage)
+
+
+@eqx.filter_jit
+def _pieces(
+    stage: Stage,
+    table: Float[Array, "n k"],
+    names: tuple[str, ...],
+    relative: tuple[str, ...],
+    links: tuple[tuple[int, int], ...],
+) -> list[LinearSystem | tuple[Everett, Float[Array, " n"]]]:
+    """What each link is, for all rows."""
+    vary = partial(_vary, stage, names, relative)
+    found: list[LinearSystem | tuple[Everett, Float[Array, " n"]]] = []
+    for first, last in links:
+        if isinstance(stage.parts[first], Preisach):
+            # One row stands for all where it is the same: its tables then stay in the cache.
+            alone = not any(name.startswith(f"{stage.names[first]}.") for name in names)
+            found.append(jax.vmap(partial(_surface, vary, first))(table[:1] if alone else table))
+        else:
+            found.append(jax.vmap(partial(_joined, vary, first, last))(table))
+    return found
+
+
+def _vary(stage: Stage, names: tuple[str, ...], relative: tuple[str, ...], row: Float[Array, " k"]) -> Stage:
+    return varied(stage, dict(zip(names, row, strict=True)), relative)
 
 
 def _plain(stage: Stage) -> bool:
@@ -92,7 +127,7 @@ def _plain(stage: Stage) -> bool:
     return stage.substeps == 1 and all(isinstance(part, AbstractLinear | Preisach) for part in stage.parts)
 
 
-def _links(stage: Stage) -> list[tuple[int, int]]:
+def _links(stage: Stage) -> tuple[tuple[int, int], ...]:
     """First and last place of neighbouring linear parts, and places of a hysteresis."""
     links: list[tuple[int, int]] = []
     for place, part in enumerate(stage.parts):
@@ -101,24 +136,32 @@ def _links(stage: Stage) -> list[tuple[int, int]]:
             links[-1] = (links[-1][0], place)
         else:
             links.append((place, place))
-    return links
+    return tuple(links)
 
 
-def _joined(vary: Callable[[Any], Stage], first: int, last: int, variant: Any) -> LinearSystem:
-    systems = [part.system() for part in vary(variant).parts[first : last + 1] if isinstance(part, AbstractLinear)]
+def _joined(vary: Callable[[Array], Stage], first: int, last: int, row: Float[Array, " k"]) -> LinearSystem:
+    systems = [part.system() for part in vary(row).parts[first : last + 1] if isinstance(part, AbstractLinear)]
     whole = systems[0]
     for system in systems[1:]:
         whole = whole.then(system)
     return whole
 
 
-def _surface(vary: Callable[[Any], Stage], place: int, variant: Any) -> tuple[Everett, Float[Array, ""]]:
-    part = vary(variant).parts[place]
+def _surface(vary: Callable[[Array], Stage], place: int, row: Float[Array, " k"]) -> tuple[Everett, Float[Array, ""]]:
+    part = vary(row).parts[place]
     assert isinstance(part, Preisach)
     return part.everett, part.offset_um
 
 
+@eqx.filter_jit
 def _linear(
+    system: LinearSystem, interval_s: Float[Array, ""], signal: Float[Array, "n t"], before: Array, hold: Hold
+) -> tuple[Float[Array, "n t"], Float[Array, " n"]]:
+    """Outputs of one system per row, and those at rest before."""
+    return _driven(system, interval_s, signal, before, hold), system.offset + system.gain * before
+
+
+def _driven(
     system: LinearSystem, interval_s: Float[Array, ""], signal: Float[Array, "n t"], before: Array, hold: Hold
 ) -> Float[Array, "n t"]:
     """Outputs of one system per row; see `LinearSystem.respond`."""
@@ -129,7 +172,7 @@ def _linear(
     if hold == "smooth":
         bend = jnp.pad(jnp.diff(signal, 2, axis=1) / 12, ((0, 0), (1, 1)))
         directly = system.gain - jnp.sum(system.read * system.rest, axis=1)
-        return _linear(system, interval_s, signal - bend, before, "first") + directly[:, None] * bend
+        return _driven(system, interval_s, signal - bend, before, "first") + directly[:, None] * bend
     step, taken = jax.vmap(lambda one: one.advance(interval_s[None], hold))(system)
     step, taken, read = step[..., 0], taken[..., 0], system.read
     start = tuple(system.rest[:, i] * (before - signal[:, 0]) for i in range(order))
@@ -145,6 +188,7 @@ def _linear(
     return jnp.concatenate([first[:, None], level[:, 1:] + moved.T], axis=1)
 
 
+@eqx.filter_jit
 def _hysteresis(
     surface: Everett, offset: Float[Array, " n"], voltage: Float[Array, "n t"], before: Array, memory: Staircase
 ) -> tuple[Float[Array, "n t"], Float[Array, " n"]]:

@@ -14,9 +14,9 @@ from fits.sweeps._devices import device_of, on_cpu
 from fits.sweeps._jobs import Request
 from fits.sweeps._kernel import respond
 from fits.sweeps._programs import Program, number, read_program
-from fits.sweeps._stages import memory_before, requested_stage, stage_parameters, varied
+from fits.sweeps._stages import memory_before, requested_stage, stage_parameters
 from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Rows
-from microid import Preisach, Stage, Staircase
+from microid import Stage, Staircase
 
 # Arrays of one value per sample that a row needs at a time, and how much memory all rows of a block may need.
 _ARRAYS, _BLOCK_BYTES, _LARGEST_BLOCK = 30, 128e6, 256
@@ -134,7 +134,7 @@ def make(request: Request) -> SimulateJob:
     return SimulateJob(stage, program, initial, request.names, request.relative, from_s, every if traces else 0)
 
 
-# In three programs: compiled as one, XLA computes much of it several times.
+# In programs of their own: compiled as one, XLA computes much of it several times.
 def _simulate(
     stage: Stage,
     table: Float[Array, "n k"],
@@ -148,7 +148,7 @@ def _simulate(
     cpu: bool,
 ) -> dict[str, Float[Array, "n ..."]]:
     voltage = drive(table, names, program, given)
-    displacement = respond_rows(stage, table, names, relative, program.interval_s, voltage, memory, cpu)
+    displacement = respond(stage, table, names, relative, program.interval_s, voltage, memory, cpu)
     found = _sum_up(voltage, displacement, first)
     if every:
         found |= {"displacement_um": displacement[:, ::every], "voltage_V": voltage[:, ::every]}
@@ -169,40 +169,10 @@ def drive(
 
 
 @eqx.filter_jit
-def respond_rows(
-    stage: Stage,
-    table: Float[Array, "n k"],
-    names: tuple[str, ...],
-    relative: tuple[str, ...],
-    interval_s: float,
-    voltage: Float[Array, "n t"],
-    memory: Staircase | None,
-    cpu: bool,
-) -> Float[Array, "n t"]:
-    """Responses of all rows, whose parameters are the columns of a table; see `respond`."""
-    one_surface = not any(name.startswith(_hysteresis_names(stage)) for name in names)
-    return respond(
-        lambda row: varied(stage, dict(zip(names, row, strict=True)), relative),
-        table,
-        jnp.asarray(interval_s),
-        voltage,
-        memory,
-        cpu,
-        one_surface,
-    )
-
-
-@eqx.filter_jit
 def _sum_up(
     voltage: Float[Array, "n t"], displacement: Float[Array, "n t"], first: int
 ) -> dict[str, Float[Array, " n"]]:
     return jax.vmap(summary)(voltage[:, first:], displacement[:, first:])
-
-
-def _hysteresis_names(stage: Stage) -> tuple[str, ...]:
-    return tuple(
-        f"{name}." for name, part in zip(stage.names, stage.parts, strict=True) if isinstance(part, Preisach)
-    )
 
 
 def summary(voltage: Float[Array, " t"], displacement: Float[Array, " t"]) -> dict[str, Float[Array, ""]]:

@@ -18,7 +18,8 @@ from fits._stage_design import nearest
 from fits._units import parse_columns
 from fits.sweeps._devices import on_cpu
 from fits.sweeps._jobs import Request
-from fits.sweeps._kinds_simulate import drive, respond_rows, table_of
+from fits.sweeps._kernel import respond
+from fits.sweeps._kinds_simulate import drive, table_of
 from fits.sweeps._programs import Program, number, read_program
 from fits.sweeps._stages import memory_before, requested_stage, stage_parameters
 from fits.sweeps._types import FloatArray, Parameter
@@ -102,7 +103,7 @@ class Simulated:
         given = None if self.program.given is None else jnp.asarray(self.program.given)
         voltage = drive(table, names, self.program, given)
         memory = memory_before(self.stage, self.initial)
-        displacement = respond_rows(
+        displacement = respond(
             self.stage, table, names, self.relative, self.program.interval_s, voltage, memory, on_cpu()
         )
         time_s = np.arange(self.program.samples) * self.program.interval_s
