@@ -75,8 +75,11 @@ def apart(*arguments: object) -> dict[str, float]:
     return found
 
 
-def workers(rows: int = 16384, samples: int = 4000, turns: int = 3) -> list[float]:
+def workers(rows: int = 16384, samples: int = 4000, turns: int = 5) -> list[float]:
     """Time of one local worker over that of two, both started and warm, in turn."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
     from fits.sweeps._cluster import connected
     from fits.sweeps._run import run_sweep
     from fits.sweeps._spec import parse_sweep
