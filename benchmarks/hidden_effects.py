@@ -56,22 +56,34 @@ def begin() -> None:
     start_jax()
 
 
+def hide(names: tuple[str, ...], seed: int, settings: dict[str, Any], temperature: bool | None = None) -> Any:
+    """Hide effects in a rig."""
+    import data_synth
+
+    sizes = {name: settings[name] for name in ("rms_per_noise", "slow_samples", "fast_samples")}
+    return data_synth.hidden(names, seed=seed, temperature=temperature, **sizes)
+
+
+def read_back(bench: Any) -> tuple[list[Any], list[Any]]:
+    """What the CSVs of a rig say: the runs, and those held out."""
+    import data_synth
+    import fits
+
+    with tempfile.TemporaryDirectory() as folder:
+        data_synth.write(bench, folder)
+        slow, fast, *aside = (fits.read_csv(Path(folder) / f"{r.name}.csv") for r in bench.records)
+    return [slow, fast], aside
+
+
 def answer(task: tuple[str, int, dict[str, Any]]) -> dict[str, Any]:
     """Hide, diagnose and compare."""
     hidden, seed, settings = task
-    import data_synth
     import fits
     from fits import diagnose
     from fits.diagnosis._select import best_of
 
     names = () if hidden == "none" else tuple(hidden.split("+"))
-    bench = data_synth.hidden(
-        names,
-        seed=seed,
-        rms_per_noise=settings["rms_per_noise"],
-        slow_samples=settings["slow_samples"],
-        fast_samples=settings["fast_samples"],
-    )
+    bench = hide(names, seed, settings)
     row: dict[str, Any] = {
         "hidden": hidden,
         "seed": seed,
@@ -87,11 +99,9 @@ def answer(task: tuple[str, int, dict[str, Any]]) -> dict[str, Any]:
     }
     began = time.monotonic()
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            data_synth.write(bench, folder)
-            slow, fast, *aside = (fits.read_csv(Path(folder) / f"{r.name}.csv") for r in bench.records)
-        found = diagnose([slow, fast], holdout=aside, false_alarm=settings["false_alarm"])
-        again = play_next(bench, found, names, [slow, fast], aside, settings)
+        records, aside = read_back(bench)
+        found = diagnose(records, holdout=aside, false_alarm=settings["false_alarm"])
+        again = play_next(bench, found, names, records, aside, settings)
     except (fits.DataError, fits.FitError) as error:
         return row | {"refused": str(error), "seconds": time.monotonic() - began}
     except Exception as error:  # a study does not end for one rig
@@ -134,6 +144,10 @@ def play_next(
     ahead = found.next_experiment
     if not names or not found.causes or not found.causes[0].also_consistent or ahead is None:
         return None
+    if ahead.column.startswith("temperature") and "temperature_C" not in bench.records[0].columns():
+        # The same rig, measured again with the column that is asked for.
+        bench = hide(names, bench.scenario.seed, settings, temperature=True)
+        records, aside = read_back(bench)
     played = bench.play(ahead.time_s, ahead.voltage_V, np.random.default_rng(0))
     own = played.columns()
     extra = {name: own[name] for name in own if name not in ("time_s", "voltage_V", "displacement_um")}

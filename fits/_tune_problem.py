@@ -288,7 +288,8 @@ def _merit(
     problem, multipliers, weight, scale = args
     found = figures(problem, problem.controller(y))
     over = excess(problem, found)
-    total = jnp.log(cost_um(problem, found))
+    # A long first step must not end where all is flat, from where no gradient leads back.
+    total = jnp.log(cost_um(problem, found)) + jnp.sum(jnp.maximum(jnp.abs(y) - 2 * REACH, 0) ** 2)
     for name, share in over.items():
         push = jnp.maximum(share + multipliers[name] / weight, 0)
         total = total + jnp.sum(weight / 2 * push**2 - multipliers[name] ** 2 / (2 * weight))
