@@ -27,6 +27,8 @@ _UNSEEN, _ANYTHING = 1e-4, 1e6
 _BLOCK = 25
 # Part of the shortest record by which another instant is tried at first.
 _AROUND = 0.05
+# Displacements beyond this are those of a model that runs away.
+_AWAY_um = 1e9
 # Multiples of the linearised answer from which a fit may start.
 _MORE = (1.0, 3.0, 9.0)
 
@@ -283,7 +285,8 @@ def _fit(
             [*fixed[run], *(law.effect(own, run) for law, own in zip(laws[held:], cut, strict=True))]
             for run in range(runs)
         ]
-        return [a - b for a, b in zip(bench.respond(effects), bench.plain, strict=True)]
+        # What runs away is as wrong as can be, and its square is still a number.
+        return [np.clip(a - b, -_AWAY_um, _AWAY_um) for a, b in zip(bench.respond(effects), bench.plain, strict=True)]
 
     def off(joined: np.ndarray) -> np.ndarray:
         moved = projector.off(joined)

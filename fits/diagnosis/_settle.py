@@ -1,6 +1,7 @@
 """Causes and the baseline fitted to each other: where both belong, beside what noise and roughness there is."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -14,6 +15,8 @@ from fits.diagnosis._regression import regress
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _OFF = 1.0
+# Rounds beside a density whose zeros stay, and standard deviations below which a coordinate has not moved.
+_BOUNDED, _MOVED = 4, 0.1
 # Noise or roughness that falls by less than this factor is the same.
 _LESS = 0.8
 
@@ -38,14 +41,40 @@ def settle(
     A baseline fitted without them may be far from where it belongs, farther than its tangent reaches.
     """
     for count in rounds:
-        # What roughness beyond the grid would explain is not put into the grid.
-        bare = Projector(projector.regression, projector.noise)
-        moved = bare.move(bare.residual - bare.join(model.change_um))
-        regression = regress(moved, projector.regression.finer)
-        bench = Bench(regression.baseline)
-        projector = Projector(regression, projector.noise, projector.roughness)
+        bench, projector = _follow(bench, projector, model)
         model = refit(bench, projector, model.laws, model.x, count)
     return bench, projector, model
+
+
+def bounded(bench: Bench, projector: Projector, model: Refit, finest: bool) -> Settled:
+    """Fit the causes again beside a density that is nowhere negative.
+
+    A tangent takes for free what cannot become less than nothing, and there a cause may hide: a play in relays
+    without width, a rail in those beyond it.
+    """
+    for _ in range(_BOUNDED if model.laws else 0):
+        moved = _follow(bench, projector, model, finest)
+        columns_um, regression = moved[0].baseline.columns_um, moved[1].regression
+        free = np.concatenate([columns_um > 0, np.ones(regression.size - len(columns_um), dtype=bool)])
+        if free.all():
+            break
+        bench, projector = moved
+        rows = tuple(np.where(free, one, 0.0) for one in regression.rows)
+        held = Projector(replace(regression, rows=rows), projector.noise, projector.roughness)
+        before, model = np.concatenate(model.x), refit(bench, held, model.laws, model.x, 4)
+        sd = np.sqrt(np.diagonal(model.covariance()))
+        if np.all(np.abs(np.concatenate(model.x) - before) <= _MOVED * sd):
+            break
+    return bench, projector, model
+
+
+def _follow(bench: Bench, projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
+    """Move the baseline to where the causes leave it."""
+    # What roughness beyond the grid would explain is not put into the grid.
+    bare = Projector(projector.regression, projector.noise)
+    moved = bare.move(bare.residual - bare.join(model.change_um))
+    regression = regress(moved, projector.regression.finer)
+    return Bench(regression.baseline, finest=finest), Projector(regression, projector.noise, projector.roughness)
 
 
 def smoother(bench: Bench, projector: Projector, model: Refit) -> Settled:
