@@ -9,7 +9,7 @@ from fits.diagnosis._candidates import Bench, Probe
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
 from fits.diagnosis._score import Family, Scored, rescore, score
-from fits.diagnosis._settle import Settled, bounded, finely, quieter, settled, smoother
+from fits.diagnosis._settle import Settled, bounded, finely, quieter, settled, smoother, stronger
 from microid import EFFECTS
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
@@ -179,7 +179,7 @@ def select(
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
         family = Family(left, rng)
     causes, model = _backward(bench, projector, causes, model)
-    bench, projector, model = smoother(bench, projector, model)
+    bench, projector, model = smoother(*stronger(bench, projector, model))
     model, finest = finely(bench, projector, model)
     bench, projector, model = bounded(bench, projector, model, finest)
     return Selection(tuple(causes), model, plain, scores, left, family, bench, projector, first_projector, finest)

@@ -10,11 +10,13 @@ from fits.diagnosis._candidates import Bench
 from fits.diagnosis._faults import find_faults
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector, learn_roughness
-from fits.diagnosis._refit import Refit, refit, relocate
+from fits.diagnosis._refit import Law, Refit, refit, relocate
 from fits.diagnosis._regression import regress
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _OFF = 1.0
+# Multiple of a strength that is tried, and the gain in chi-square for which it is taken.
+_LARGER, _BETTER = 1.5, 10.0
 # Rounds beside a density whose zeros stay, and standard deviations below which a coordinate has not moved.
 _BOUNDED, _MOVED = 4, 0.1
 # Noise or roughness that falls by less than this factor is the same.
@@ -43,6 +45,23 @@ def settle(
     for count in rounds:
         bench, projector = _follow(bench, projector, model)
         model = refit(bench, projector, model.laws, model.x, count)
+    return bench, projector, model
+
+
+def stronger(bench: Bench, projector: Projector, model: Refit) -> Settled:
+    """Try effects that level off at larger strengths, from where a baseline that has taken part of one lets it go."""
+    for k in range(len(model.laws)):
+        while (form := model.laws[k].form).finite and form.strength:
+            here = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
+            law = Law(
+                [replace(one, **{name: _LARGER * getattr(one, name) for name in form.strength}) for one in here]
+            )
+            laws, x = list(model.laws), list(model.x)
+            laws[k], x[k] = law, law.start
+            trial = settle(bench, projector, refit(bench, projector, laws, x, 0))
+            if trial[-1].cost > model.cost - _BETTER:
+                break
+            bench, projector, model = trial
     return bench, projector, model
 
 
