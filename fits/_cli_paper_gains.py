@@ -24,8 +24,8 @@ _TRACK = {
 }
 # The network starts at the gains of the PID controller, and may take them this factor up and down.
 _SPAN, _NETWORK_RATE_per_um2, _NETWORK_um = 1.5, 1e-3, 20.0
-_LEVELS, _GENERALISATION, _TABLE_V = (32, 32), 16, 2.0
-_TRACK_RATE, _STEP_RATE = 0.01, 3e-4
+_LEVELS, _GENERALISATION, _TABLE_V = (64, 64), 32, 2.0
+_TRACK_RATE, _STEP_RATE = 0.005, 3e-4
 
 
 @dataclass(frozen=True)

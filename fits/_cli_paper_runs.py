@@ -27,7 +27,7 @@ LEVELS = 23
 # Loops are closed this long before a run begins, so that the noise they carry has found its level.
 LEAD_s = 1.0
 # What a table learns from before a tracking run: two periods and a rest each.
-TRAINING_RUNS = 3
+TRAINING_RUNS = 6
 _STEP_s = 3.0
 
 
