@@ -1,5 +1,6 @@
 """All runs as one regression: derivatives of the baseline, and finer structure of the density than its grid has."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -13,6 +14,8 @@ from fits._stage_moments import Chain, linearise, pieces
 from fits._stage_run import StageRun
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import simulate
+from fits.diagnosis._through import behind, dressed, passed
+from microid import AbstractEffect
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
 _FINE = 64
@@ -44,6 +47,8 @@ class Regression:
         Measurement less simulation, in um, shape `(n,)` per run.
     root
         Root of the prior precision of the columns, shape `(D, D)`.
+    through
+        Per run, the effects that the derivatives go through; the residuals are those without them.
     """
 
     baseline: Baseline
@@ -53,6 +58,7 @@ class Regression:
     finer: Kinds
     residuals: tuple[np.ndarray, ...]
     root: np.ndarray
+    through: tuple[tuple[AbstractEffect, ...], ...]
 
     @property
     def size(self) -> int:
@@ -60,31 +66,45 @@ class Regression:
         return self.rows[0].shape[1]
 
 
-def regress(baseline: Baseline, finer: Kinds | None = None) -> Regression:
+def regress(
+    baseline: Baseline, finer: Kinds | None = None, effects: Sequence[Sequence[AbstractEffect]] = ()
+) -> Regression:
     """Linearise a baseline in all its runs.
 
-    Structure finer than its grid is computed where it is not known already, from a baseline nearby.
+    Parameters
+    ----------
+    baseline
+        The plain stage.
+    finer
+        Structure finer than its grid, from a baseline nearby and under the same effects; computed by default.
+    effects
+        Per run, those beside which the baseline moves: the derivatives go through them where that matters.
     """
-    chain, runs = baseline.chain, baseline.runs
+    chain, runs, z = baseline.chain, baseline.runs, jnp.asarray(baseline.z)
     assert chain.grid is not None
-    fine = Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE)
-    fine_chain = Chain(chain.coordinates, chain.place, fine)
+    through = tuple(map(passed, effects)) if effects else ((),) * len(runs)
     bases = _bases(baseline) if finer is None else []
     rows, own, residuals = [], [], []
     kinds: list[list[np.ndarray]] = [[] for _ in bases]
     stage = baseline.stage
-    for run, fine_run in zip(runs, baseline.fine, strict=True):
-        _, slope, free = linearise(chain, jnp.asarray(baseline.z), jnp.asarray(baseline.columns_um), run)
+    for run, fine_run, there in zip(runs, baseline.fine, through, strict=True):
+        here = dressed(chain, baseline.z, there)
+        _, slope, free = linearise(here, z, jnp.asarray(baseline.columns_um), run)
+        if there:
+            _, _, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
         both[:, chain.size :] = slope[:n]
-        for first, columns in pieces(chain, jnp.asarray(baseline.z), run, True):
+        for first, columns in pieces(here, z, run, True):
             both[first : first + len(columns), : chain.size] = columns[: n - first]
+        around = both[:, : chain.size] @ baseline.columns_um
+        both[:, : chain.size] = behind(here, baseline.z, run, around, both[:, : chain.size])
         rows.append(both)
         own.append(free[:n])
         residuals.append(run.displacement_um - simulate(stage, fine_run))
         if finer is None:
-            for kind, part in zip(kinds, _along(fine_chain, baseline, run, bases), strict=True):
+            fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
+            for kind, part in zip(kinds, _along(fine, baseline, run, bases, around), strict=True):
                 kind.append(part)
     trace = np.trace(baseline.prior) / len(baseline.prior)
     return Regression(
@@ -95,6 +115,7 @@ def regress(baseline: Baseline, finer: Kinds | None = None) -> Regression:
         tuple(tuple(kind) for kind in kinds) if finer is None else finer,
         tuple(residuals),
         cholesky(baseline.prior + 1e-12 * trace * np.eye(len(baseline.prior))),
+        through,
     )
 
 
@@ -116,8 +137,10 @@ def _bases(baseline: Baseline) -> list[np.ndarray]:
     return [loops, places]
 
 
-def _along(finer: Chain, baseline: Baseline, run: StageRun, bases: list[np.ndarray]) -> list[np.ndarray]:
+def _along(
+    finer: Chain, baseline: Baseline, run: StageRun, bases: list[np.ndarray], around_um: np.ndarray
+) -> list[np.ndarray]:
     joined = np.concatenate(bases, axis=1)
     parts = [columns @ joined for _, columns in pieces(finer, jnp.asarray(baseline.z), run, True)]
-    moved = np.concatenate(parts)[: len(run.record)]
+    moved = behind(finer, baseline.z, run, around_um, np.concatenate(parts)[: len(run.record)])
     return np.split(moved, np.cumsum([base.shape[1] for base in bases])[:-1], axis=1)

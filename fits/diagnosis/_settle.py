@@ -12,6 +12,7 @@ from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._refit import Law, Refit, refit, relocate
 from fits.diagnosis._regression import regress
+from fits.diagnosis._through import passed
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _OFF = 1.0
@@ -92,7 +93,10 @@ def _follow(bench: Bench, projector: Projector, model: Refit, finest: bool = Fal
     # What roughness beyond the grid would explain is not put into the grid.
     bare = Projector(projector.regression, projector.noise)
     moved = bare.move(bare.residual - bare.join(model.change_um))
-    regression = regress(moved, projector.regression.finer)
+    effects = [model.effects(run) for run in range(len(bench.prepared))]
+    # What is finer than the grid hardly changes, but where derivatives go through effects.
+    plain = not any(projector.regression.through) and not any(map(passed, effects))
+    regression = regress(moved, projector.regression.finer if plain else None, effects)
     return Bench(regression.baseline, finest=finest), Projector(regression, projector.noise, projector.roughness)
 
 
