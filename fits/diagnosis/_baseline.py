@@ -97,7 +97,7 @@ class Baseline:
         """The fitted stage, without an offset."""
         return self.chain.stage(jnp.asarray(self.z), jnp.asarray(self.columns_um))
 
-    def moved(self, dz: np.ndarray, dcolumns_um: np.ndarray) -> "Baseline":
+    def moved(self, dz: np.ndarray, dcolumns_um: np.ndarray | float) -> "Baseline":
         """The same at other coordinates and columns."""
         return replace(self, z=self.z + dz, columns_um=self.columns_um + dcolumns_um)
 

@@ -13,13 +13,15 @@ from fits._prior import interpolation
 from fits._stage_moments import Chain, linearise, pieces
 from fits._stage_run import StageRun
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._evaluate import simulate
+from fits.diagnosis._evaluate import simulate, with_effects
 from fits.diagnosis._through import behind, dressed, passed
 from microid import AbstractEffect
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
 _FINE = 64
 _EXAMPLES = 120
+# Of central differences along coordinates, which are of the size of one.
+_STEP = 1e-4
 
 
 # By kind, per run.
@@ -89,12 +91,10 @@ def regress(
     stage = baseline.stage
     for run, fine_run, there in zip(runs, baseline.fine, through, strict=True):
         here = dressed(chain, baseline.z, there)
-        _, slope, free = linearise(here, z, jnp.asarray(baseline.columns_um), run)
-        if there:
-            _, _, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
+        _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
-        both[:, chain.size :] = slope[:n]
+        both[:, chain.size :] = _slope(baseline, there, fine_run) if there else slope[:n]
         for first, columns in pieces(here, z, run, True):
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         around = both[:, : chain.size] @ baseline.columns_um
@@ -117,6 +117,18 @@ def regress(
         cholesky(baseline.prior + 1e-12 * trace * np.eye(len(baseline.prior))),
         through,
     )
+
+
+def _slope(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: StageRun) -> np.ndarray:
+    """Derivatives along the coordinates of the stage with effects, shape `(n, p)`, by central differences.
+
+    Their programs are at hand, those of exact ones would have to be compiled for every effect.
+    """
+    out = np.empty((len(run.record), len(baseline.z)))
+    for k, step in enumerate(_STEP * np.eye(len(baseline.z))):
+        ends = [simulate(with_effects(baseline.moved(way, 0.0).stage, effects), run) for way in (step, -step)]
+        out[:, k] = (ends[0] - ends[1]) / (2 * _STEP)
+    return out
 
 
 def _bases(baseline: Baseline) -> list[np.ndarray]:
