@@ -1,7 +1,6 @@
 """Rows in chunks that are computed and kept one at a time, and in blocks within them."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,41 +52,32 @@ def rows_of(sweep: Sweep, chunk: int) -> NDArray[np.int64]:
 
 
 def compute_chunk(sweep: Sweep, chunk: int, tell: Callable[[int], None] = lambda _: None) -> Rows:
-    """Compute a chunk block by block, the last one filled up with its last row.
+    """Compute a chunk, as many blocks at a time as there are devices, the last ones filled up with the last row.
 
     Parameters
     ----------
     sweep, chunk
         Which.
     tell
-        Called with the number of rows that a block has added.
+        Called with the number of rows that are added each time.
 
     Returns
     -------
     Rows
         With the swept values beside the outputs, and `status`.
     """
-    rows, block = rows_of(sweep, chunk), sweep.facts.block
-    pieces = [rows[first : first + block] for first in range(0, len(rows), block)]
+    rows, facts = rows_of(sweep, chunk), sweep.facts
+    together = facts.block * (1 if facts.alone else device_count())
     parts = []
-    for piece, part in zip(pieces, _blocks(sweep, pieces), strict=True):
-        parts.append(part)
-        tell(len(piece))
+    for first in range(0, len(rows), together):
+        parts.append(_blocks(sweep, rows[first : first + together], together))
+        tell(len(parts[-1].reasons))
     outputs = {name: np.concatenate([part.outputs[name] for part in parts]) for name in parts[0].outputs}
     return Rows(outputs, tuple(reason for part in parts for reason in part.reasons))
 
 
-def _blocks(sweep: Sweep, pieces: list[NDArray[np.int64]]) -> Iterator[Rows]:
-    """Blocks in their order; where there are several devices, each has a thread that waits for it."""
-    if device_count() == 1:
-        yield from (_block(sweep, piece) for piece in pieces)
-        return
-    with ThreadPoolExecutor(device_count()) as pool:
-        yield from pool.map(lambda piece: _block(sweep, piece), pieces)
-
-
-def _block(sweep: Sweep, rows: NDArray[np.int64]) -> Rows:
-    padded = np.pad(rows, (0, sweep.facts.block - len(rows)), mode="edge")
+def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
+    padded = np.pad(rows, (0, together - len(rows)), mode="edge")
     values = sweep.plan.values(padded)
     inside, refused = outside(sweep, values) if values else (values, [""] * len(padded))
     found = sweep.job.compute(inside, padded, sweep.plan.repeat_of(padded), sweep.seed)

@@ -1,10 +1,19 @@
-"""Which device computes a block: blocks go round all local ones."""
+"""Blocks of rows on all local devices: as many blocks as there are devices are one array, sharded over them."""
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array
 from numpy.typing import NDArray
+
+_ROWS = "rows"
 
 
 def on_cpu() -> bool:
@@ -17,7 +26,91 @@ def device_count() -> int:
     return jax.local_device_count()
 
 
-def device_of(rows: NDArray[np.int64]) -> Any:
-    """The local device that computes a block, which its first row chooses."""
-    devices = jax.local_devices()
-    return devices[int(rows[0]) // max(1, len(rows)) % len(devices)]
+def place(rows: NDArray[Any]) -> Array:
+    """Put an array on the devices, a block of its first axis on each, or on one if they cannot share it evenly."""
+    if _shares(len(rows)) == 1:
+        return jnp.asarray(rows)
+    mesh = Mesh(np.array(jax.local_devices()), (_ROWS,))
+    return jax.device_put(rows, NamedSharding(mesh, PartitionSpec(_ROWS)))
+
+
+def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Jit a function of rows. Where its rows are on several devices, each runs it for its own ones.
+
+    Nothing goes from device to device: each runs the program that it would run for its block alone.
+
+    Parameters
+    ----------
+    own
+        Names of the arguments whose arrays have the rows along their first axis, as all results have. What else there
+        is of arrays belongs to all rows.
+
+    Returns
+    -------
+    Callable
+        Decorator. What it makes takes arguments by place.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        names = tuple(inspect.signature(function).parameters)
+        specs = tuple(PartitionSpec(_ROWS) if name in own else PartitionSpec() for name in names)
+        first, whole = names.index(own[0]), eqx.filter_jit(function)
+
+        @eqx.filter_jit
+        def shared(mesh: Mesh, arguments: tuple[Any, ...]) -> Any:
+            arrays, others = eqx.partition(arguments, eqx.is_array)
+            run = jax.shard_map(
+                lambda arrays: function(*eqx.combine(arrays, others)),
+                mesh=mesh,
+                in_specs=(specs,),
+                out_specs=PartitionSpec(_ROWS),
+                # It would refuse loops that start from constants, and nothing is exchanged that needs the check.
+                check_vma=False,
+            )
+            return run(arrays)
+
+        @wraps(function)
+        def called(*arguments: Any) -> Any:
+            mesh = _mesh(arguments[first])
+            return whole(*arguments) if mesh is None else shared(mesh, arguments)
+
+        return called
+
+    return decorate
+
+
+def in_turn(function: Callable[..., Any], *rows: NDArray[Any]) -> Any:
+    """Call a function for block after block on one CPU.
+
+    For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib up to 0.10 the threads
+    of several CPU devices that factor many matrices at once wait for each other for ever.
+
+    Parameters
+    ----------
+    function
+        Of arrays with the rows of one block along their first axis, as its results have.
+    rows
+        Its arguments, for the blocks of all devices.
+
+    Returns
+    -------
+    Any
+        Its results for all blocks, joined.
+    """
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        blocks = zip(*(np.split(each, _shares(len(each))) for each in rows), strict=True)
+        found = [jax.device_get(function(*map(jnp.asarray, block))) for block in blocks]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+
+
+def _shares(rows: int) -> int:
+    return 1 if rows % device_count() else device_count()
+
+
+def _mesh(rows: Any) -> Mesh | None:
+    """Devices that share rows, None where there is one."""
+    sharding = getattr(jax.tree.leaves(rows)[0], "sharding", None)
+    if not isinstance(sharding, NamedSharding) or sharding.num_devices == 1:
+        return None
+    assert isinstance(sharding.mesh, Mesh)
+    return sharding.mesh

@@ -17,6 +17,7 @@ from fits._evidence import effective, posterior, renew_noise
 from fits._moments import Moments
 from fits._nonnegative import BlockPivoting
 from fits._prior import Hyper, Roughness
+from fits.sweeps._devices import by_rows
 from microid import Staircase
 
 _ATOL, _STEPS = 1e-6, 500
@@ -46,7 +47,7 @@ class BatchFit(eqx.Module):
     success: Array
 
 
-@eqx.filter_jit
+@by_rows("voltage_V", "displacement_um", "weight", "limits_V", "smoothness", "starts")
 def fit_batch(
     levels: int,
     table: Float[Array, "4 k D"],

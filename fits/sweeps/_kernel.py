@@ -9,12 +9,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from fits.sweeps._devices import by_rows
 from fits.sweeps._stages import varied
 from microid import (
     AbstractLinear,
@@ -82,7 +82,7 @@ def respond(
     return signal
 
 
-@eqx.filter_jit
+@by_rows("table", "voltage")
 def _mapped(
     stage: Stage,
     table: Float[Array, "n k"],
@@ -97,7 +97,7 @@ def _mapped(
     return jax.vmap(lambda row, signal: vary(row)(interval, signal, start))(table, voltage)
 
 
-@eqx.filter_jit
+@by_rows("table")
 def _pieces(
     stage: Stage,
     table: Float[Array, "n k"],
@@ -153,7 +153,7 @@ def _surface(vary: Callable[[Array], Stage], place: int, row: Float[Array, " k"]
     return part.everett, part.offset_um
 
 
-@eqx.filter_jit
+@by_rows("system", "signal", "before")
 def _linear(
     system: LinearSystem, interval_s: Float[Array, ""], signal: Float[Array, "n t"], before: Array, hold: Hold
 ) -> tuple[Float[Array, "n t"], Float[Array, " n"]]:
@@ -188,7 +188,7 @@ def _driven(
     return jnp.concatenate([first[:, None], level[:, 1:] + moved.T], axis=1)
 
 
-@eqx.filter_jit
+@by_rows("surface", "offset", "voltage", "before")
 def _hysteresis(
     surface: Everett, offset: Float[Array, " n"], voltage: Float[Array, "n t"], before: Array, memory: Staircase
 ) -> tuple[Float[Array, "n t"], Float[Array, " n"]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fits._errors import DataError
 from fits._stage_design import nearest
-from fits.sweeps._devices import device_of
+from fits.sweeps._devices import by_rows, in_turn, place
 from fits.sweeps._jobs import Request
 from fits.sweeps._kinds_simulate import block_rows, drive, table_of
 from fits.sweeps._programs import Program, number, read_program
@@ -99,27 +99,24 @@ class ControlJob(AbstractJob):
     ) -> Rows:
         """Run one block of loops; see `AbstractJob.compute`."""
         del sources, seed
-        with jax.default_device(device_of(rows)):
-            settings = table_of(values, self._names, len(rows))
-            table = jnp.asarray(settings)
-            wanted = drive(table, self._names, self._reference, self._given)
-            found = _control(
-                self._stage,
-                self._pid,
-                table,
-                self._names,
-                self._relative,
-                wanted,
-                self._start,
-                self._delay,
-                self._reference.shape == "step",
-            )
-            outputs = {name: np.asarray(value) for name, value in found.items()}
-        # Eigenvalues of general matrices are found on CPUs.
-        with jax.default_device(jax.local_devices(backend="cpu")[0]):
-            outputs["pole_radius"] = np.asarray(
-                _radius(self._stage, self._pid, jnp.asarray(settings), self._names, self._relative, self._delay)
-            )
+        settings = table_of(values, self._names, len(rows))
+        table = place(settings)
+        wanted = drive(table, self._names, self._reference, self._given)
+        found = _control(
+            self._stage,
+            self._pid,
+            table,
+            self._names,
+            self._relative,
+            wanted,
+            self._start,
+            self._delay,
+            self._reference.shape == "step",
+        )
+        outputs = {name: np.asarray(value) for name, value in found.items()}
+        outputs["pole_radius"] = in_turn(
+            lambda rows: _radius(self._stage, self._pid, rows, self._names, self._relative, self._delay), settings
+        )
         moved = np.ptp(np.asarray(wanted), axis=1)
         way = np.maximum(moved, np.abs(outputs.pop("from_um")))
         return Rows(outputs, tuple(map(_why_not, way, outputs["pole_radius"], outputs["e_max_pct"])))
@@ -188,7 +185,7 @@ def _pid_parameters(pid: PID) -> tuple[Parameter, ...]:
     )
 
 
-@eqx.filter_jit
+@by_rows("table", "wanted")
 def _control(
     stage: Stage,
     pid: PID,

@@ -42,7 +42,7 @@ class DiagnoseJob(AbstractJob):
         """What is known before it runs."""
         sources = self._records.names if isinstance(self._records, Files) else ()
         alarm = Parameter("diagnose.false_alarm", "1", self._false_alarm, 1e-6, 0.5)
-        return Facts((*self._records.parameters, alarm), _OUTPUTS, 1, sources)
+        return Facts((*self._records.parameters, alarm), _OUTPUTS, 1, sources, alone=True)
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int

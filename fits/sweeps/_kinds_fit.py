@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from numpy.typing import NDArray
 
 from fits._design import branch_table
@@ -16,7 +17,8 @@ from fits._record import Record
 from fits._result import FitError
 from fits._run import INITIAL_STATES, initial_state, known_samples
 from fits._stage_design import nearest
-from fits.sweeps._fit_batch import fit_batch
+from fits.sweeps._devices import in_turn, on_cpu, place
+from fits.sweeps._fit_batch import BatchFit, fit_batch
 from fits.sweeps._jobs import Request
 from fits.sweeps._programs import number
 from fits.sweeps._records import Files, Simulated, requested_records
@@ -88,7 +90,7 @@ class FitJob(AbstractJob):
         if self._batch:
             parameters = (*parameters, Parameter("fit.smoothness", "1", self._smoothness, 1e-12, 1e6))
         block = _BLOCK if self._batch else 1
-        return Facts(parameters, tuple(outputs), block, sources)
+        return Facts(parameters, tuple(outputs), block, sources, alone=not self._batch)
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
@@ -147,17 +149,14 @@ class FitJob(AbstractJob):
                 reasons[k] = f"only {int(fitted[k].sum())} samples are left to fit, {_FEWEST} are needed"
             start = initial_state(self._initial, *limits[k])
             extremes[k], used[k] = np.asarray(start.extremes_V), int(start.count)
-        found = fit_batch(
-            levels,
-            jnp.asarray(branch_table(levels)),
-            roughness(levels),
-            jnp.asarray(voltage),
-            jnp.asarray(displacement),
-            jnp.asarray(fitted),
-            jnp.asarray(limits),
-            jnp.asarray(smoothness),
-            Staircase(jnp.asarray(extremes), jnp.asarray(used)),
-        )
+        table, rough = jnp.asarray(branch_table(levels)), roughness(levels)
+
+        def regress(*rows: Array) -> BatchFit:
+            found: BatchFit = fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
+            return found
+
+        rows = voltage, displacement, fitted, limits, smoothness, extremes, used
+        found = in_turn(regress, *rows) if on_cpu() else regress(*map(place, rows))
         areas = node_areas(levels)[np.tril_indices(levels)]
         weights = np.asarray(found.columns_um)[:, : len(areas)] * areas
         outputs: dict[str, Any] = {

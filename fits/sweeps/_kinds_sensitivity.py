@@ -13,7 +13,7 @@ import microid as m
 from fits._errors import DataError
 from fits._stage_design import Design, paper_design
 from fits._stage_toml import read_design
-from fits.sweeps._devices import device_of
+from fits.sweeps._devices import by_rows, place
 from fits.sweeps._files import in_a_file
 from fits.sweeps._jobs import Request
 from fits.sweeps._kinds_simulate import table_of
@@ -54,28 +54,27 @@ class SensitivityJob(AbstractJob):
         del sources, seed
         design = self._design
         outputs: dict[str, np.ndarray] = {}
-        with jax.default_device(device_of(rows)):
-            table = jnp.asarray(table_of(values, self._names, len(rows)))
-            for axis in self._axes:
-                names = m.MOTIONS[axis].dimensions
-                tolerance = jnp.asarray([design.tolerance[name] for name in names])
-                together = jnp.asarray(design.correlation(names))
-                nominal = jnp.asarray(design.youngs_modulus_GPa), jnp.asarray(design.guides)
-                found = _evaluate(
-                    design.geometry,
-                    design.actuation,
-                    nominal,
-                    table,
-                    tolerance,
-                    together,
-                    self._names,
-                    self._relative,
-                    axis,
-                    design.level,
-                )
-                unit = m.MOTIONS[axis].unit
-                ends = (f"gain_{unit}_per_um", f"stroke_{unit}", "resonance_Hz", "spread_pct")
-                outputs |= {f"{axis}_{end}": np.asarray(value) for end, value in zip(ends, found, strict=True)}
+        table = place(table_of(values, self._names, len(rows)))
+        for axis in self._axes:
+            names = m.MOTIONS[axis].dimensions
+            tolerance = jnp.asarray([design.tolerance[name] for name in names])
+            together = jnp.asarray(design.correlation(names))
+            nominal = jnp.asarray(design.youngs_modulus_GPa), jnp.asarray(design.guides)
+            found = _evaluate(
+                design.geometry,
+                design.actuation,
+                nominal,
+                table,
+                tolerance,
+                together,
+                self._names,
+                self._relative,
+                axis,
+                design.level,
+            )
+            unit = m.MOTIONS[axis].unit
+            ends = (f"gain_{unit}_per_um", f"stroke_{unit}", "resonance_Hz", "spread_pct")
+            outputs |= {f"{axis}_{end}": np.asarray(value) for end, value in zip(ends, found, strict=True)}
         good = np.all([np.isfinite(value) for value in outputs.values()], axis=0)
         reasons = tuple("" if each else "no finite number comes out: such a stage cannot be built" for each in good)
         return Rows(outputs, reasons)
@@ -112,7 +111,7 @@ def _parameters(design: Design) -> tuple[Parameter, ...]:
     return tuple(found)
 
 
-@eqx.filter_jit
+@by_rows("table")
 def _evaluate(
     geometry: m.Geometry,
     actuation: m.Actuation,

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from fits._errors import DataError
-from fits.sweeps._devices import device_of, on_cpu
+from fits.sweeps._devices import by_rows, on_cpu, place
 from fits.sweeps._jobs import Request
 from fits.sweeps._kernel import respond
 from fits.sweeps._programs import Program, number, read_program
@@ -84,20 +83,19 @@ class SimulateJob(AbstractJob):
         """Simulate one block; see `AbstractJob.compute`."""
         del sources, seed
         table = table_of(values, self._names, len(rows))
-        with jax.default_device(device_of(rows)):
-            found = _simulate(
-                self._stage,
-                jnp.asarray(table),
-                self._names,
-                self._relative,
-                self._program,
-                self._given,
-                self._memory,
-                self._first,
-                self._every,
-                on_cpu(),
-            )
-            outputs = {name: np.asarray(value) for name, value in found.items()}
+        found = _simulate(
+            self._stage,
+            place(table),
+            self._names,
+            self._relative,
+            self._program,
+            self._given,
+            self._memory,
+            self._first,
+            self._every,
+            on_cpu(),
+        )
+        outputs = {name: np.asarray(value) for name, value in found.items()}
         fine = np.isfinite(outputs["displacement_rms_um"])
         reasons = tuple("" if good else "the displacement is not finite" for good in fine)
         return Rows(outputs, reasons)
@@ -160,7 +158,7 @@ def table_of(values: Mapping[str, FloatArray], names: tuple[str, ...], count: in
     return np.stack([values[name] for name in names], axis=1) if names else np.zeros((count, 0))
 
 
-@eqx.filter_jit
+@by_rows("table")
 def drive(
     table: Float[Array, "n k"], names: tuple[str, ...], program: Program, given: Float[Array, " t"] | None
 ) -> Float[Array, "n t"]:
@@ -168,7 +166,7 @@ def drive(
     return jax.vmap(lambda row: program.signal(dict(zip(names, row, strict=True)), given))(table)
 
 
-@eqx.filter_jit
+@by_rows("voltage", "displacement")
 def _sum_up(
     voltage: Float[Array, "n t"], displacement: Float[Array, "n t"], first: int
 ) -> dict[str, Float[Array, " n"]]:

@@ -16,7 +16,7 @@ from fits._read_csv import read_csv
 from fits._record import Record
 from fits._stage_design import nearest
 from fits._units import parse_columns
-from fits.sweeps._devices import on_cpu
+from fits.sweeps._devices import on_cpu, place
 from fits.sweeps._jobs import Request
 from fits.sweeps._kernel import respond
 from fits.sweeps._kinds_simulate import drive, table_of
@@ -99,7 +99,7 @@ class Simulated:
         del sources
         own = tuple(parameter.name for parameter in self.parameters)
         names = tuple(name for name in self.names if name in own)
-        table = jnp.asarray(table_of(values, names, len(rows)))
+        table = place(table_of(values, names, len(rows)))
         given = None if self.program.given is None else jnp.asarray(self.program.given)
         voltage = drive(table, names, self.program, given)
         memory = memory_before(self.stage, self.initial)

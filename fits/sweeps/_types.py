@@ -96,12 +96,14 @@ class Facts:
     outputs
         All that comes out.
     block
-        Rows that are computed together. A row's numbers may depend on its place in the block, and on nothing else
-        of the rows beside it.
+        Rows that one device computes together. A row's numbers may depend on its place in the block, and on nothing
+        else of the rows beside it.
     sources
         Names of the rows there are by themselves, such as files; without them only the axes make rows.
     coordinates
         Values along the outputs' own axes: name to axis, unit and values.
+    alone
+        Whether rows go one by one, on one device whatever the number of devices.
     """
 
     parameters: tuple[Parameter, ...]
@@ -109,10 +111,14 @@ class Facts:
     block: int
     sources: tuple[str, ...] = ()
     coordinates: Mapping[str, tuple[str, str, FloatArray]] = field(default_factory=dict)
+    alone: bool = False
 
 
 class AbstractJob(abc.ABC):
-    """What is done with each row. Rows go through in blocks of one size, the last one filled up."""
+    """What is done with each row. Rows go through in blocks of one size, the last one filled up.
+
+    With several local devices as many blocks go through at once, one on each device.
+    """
 
     @property
     @abc.abstractmethod
@@ -123,16 +129,16 @@ class AbstractJob(abc.ABC):
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
     ) -> Rows:
-        """Compute one block.
+        """Compute one block on each device, `n` rows in all.
 
         Parameters
         ----------
         values
-            Swept parameters by name, in their own units, shape `(block,)`. Relative ones are factors.
+            Swept parameters by name, in their own units, shape `(n,)`. Relative ones are factors.
         rows
-            Their numbers in the sweep, shape `(block,)`; numbers of filling are repeated.
+            Their numbers in the sweep, shape `(n,)`; numbers of filling are repeated.
         sources
-            Which of `facts.sources` each has, shape `(block,)`.
+            Which of `facts.sources` each has, shape `(n,)`.
         seed
             Of the sweep.
         """
