@@ -1,13 +1,9 @@
 """What is said where a package of an extra is missing."""
 
-import os
-import subprocess
 import sys
-from pathlib import Path
 
-import pandas as pd
 import pytest
-from _command import OFF, refused, run
+from _command import refused, run
 from _sweeps import small
 
 from fits import DataError
@@ -48,18 +44,3 @@ def test_an_interrupted_sweep_goes_on(monkeypatch, tmp_path, seed):
     assert stopped.stderr == "Interrupted: what was computed is kept; go on with --resume.\n"
     monkeypatch.setattr(_run, "compute_chunk", compute)
     assert "344 computed" in run("sweep", tmp_path / "sweep.toml", "--out", out, "--resume").stdout
-
-
-def test_two_devices_give_the_same_bits(tmp_path, seed):
-    file, two = tmp_path / "sweep.toml", tmp_path / "two"
-    file.write_text(small(seed, rows=700))
-    subprocess.run(
-        [sys.executable, "-m", "fits", "sweep", str(file), "--out", str(two)],
-        cwd=Path(__file__).parents[1],
-        env=os.environ | OFF | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"},
-        check=True,
-        capture_output=True,
-    )
-    assert run("sweep", file, "--out", tmp_path / "one").exit_code == 0
-    here, there = (pd.read_parquet(tmp_path / name / "results.parquet") for name in ("one", "two"))
-    assert here.equals(there)

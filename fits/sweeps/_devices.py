@@ -37,7 +37,7 @@ def place(rows: NDArray[Any]) -> Array:
 def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Jit a function of rows. Where its rows are on several devices, each runs it for its own ones.
 
-    Nothing goes from device to device: each runs the program that it would run for its block alone.
+    Nothing goes from device to device: each does for its block what it would do with that block alone.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 def in_turn(function: Callable[..., Any], *rows: NDArray[Any]) -> Any:
     """Call a function for block after block on one CPU.
 
-    For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib up to 0.10 the threads
+    For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads
     of several CPU devices that factor many matrices at once wait for each other for ever.
 
     Parameters

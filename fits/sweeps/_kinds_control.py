@@ -97,7 +97,7 @@ class ControlJob(AbstractJob):
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
     ) -> Rows:
-        """Run one block of loops; see `AbstractJob.compute`."""
+        """Run a block of loops on each device; see `AbstractJob.compute`."""
         del sources, seed
         settings = table_of(values, self._names, len(rows))
         table = place(settings)

@@ -95,7 +95,7 @@ class FitJob(AbstractJob):
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
     ) -> Rows:
-        """Fit one block of records; see `AbstractJob.compute`."""
+        """Fit the records of some blocks; see `AbstractJob.compute`."""
         records = self._records.records(values, rows, sources, seed)
         holdout = values.get("fit.holdout", np.full(len(rows), self._holdout))
         if self._batch:

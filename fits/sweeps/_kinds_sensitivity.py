@@ -50,7 +50,7 @@ class SensitivityJob(AbstractJob):
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
     ) -> Rows:
-        """Evaluate one block of stages; see `AbstractJob.compute`."""
+        """Evaluate a block of stages on each device; see `AbstractJob.compute`."""
         del sources, seed
         design = self._design
         outputs: dict[str, np.ndarray] = {}

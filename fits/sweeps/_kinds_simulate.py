@@ -80,7 +80,7 @@ class SimulateJob(AbstractJob):
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
     ) -> Rows:
-        """Simulate one block; see `AbstractJob.compute`."""
+        """Simulate a block on each device; see `AbstractJob.compute`."""
         del sources, seed
         table = table_of(values, self._names, len(rows))
         found = _simulate(
