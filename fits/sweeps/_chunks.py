@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.sweeps._choices import kept_as, spelt
 from fits.sweeps._devices import device_count
 from fits.sweeps._spec import Sweep, outside
 from fits.sweeps._types import DONE, FAILED, Output, Rows
@@ -32,7 +33,13 @@ def chunk_rows(sweep: Sweep) -> int:
 
 def bytes_per_row(sweep: Sweep) -> int:
     """What a row takes before compression, without the reason, of which compression leaves next to nothing."""
-    return sum(output.bytes_per_row for output in sweep.facts.outputs) + 8 * len(sweep.plan.axes) + 1
+    return sum(output.bytes_per_row for output in (*swept_of(sweep), *sweep.facts.outputs)) + 1
+
+
+def swept_of(sweep: Sweep) -> tuple[Output, ...]:
+    """The variables that hold the values of the axes."""
+    known = {parameter.name: parameter for parameter in sweep.facts.parameters}
+    return tuple(kept_as(known[axis.parameter], axis.relative) for axis in sweep.plan.axes)
 
 
 def source_of(sweep: Sweep) -> Output:
@@ -86,7 +93,8 @@ def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
     ]
     failed = np.array([bool(reason) for reason in reasons])
     outputs = {output.name: _kept(found, output, failed, len(rows)) for output in sweep.facts.outputs}
-    outputs |= {name: value[: len(rows)] for name, value in values.items()}
+    known = {parameter.name: parameter for parameter in sweep.facts.parameters}
+    outputs |= {name: spelt(known[name], value[: len(rows)]) for name, value in values.items()}
     if sweep.facts.sources:
         names = [sweep.facts.sources[k] for k in sweep.plan.repeat_of(rows)]
         outputs["source"] = np.array(names, dtype=source_of(sweep).dtype)

@@ -11,6 +11,7 @@ import numpy as np
 
 from fits._errors import DataError
 from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
+from fits.sweeps._choices import check_plain, code_of
 from fits.sweeps._programs import number
 from fits.sweeps._types import Parameter
 
@@ -123,7 +124,8 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
             f"{place}.parameter: {parameter.name} is an array, varied relative to itself; add relative = true."
         )
     factor = _factor(entry.get("unit"), "1" if relative else parameter.unit, f"{place}.unit", parameter.name)
-    found = _values(entry, place, factor)
+    found = _values(entry, place, factor, parameter)
+    check_plain(parameter, found if isinstance(found, np.ndarray) else None, relative, place)
     if relative and math.isfinite(parameter.nominal):
         # Factors of single numbers become values at once; only those of arrays stay factors.
         if parameter.nominal == 0:
@@ -143,7 +145,9 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
     return axis, None
 
 
-def _values(entry: Mapping[str, Any], place: str, factor: float) -> np.ndarray | tuple[str, float, float]:
+def _values(
+    entry: Mapping[str, Any], place: str, factor: float, parameter: Parameter
+) -> np.ndarray | tuple[str, float, float]:
     """Values of a list or grid, or the distribution to draw from with its two numbers."""
     ways = [way for way in ("values", "low", "mean") if way in entry]
     if len(ways) != 1:
@@ -153,14 +157,22 @@ def _values(entry: Mapping[str, Any], place: str, factor: float) -> np.ndarray |
     for key in entry:
         if key not in ("parameter", "unit", "relative", *_WAYS[ways[0]]):
             raise DataError(f"{place}.{key}: an axis with {ways[0]} has no {key}; leave out one of the two.")
+    if parameter.words and ways[0] != "values":
+        raise DataError(
+            f"{place}.{ways[0]}: {parameter.name} is a choice of words, which are listed; give values, some of "
+            f"{', '.join(parameter.words)}."
+        )
     if ways[0] == "low" and "zip" in entry and "count" not in entry:
         raise DataError(f"{place}.zip: an axis that is drawn is not zipped; add count, or leave out zip.")
     if ways[0] == "values":
         values = entry["values"]
         if not isinstance(values, list):
-            raise DataError(f"{place}.values: expected a list of numbers, found {values!r}.")
+            kind = "words" if parameter.words else "numbers"
+            raise DataError(f"{place}.values: expected a list of {kind}, found {values!r}.")
         if not values:
             raise DataError(f"{place}.values: the axis is empty; give at least one value.")
+        if parameter.words:
+            return np.array([code_of(value, parameter, f"{place}.values") for value in values])
         return factor * np.array([number(value, f"{place}.values") for value in values])
     if ways[0] == "mean":
         mean, sd = (number(entry.get(key), f"{place}.{key}") * factor for key in ("mean", "sd"))
@@ -254,16 +266,28 @@ def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], byte
         if math.isnan(known[axis.parameter].nominal):
             raise DataError(f"{name}: {axis.parameter} is an array; vary it by [[axis]] with relative = true.")
     table = np.empty((len(axes), len(lines)))
+    columns = [known[axis.parameter] for axis in axes]
+    kind = "values" if any(parameter.words for parameter in columns) else "numbers"
     for k, (line, cells) in enumerate(lines):
-        try:
-            numbers = [float(cell) for cell in cells]
-        except ValueError:
-            numbers = []
-        if len(numbers) != len(axes):
-            raise DataError(
-                f"{name}, line {line}: expected {len(axes)} numbers, found {', '.join(cells)!r}; correct it."
-            )
+        place = f"{name}, line {line}"
+        numbers: list[float] = []
+        if len(cells) == len(axes):
+            numbers = [_cell(cell, parameter, place) for cell, parameter in zip(cells, columns, strict=True)]
+        if not numbers or any(map(math.isnan, numbers)):
+            raise DataError(f"{place}: expected {len(axes)} {kind}, found {', '.join(cells)!r}; correct it.")
         table[:, k] = numbers
     if not np.all(np.isfinite(table)):
         raise DataError(f"{name}: expected finite numbers, found others; correct them.")
+    for parameter, values in zip(columns, table, strict=True):
+        check_plain(parameter, values, False, name)
     return Listed(axes, table)
+
+
+def _cell(cell: str, parameter: Parameter, place: str) -> float:
+    """The number of a cell, or of its word; NaN where it is none."""
+    if parameter.words:
+        return code_of(cell.strip(), parameter, place)
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan

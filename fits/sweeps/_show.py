@@ -135,7 +135,11 @@ def _best(data: Any, about: dict[str, Any], done: np.ndarray, by: str | None, la
     there = np.flatnonzero(done & np.isfinite(values))
     order = there[np.argsort(-values[there] if largest else values[there], kind="stable")[:5]]
     names = [*about["parameters"], by]
-    return [{"row": int(row)} | {name: float(data[name].values[row]) for name in names} for row in order]
+    return [{"row": int(row)} | {name: _plain(data[name].values[row]) for name in names} for row in order]
+
+
+def _plain(value: Any) -> float | str:
+    return value if isinstance(value, str) else float(value)
 
 
 def describe(summary: dict[str, Any]) -> str:
@@ -156,9 +160,13 @@ def describe(summary: dict[str, Any]) -> str:
     if best["rows"]:
         lines += ["", f"{'largest' if best['largest'] else 'smallest'} {best['by']}"]
         for row in best["rows"]:
-            place = ", ".join(f"{name} {value:.5g}" for name, value in row.items() if name not in ("row", best["by"]))
+            place = ", ".join(f"{name} {_told(x)}" for name, x in row.items() if name not in ("row", best["by"]))
             lines.append(f"  row {row['row']}: {row[best['by']]:.6g} at {place}")
     return "\n".join(lines)
+
+
+def _told(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.5g}"
 
 
 def plot_sweep(folder: str | os.PathLike[str], out: Path, by: str | None = None) -> list[Path]:
@@ -179,14 +187,21 @@ def _plots(folder: str | os.PathLike[str], about: dict[str, Any], data: Any, out
     if done.sum() < 2:
         return []
     values = data[by].values[done]
-    swept = {name: data[name].values[done] for name in names}
-    made = [_parallel(out / "parallel.svg", swept, by, values)]
+    swept, words = {}, {}
+    for name in names:
+        found = data[name].values[done]
+        if found.dtype.kind != "f":
+            words[name], found = np.unique(found.astype(str), return_inverse=True)
+        swept[name] = found
+    made = [_parallel(out / "parallel.svg", swept, words, by, values)]
     pairs = [(one, other) for k, one in enumerate(names) for other in names[k + 1 :]][:6]
-    made += [_heat(out / f"heat_{k}.svg", swept, pair, by, values) for k, pair in enumerate(pairs)]
+    made += [_heat(out / f"heat_{k}.svg", swept, words, pair, by, values) for k, pair in enumerate(pairs)]
     return made
 
 
-def _parallel(path: Path, swept: dict[str, np.ndarray], by: str, values: np.ndarray) -> Path:
+def _parallel(
+    path: Path, swept: dict[str, np.ndarray], words: dict[str, np.ndarray], by: str, values: np.ndarray
+) -> Path:
     every = max(1, -(-len(values) // _LINES))
     columns = np.stack([*swept.values(), values], axis=1)[::every]
     low, high = columns.min(axis=0), columns.max(axis=0)
@@ -196,15 +211,28 @@ def _parallel(path: Path, swept: dict[str, np.ndarray], by: str, values: np.ndar
     colours = np.argsort(np.argsort(columns[:, -1])) / max(1, len(columns) - 1)
     for line, colour in zip(scaled, colours, strict=True):
         axes.plot(line, color=(colour, 0.25, 1 - colour), linewidth=0.4, alpha=0.6)
-    ticks = [f"{name}\n{a:.3g} to {b:.3g}" for name, a, b in zip([*swept, by], low, high, strict=True)]
-    axes.set_xticks(range(len(ticks)), ticks, fontsize=6)
+    ranges = {name: f"{a:.3g} to {b:.3g}" for name, a, b in zip([*swept, by], low, high, strict=True)}
+    ranges |= {name: ", ".join(each) for name, each in words.items()}
+    axes.set_xticks(range(len(ranges)), [f"{name}\n{each}" for name, each in ranges.items()], fontsize=6)
     axes.set_yticks([])
     label(axes)
     return _saved(picture, path)
 
 
-def _heat(path: Path, swept: dict[str, np.ndarray], pair: tuple[str, str], by: str, values: np.ndarray) -> Path:
-    edges = [np.histogram_bin_edges(swept[name], min(_CELLS, len(np.unique(swept[name])))) for name in pair]
+def _heat(
+    path: Path,
+    swept: dict[str, np.ndarray],
+    words: dict[str, np.ndarray],
+    pair: tuple[str, str],
+    by: str,
+    values: np.ndarray,
+) -> Path:
+    edges = [
+        np.arange(len(words[name]) + 1) - 0.5
+        if name in words
+        else np.histogram_bin_edges(swept[name], min(_CELLS, len(np.unique(swept[name]))))
+        for name in pair
+    ]
     x, y = (swept[name] for name in pair)
     count, *_ = np.histogram2d(x, y, bins=edges)
     total, *_ = np.histogram2d(x, y, bins=edges, weights=values)
@@ -215,6 +243,9 @@ def _heat(path: Path, swept: dict[str, np.ndarray], pair: tuple[str, str], by: s
     drawn = axes.pcolormesh(edges[0], edges[1], mean.T, cmap="viridis")
     picture.colorbar(drawn, label=f"mean {by}")
     label(axes, *pair)
+    for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
+        if name in words:
+            axis.set_ticks(range(len(words[name])), words[name].tolist())
     return _saved(picture, path)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from fits._atomic import atomic_write_text
 from fits._errors import DataError
 from fits.sweeps._about import ABOUT, SCHEMA, about_of
-from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of
+from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of
 from fits.sweeps._extra import need
 from fits.sweeps._spec import Sweep
 from fits.sweeps._types import STATUS_WORDS, Output, Rows
@@ -47,13 +47,8 @@ class Store:
     @property
     def variables(self) -> tuple[Output, ...]:
         """Everything that is kept per row."""
-        units = {parameter.name: parameter.unit for parameter in self.sweep.facts.parameters}
-        swept = [
-            Output(axis.parameter, "1" if axis.relative else units[axis.parameter], "swept")
-            for axis in self.sweep.plan.axes
-        ]
         sources = (source_of(self.sweep),) if self.sweep.facts.sources else ()
-        return (*swept, *sources, *self.sweep.facts.outputs, _STATUS, REASON)
+        return (*swept_of(self.sweep), *sources, *self.sweep.facts.outputs, _STATUS, REASON)
 
     def create(self) -> None:
         """Write the empty store and what is known of the sweep."""

@@ -29,6 +29,10 @@ class Parameter:
         What it is where the sweep says nothing; NaN for an array, which can only be varied relative to itself.
     lower, upper
         Bounds. A row outside fails with a reason.
+    words
+        Those it may be, where it is a choice: its values are places among them.
+    whole
+        Whether it is a whole number.
     """
 
     name: str
@@ -36,6 +40,8 @@ class Parameter:
     nominal: float
     lower: float = -math.inf
     upper: float = math.inf
+    words: tuple[str, ...] = ()
+    whole: bool = False
 
 
 @dataclass(frozen=True)
