@@ -11,6 +11,7 @@ from fits._record import Record
 from fits._result import FitError
 from fits._run import INITIAL_STATES
 from fits._stage_design import nearest
+from fits.sweeps._choices import choice, chosen
 from fits.sweeps._jobs import Request
 from fits.sweeps._programs import number
 from fits.sweeps._records import Files, Simulated, requested_records
@@ -41,16 +42,22 @@ class DiagnoseJob(AbstractJob):
     def facts(self) -> Facts:
         """What is known before it runs."""
         sources = self._records.names if isinstance(self._records, Files) else ()
-        alarm = Parameter("diagnose.false_alarm", "1", self._false_alarm, 1e-6, 0.5)
-        return Facts((*self._records.parameters, alarm), _OUTPUTS, 1, sources, alone=True)
+        options = (
+            Parameter("diagnose.false_alarm", "1", self._false_alarm, 1e-6, 0.5),
+            Parameter("diagnose.holdout", "1", self._holdout, 0.0, 0.9),
+            choice("diagnose.initial", INITIAL_STATES, self._initial),
+        )
+        return Facts((*self._records.parameters, *options), _OUTPUTS, 1, sources, alone=True)
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
     ) -> Rows:
         """Diagnose one record; see `AbstractJob.compute`."""
-        records = self._records.records(values, rows, sources, seed)
-        alarm = values.get("diagnose.false_alarm", np.full(len(rows), self._false_alarm))
-        found = [self._one(record, float(share), seed) for record, share in zip(records, alarm, strict=True)]
+        records, every = self._records.records(values, rows, sources, seed), np.ones(len(rows))
+        alarm = values.get("diagnose.false_alarm", every * self._false_alarm).tolist()
+        holdout = values.get("diagnose.holdout", every * self._holdout).tolist()
+        initial = chosen(values, "diagnose.initial", INITIAL_STATES, self._initial, len(rows))
+        found = [self._one(*options, seed) for options in zip(records, alarm, holdout, initial, strict=True)]
         outputs = {
             output.name: np.array(
                 [each[0].get(output.name, "" if output.dtype[0] == "U" else np.nan) for each in found]
@@ -59,15 +66,15 @@ class DiagnoseJob(AbstractJob):
         }
         return Rows(outputs, tuple(reason for _, reason in found))
 
-    def _one(self, record: Record | str, false_alarm: float, seed: int) -> tuple[dict[str, Any], str]:
+    def _one(
+        self, record: Record | str, false_alarm: float, holdout: float, initial: str, seed: int
+    ) -> tuple[dict[str, Any], str]:
         if isinstance(record, str):
             return {}, record
         from fits.diagnosis._diagnose import diagnose
 
         try:
-            found = diagnose(
-                [record], holdout=self._holdout, false_alarm=false_alarm, initial=self._initial, seed=seed
-            )
+            found = diagnose([record], holdout=holdout, false_alarm=false_alarm, initial=initial, seed=seed)
         except (DataError, FitError) as error:
             return {}, " ".join(str(error).split())
         first = found.causes[0] if found.causes else None

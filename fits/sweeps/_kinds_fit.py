@@ -17,6 +17,7 @@ from fits._record import Record
 from fits._result import FitError
 from fits._run import INITIAL_STATES, initial_state, known_samples
 from fits._stage_design import nearest
+from fits.sweeps._choices import choice, chosen
 from fits.sweeps._devices import in_turn, on_cpu, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch
 from fits.sweeps._jobs import Request
@@ -27,6 +28,7 @@ from microid import Staircase, node_areas
 
 _KEYS = ("method", "levels", "holdout", "initial", "samples", "weights", "smoothness")
 _BLOCK, _PLACES, _FEWEST = 32, 64, 50
+_FEWEST_LEVELS, _MOST_LEVELS, _DEFAULT_LEVELS = 4, 32, 8
 _OUTPUTS = (
     Output("offset_um", "um", "reading at negative saturation"),
     Output("noise_um", "um", "standard deviation of the noise"),
@@ -60,7 +62,7 @@ class FitJob(AbstractJob):
         records
             What is fitted.
         levels
-            Of the grid; None chooses them, one by one only.
+            Of the grid where they do not vary; None chooses them, one by one only.
         holdout
             Share at the end of each record that is only predicted.
         initial
@@ -82,11 +84,16 @@ class FitJob(AbstractJob):
         """What is known before it runs."""
         sources = self._records.names if isinstance(self._records, Files) else ()
         outputs = list(_OUTPUTS)
-        size = (self._levels or 0) * ((self._levels or 0) + 1) // 2
         if self._weights:
+            size = len(_packed(self._levels or 0)[0])
             outputs.append(Output("weights_um", "um", "weights of Eq. 9, packed row by row", (("weight", size),)))
-        holdout = Parameter("fit.holdout", "1", self._holdout, 0.0, 0.9)
-        parameters = (*self._records.parameters, holdout)
+        levels = float(self._levels or _DEFAULT_LEVELS)
+        parameters = (
+            *self._records.parameters,
+            Parameter("fit.holdout", "1", self._holdout, 0.0, 0.9),
+            Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),
+            choice("fit.initial", INITIAL_STATES, self._initial),
+        )
         if self._batch:
             parameters = (*parameters, Parameter("fit.smoothness", "1", self._smoothness, 1e-12, 1e6))
         block = _BLOCK if self._batch else 1
@@ -96,21 +103,29 @@ class FitJob(AbstractJob):
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
     ) -> Rows:
         """Fit the records of some blocks; see `AbstractJob.compute`."""
-        records = self._records.records(values, rows, sources, seed)
-        holdout = values.get("fit.holdout", np.full(len(rows), self._holdout))
+        records, every = self._records.records(values, rows, sources, seed), np.ones(len(rows))
+        holdout = values.get("fit.holdout", every * self._holdout)
+        initial = chosen(values, "fit.initial", INITIAL_STATES, self._initial, len(rows))
         if self._batch:
-            smoothness = values.get("fit.smoothness", np.full(len(rows), self._smoothness))
-            return self._together(records, holdout, smoothness)
-        found = [self._alone(record, float(share)) for record, share in zip(records, holdout, strict=True)]
-        names = [output.name for output in self.facts.outputs]
-        outputs = {name: np.array([each[0].get(name, np.nan) for each in found]) for name in names}
+            levels = values.get("fit.levels", every * (self._levels or _DEFAULT_LEVELS)).astype(int)
+            smoothness = values.get("fit.smoothness", every * self._smoothness)
+            return self._together(records, holdout, initial, levels, smoothness)
+        swept = values.get("fit.levels")
+        numbers = [self._levels] * len(rows) if swept is None else swept.astype(int).tolist()
+        found = [self._alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
+        outputs = {
+            output.name: np.array([each[0].get(output.name, np.full(output.shape, np.nan)) for each in found])
+            for output in self.facts.outputs
+        }
         return Rows(outputs, tuple(reason for _, reason in found))
 
-    def _alone(self, record: Record | str, holdout: float) -> tuple[dict[str, Any], str]:
+    def _alone(
+        self, record: Record | str, levels: int | None, holdout: float, initial: str
+    ) -> tuple[dict[str, Any], str]:
         if isinstance(record, str):
             return {}, record
         try:
-            result = fit([record], levels=self._levels, holdout=holdout, initial=self._initial)
+            result = fit([record], levels=levels, holdout=holdout, initial=initial)
         except (DataError, FitError) as error:
             return {}, " ".join(str(error).split())
         run = result.runs[0]
@@ -120,15 +135,22 @@ class FitJob(AbstractJob):
             "noise_um": result.noise_um,
             "loops_um": float(weights.sum()),
             "levels": len(weights),
+            "weights_um": weights[_packed(len(weights))],
         }
         for start, figures in (("", run.in_sample), ("heldout_", run.held_out)):
             if figures is not None:
                 found |= {f"{start}e_rms_pct": figures.e_rms_pct, f"{start}e_max_pct": figures.e_max_pct}
         return found, ""
 
-    def _together(self, records: list[Record | str], holdout: FloatArray, smoothness: FloatArray) -> Rows:
-        assert self._levels is not None
-        count, samples, levels = len(records), self._samples, self._levels
+    def _together(
+        self,
+        records: list[Record | str],
+        holdout: FloatArray,
+        initial: list[str],
+        levels: NDArray[np.int64],
+        smoothness: FloatArray,
+    ) -> Rows:
+        count, samples = len(records), self._samples
         voltage, displacement = np.zeros((count, samples)), np.zeros((count, samples))
         fitted, known = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
         limits, extremes, used = np.tile([0.0, 1.0], (count, 1)), np.zeros((count, _PLACES)), np.ones(count, "i4")
@@ -143,35 +165,23 @@ class FitJob(AbstractJob):
             n, v = len(record), record.voltage_V
             limits[k] = v.min(), v.max()
             voltage[k], displacement[k, :n] = np.pad(v, (0, samples - n), mode="edge"), record.displacement_um
-            known[k, :n] = True if self._initial != "unknown" else known_samples(v, *limits[k])
+            known[k, :n] = True if initial[k] != "unknown" else known_samples(v, *limits[k])
             fitted[k] = known[k] & (np.arange(samples) < n - round(holdout[k] * n))
             if fitted[k].sum() < _FEWEST:
                 reasons[k] = f"only {int(fitted[k].sum())} samples are left to fit, {_FEWEST} are needed"
-            start = initial_state(self._initial, *limits[k])
+            start = initial_state(initial[k], *limits[k])
             extremes[k], used[k] = np.asarray(start.extremes_V), int(start.count)
-        table, rough = jnp.asarray(branch_table(levels)), roughness(levels)
-
-        def regress(*rows: Array) -> BatchFit:
-            found: BatchFit = fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
-            return found
-
         rows = voltage, displacement, fitted, limits, smoothness, extremes, used
-        found = in_turn(regress, *rows) if on_cpu() else regress(*map(place, rows))
-        areas = node_areas(levels)[np.tril_indices(levels)]
-        weights = np.asarray(found.columns_um)[:, : len(areas)] * areas
-        outputs: dict[str, Any] = {
-            "offset_um": np.asarray(found.offset_um),
-            "noise_um": np.asarray(found.noise_um),
-            "loops_um": weights.sum(axis=1),
-            "levels": np.full(count, float(levels)),
-        }
-        predicted, success = np.asarray(found.predicted_um), np.asarray(found.success)
+        # The whole block on each number of levels there is in it, of which every row takes its own: what is found
+        # for a row depends on its place in the block, and not on what the rows beside it ask for.
+        found = {number: _fitted(number, rows) for number in np.unique(levels).tolist()}
+        names = [name for name in found[int(levels[0])] if name != "weights_um" or self._weights]
+        outputs = {name: np.array([found[n][name][k] for k, n in enumerate(levels.tolist())]) for name in names}
+        predicted, success = outputs.pop("predicted_um"), outputs.pop("success")
         for start_name, samples_of in (("", fitted > 0), ("heldout_", known & (fitted == 0))):
             figures = [_errors(displacement[k], predicted[k], samples_of[k], known[k]) for k in range(count)]
             outputs[f"{start_name}e_rms_pct"] = np.array([each[0] for each in figures])
             outputs[f"{start_name}e_max_pct"] = np.array([each[1] for each in figures])
-        if self._weights:
-            outputs["weights_um"] = weights
         for k in range(count):
             if not reasons[k] and not (success[k] and np.isfinite(outputs["e_rms_pct"][k])):
                 reasons[k] = "the regression did not converge"
@@ -183,6 +193,33 @@ class FitJob(AbstractJob):
         if record.displacement_um is None or np.ptp(record.displacement_um) == 0 or np.ptp(record.voltage_V) == 0:
             return "nothing moves in the record"
         return ""
+
+
+def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[Any]]:
+    """Fit whole blocks on one number of levels; figures by output, weights, predictions and success."""
+    table, rough = jnp.asarray(branch_table(levels)), roughness(levels)
+
+    def regress(*rows: Array) -> BatchFit:
+        fits: BatchFit = fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
+        return fits
+
+    found = in_turn(regress, *rows) if on_cpu() else regress(*map(place, rows))
+    packed = _packed(levels)
+    weights = np.asarray(found.columns_um)[:, : len(packed[0])] * node_areas(levels)[packed]
+    return {
+        "offset_um": np.asarray(found.offset_um),
+        "noise_um": np.asarray(found.noise_um),
+        "loops_um": weights.sum(axis=1),
+        "levels": np.full(len(weights), float(levels)),
+        "weights_um": weights,
+        "predicted_um": np.asarray(found.predicted_um),
+        "success": np.asarray(found.success),
+    }
+
+
+def _packed(levels: int) -> tuple[NDArray[np.int64], ...]:
+    """Places of the weights in their square array, row by row."""
+    return tuple(np.tril_indices(levels))
 
 
 def _errors(measured: FloatArray, predicted: FloatArray, samples: Any, known: Any) -> tuple[float, float]:
@@ -205,12 +242,17 @@ def make(request: Request) -> FitJob:
     initial = known if initial is None else initial
     if initial not in INITIAL_STATES:
         raise DataError(f"fit.initial: expected one of {', '.join(INITIAL_STATES)}, found {initial!r}; choose one.")
-    levels = table.get("levels", 8 if method == "batch" else None)
-    if levels is not None and (isinstance(levels, bool) or not isinstance(levels, int) or not 4 <= levels <= 32):
-        raise DataError(f"fit.levels: expected a number from 4 to 32, found {levels!r}; correct it.")
+    levels = table.get("levels", _DEFAULT_LEVELS if method == "batch" else None)
+    whole = isinstance(levels, int) and not isinstance(levels, bool)
+    if levels is not None and not (whole and _FEWEST_LEVELS <= levels <= _MOST_LEVELS):
+        raise DataError(
+            f"fit.levels: expected a number from {_FEWEST_LEVELS} to {_MOST_LEVELS}, found {levels!r}; correct it."
+        )
     weights = table.get("weights", False)
     if not isinstance(weights, bool) or (weights and levels is None):
         raise DataError(f"fit.weights: expected true, with fit.levels, or false, found {weights!r}; correct it.")
+    if weights and "fit.levels" in request.names:
+        raise DataError("fit.weights: rows of other fit.levels have other weights; leave out one of the two.")
     samples = records.program.samples if isinstance(records, Simulated) else table.get("samples", 2048)
     if isinstance(samples, bool) or not isinstance(samples, int) or samples < _FEWEST:
         raise DataError(f"fit.samples: expected a number of {_FEWEST} or more, found {samples!r}; correct it.")

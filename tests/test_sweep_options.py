@@ -1,0 +1,204 @@
+"""Options of fits and diagnoses as axes: numbers of levels and initial states, as words in the results."""
+
+import json
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from _command import refused, run
+from _sweeps import parsed
+
+from fits import DataError, fit
+from fits._design import branch_table
+from fits._prior import roughness
+from fits._run import initial_state, known_samples
+from fits.sweeps._chunks import chunk_count, compute_chunk
+from fits.sweeps._fit_batch import fit_batch
+from fits.sweeps._run import run_sweep
+from fits.sweeps._show import open_sweep
+from microid import Staircase
+
+HEAD = """
+schema = "microid.sweep/1"
+kind = "{kind}"
+seed = {seed}
+initial = "negative"
+[{kind}]
+{options}
+[program]
+shape = "decay"
+samples = 200
+interval_s = 0.02
+offset_V = 60.0
+amplitude_V = 60.0
+frequency_Hz = 1.0
+"""
+LEVELS = '[[axis]]\nparameter = "fit.levels"\nvalues = {levels}\n'
+INITIAL = '[[axis]]\nparameter = "{kind}.initial"\nvalues = {words}\n'
+WORDS = ["unknown", "negative", "positive", "demagnetised"]
+
+
+def text(seed, *axes, kind="fit", options=""):
+    return HEAD.format(kind=kind, seed=seed, options=options) + "".join(axes)
+
+
+def words(chosen, kind="fit"):
+    return INITIAL.format(kind=kind, words=json.dumps(chosen))
+
+
+def records_of(sweep, rows):
+    return sweep.job._records.records(sweep.plan.values(rows), rows, sweep.plan.repeat_of(rows), sweep.seed)
+
+
+def batch_of(record, levels, initial, smoothness=0.01, holdout=0.2):
+    """The same regression in a batch that holds one record throughout."""
+    v, n = record.voltage_V, len(record)
+    limits = v.min(), v.max()
+    known = np.ones(n, dtype=bool) if initial != "unknown" else known_samples(v, *limits)
+    weight = known & (np.arange(n) < n - round(holdout * n))
+    start = initial_state(initial, *limits)
+    numbers = (v, record.displacement_um, weight.astype(float), np.array(limits), np.array(smoothness))
+    rows = (jnp.asarray(np.stack([each] * 32)) for each in numbers)
+    start = Staircase(jnp.stack([start.extremes_V] * 32), jnp.stack([jnp.asarray(start.count)] * 32))
+    return fit_batch(levels, jnp.asarray(branch_table(levels)), roughness(levels), *rows, start)
+
+
+def test_rows_of_a_batch_have_their_own_levels_and_initial_state(seed):
+    sweep = parsed(text(seed, words(WORDS), LEVELS.format(levels=[5, 8])))
+    found = compute_chunk(sweep, 0)
+    assert set(found.reasons) == {""}
+    assert found.outputs["fit.initial"].tolist() == [word for word in WORDS for _ in range(2)]
+    assert found.outputs["levels"].tolist() == found.outputs["fit.levels"].tolist() == [5, 8] * 4
+    for row, record in enumerate(records_of(sweep, np.arange(8))):
+        alone = batch_of(record, (5, 8)[row % 2], WORDS[row // 2])
+        assert found.outputs["noise_um"][row] == pytest.approx(float(alone.noise_um[0]), rel=1e-10)
+        assert found.outputs["offset_um"][row] == pytest.approx(float(alone.offset_um[0]), rel=1e-10)
+        assert found.outputs["loops_um"][row] > 0
+    # The stage began at negative saturation, and what begins with another memory leaves more.
+    noise = dict(zip(WORDS, found.outputs["noise_um"][1::2], strict=True))
+    assert noise["negative"] < 0.9 * noise["positive"]
+
+
+def test_rows_do_not_depend_on_chunks_and_words_are_kept_as_such(tmp_path, seed):
+    noise = '[[axis]]\nparameter = "records.noise_um"\nlow = 0.01\nhigh = 0.1\ncount = 20\n'
+    whole = text(seed, noise, words(["negative", "unknown"]), LEVELS.format(levels=[5, 8]))
+    sweeps = [parsed(f"{whole}[run]\nchunk_rows = {rows}\n") for rows in (32, 64)]
+    assert [chunk_count(sweep) for sweep in sweeps] == [3, 2]
+    for sweep, name in zip(sweeps, ("a", "b"), strict=True):
+        run_sweep(sweep, str(tmp_path / name))
+    tables = [pd.read_parquet(tmp_path / name / "results.parquet") for name in ("a", "b")]
+    assert tables[0].equals(tables[1])
+    assert tables[0]["fit.initial"].tolist() == ["negative", "negative", "unknown", "unknown"] * 20
+    found = open_sweep(tmp_path / "a")
+    assert "fit.initial" in found.coords
+    chosen = found["noise_um"].where(found["fit.initial"] == "unknown", drop=True)
+    assert chosen.sizes["row"] == 40
+    plots = ("--plots", tmp_path / "plots")
+    best = json.loads(run("sweep", "show", tmp_path / "a", "--best", "noise_um", *plots, "--json").stdout)["best"]
+    assert best["rows"][0]["fit.initial"] in ("negative", "unknown")
+    assert (
+        "unknown" in (tmp_path / "plots" / "parallel.svg").read_text()
+        or len(list((tmp_path / "plots").iterdir())) == 4
+    )
+    assert "fit.initial negative" in run("sweep", "show", tmp_path / "a", "--best", "noise_um").stdout
+
+
+def test_rows_one_by_one_ask_for_their_own_options(monkeypatch, seed):
+    asked = []
+
+    def fitted(records, **options):
+        asked.append(options)
+        figures = SimpleNamespace(e_rms_pct=1.0, e_max_pct=2.0)
+        report = SimpleNamespace(offset_um=0.0, in_sample=figures, held_out=None)
+        weights = np.tril(np.arange(options["levels"] ** 2.0).reshape(2 * [options["levels"]]))
+        return SimpleNamespace(runs=[report], noise_um=0.1, weights_um=weights)
+
+    monkeypatch.setattr("fits.sweeps._kinds_fit.fit", fitted)
+    options = 'method = "one_by_one"\n'
+    sweep = parsed(text(seed, words(["negative", "unknown"]), LEVELS.format(levels=[6, 9]), options=options))
+    for chunk in range(chunk_count(sweep)):
+        assert set(compute_chunk(sweep, chunk).reasons) == {""}
+    assert [(each["initial"], each["levels"]) for each in asked] == [
+        (word, levels) for word in ("negative", "unknown") for levels in (6, 9)
+    ]
+    kept = parsed(text(seed, words(["negative"]), options=f"{options}levels = 6\nweights = true\n"))
+    weights = compute_chunk(kept, 0).outputs["weights_um"]
+    assert weights.shape == (1, 21)
+    assert weights[0, :4].tolist() == [0.0, 6.0, 7.0, 12.0]
+
+
+@pytest.mark.slow
+def test_a_row_one_by_one_is_that_of_fit(seed):
+    options = 'method = "one_by_one"\n'
+    sweep = parsed(text(seed, words(["unknown", "negative"]), LEVELS.format(levels=[6, 9]), options=options))
+    (record,) = records_of(sweep, np.array([2]))
+    found, alone = compute_chunk(sweep, 2), fit([record], levels=6, initial="negative")
+    assert found.reasons == ("",)
+    assert found.outputs["noise_um"] == [alone.noise_um]
+    assert found.outputs["offset_um"] == [alone.runs[0].offset_um]
+
+
+def test_diagnoses_ask_for_their_own_options(monkeypatch, seed):
+    asked = []
+
+    def diagnose(records, **options):
+        asked.append((options["initial"], options["holdout"], options["false_alarm"]))
+        raise DataError("enough")
+
+    monkeypatch.setattr("fits.diagnosis._diagnose.diagnose", diagnose)
+    holdout = '[[axis]]\nparameter = "diagnose.holdout"\nvalues = [0.1, 0.3]\n'
+    sweep = parsed(text(seed, words(["positive", "unknown"], "diagnose"), holdout, kind="diagnose"))
+    found = [compute_chunk(sweep, row) for row in range(4)]
+    assert asked == [(word, share, 0.01) for word in ("positive", "unknown") for share in (0.1, 0.3)]
+    assert found[3].outputs["diagnose.initial"].tolist() == ["unknown"]
+
+
+def test_a_list_may_hold_words(seed):
+    listed = text(seed, '[list]\nfile = "rows.csv"\n')
+    sweep = parsed(listed, rows=b"fit.initial,fit.levels\npositive,5\n unknown ,8\n")
+    assert sweep.plan.values(np.arange(2))["fit.initial"].tolist() == [2, 0]
+    with pytest.raises(DataError, match=r"rows.csv, line 3: expected one of .* did you mean negative"):
+        parsed(listed, rows=b"fit.initial,fit.levels\npositive,5\nnegativ,8\n")
+    with pytest.raises(DataError, match=r"rows.csv, line 2: expected 2 values, found 'positive'"):
+        parsed(listed, rows=b"fit.initial,fit.levels\npositive\n")
+    with pytest.raises(DataError, match=r"rows.csv: fit.levels is a whole number, found 5.5"):
+        parsed(listed, rows=b"fit.initial,fit.levels\npositive,5.5\n")
+
+
+def test_numbers_of_levels_out_of_bounds_fail_as_rows(seed):
+    found = compute_chunk(parsed(text(seed, LEVELS.format(levels=[5, 64]))), 0)
+    assert found.reasons[0] == ""
+    assert found.reasons[1].startswith("fit.levels = 64 lies outside its bounds, 4 to 32")
+
+
+@pytest.mark.parametrize(
+    ("axis", "sentence"),
+    [
+        ('parameter = "fit.initial"\nvalues = ["negativ"]', "did you mean negative?"),
+        (
+            'parameter = "fit.initial"\nvalues = [1]',
+            "expected one of unknown, negative, positive, demagnetised, found 1",
+        ),
+        ('parameter = "fit.initial"\nvalues = "negative"', "expected a list of words"),
+        (
+            'parameter = "fit.initial"\nlow = 0\nhigh = 3\ncount = 4',
+            "is a choice of words, which are listed; give values",
+        ),
+        ('parameter = "fit.initial"\nmean = 0\nsd = 3', "is a choice of words, which are listed; give values"),
+        ('parameter = "fit.initial"\nrelative = true\nvalues = ["unknown"]', "which no factor changes"),
+        ('parameter = "fit.levels"\nvalues = [5, 6.5]', "fit.levels is a whole number, found 6.5; give whole values"),
+        ('parameter = "fit.levels"\nvalues = ["many"]', "expected a finite number, found 'many'"),
+        ('parameter = "fit.levels"\nlow = 4\nhigh = 9\ncount = 3', "is a whole number, found 6.5"),
+        ('parameter = "fit.levels"\nlow = 4\nhigh = 9', "is a whole number, which is not drawn; give values"),
+        ('parameter = "fit.levels"\nrelative = true\nvalues = [0.5]', "which no factor changes"),
+        ('parameter = "fit.method"\nvalues = ["batch"]', "there is no parameter 'fit.method'"),
+        ('parameter = "fit.levels"\nvalues = [5]\n[fit]\nweights = true', "leave out one of the two"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_sentence(tmp_path, axis, sentence):
+    file = tmp_path / "sweep.toml"
+    file.write_text(f'schema = "microid.sweep/1"\nkind = "fit"\n[[axis]]\n{axis}\n')
+    refused(run("sweep", file, "--out", tmp_path / "out"), sentence)
+    assert not (tmp_path / "out").exists()
