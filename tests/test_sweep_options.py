@@ -98,10 +98,8 @@ def test_rows_do_not_depend_on_chunks_and_words_are_kept_as_such(tmp_path, seed)
     plots = ("--plots", tmp_path / "plots")
     best = json.loads(run("sweep", "show", tmp_path / "a", "--best", "noise_um", *plots, "--json").stdout)["best"]
     assert best["rows"][0]["fit.initial"] in ("negative", "unknown")
-    assert (
-        "unknown" in (tmp_path / "plots" / "parallel.svg").read_text()
-        or len(list((tmp_path / "plots").iterdir())) == 4
-    )
+    # Parallel coordinates, and a map of each pair of three axes.
+    assert len(list((tmp_path / "plots").iterdir())) == 4
     assert "fit.initial negative" in run("sweep", "show", tmp_path / "a", "--best", "noise_um").stdout
 
 
