@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fits._control_defaults import PERIODS, bp_defaults, cmac_defaults, strongest_Hz
 from fits._control_gains import GAINS, Given
 from fits._control_setup import Setup
 from fits._errors import DataError
 from fits._tune import tune_controller
 from fits._tune_problem import Goal, linear_part
 from fits._tune_result import Tuning
-from fits._tune_start import relay_start, slope_array, steepest_slope
+from fits._tune_start import relay_start, slope_array
 from microid import (
     BPPID,
     CMACPID,
@@ -29,10 +30,6 @@ from microid import (
     simulate_loop,
 )
 
-# Resonators take up an error over so many of their periods, and a table holds this share of the reference's voltage.
-_PERIODS = 3.0
-_TABLE = 0.5
-_LEARNING = 0.1
 _MOST_PEAK = 4.0
 # Resonators that are nearer to each other than this share of their frequency fight.
 _ALIKE = 1e-3
@@ -175,20 +172,14 @@ class Maker:
 
     def _learner(self, kind: str, pid: PID) -> BPPID | CMACPID:
         ready = self.loop.ready
-        low, high = float(ready.reference_um.min()), float(ready.reference_um.max())
-        stage = self.loop.plants[0]
         if kind == "bp-pid":
-            slope = float(stage.static_gain) * (steepest_slope(stage) or 1.0)
             if min(float(getattr(pid, name)) for name in GAINS) <= 0:
                 raise DataError("bp-pid: expected three gains above 0 to learn around, found one of 0; choose pid.")
-            scale = max(high - low, 1e-9) / 10
-            return BPPID.around(pid, jax.random.key(self.seed), slope_um_per_V=slope, scale_um=scale)
-        fastest = float(np.abs(np.diff(ready.reference_um)).max()) / ready.interval_s
-        limit = _TABLE * max(float(np.ptp(ready.static_V)), 1e-6)
-        pad = 0.02 * max(high - low, 1e-9)
-        ends = low - pad, high + pad, 1.02 * fastest + 1e-9
-        lower, upper, rate, learning, most = (jnp.asarray(x) for x in (*ends, _LEARNING, limit))
-        return CMACPID(pid, lower, upper, rate, learning, most)
+            around = bp_defaults(self.loop.plants[0], ready.reference_um)
+            return BPPID.around(pid, jax.random.key(self.seed), **around)
+        table = cmac_defaults(ready.reference_um, ready.static_V, ready.interval_s)
+        fields: dict[str, Any] = {name: jnp.asarray(value) for name, value in table.items()}
+        return CMACPID(pid, **fields)
 
     def _tuned(self, controller: Any) -> Tuning[Any]:
         ready = self.loop.ready
@@ -225,7 +216,12 @@ class Maker:
         elif held is not None:
             more.append("the resonators of --gains are at other frequencies than --frequency, and made anew")
         elif not own:
-            own = [_strongest_Hz(ready.reference_um, ready.interval_s)]
+            strongest = strongest_Hz(ready.reference_um, ready.interval_s)
+            if strongest is None:
+                raise DataError(
+                    "--controller resonant: expected a reference that oscillates, found none; state --frequency."
+                )
+            own = [strongest]
             more.append(f"the resonator is at {own[0]:.6g} Hz, the strongest in the reference")
         bad = [f for f in own if not 0 < f < 0.5 / ready.interval_s]
         if bad:
@@ -243,7 +239,7 @@ class Maker:
             pid,
             stage,
             jnp.asarray(own),
-            min(own) / _PERIODS,
+            min(own) / PERIODS,
             delay=self.loop.delay,
             slope_um_per_V=slope_array(stage),
         )
@@ -260,15 +256,3 @@ class Maker:
 
 def _limited(pid: PID, limits_V: tuple[float, float]) -> PID:
     return eqx.tree_at(lambda p: (p.lower_V, p.upper_V), pid, tuple(jnp.asarray(x) for x in limits_V))
-
-
-def _strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float:
-    """Frequency of the strongest line of a reference, between the lines of its transform by a parabola."""
-    n = len(reference_um)
-    size = np.abs(np.fft.rfft((reference_um - reference_um.mean()) * np.hanning(n), 8 * n))
-    k = int(np.clip(np.argmax(size), 1, len(size) - 2))
-    if size[k] <= 0:
-        raise DataError("--controller resonant: expected a reference that oscillates, found none; state --frequency.")
-    left, here, right = np.log(np.maximum(size[k - 1 : k + 2], 1e-300))
-    bend = left - 2 * here + right
-    return float((k + (0.5 * (left - right) / bend if bend else 0.0)) / (8 * n * interval_s))
