@@ -1,4 +1,4 @@
-"""The job `control`: a stage in closed loop with a PID controller, and its figures of merit."""
+"""The job `control`: a stage in closed loop with a controller, and its figures of merit."""
 
 from collections.abc import Mapping
 
@@ -9,22 +9,20 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from fits._errors import DataError
-from fits._stage_design import nearest
+from fits._tune_problem import linear_part
+from fits.sweeps._controllers import Controllers, read_controllers
 from fits.sweeps._devices import by_rows, in_turn, place
 from fits.sweeps._jobs import Request
 from fits.sweeps._kinds_simulate import block_rows, drive, table_of
-from fits.sweeps._programs import Program, number, read_program
-from fits.sweeps._stages import memory_before, range_of, requested_stage, stage_parameters, varied
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Rows
+from fits.sweeps._programs import Program, read_program
+from fits.sweeps._stages import memory_before, requested_stage, stage_parameters, varied
+from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Rows
 from microid import (
-    PID,
     AbstractLinear,
     Preisach,
     Stage,
     Start,
     margins,
-    parameter_table,
     simulate_loop,
     step_metrics,
 )
@@ -40,7 +38,8 @@ _OUTPUTS = (
     Output(
         "pole_radius",
         "1",
-        "largest modulus of the loop's poles where the hysteresis is steepest; NaN of a nonlinear part",
+        "largest modulus of the loop's poles where the hysteresis is steepest, before a controller learns; NaN of a "
+        "nonlinear part",
     ),
 )
 _STEP = (
@@ -61,35 +60,32 @@ class ControlJob(AbstractJob):
     def __init__(
         self,
         stage: Stage,
-        pid: PID,
+        controllers: Controllers,
         reference: Program,
         initial: str,
         names: tuple[str, ...],
         relative: tuple[str, ...],
-        delay: int,
     ):
         """Prepare the job.
 
         Parameters
         ----------
-        stage, pid, reference
+        stage, controllers, reference
             The loop and what it follows.
         initial
             Memory before each row.
         names, relative
             Parameters that vary, and which of them as factors.
-        delay
-            Samples by which readings are late.
         """
-        self._stage, self._pid, self._reference = stage, pid, reference
+        self._stage, self._controllers, self._reference = stage, controllers, reference
         self._start = Start(None, memory_before(stage, initial))
-        self._names, self._relative, self._delay = names, relative, delay
+        self._names, self._relative = names, relative
         self._given = None if reference.given is None else jnp.asarray(reference.given)
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
-        parameters = (*_pid_parameters(self._pid), *stage_parameters(self._stage), *self._reference.parameters)
+        parameters = (*self._controllers.parameters(), *stage_parameters(self._stage), *self._reference.parameters)
         outputs = (*_OUTPUTS, *_STEP) if self._reference.shape == "step" else _OUTPUTS
         samples = self._reference.samples
         return Facts(parameters, outputs, block_rows(samples))
@@ -104,18 +100,17 @@ class ControlJob(AbstractJob):
         wanted = drive(table, self._names, self._reference, self._given)
         found = _control(
             self._stage,
-            self._pid,
+            self._controllers,
             table,
             self._names,
             self._relative,
             wanted,
             self._start,
-            self._delay,
             self._reference.shape == "step",
         )
         outputs = {name: np.asarray(value) for name, value in found.items()}
         outputs["pole_radius"] = in_turn(
-            lambda rows: _radius(self._stage, self._pid, rows, self._names, self._relative, self._delay), settings
+            lambda rows: _radius(self._stage, self._controllers, rows, self._names, self._relative), settings
         )
         moved = np.ptp(np.asarray(wanted), axis=1)
         way = np.maximum(moved, np.abs(outputs.pop("from_um")))
@@ -136,71 +131,25 @@ def make(request: Request) -> ControlJob:
     """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
     stage, initial = requested_stage(request)
     reference = read_program(request.table.get("reference", {"shape": "step"}), "reference", "um", request.load)
-    given = request.table.get("controller", {})
-    fields = {
-        "proportional_V_per_um": 0.0,
-        "integral_V_per_um_s": 100.0,
-        "derivative_V_s_per_um": 0.0,
-        "filter_s": 0.0,
-        "reference_weight": 1.0,
-        "derivative_weight": 1.0,
-    }
-    limits = range_of(stage) or (-1e3, 1e3)
-    others = {"lower_V": limits[0], "upper_V": limits[1]}
-    for key in given:
-        known = [*fields, *others, "delay_samples"]
-        if key not in known:
-            raise DataError(f"controller.{key}: expected a known key, found '{key}'; {nearest(key, known)}")
-    stated = {key: number(value, f"controller.{key}") for key, value in given.items() if key != "delay_samples"}
-    delay = given.get("delay_samples", 0)
-    if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= 100:
-        raise DataError(f"controller.delay_samples: expected a number from 0 to 100, found {delay!r}; correct it.")
-    values = fields | others | stated
-    pid = PID(interval_s=jnp.asarray(reference.interval_s), **values)
-    for info in parameter_table(pid):
-        value, spec = values[info.path], info.spec
-        if not spec.lower <= value <= spec.upper:
-            raise DataError(
-                f"controller.{info.path}: expected {spec.lower:g} to {spec.upper:g} {spec.unit}, found {value:g}; "
-                "correct it."
-            )
-    if not values["lower_V"] < values["upper_V"]:
-        raise DataError(
-            f"controller.lower_V: expected less than upper_V, which is {values['upper_V']:g} V, found "
-            f"{values['lower_V']:g}; correct one of them."
-        )
-    return ControlJob(stage, pid, reference, initial, request.names, request.relative, delay)
-
-
-def _pid_parameters(pid: PID) -> tuple[Parameter, ...]:
-    return tuple(
-        Parameter(
-            f"controller.{info.path}",
-            info.spec.unit,
-            float(getattr(pid, info.path)),
-            info.spec.lower,
-            info.spec.upper,
-        )
-        for info in parameter_table(pid)
-    )
+    controllers = read_controllers(request.table.get("controller", {}), stage, initial, reference)
+    return ControlJob(stage, controllers, reference, initial, request.names, request.relative)
 
 
 @by_rows("table", "wanted")
 def _control(
     stage: Stage,
-    pid: PID,
+    controllers: Controllers,
     table: Float[Array, "n k"],
     names: tuple[str, ...],
     relative: tuple[str, ...],
     wanted: Float[Array, "n t"],
     start: Start,
-    delay: int,
     step: bool,
 ) -> dict[str, Float[Array, " n"]]:
     def one(row: Float[Array, " k"], reference: Float[Array, " t"]) -> dict[str, Float[Array, ""]]:
         values = dict(zip(names, row, strict=True))
-        controller = _controller(pid, values, relative)
-        run = simulate_loop(controller, varied(stage, values, relative), reference, delay=delay, start=start)
+        changed = varied(stage, values, relative)
+        run = simulate_loop(controllers.at(values), changed, reference, delay=controllers.delay, start=start)
         # A step at the first sample is none within the record, but from where the stage stood.
         way = jnp.append(reference, run.displacement_um[0])
         share = 100 / jnp.ptp(way)
@@ -222,25 +171,13 @@ def _control(
     return jax.vmap(one)(table, wanted)
 
 
-def _controller(pid: PID, values: Mapping[str, Float[Array, ""]], relative: tuple[str, ...]) -> PID:
-    own = [name for name in values if name.startswith("controller.")]
-    if not own:
-        return pid
-    fields = [name.removeprefix("controller.") for name in own]
-    old = [getattr(pid, field) for field in fields]
-    new = [v * values[name] if name in relative else values[name] for v, name in zip(old, own, strict=True)]
-    found: PID = eqx.tree_at(lambda p: [getattr(p, field) for field in fields], pid, new)
-    return found
-
-
 @eqx.filter_jit
 def _radius(
     stage: Stage,
-    pid: PID,
+    controllers: Controllers,
     table: Float[Array, "n k"],
     names: tuple[str, ...],
     relative: tuple[str, ...],
-    delay: int,
 ) -> Float[Array, " n"]:
     """Largest modulus of the poles of each loop, NaN where a part of the stage has no linear form."""
     if not all(isinstance(part, AbstractLinear | Preisach) for part in stage.parts):
@@ -249,8 +186,8 @@ def _radius(
     def one(row: Float[Array, " k"]) -> Float[Array, ""]:
         values = dict(zip(names, row, strict=True))
         changed = varied(stage, values, relative)
-        found = margins(_controller(pid, values, relative), changed, delay=delay, slope_um_per_V=_slope(changed))
-        return found.radius
+        linear = linear_part(controllers.at(values))
+        return margins(linear, changed, delay=controllers.delay, slope_um_per_V=_slope(changed)).radius
 
     return jax.vmap(one)(table)
 
