@@ -27,7 +27,8 @@ frequency_Hz = 20.0
 from_s = 0.05             # figures count from here on
 traces = false            # true keeps the displacement over time, at every `every` samples
 
-# Axes with values or with low, high and count are crossed; those with the same `zip` run together.
+# Axes with values or with low, high and count are crossed, and the last one runs fastest; those with the same `zip`
+# run together.
 [[axis]]
 parameter = "program.amplitude_V"
 values = [10.0, 20.0, 40.0, 60.0]
@@ -75,12 +76,21 @@ interval_s = 5e-4         # also that of the controller
 amplitude_um = 5.0
 step_s = 0.0
 
-[controller]              # what does not vary: gains, filter_s, weights, delay_samples, lower_V and upper_V
+# What does not vary. Every kind has gains, filter_s, lower_V and upper_V of a PID controller, and delay_samples. All
+# but bp-pid have reference_weight and derivative_weight, and
+#   bp-pid    learning_rate_per_um2, momentum, slope_um_per_V, scale_um, seed (of its first weights) and span,
+#   cmac-pid  learning_rate, limit_V, lower_um, upper_um and fastest_um_per_s,
+#   resonant  frequency_Hz, resonant_V_per_um_s and lead_deg of one resonator.
+# Gains are not tuned. What else is left out is made as `microid control` does, for the stage and the reference stated
+# here and not for those of a row: zip controller.frequency_Hz with reference.frequency_Hz where the latter varies.
+# All may be axes but kind, delay_samples, span, lower_V, upper_V, lower_um, upper_um and fastest_um_per_s.
+[controller]
+kind = "pid"              # pid, bp-pid, cmac-pid or resonant
 derivative_V_s_per_um = 0.0
 delay_samples = 1         # by which readings are late
 
 # Both axes have a count, so they are crossed: 32 x 32 rows. Rows whose loop is unstable where the hysteresis is
-# steepest fail, and say so.
+# steepest fail, and say so; of a controller that learns it is the loop before it learns that counts.
 [[axis]]
 parameter = "controller.integral_V_per_um_s"
 low = 5.0
@@ -159,12 +169,16 @@ seed = 1                  # of the noise and of what is drawn
 model = "nominal"
 initial = "negative"
 
+# All but method, samples and weights may be axes: parameter = "fit.levels" with values = [6, 8, 12], or "fit.initial"
+# with values = ["unknown", "negative"]. Each block of a batch is fitted on every number of levels there is in it, so
+# put the axis of the levels first, where it runs slowest.
 [fit]
 method = "batch"          # all rows of a block at once on one grid; one_by_one is `microid fit` for each
 levels = 8
+# initial = "unknown"     # or negative, positive, demagnetised; left out: that of what is simulated, unknown of files
 smoothness = 0.01         # of a batch; one_by_one finds it from the data
 holdout = 0.2
-weights = false           # true keeps the weights of every row
+weights = false           # true keeps the weights of every row, where the levels do not vary
 
 """
     + _RECORDS.format(samples=400, interval=0.02, frequency=0.8)
@@ -198,9 +212,10 @@ seed = 1
 model = "nominal"
 initial = "negative"
 
-[diagnose]
+[diagnose]                # each may be an axis
 false_alarm = 0.01
 holdout = 0.2
+# initial = "unknown"     # or negative, positive, demagnetised; left out: that of what is simulated, unknown of files
 
 """
     + _RECORDS.format(samples=2000, interval=0.001, frequency=5.0)
