@@ -28,7 +28,7 @@ def in_sentences(command: _Command) -> _Command:
             sys.exit(130)
         except DataError as error:
             sentence = " ".join(str(error).split())
-            click.echo(sentence if sentence.endswith(".") else f"{sentence}.", err=True)
+            click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
             sys.exit(2)
 
     return run  # type: ignore[return-value]
