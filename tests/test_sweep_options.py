@@ -17,7 +17,7 @@ from fits._run import initial_state, known_samples
 from fits.sweeps._chunks import chunk_count, compute_chunk
 from fits.sweeps._fit_batch import fit_batch
 from fits.sweeps._run import run_sweep
-from fits.sweeps._show import open_sweep
+from fits.sweeps._show import _edges, _logarithmic, open_sweep
 from microid import Staircase
 
 HEAD = """
@@ -200,3 +200,14 @@ def test_what_makes_no_sense_is_refused_in_one_sentence(tmp_path, axis, sentence
     file.write_text(f'schema = "microid.sweep/1"\nkind = "fit"\n[[axis]]\n{axis}\n')
     refused(run("sweep", file, "--out", tmp_path / "out"), sentence)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("values", "logarithmic"),
+    [([6.0, 8.0, 10.0], False), (np.geomspace(5, 500, 7), True), ([0.0, 1.0, 2.0], False), ([1.0, 2.0, 9.0], False)],
+)
+def test_heat_maps_have_a_cell_around_each_value(values, logarithmic):
+    values = np.asarray(values)
+    assert _logarithmic(values) == logarithmic
+    shown = np.log10(values) if logarithmic else values
+    assert np.histogram(np.repeat(shown, 3), _edges(shown))[0].tolist() == [3] * len(values)

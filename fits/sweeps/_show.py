@@ -19,6 +19,8 @@ from fits.sweeps._types import DONE, FAILED
 
 SCHEMA = "microid.sweep.summary/1"
 _CELLS = 12
+# Axes are logarithmic where values span more than this factor, and most lie near its lower end.
+_DECADE = 10.0
 # More lines than this do not show.
 _LINES = 400
 _WIDE_in, _HIGH_in = 7.09, 2.6
@@ -227,26 +229,40 @@ def _heat(
     by: str,
     values: np.ndarray,
 ) -> Path:
-    edges = [
-        np.arange(len(words[name]) + 1) - 0.5
-        if name in words
-        else np.histogram_bin_edges(swept[name], min(_CELLS, len(np.unique(swept[name]))))
-        for name in pair
-    ]
-    x, y = (swept[name] for name in pair)
+    # Words are 0, 1, 2 and so on.
+    logs = [name not in words and _logarithmic(swept[name]) for name in pair]
+    x, y = (np.log10(swept[name]) if log else swept[name] for name, log in zip(pair, logs, strict=True))
+    edges = [_edges(x), _edges(y)]
     count, *_ = np.histogram2d(x, y, bins=edges)
     total, *_ = np.histogram2d(x, y, bins=edges, weights=values)
     with np.errstate(invalid="ignore"):
         mean = np.where(count > 0, total / np.maximum(count, 1), math.nan)
     picture = figure(_WIDE_in / 2, _HIGH_in)
     axes = picture.add_subplot()
-    drawn = axes.pcolormesh(edges[0], edges[1], mean.T, cmap="viridis")
+    corners = [10**ends if log else ends for ends, log in zip(edges, logs, strict=True)]
+    drawn = axes.pcolormesh(*corners, mean.T, cmap="viridis")
+    axes.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
     picture.colorbar(drawn, label=f"mean {by}")
     label(axes, *pair)
     for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
         if name in words:
             axis.set_ticks(range(len(words[name])), words[name].tolist())
     return _saved(picture, path)
+
+
+def _logarithmic(found: np.ndarray) -> bool:
+    """Whether values lie evenly by their logarithms rather than by themselves."""
+    low, middle, high = float(found.min()), float(np.median(np.unique(found))), float(found.max())
+    return low > 0 and high > _DECADE * low and middle < (low + high) / 3
+
+
+def _edges(found: np.ndarray) -> np.ndarray:
+    """Edges of cells around values, one cell for each where there are few."""
+    distinct = np.unique(found)
+    if not 1 < len(distinct) <= _CELLS:
+        return np.histogram_bin_edges(found, min(_CELLS, len(distinct)))
+    middles = (distinct[1:] + distinct[:-1]) / 2
+    return np.concatenate([2 * distinct[:1] - middles[:1], middles, 2 * distinct[-1:] - middles[-1:]])
 
 
 def _saved(picture: Any, path: Path) -> Path:
