@@ -3,6 +3,9 @@
 Only the standard library and click are imported before a command runs.
 """
 
+import os
+import sys
+
 import click
 
 from fits._cli_commands_control import control
@@ -11,6 +14,7 @@ from fits._cli_commands_model import compensate, export, fit, info, simulate, sy
 from fits._cli_commands_paper import paper
 from fits._cli_commands_stage import budget, sensitivity
 from fits._cli_commands_sweep import sweep
+from fits._cli_common import INTERRUPTED
 
 
 def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -57,4 +61,12 @@ for _command in (
 
 def main() -> None:
     """Run the command."""
-    cli(prog_name="microid")
+    try:
+        cli(prog_name="microid")
+    except SystemExit as stop:
+        if stop.code == INTERRUPTED:
+            # All that is kept is written. Threads that still compile crash an interpreter that is taken down.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(INTERRUPTED)
+        raise

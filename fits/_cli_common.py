@@ -13,6 +13,8 @@ import click
 
 from fits._errors import DataError
 
+# Exit status after Ctrl-C, as shells have it.
+INTERRUPTED = 130
 _Command = TypeVar("_Command", bound=Callable[..., None])
 
 
@@ -25,7 +27,7 @@ def in_sentences(command: _Command) -> _Command:
             command(*args, **kwargs)
         except KeyboardInterrupt:
             click.echo("Interrupted: no unfinished file was left.", err=True)
-            sys.exit(130)
+            sys.exit(INTERRUPTED)
         except DataError as error:
             sentence = " ".join(str(error).split())
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)

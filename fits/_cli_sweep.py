@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from fits._cli_common import INTERRUPTED
 from fits._cli_files import new_folder, progress_to_stderr
 from fits._cli_jax import start_jax
 
@@ -23,7 +24,7 @@ def run_sweep(*, file: str, out: str, resume: bool, cluster: str | None, as_json
         outcome = run_all(sweep, out, resume=resume, cluster=cluster, progress=progress)
     except KeyboardInterrupt:
         click.echo("Interrupted: what was computed is kept; go on with --resume.", err=True)
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     files = [str(Path(out) / name) for name in (RESULTS, TABLE)]
     if as_json:
         content = {

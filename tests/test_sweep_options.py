@@ -193,6 +193,9 @@ def test_numbers_of_levels_out_of_bounds_fail_as_rows(seed):
         ('parameter = "fit.levels"\nrelative = true\nvalues = [0.5]', "which no factor changes"),
         ('parameter = "fit.method"\nvalues = ["batch"]', "there is no parameter 'fit.method'"),
         ('parameter = "fit.levels"\nvalues = [5]\n[fit]\nweights = true', "leave out one of the two"),
+        ('parameter = "fit.levels"\nvalues = [5]\n[fit]\nsamples = 300', "the samples of their program"),
+        ('parameter = "fit.levels"\nvalues = [5]\n[fit]\nmethod = "one_by_one"\nsmoothness = 0.1', "leave it out"),
+        ('parameter = "fit.levels"\nvalues = [3, 40]', "all values lie outside the bounds of fit.levels, 4 to 32;"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_sentence(tmp_path, axis, sentence):

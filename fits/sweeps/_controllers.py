@@ -226,10 +226,7 @@ def _check(parameters: tuple[Parameter, ...], numbers: Mapping[str, float]) -> N
     for name, value in numbers.items():
         each = bounds[name]
         if not each.lower <= value <= each.upper:
-            raise DataError(
-                f"controller.{name}: expected {each.lower:g} to {each.upper:g} {each.unit}, found {value:g}; "
-                "correct it."
-            )
+            raise DataError(f"controller.{name}: expected {each.range_words}, found {value:g}; correct it.")
         check_plain(each, np.array([value]), False, f"controller.{name}")
 
 
@@ -240,7 +237,8 @@ def _defaults(
     if kind == "pid":
         return _DEFAULTS
     if kind == "resonant":
-        return _DEFAULTS | {"frequency_Hz": stated.get("frequency_Hz") or _frequency_Hz(reference)}
+        own = stated["frequency_Hz"] if "frequency_Hz" in stated else _frequency_Hz(reference)
+        return _DEFAULTS | {"frequency_Hz": own}
     way_um = _way_um(stage, initial, reference)
     if kind == "bp-pid":
         return {"filter_s": 0.0} | _BP_DEFAULTS | bp_defaults(stage, way_um)

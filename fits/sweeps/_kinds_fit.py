@@ -253,6 +253,10 @@ def make(request: Request) -> FitJob:
         raise DataError(f"fit.weights: expected true, with fit.levels, or false, found {weights!r}; correct it.")
     if weights and "fit.levels" in request.names:
         raise DataError("fit.weights: rows of other fit.levels have other weights; leave out one of the two.")
+    if isinstance(records, Simulated) and "samples" in table:
+        raise DataError("fit.samples: simulated records have the samples of their program; leave it out.")
+    if method == "one_by_one" and "smoothness" in table:
+        raise DataError("fit.smoothness: one_by_one finds it from the data; leave it out.")
     samples = records.program.samples if isinstance(records, Simulated) else table.get("samples", 2048)
     if isinstance(samples, bool) or not isinstance(samples, int) or samples < _FEWEST:
         raise DataError(f"fit.samples: expected a number of {_FEWEST} or more, found {samples!r}; correct it.")

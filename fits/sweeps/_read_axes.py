@@ -133,16 +133,19 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
         relative, nominal = False, parameter.nominal
         found = found * nominal if isinstance(found, np.ndarray) else _scaled(*found, nominal)
     if isinstance(found, np.ndarray):
+        if not relative and np.all((found < parameter.lower) | (found > parameter.upper)):
+            raise DataError(_all_outside(place, parameter))
         return Axis(parameter.name, relative, tuple(found.tolist())), found
     distribution, first, second = found
     axis = Axis(parameter.name, relative, None, distribution, first, second)
     ends = [first, second]
     if not relative and distribution != "normal" and (min(ends) > parameter.upper or max(ends) < parameter.lower):
-        raise DataError(
-            f"{place}: all values lie outside the bounds of {parameter.name}, {parameter.lower:g} to "
-            f"{parameter.upper:g} {parameter.unit}; correct them."
-        )
+        raise DataError(_all_outside(place, parameter))
     return axis, None
+
+
+def _all_outside(place: str, parameter: Parameter) -> str:
+    return f"{place}: all values lie outside the bounds of {parameter.name}, {parameter.range_words}; correct them."
 
 
 def _values(

@@ -205,7 +205,7 @@ def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, n
             kept[axis.parameter] = np.where(wrong, 1.0 if axis.relative else parameter.nominal, value)
             for k in np.flatnonzero(wrong):
                 reasons[k] = reasons[k] or (
-                    f"{parameter.name} = {value[k]:.6g} lies outside its bounds, {lower:g} to {upper:g} "
-                    f"{'times its own' if axis.relative else parameter.unit}"
+                    f"{parameter.name} = {value[k]:.6g} lies outside its bounds, "
+                    f"{f'{lower:g} to {upper:g} times its own' if axis.relative else parameter.range_words}"
                 )
     return kept, reasons

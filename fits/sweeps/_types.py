@@ -43,6 +43,12 @@ class Parameter:
     words: tuple[str, ...] = ()
     whole: bool = False
 
+    @property
+    def range_words(self) -> str:
+        """Its bounds and unit in words."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{self.lower:g} to {self.upper:g}{unit}"
+
 
 @dataclass(frozen=True)
 class Output:
