@@ -18,6 +18,8 @@ _STAIRCASES = (64, 512, 4096)
 _NEAR = 1e-3
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
+UNSWEPT = "unswept"
+"""As `unknown`, where relays that the range does not reach back may have any state, too."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def prepare_run(record: Record, lower_V: float, upper_V: float, initial: str, ho
     """
     voltage = record.voltage_V
     starts, anchor_V, rising = _walk(voltage, initial_state(initial, lower_V, upper_V))
-    known = np.ones(len(voltage), dtype=bool) if initial != "unknown" else known_samples(voltage, lower_V, upper_V)
+    known = known_samples(voltage, lower_V, upper_V, initial)
     fitted = known.copy()
     if holdout > 0:
         fitted[len(voltage) - round(holdout * len(voltage)) :] = False
@@ -102,7 +104,7 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
     An unknown state is stood in for by negative saturation; the samples that would show the difference are not
     known ones.
     """
-    if name in ("negative", "unknown"):
+    if name in ("negative", "unknown", UNSWEPT):
         return negative_saturation(lower_V)
     if name == "positive":
         return positive_saturation(lower_V, upper_V)
@@ -111,17 +113,20 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
     raise DataError(f"unknown initial state {name!r}: choose one of {', '.join(INITIAL_STATES)}")
 
 
-def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float) -> np.ndarray:
-    """Mark what no longer depends on the past.
+def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:
+    """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES` or `UNSWEPT`.
 
-    At an end of the range every relay is in a known state. Short of that, relays outside the extremes that this
-    run itself reaches either never switch or switch on the way to them; once both have been visited they are a
-    constant, which the run's own offset takes up.
+    At an end of the range every relay is in a known state, if none lies beyond: one that a voltage within the range
+    switches on and none switches off is on after the first loop, and may have been off before. Short of that, relays
+    outside the extremes that this run itself reaches either never switch or switch on the way to them; once both
+    have been visited they are a constant, which the run's own offset takes up.
     """
+    if initial not in ("unknown", UNSWEPT):
+        return np.ones(len(voltage), dtype=bool)
     near = _NEAR * (upper_V - lower_V)
     saturated = (voltage <= lower_V + near) | (voltage >= upper_V - near)
     both = (np.maximum.accumulate(voltage) >= voltage.max()) & (np.minimum.accumulate(voltage) <= voltage.min())
-    return np.maximum.accumulate(saturated | both)
+    return np.maximum.accumulate(both if initial == UNSWEPT else saturated | both)
 
 
 def _walk(voltage: np.ndarray, start: Staircase) -> tuple[tuple[Staircase, ...], np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from fits._errors import DataError
 from fits._record import Record
-from fits._run import initial_state, known_samples
+from fits._run import UNSWEPT, initial_state, known_samples
 from microid import (
     AbstractHysteresis,
     AbstractLinear,
@@ -132,7 +132,7 @@ def prepare_stage_run(
     range_V
         Range of the command.
     initial
-        Memory before the first sample, one of `INITIAL_STATES`.
+        Memory before the first sample, one of `INITIAL_STATES`, or `UNSWEPT`.
     holdout
         Fraction at the end that is kept out of the fit.
     stride
@@ -151,8 +151,8 @@ def prepare_stage_run(
     if record.displacement_um is None:
         raise DataError(f"{record.source}: a displacement column is needed here")
     lower, upper = range_V
-    n, unknown = len(record), initial == "unknown"
-    known = known_samples(record.voltage_V, lower, upper) if unknown and gain is not None else np.ones(n, dtype=bool)
+    n, unknown = len(record), initial in ("unknown", UNSWEPT)
+    known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
     fitted = known.copy()
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False

@@ -76,7 +76,7 @@ def conclude(
         why = f"explains only {share:.0%} of what is left" if share < _SHARE else "predicts what was kept aside worse"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
         model, kept = found.plain, ()
-        rest_share = ((explained + max(rest - rest_freedom, 0.0)) / projector.count) ** 0.5
+        rest_share = (max(explained + max(rest - rest_freedom, 0.0), 0.0) / projector.count) ** 0.5
         left_over = rest_share > _REST
         extended, compared, effects = _extended(ready, found, None)
     cyclic = cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)

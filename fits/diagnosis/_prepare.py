@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits._record import Record
+from fits._run import UNSWEPT
 from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
 from fits.diagnosis._faults import SINGLE, Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._score import Scored, score
+from fits.diagnosis._unswept import unswept
 from microid import EFFECTS
 
 # Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
@@ -20,6 +22,10 @@ _LATE, _AS_WELL = 25.0, 0.97
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
     "sample; a delay of that length would look the same"
+)
+_FIRST = (
+    "the voltage's first way through its range differs from later ones, as after a rest or a demagnetisation, and was "
+    "not used"
 )
 # Part of its range through which the voltage goes up, and down, in what is fitted.
 _BOTH_WAYS = 0.5
@@ -67,6 +73,15 @@ def prepare_diagnosis(
     progress("simulating every effect")
     bench, probes, skipped = _probed(baseline, faults)
     projector = Projector(regression, faults.noise)
+    if initial == "unknown" and unswept(baseline, projector, max(one.z for one in _scores(projector, probes))):
+        progress("fitting the plain stage again, without the first way of each run")
+        initial = UNSWEPT
+        baseline = fit_baseline(records, aside, fraction, initial, progress)
+        regression = regress(baseline)
+        faults = replace(find_faults(regression), spikes=faults.spikes, heights_um=faults.heights_um)
+        bench, probes, skipped = _probed(baseline, faults)
+        projector = Projector(regression, faults.noise)
+        said = (*said, _FIRST)
     late = max((one.drop for one in _scores(projector, probes, "transport_delay")), default=0.0)
     if baseline.dynamic and late > _LATE:
         progress("fitting the plain stage again, its command held in steps")
@@ -110,8 +125,9 @@ def _probed(baseline: Baseline, faults: Faults) -> tuple[Bench, list[Probe], lis
     return bench, probes, skipped
 
 
-def _scores(projector: Projector, probes: Sequence[Probe], name: str) -> tuple[Scored, ...]:
-    return score(projector, [probe for probe in probes if probe.name == name], projector.off(projector.residual))
+def _scores(projector: Projector, probes: Sequence[Probe], name: str | None = None) -> tuple[Scored, ...]:
+    asked = [probe for probe in probes if name in (None, probe.name)]
+    return score(projector, asked, projector.off(projector.residual))
 
 
 def _left(projector: Projector) -> float:

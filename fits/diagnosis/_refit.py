@@ -318,8 +318,8 @@ def _fit(
         moved = False
         for _ in range(4):
             step = -np.linalg.solve(gram + damping * np.eye(len(flat)), cross) / scale
-            # No coordinate moves by more than a few e-folds at a time.
-            step *= min(1.0, _FARTHEST / (float(np.max(np.abs(step))) + 1e-300))
+            # No coordinate moves by more than a few e-folds at a time, and one at its bound does not hold others back.
+            step = np.clip(step, -_FARTHEST, _FARTHEST)
             ahead = joined(flat + step)
             trial = left(ahead)
             if float(trial @ trial) < cost:

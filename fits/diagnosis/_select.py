@@ -155,7 +155,7 @@ def select(
         if not fitted:
             refused |= {one.name for one in open_ if one.z > _WORTH * top}
             continue
-        first, beside = _leader(bench, projector, probes, model, fitted, best_of(open_))
+        first, beside = _leader(bench, projector, probes, model, fitted, best_of(open_), taken & once)
         drop = model.cost - first.refit.cost
         rivals = _rivals(first, fitted, max(drop, 0.0))
         usual = next((rival for rival in rivals if rival.name in _USUAL and first.name not in _USUAL), None)
@@ -192,10 +192,12 @@ def _leader(
     model: Refit,
     fitted: Sequence[Rival],
     scores: Mapping[str, Scored],
+    closed: Collection[str],
 ) -> tuple[Rival, Settled]:
     """Choose the cause: the best, or among those about as good the one beside which another explains most.
 
-    Where two causes act, one that is neither may follow part of each and come first.
+    Where two causes act, one that is neither may follow part of each and come first. None comes twice of those
+    that are `closed`.
     """
     best, chosen = fitted[0], settled(bench, projector, fitted[0].refit)
     highest = max(scores[one.name].z for one in fitted)
@@ -205,7 +207,7 @@ def _leader(
         there, beside, own = at
         basis = own.basis()
         left = rescore(score(beside, probes, own.residual), basis, own.residual)
-        others = [other for other in left if other.name != one.name]
+        others = [other for other in left if other.name != one.name and other.name not in closed]
         if not others:
             return 0.0, own.cost
         next_ = max(others, key=lambda other: other.z)
