@@ -201,7 +201,11 @@ def _resolve(
     best = trial(levels or LADDER[0], Hyper.start())
     trials = [LevelTrial(best.data.grid.levels, best.error_um)]
     for n in [n for n in LADDER[1:] if n <= finest] if levels is None else ():
-        finer = trial(n, best.solution.hyper)
+        try:
+            finer = trial(n, best.solution.hyper)
+        except FitError:
+            # What is coarser has an answer.
+            break
         trials.append(LevelTrial(n, finer.error_um))
         pays = finer.error_um < (1 - _WORTH) * best.error_um
         best = finer if finer.error_um <= best.error_um else best

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -14,18 +15,19 @@ from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._score import Scored, score
 from fits.diagnosis._unswept import unswept
-from microid import EFFECTS
+from microid import EFFECTS, Hold
 
 # Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
 # command held in steps must explain to be taken for it: then what looked like a delay is half a sample.
 _LATE, _AS_WELL = 25.0, 0.97
+_HOLDS: tuple[Hold, ...] = ("first", "zero")
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
     "sample; a delay of that length would look the same"
 )
 _FIRST = (
-    "the voltage's first way through its range differs from later ones, as after a rest or a demagnetisation, and was "
-    "not used"
+    "the voltage's first way through its range differs from later ones, as after a rest or a demagnetisation, and "
+    "was not used"
 )
 # Part of its range through which the voltage goes up, and down, in what is fitted.
 _BOTH_WAYS = 0.5
@@ -48,6 +50,33 @@ class Prepared:
     skipped: tuple[tuple[str, str], ...]
 
 
+@dataclass(frozen=True)
+class _Fitted:
+    """The plain stage, fitted to runs in one way."""
+
+    regression: Regression
+    faults: Faults
+
+    @cached_property
+    def projector(self) -> Projector:
+        return Projector(self.regression, self.faults.noise)
+
+    @cached_property
+    def probed(self) -> tuple[Bench, list[Probe], list[tuple[str, str]]]:
+        return _probed(self.regression.baseline, self.faults)
+
+    def left(self) -> float:
+        """Sum of squares that is left."""
+        left = self.projector.off(self.projector.residual)
+        return float(left @ left)
+
+    def best(self, name: str | None = None) -> Scored | None:
+        """What has most evidence, of one effect or of all."""
+        asked = [probe for probe in self.probed[1] if name in (None, probe.name)]
+        scores = score(self.projector, asked, self.projector.off(self.projector.residual))
+        return max(scores, key=lambda one: one.z, default=None)
+
+
 def prepare_diagnosis(
     records: Sequence[Record],
     aside: Sequence[Record],
@@ -59,43 +88,42 @@ def prepare_diagnosis(
     said: tuple[str, ...] = ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (_ONE_WAY,)
-    progress("fitting the plain stage")
-    baseline = fit_baseline(records, aside, fraction, initial, progress)
-    progress("reading the noise")
-    regression = regress(baseline)
-    faults = find_faults(regression)
-    if faults.repaired:
+
+    def fitted(hold: Hold) -> _Fitted:
+        regression = regress(fit_baseline(records, aside, fraction, initial, progress, hold))
+        faults = find_faults(regression)
+        if not faults.repaired:
+            return _Fitted(regression, faults)
         progress("fitting the plain stage again, without single bad samples")
-        records = faults.clean(records)
-        baseline = fit_baseline(records, aside, fraction, initial, progress)
-        regression = regress(baseline)
-        faults = replace(find_faults(regression), spikes=faults.spikes, heights_um=faults.heights_um)
+        regression = regress(fit_baseline(faults.clean(records), aside, fraction, initial, progress, hold))
+        found = find_faults(regression)
+        return _Fitted(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
+
+    progress("fitting the plain stage")
+    here = fitted("first")
     progress("simulating every effect")
-    bench, probes, skipped = _probed(baseline, faults)
-    projector = Projector(regression, faults.noise)
-    if initial == "unknown" and unswept(baseline, projector, max(one.z for one in _scores(projector, probes))):
-        progress("fitting the plain stage again, without the first way of each run")
-        initial = UNSWEPT
-        baseline = fit_baseline(records, aside, fraction, initial, progress)
-        regression = regress(baseline)
-        faults = replace(find_faults(regression), spikes=faults.spikes, heights_um=faults.heights_um)
-        bench, probes, skipped = _probed(baseline, faults)
-        projector = Projector(regression, faults.noise)
-        said = (*said, _FIRST)
-    late = max((one.drop for one in _scores(projector, probes, "transport_delay")), default=0.0)
-    if baseline.dynamic and late > _LATE:
-        progress("fitting the plain stage again, its command held in steps")
-        steps = regress(fit_baseline(records, aside, fraction, initial, progress, "zero"))
-        if _left(projector) - _left(Projector(steps, faults.noise)) > _AS_WELL * late:
-            baseline, regression = replace(steps.baseline, remarks=(*steps.baseline.remarks, _STEPS)), steps
-            faults = replace(find_faults(regression), spikes=faults.spikes, heights_um=faults.heights_um)
-            bench, probes, skipped = _probed(baseline, faults)
-    baseline = replace(baseline, remarks=(*baseline.remarks, *said))
+    for hold in _HOLDS:
+        if hold != "first":
+            late = here.best("transport_delay")
+            if not here.regression.baseline.dynamic or late is None or late.drop <= _LATE:
+                break
+            progress("fitting the plain stage again, its command held in steps")
+            steps = fitted(hold)
+            # With the same noise, they compare.
+            if here.left() - _Fitted(steps.regression, here.faults).left() <= _AS_WELL * late.drop:
+                break
+            here, said = steps, (*said, _STEPS)
+        most = here.best()
+        if initial == "unknown" and most is not None and unswept(here.projector, most.z):
+            progress("fitting the plain stage again, without the first way of each run")
+            initial = UNSWEPT
+            here, said = fitted(hold), (*said, _FIRST)
+    bench, probes, skipped = here.probed
+    baseline = replace(here.regression.baseline, remarks=(*here.regression.baseline.remarks, *said))
     progress("learning how rough the density is")
-    signatures = [column for probe in probes for column in probe.signatures]
-    rough = learn_roughness(Projector(regression, faults.noise), signatures)
-    projector = Projector(regression, faults.noise, rough)
-    return Prepared(baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
+    rough = learn_roughness(here.projector, [column for probe in probes for column in probe.signatures])
+    projector = Projector(here.regression, here.faults.noise, rough)
+    return Prepared(baseline, here.regression, bench, projector, tuple(probes), here.faults, tuple(skipped))
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:
@@ -123,13 +151,3 @@ def _probed(baseline: Baseline, faults: Faults) -> tuple[Bench, list[Probe], lis
             skipped.append((form.name, "nothing of it was found, sample by sample" if form.name in SINGLE else why))
         probes += own
     return bench, probes, skipped
-
-
-def _scores(projector: Projector, probes: Sequence[Probe], name: str | None = None) -> tuple[Scored, ...]:
-    asked = [probe for probe in probes if name in (None, probe.name)]
-    return score(projector, asked, projector.off(projector.residual))
-
-
-def _left(projector: Projector) -> float:
-    left = projector.off(projector.residual)
-    return float(left @ left)

@@ -68,7 +68,10 @@ class Projector:
             k = kind[0].shape[1]
             matrix[row : row + k, at : at + k] = np.eye(k) / size
             at, row = at + k, row + k
-        self._scale = np.sqrt(np.einsum("ij,ij->j", matrix, matrix)) + 1e-300
+        size = np.sqrt(np.einsum("ij,ij->j", matrix, matrix))
+        # What changes nothing in the samples that count, as what has died away before them, stays where it is.
+        self._live = size > 0
+        self._scale = np.where(self._live, size, 1.0)
         matrix /= self._scale
         value, vector = np.linalg.eigh(matrix.T @ matrix)
         # Directions that the runs do not show have nothing to be projected on.
@@ -162,9 +165,11 @@ class Projector:
         columns = baseline.chain.size
         answer = self._answer(joined)
         gram = self.root.T @ self.root
-        own = gram[columns:, columns:]
-        own = own + 1e-12 * np.diag(np.diagonal(own)) + 1e-300 * np.eye(len(own))
-        follow = np.linalg.solve(own, gram[columns:, :columns])
+        live = self._live[columns:]
+        own = gram[columns:, columns:][np.ix_(live, live)]
+        own = own + 1e-12 * np.diag(np.diagonal(own))
+        follow = np.zeros((len(live), columns))
+        follow[live] = np.linalg.solve(own, gram[columns:, :columns][live])
         precision = gram[:columns, :columns] - gram[:columns, columns:] @ follow
         precision = (precision + precision.T) / 2 + 1e-12 * np.diag(np.diagonal(precision))
         mean = baseline.columns_um + answer[:columns]
@@ -172,9 +177,11 @@ class Projector:
             Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
         )
         if result != RESULTS.successful:
-            # Block pivoting may go round in circles; one column at a time is slow and sure.
-            upper = np.linalg.cholesky(precision).T
-            kept, _ = nnls(upper, upper @ mean, maxiter=30 * len(mean))
+            # Block pivoting may go round in circles, or rounding leave no Cholesky factor; one column at a time is
+            # slow and sure.
+            value, vector = np.linalg.eigh(precision)
+            root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
+            kept, _ = nnls(root, root @ mean, maxiter=30 * len(mean))
         change = np.asarray(kept) - baseline.columns_um
         others = answer[columns:] - follow @ (change - answer[:columns])
         return baseline.moved(others[: self.regression.size - columns], change)

@@ -318,7 +318,7 @@ def _fit(
         moved = False
         for _ in range(4):
             step = -np.linalg.solve(gram + damping * np.eye(len(flat)), cross) / scale
-            # No coordinate moves by more than a few e-folds at a time, and one at its bound does not hold others back.
+            # No coordinate moves by more than a few e-folds at a time; one at its bound holds no other back.
             step = np.clip(step, -_FARTHEST, _FARTHEST)
             ahead = joined(flat + step)
             trial = left(ahead)

@@ -264,6 +264,8 @@ def _contest(
                 continue
             tried[form] = tried.get(form, 0) + 1
             found = refit_beside(bench, projector, model, one)
+            if not all(np.all(np.isfinite(change)) for change in found.change_um):
+                continue
             # What does not stand out of the rest of the misfit must show in what was kept aside.
             plain = one.sure > (_SURE if one.z > 2 * _INEXACT * explained else 2 * _SURE)
             most = _WORSE if plain else _BETTER

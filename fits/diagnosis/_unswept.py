@@ -10,29 +10,31 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import evidence
 from fits.diagnosis._structure import View
 
-# Waves over the first way, evidence from which it counts, and samples that are needed beside it.
-_WAVES, _SURE, _FEWEST = 6, 5.5, 200
+# Waves over the first way, evidence from which it counts, the share of that for the best effect from which it is the
+# likelier reason, and samples that are needed beside it.
+_WAVES, _SURE, _NEARLY, _FEWEST = 12, 5.5, 0.8, 200
 
 
-def unswept(baseline: Baseline, projector: Projector, highest: float) -> bool:
-    """Whether the first ways of the runs explain more than anything else.
+def unswept(projector: Projector, highest: float) -> bool:
+    """Whether the first ways of the runs explain about as much as anything else.
 
     A stage that was at rest since it was made, or demagnetised, begins on a curve of its own. What it lacks of a
     loop depends on nothing but how far the voltage has come.
 
     Parameters
     ----------
-    baseline, projector
-        Fitted to runs whose state before is unknown, and taken for saturated where they begin at an end of the range.
+    projector
+        Of a baseline fitted to runs whose state before is unknown, and taken for saturated where they begin at an end
+        of the range.
     highest
         Evidence for the best of all effects, in standard deviations.
     """
-    view = _first_ways(baseline)
+    view = _first_ways(projector.regression.baseline)
     if view is None:
         return False
     joined = projector.off(np.stack([projector.join(column) for column in view.columns], axis=1))
     z, _, _ = evidence(joined, projector.off(projector.residual), False)
-    return z > max(_SURE, highest)
+    return z > max(_SURE, _NEARLY * highest)
 
 
 def _first_ways(baseline: Baseline) -> View | None:
