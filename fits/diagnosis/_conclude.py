@@ -12,6 +12,7 @@ from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._experiment import suggest
 from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_of, left_of, shared_effects
 from fits.diagnosis._faults import Faults, find_faults, name_faults
+from fits.diagnosis._floor import SPIKE
 from fits.diagnosis._irregular import irregular
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._projector import Projector
@@ -57,7 +58,7 @@ def conclude(
     none = np.zeros((len(found.plain.residual), 0))
     seen = look(projector, none, found.plain.residual, [*ways, *further_views(baseline.runs)])
     # What the causes explain and what is left to be seen in any way is what there is to be explained.
-    explained = found.plain.cost - found.model.cost
+    explained = max(found.plain.cost - found.model.cost, 0.0)
     rest, rest_freedom = together(found.projector, found.model.basis(), found.model.residual, ways)
     period_um, cycle_z, cycle_drop = cycles(found.projector, found.model.residual, bench.plain)
     rest = max(rest, cycle_drop)
@@ -85,7 +86,7 @@ def conclude(
             f"what is left repeats itself every {period_um:.3g} um of the position, as the error of an "
             "interferometer or an encoder does"
         )
-    faults = name_faults(_beside(ready, found, model) if kept else ready.faults, cyclic)
+    faults = name_faults(_beside(ready, found, model, compared) if kept else ready.faults, cyclic)
     causes = causes_of(kept, model, found.projector, found.bench, misfit, faults, ready.faults)
     ahead = suggest(ready, found, causes, duration_s, progress)
     if ahead is None and any(cause.also_consistent for cause in causes):
@@ -173,10 +174,14 @@ def conclude(
     )
 
 
-def _beside(ready: Prepared, found: Selection, model: Refit) -> Faults:
-    """Faults of samples and noise, as they are beside the causes."""
+def _beside(ready: Prepared, found: Selection, model: Refit, compared: Sequence[Compared]) -> Faults:
+    """Faults of samples and noise, as they are beside the causes, which may explain what looked like a bad sample."""
     now = find_faults(found.projector.regression, model.change_um)
-    return replace(now, spikes=ready.faults.spikes, heights_um=ready.faults.heights_um)
+    standing = tuple(
+        bad & (np.abs(one.after_um + height_um) > SPIKE * noise.total_um)
+        for bad, height_um, one, noise in zip(ready.faults.spikes, ready.faults.heights_um, compared, now.noise, strict=False)
+    )
+    return replace(now, spikes=standing, heights_um=ready.faults.heights_um)
 
 
 def _worse(compared: Sequence[Compared]) -> float:

@@ -22,7 +22,7 @@ _STEADY_s = 1.5
 _WIDE = 0.2
 # A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
 # so far away are much smaller.
-_SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
+SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
 # A command that moves by more than this part of its range within some samples may cause what looks like a spike.
 _EDGE, _NEAR = 0.02, 6
 
@@ -114,7 +114,7 @@ def spikes(run: StageRun, residual_um: np.ndarray, least_um: float = 0.0) -> np.
     off = residual_um - median_filter(residual_um, 7, mode="nearest")
     spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")
     spread = np.maximum(spread, 1.4826 * float(np.median(np.abs(off))))
-    far = np.abs(off) > np.maximum(_SPIKE * spread, least_um + 1e-300)
+    far = np.abs(off) > np.maximum(SPIKE * spread, least_um + 1e-300)
     # What rings has neighbours as large; what is alone has none.
     size = np.abs(off)
     around = np.zeros_like(size)

@@ -18,8 +18,9 @@ from fits.diagnosis._unswept import unswept
 from microid import EFFECTS, Hold
 
 # Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
-# command held in steps must explain to be taken for it: then what looked like a delay is half a sample.
-_LATE, _AS_WELL = 25.0, 0.97
+# command held in steps must explain to be taken for it: then what looked like a delay is half a sample. Or steps
+# leave, beside a delay of their own, less than lines do, by such a part.
+_LATE, _AS_WELL, _BETTER = 25.0, 0.97, 0.03
 _HOLDS: tuple[Hold, ...] = ("first", "zero")
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
@@ -109,8 +110,11 @@ def prepare_diagnosis(
                 break
             progress("fitting the plain stage again, its command held in steps")
             steps = fitted(hold)
-            # With the same noise, they compare.
-            if here.left() - _Fitted(steps.regression, here.faults).left() <= _AS_WELL * late.drop:
+            # With the same noise, they compare: with a delay beside each, too.
+            same = _Fitted(steps.regression, here.faults)
+            more = same.best("transport_delay")
+            beside = here.left() - late.drop - (same.left() - (more.drop if more is not None else 0.0))
+            if here.left() - same.left() <= _AS_WELL * late.drop and beside <= _BETTER * late.drop:
                 break
             here, said = steps, (*said, _STEPS)
         most = here.best()

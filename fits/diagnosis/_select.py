@@ -147,8 +147,9 @@ def select(
         if not open_:
             break
         top = max(one.z for one in open_)
-        p = family.p(top)
-        if p >= false_alarm:
+        # Noise that was read too low makes chance look like evidence: what is left says how low at most.
+        sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
+        if family.p(top / sigma) >= false_alarm:
             break
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
         fitted = _contest(bench, projector, model, open_, top, explained)
@@ -167,13 +168,16 @@ def select(
             # Its strength is anybody's guess, or what it explains is out of reach where all is fitted together.
             refused.add(first.name)
             continue
+        z = max(drop, 0.0) ** 0.5
+        if family.p(z / sigma) >= false_alarm:
+            refused.add(first.name)
+            continue
         bench, projector, model = beside
         less = quieter(projector, model) if again else None
         if less is not None:
             # The cause was taken for noise, too: all is asked again beside what noise there is.
             afresh = Projector(first_projector.regression, less, projector.roughness)
             return select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)
-        z = max(drop, 0.0) ** 0.5
         causes.append(Cause(first.name, z, family.p(z), rivals, drop))
         basis = model.basis()
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
