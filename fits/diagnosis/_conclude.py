@@ -179,7 +179,9 @@ def _beside(ready: Prepared, found: Selection, model: Refit, compared: Sequence[
     now = find_faults(found.projector.regression, model.change_um)
     standing = tuple(
         bad & (np.abs(one.after_um + height_um) > SPIKE * noise.total_um)
-        for bad, height_um, one, noise in zip(ready.faults.spikes, ready.faults.heights_um, compared, now.noise, strict=False)
+        for bad, height_um, one, noise in zip(
+            ready.faults.spikes, ready.faults.heights_um, compared, now.noise, strict=False
+        )
     )
     return replace(now, spikes=standing, heights_um=ready.faults.heights_um)
 
