@@ -11,8 +11,8 @@ from fits.diagnosis._score import evidence
 from fits.diagnosis._structure import View
 
 # Waves over the first way, evidence from which it counts, the share of that for the best effect from which it is the
-# likelier reason, and samples that are needed beside it.
-_WAVES, _SURE, _NEARLY, _FEWEST = 12, 5.5, 0.8, 200
+# likelier reason, and the part of the range through which the voltage goes up, and down, beside it.
+_WAVES, _SURE, _NEARLY, _BOTH_WAYS = 12, 5.5, 0.8, 1.0
 
 
 def unswept(projector: Projector, highest: float) -> bool:
@@ -41,17 +41,21 @@ def _first_ways(baseline: Baseline) -> View | None:
     """Signals along which the first ways may differ from later ones, where there is enough beside them."""
     columns: list[tuple[np.ndarray, ...]] = []
     none = [np.zeros(len(run.record)) for run in baseline.runs]
+    up_V = down_V = 0.0
     for k, run in enumerate(baseline.runs):
         voltage = run.record.voltage_V
         strict = known_samples(voltage, *baseline.range_V, UNSWEPT)
-        if int(np.sum(run.fitted & strict)) < _FEWEST:
-            return None
+        moves_V = np.diff(voltage)[(run.fitted & strict)[1:]]
+        up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
         first = run.fitted & ~strict
         if first.any():
             gone = np.maximum.accumulate(np.abs(voltage - voltage[0]))
             share = gone / max(float(gone[first].max()), 1e-300)
             columns += [_only(none, k, first * np.cos(np.pi * wave * share)) for wave in range(_WAVES)]
-    return View("first way", tuple(columns), "the first way differs from later ones") if columns else None
+    span_V = baseline.range_V[1] - baseline.range_V[0]
+    if not columns or min(up_V, down_V) < _BOTH_WAYS * span_V:
+        return None
+    return View("first way", tuple(columns), "the first way differs from later ones")
 
 
 def _only(none: Sequence[np.ndarray], k: int, values: np.ndarray) -> tuple[np.ndarray, ...]:
