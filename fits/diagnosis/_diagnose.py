@@ -7,10 +7,12 @@ import numpy as np
 
 from fits._errors import DataError
 from fits._record import Record, refuse_repeats
+from fits._run import UNSWEPT
 from fits.diagnosis._conclude import conclude
-from fits.diagnosis._prepare import prepare_diagnosis
+from fits.diagnosis._prepare import Prepared, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis
-from fits.diagnosis._select import select
+from fits.diagnosis._select import Selection, select
+from fits.diagnosis._unswept import FirstWaysError
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
@@ -76,6 +78,14 @@ def diagnose(
     refuse_repeats([*records, *aside])
     rng = np.random.default_rng(seed)
     ready = prepare_diagnosis(records, aside, fraction, initial, progress)
-    progress("asking for every effect")
-    found = select(ready.bench, ready.projector, ready.probes, false_alarm, rng, progress)
+
+    def selected(ready: Prepared, guessed: bool) -> Selection:
+        progress("asking for every effect")
+        return select(ready.bench, ready.projector, ready.probes, false_alarm, rng, progress, guessed)
+
+    try:
+        found = selected(ready, initial == "unknown")
+    except FirstWaysError:
+        ready = prepare_diagnosis(records, aside, fraction, UNSWEPT, progress)
+        found = selected(ready, False)
     return conclude(ready, found, [*records, *aside], false_alarm, progress, duration_s)

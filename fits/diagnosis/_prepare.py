@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import qr
 
 from fits._record import Record
 from fits._run import UNSWEPT
@@ -13,14 +14,16 @@ from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scal
 from fits.diagnosis._faults import SINGLE, Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._regression import Regression, regress
-from fits.diagnosis._score import Scored, score
-from fits.diagnosis._unswept import unswept
-from microid import EFFECTS, Hold
+from fits.diagnosis._score import rescore, score
+from fits.diagnosis._unswept import first_ways, unswept
+from microid import EFFECTS, Hold, Scales
 
 # Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
 # command held in steps must explain to be taken for it: then what looked like a delay is half a sample. Or steps
 # leave, beside a delay of their own, less than lines do, by such a part.
 _LATE, _AS_WELL, _BETTER = 25.0, 0.97, 0.03
+# Part of a direction that must be its own.
+_SEEN = 1e-6
 _HOLDS: tuple[Hold, ...] = ("first", "zero")
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
@@ -63,19 +66,43 @@ class _Fitted:
         return Projector(self.regression, self.faults.noise)
 
     @cached_property
-    def probed(self) -> tuple[Bench, list[Probe], list[tuple[str, str]]]:
-        return _probed(self.regression.baseline, self.faults)
+    def bench(self) -> Bench:
+        return Bench(self.regression.baseline)
+
+    @cached_property
+    def scales(self) -> Scales:
+        return scales_of(self.bench, min(noise.total_um for noise in self.faults.noise))
+
+    @cached_property
+    def probed(self) -> tuple[list[Probe], list[tuple[str, str]]]:
+        return _probed(self.bench, self.scales)
+
+    @cached_property
+    def beside(self) -> np.ndarray:
+        """Orthonormal columns along which the first ways may differ from later ones."""
+        joined = self.projector.off(first_ways(self.projector))
+        if joined.shape[1] == 0:
+            return joined
+        q, r, _ = qr(joined / (np.linalg.norm(joined, axis=0) + 1e-300), mode="economic", pivoting=True)
+        return q[:, np.abs(np.diagonal(r)) > _SEEN]
 
     def left(self) -> float:
-        """Sum of squares that is left."""
+        """Sum of squares that is left, whatever the first ways are."""
         left = self.projector.off(self.projector.residual)
-        return float(left @ left)
+        return float(left @ left) - float(np.sum((self.beside.T @ left) ** 2))
 
-    def best(self, name: str | None = None) -> Scored | None:
-        """What has most evidence, of one effect or of all."""
-        asked = [probe for probe in self.probed[1] if name in (None, probe.name)]
-        scores = score(self.projector, asked, self.projector.off(self.projector.residual))
-        return max(scores, key=lambda one: one.z, default=None)
+    def late(self) -> float:
+        """Decrease of that by a delay."""
+        left = self.projector.off(self.projector.residual)
+        delays = [form for form in EFFECTS if form.name == "transport_delay"]
+        probes = [probe for form in delays for probe in probes_of(self.bench, form, self.scales)]
+        scores = rescore(score(self.projector, probes, left), self.beside, left)
+        return max((one.drop for one in scores), default=0.0)
+
+    def highest(self) -> float:
+        """Evidence of the effect that has most."""
+        scores = score(self.projector, self.probed[0], self.projector.off(self.projector.residual))
+        return max((one.z for one in scores), default=0.0)
 
 
 def prepare_diagnosis(
@@ -86,9 +113,9 @@ def prepare_diagnosis(
     progress: Callable[[str], None],
 ) -> Prepared:
     """Fit the plain stage, learn the noise, and simulate every probe of every effect."""
-    said: tuple[str, ...] = ()
+    said: tuple[str, ...] = (_FIRST,) if initial == UNSWEPT else ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
-        fraction, said = 0.0, (_ONE_WAY,)
+        fraction, said = 0.0, (*said, _ONE_WAY)
 
     def fitted(hold: Hold) -> _Fitted:
         regression = regress(fit_baseline(records, aside, fraction, initial, progress, hold))
@@ -105,29 +132,26 @@ def prepare_diagnosis(
     progress("simulating every effect")
     for hold in _HOLDS:
         if hold != "first":
-            late = here.best("transport_delay")
-            if not here.regression.baseline.dynamic or late is None or late.drop <= _LATE:
+            if not here.regression.baseline.dynamic or (late := here.late()) <= _LATE:
                 break
             progress("fitting the plain stage again, its command held in steps")
             steps = fitted(hold)
-            # With the same noise, they compare: with a delay beside each, too.
+            # With the same noise, they compare: by themselves, and with a delay beside each.
             same = _Fitted(steps.regression, here.faults)
-            more = same.best("transport_delay")
-            beside = here.left() - late.drop - (same.left() - (more.drop if more is not None else 0.0))
-            if here.left() - same.left() <= _AS_WELL * late.drop and beside <= _BETTER * late.drop:
+            gained = here.left() - same.left()
+            if gained <= _AS_WELL * late and gained - late + same.late() <= _BETTER * late:
                 break
             here, said = steps, (*said, _STEPS)
-        most = here.best()
-        if initial == "unknown" and most is not None and unswept(here.projector, most.z):
+        if initial == "unknown" and unswept(here.projector, here.highest()):
             progress("fitting the plain stage again, without the first way of each run")
             initial = UNSWEPT
             here, said = fitted(hold), (*said, _FIRST)
-    bench, probes, skipped = here.probed
+    probes, skipped = here.probed
     baseline = replace(here.regression.baseline, remarks=(*here.regression.baseline.remarks, *said))
     progress("learning how rough the density is")
     rough = learn_roughness(here.projector, [column for probe in probes for column in probe.signatures])
     projector = Projector(here.regression, here.faults.noise, rough)
-    return Prepared(baseline, here.regression, bench, projector, tuple(probes), here.faults, tuple(skipped))
+    return Prepared(baseline, here.regression, here.bench, projector, tuple(probes), here.faults, tuple(skipped))
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:
@@ -138,14 +162,12 @@ def _covered(records: Sequence[Record], fraction: float) -> bool:
     return min(float(moves_V[moves_V > 0].sum()), -float(moves_V[moves_V < 0].sum())) > _BOTH_WAYS * span_V
 
 
-def _probed(baseline: Baseline, faults: Faults) -> tuple[Bench, list[Probe], list[tuple[str, str]]]:
+def _probed(bench: Bench, scales: Scales) -> tuple[list[Probe], list[tuple[str, str]]]:
     """Simulate every probe of every effect that can be asked about, and say of the others why not."""
-    bench = Bench(baseline)
     probes: list[Probe] = []
     skipped = []
-    scales = scales_of(bench, min(noise.total_um for noise in faults.noise))
     for form in EFFECTS:
-        reason = applicable(baseline, form)
+        reason = applicable(bench.baseline, form)
         if reason is not None:
             skipped.append((form.name, reason))
             continue
@@ -154,4 +176,4 @@ def _probed(baseline: Baseline, faults: Faults) -> tuple[Bench, list[Probe], lis
             why = "the runs are too short or too plain to show it"
             skipped.append((form.name, "nothing of it was found, sample by sample" if form.name in SINGLE else why))
         probes += own
-    return bench, probes, skipped
+    return probes, skipped

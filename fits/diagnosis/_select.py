@@ -10,6 +10,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
 from fits.diagnosis._score import Family, Scored, rescore, score
 from fits.diagnosis._settle import Settled, bounded, finely, quieter, settled, smoother, stronger
+from fits.diagnosis._unswept import FirstWaysError, unswept
 from microid import EFFECTS
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
@@ -124,9 +125,16 @@ def select(
     false_alarm: float,
     rng: np.random.Generator,
     progress: Callable[[str], None],
+    guessed: bool = False,
     again: int = 2,
 ) -> Selection:
-    """Add effects one at a time until chance explains the rest; where they are less noise, begin again so often."""
+    """Add effects one at a time until chance explains the rest; where they are less noise, begin again so often.
+
+    Raises
+    ------
+    FirstWaysError
+        If the state before the runs was `guessed`, and a wrong guess explains what is left.
+    """
     plain = model = nothing(bench, projector)
     scores = left = score(projector, probes, plain.residual)
     family = Family(scores, rng)
@@ -151,6 +159,8 @@ def select(
         sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
         if family.p(top / sigma) >= false_alarm:
             break
+        if guessed and causes and unswept(projector, top, model):
+            raise FirstWaysError
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
         fitted = _contest(bench, projector, model, open_, top, explained)
         if not fitted:
@@ -177,7 +187,7 @@ def select(
         if less is not None:
             # The cause was taken for noise, too: all is asked again beside what noise there is.
             afresh = Projector(first_projector.regression, less, projector.roughness)
-            return select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)
+            return select(first_bench, afresh, probes, false_alarm, rng, progress, guessed, again - 1)
         causes.append(Cause(first.name, z, family.p(z), rivals, drop))
         basis = model.basis()
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
