@@ -144,7 +144,7 @@ def play_next(
     ahead = found.next_experiment
     if not names or not found.causes or not found.causes[0].also_consistent or ahead is None:
         return None
-    if ahead.column.startswith("temperature") and "temperature_C" not in bench.records[0].columns():
+    if ahead.extra_column.startswith("temperature") and "temperature_C" not in bench.records[0].columns():
         # The same rig, measured again with the column that is asked for.
         bench = hide(names, bench.scenario.seed, settings, temperature=True)
         records, aside = read_back(bench)

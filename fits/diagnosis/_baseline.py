@@ -73,6 +73,8 @@ class Baseline:
         Whether driver and mechanics were fitted.
     remarks
         What the user should know, one sentence each.
+    skewed
+        Whether the readings of a run may be late or early by a small part of the sampling interval.
     """
 
     chain: Chain
@@ -91,6 +93,7 @@ class Baseline:
     fine_aside: tuple[StageRun, ...]
     dynamic: bool
     remarks: tuple[str, ...]
+    skewed: bool = False
 
     @property
     def stage(self) -> Stage:

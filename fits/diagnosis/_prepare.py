@@ -17,11 +17,18 @@ from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._score import rescore, score
 from fits.diagnosis._unswept import first_ways, unswept
 from microid import EFFECTS, Hold, Scales
+from microid.effects.transport_delay import TransportDelay
 
 # Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
 # command held in steps must explain to be taken for it: then what looked like a delay is half a sample. Or steps
 # leave, beside a delay of their own, less than lines do, by such a part.
 _LATE, _AS_WELL, _BETTER = 25.0, 0.97, 0.03
+# Part of the sampling interval below which what is late is no effect, where that has about as much evidence as any.
+_SKEW, _ABOUT = 0.04, 0.8
+_SKEWED = (
+    "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "
+    "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
+)
 # Part of a direction that must be its own.
 _SEEN = 1e-6
 _HOLDS: tuple[Hold, ...] = ("first", "zero")
@@ -91,13 +98,15 @@ class _Fitted:
         left = self.projector.off(self.projector.residual)
         return float(left @ left) - float(np.sum((self.beside.T @ left) ** 2))
 
-    def late(self) -> float:
-        """Decrease of that by a delay."""
+    def late(self) -> tuple[float, float]:
+        """Decrease of that by a delay, and the delay in s."""
         left = self.projector.off(self.projector.residual)
-        delays = [form for form in EFFECTS if form.name == "transport_delay"]
-        probes = [probe for form in delays for probe in probes_of(self.bench, form, self.scales)]
+        probes = list(probes_of(self.bench, TransportDelay, self.scales))
         scores = rescore(score(self.projector, probes, left), self.beside, left)
-        return max((one.drop for one in scores), default=0.0)
+        best = max(scores, key=lambda one: one.drop)
+        first = best.probe.effects[0]
+        assert isinstance(first, TransportDelay)
+        return best.drop, float(best.coefficients[0] * first.delay_s)
 
     def highest(self) -> float:
         """Evidence of the effect that has most."""
@@ -132,20 +141,25 @@ def prepare_diagnosis(
     progress("simulating every effect")
     for hold in _HOLDS:
         if hold != "first":
-            if not here.regression.baseline.dynamic or (late := here.late()) <= _LATE:
+            if not here.regression.baseline.dynamic or (late := here.late()[0]) <= _LATE:
                 break
             progress("fitting the plain stage again, its command held in steps")
             steps = fitted(hold)
             # With the same noise, they compare: by themselves, and with a delay beside each.
             same = _Fitted(steps.regression, here.faults)
             gained = here.left() - same.left()
-            if gained <= _AS_WELL * late and gained - late + same.late() <= _BETTER * late:
+            if gained <= _AS_WELL * late and gained - late + same.late()[0] <= _BETTER * late:
                 break
             here, said = steps, (*said, _STEPS)
         if initial == "unknown" and unswept(here.projector, here.highest()):
             progress("fitting the plain stage again, without the first way of each run")
             initial = UNSWEPT
             here, said = fitted(hold), (*said, _FIRST)
+    if here.regression.baseline.dynamic:
+        drop, late_s = here.late()
+        if drop > max(_LATE, (_ABOUT * here.highest()) ** 2) and late_s < _SKEW * here.scales.interval_s:
+            here = _Fitted(regress(replace(here.regression.baseline, skewed=True)), here.faults)
+            said = (*said, _SKEWED.format(late_s))
     probes, skipped = here.probed
     baseline = replace(here.regression.baseline, remarks=(*here.regression.baseline.remarks, *said))
     progress("learning how rough the density is")

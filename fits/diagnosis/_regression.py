@@ -100,8 +100,10 @@ def regress(
         around = both[:, : chain.size] @ baseline.columns_um
         both[:, : chain.size] = behind(here, baseline.z, run, around, both[:, : chain.size])
         rows.append(both)
-        own.append(free[:n])
-        residuals.append(run.displacement_um - simulate(stage, fine_run))
+        plain = simulate(stage, fine_run)
+        late = [np.gradient(plain, run.record.time_s)[:, None]] if baseline.skewed else []
+        own.append(np.concatenate([free[:n], *late], axis=1))
+        residuals.append(run.displacement_um - plain)
         if finer is None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
             for kind, part in zip(kinds, _along(fine, baseline, run, bases, around), strict=True):
