@@ -29,6 +29,8 @@ _SLOW = 4.0
 # Intervals are divided until the error of the finite step moves no parameter by this many standard deviations.
 _BIAS = 0.15
 _FINEST = 16
+# Parts of the sampling interval below which a driver has no time constant, and from which it may find one again.
+_ASLEEP, _WAKE = 1e-2, 0.3
 
 
 def default_stage(hold: Hold = "first") -> Stage:
@@ -326,3 +328,22 @@ def _refine(plan: _Plan, problem: _Problem) -> tuple[_Problem, Solved, Precision
             return problem, solved, precision
         stride = min(_FINEST, 2 ** math.ceil(math.log2(excess) / 2))
         plan.progress(f"{stride} steps per sample")
+        problem = replace(problem, z=_awake(plan, problem, solved))
+
+
+def _awake(plan: _Plan, problem: _Problem, solved: Solved) -> np.ndarray:
+    """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
+
+    A command that jumps at every sample has all of the driver's answer between two: whole steps do not see it, and
+    from no time constant at all there is no way back.
+    """
+    stage = problem.at(solved)
+    interval_s = min(float(np.median(np.diff(record.time_s))) for record in plan.records)
+    changed = False
+    for name, part in zip(stage.names, stage.parts, strict=True):
+        if isinstance(part, Driver) and float(part.time_constant_s) < _ASLEEP * interval_s:
+            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_WAKE * interval_s)))
+            changed = True
+    if plan.hold != "zero" or not changed:
+        return solved.z
+    return np.asarray(problem.chain.coordinates.of(stage))
