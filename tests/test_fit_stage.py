@@ -217,19 +217,20 @@ def test_runs_of_different_rigs_are_refused(rig):
         fits.fit_stage([rig.records["slow"], other], levels=8, initial="negative", holdout=0.0)
 
 
-def test_a_command_held_in_steps_behind_a_slow_driver_is_fitted():
-    """The slow loops lag by what the driver takes, and the first hysteresis has that in it."""
+@pytest.mark.parametrize("tau", [4e-3, 1e-4], ids=["slow driver", "driver faster than a sample"])
+def test_a_command_held_in_steps_is_fitted(tau):
+    """Slow loops lag by what a slow driver takes, and whole samples see nothing of a quick one."""
     seed = secrets.randbelow(2**31)
     print(f"rig of seed {seed}")
-    text = SCENARIO.format(tau=4e-3, frequency=120.0, damping=0.05).replace("[plant]", '[plant]\nhold = "zero"')
+    text = SCENARIO.format(tau=tau, frequency=120.0, damping=0.05).replace("[plant]", '[plant]\nhold = "zero"')
     bench = data_synth.simulate(data_synth.parse_scenario(text), seed)
     runs = [Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in bench.records[:2]]
     result = fits.fit_stage(runs, stage=fits.default_stage("zero"), initial="negative", levels=16, holdout=0.0)
-    truth = {"driver.time_constant_s": 4e-3, "mechanics.natural_frequency_Hz": 120.0, "mechanics.damping_ratio": 0.05}
+    truth = {"driver.time_constant_s": tau, "mechanics.natural_frequency_Hz": 120.0, "mechanics.damping_ratio": 0.05}
     for name, value in truth.items():
         print(result[name])
         assert abs(result[name].value - value) < 5 * result[name].sd + 2e-3 * value
-    assert result.in_sample.rms_um < 1.1 * 0.03
+    assert result.in_sample.rms_um < 1.2 * 0.03
     linear = fits.default_stage("zero").without("driver")
     with pytest.raises(fits.DataError, match="only with a driver ahead of the hysteresis"):
         fits.fit_stage(runs, stage=linear)
