@@ -10,6 +10,7 @@ from typing import Any
 from scipy.stats import binomtest
 
 Row = dict[str, Any]
+_HOLDS = {"first": "lines", "zero": "steps"}
 _BINS = ((-math.inf, 3.0, "below 3"), (3.0, 5.5, "3 to 5.5"), (5.5, 11.0, "5.5 to 11"), (11.0, math.inf, "above 11"))
 
 
@@ -65,7 +66,8 @@ def report(rows: Sequence[Row], settings: Row, seed: int) -> str:
     pairs = {name: own for name, own in groups.items() if "+" in name}
     parts = [
         f"# Hidden effects, {date.today()}\n\nRigs from seed {seed}, effects of {settings['rms_per_noise']:g} times "
-        f"the noise, {settings['slow_samples']} and {settings['fast_samples']} samples, false alarms asked for "
+        f"the noise, {settings['slow_samples']} and {settings['fast_samples']} samples, commands in "
+        f"{_HOLDS[settings.get('hold', 'first')]}, false alarms asked for "
         f"{settings['false_alarm']:g}, code {settings['code']}: {len(done)} of {len(rows)} rigs were diagnosed."
     ]
     if "none" in groups:

@@ -61,7 +61,7 @@ def hide(names: tuple[str, ...], seed: int, settings: dict[str, Any], temperatur
     import data_synth
 
     sizes = {name: settings[name] for name in ("rms_per_noise", "slow_samples", "fast_samples")}
-    return data_synth.hidden(names, seed=seed, temperature=temperature, **sizes)
+    return data_synth.hidden(names, seed=seed, temperature=temperature, hold=settings.get("hold", "first"), **sizes)
 
 
 def read_back(bench: Any) -> tuple[list[Any], list[Any]]:
@@ -199,6 +199,7 @@ def main() -> None:
     )
     parser.add_argument("--rms-per-noise", type=float, default=5.0, help="strength over the noise (default 5)")
     parser.add_argument("--samples", type=int, nargs=2, default=(4000, 8000), metavar=("SLOW", "FAST"))
+    parser.add_argument("--hold", choices=["first", "zero"], default="first", help="command in lines, or in steps")
     parser.add_argument("--false-alarm", type=float, default=0.01)
     parser.add_argument("--jobs", type=int, default=2, help="rigs at a time (default 2)")
     parser.add_argument(
@@ -218,6 +219,7 @@ def main() -> None:
         "slow_samples": options.samples[0],
         "fast_samples": options.samples[1],
         "false_alarm": options.false_alarm,
+        "hold": options.hold,
     }
     plain = _NONE_PER_EFFECT * options.rigs if options.none is None else options.none
     counts = {name: plain if name == "none" else options.rigs for name in chosen}

@@ -11,6 +11,7 @@ from data_synth._bench import Bench, simulate
 from data_synth._effect import REGISTRY
 from data_synth._environment import OtherAxisSettings, TemperatureSettings
 from data_synth._errors import ScenarioError
+from data_synth._plant import Hold
 from data_synth._rig import Kind
 from data_synth._scenario import PlantSettings, RigSettings, Run, Scenario, Segment
 from data_synth._sensor import Sensor
@@ -36,6 +37,7 @@ def hidden(
     stroke_um: float | None = None,
     relays: int = 2000,
     plays: int = 400,
+    hold: Hold = "first",
 ) -> Bench:
     """Draw a stage of 0 to 120 V, hide effects in it, and measure it.
 
@@ -67,6 +69,8 @@ def hidden(
         Of the hysteresis, as in `random_rig`; drawn if None. The stroke is drawn from 20 to 80 um.
     relays, plays
         How fine the hysteresis is, as in `random_rig`.
+    hold
+        Whether the command runs in lines between samples (`first`), or stays and jumps (`zero`).
 
     Returns
     -------
@@ -131,7 +135,7 @@ def hidden(
             ),
             runs=tuple(runs),
             sensor=Sensor(noise_um=drawn_noise_um if noise_um is None else noise_um, quantum_um=1e-5),
-            plant=PlantSettings(random=True, natural_frequency_Hz=frequency_Hz),
+            plant=PlantSettings(random=True, natural_frequency_Hz=frequency_Hz, hold=hold),
             effects=settings,
             temperature=TemperatureSettings() if has_room else None,
             other_axis=OtherAxisSettings()

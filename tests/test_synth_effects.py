@@ -36,6 +36,14 @@ def rms(parts):
     return np.sqrt(np.mean(np.concatenate([part - part.mean() for part in parts]) ** 2))
 
 
+def test_a_command_held_in_steps_comes_half_a_sample_later(seed):
+    lines, steps = (bench(seed=seed, hold=hold).record("fast") for hold in ("first", "zero"))
+    rate_um_per_s = np.gradient(lines.true_displacement_um, lines.time_s)
+    change_um = steps.true_displacement_um - lines.true_displacement_um
+    later_s = -(change_um @ rate_um_per_s) / (rate_um_per_s @ rate_um_per_s)
+    assert later_s == pytest.approx((lines.time_s[1] - lines.time_s[0]) / 2, rel=0.1)
+
+
 @pytest.mark.parametrize("name", ALL)
 def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed):
     hidden = bench(name, seed=seed, fast_samples=1000, rms_per_noise=3.0, temperature=name == "thermal_drift")
