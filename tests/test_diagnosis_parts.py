@@ -225,8 +225,10 @@ def test_evidence_beside_a_misfit_is_worth_less(rng):
     # The same signal in white noise, and in steps that have nothing to do with it.
     n = 4000
     reg = regression(rng, lengths=(n,), kinds=1)
-    shape = np.cumsum(rng.standard_normal(n)) / n**0.5
+    shape = np.cumsum(rng.standard_normal(n))
+    shape = (shape - shape.mean()) / shape.std()
     steps = np.repeat(rng.normal(0, 5, n // 200), 200)
+    steps -= shape * (shape @ steps) / (shape @ shape)
     for left, trusted in ((rng.standard_normal(n), True), (rng.standard_normal(n) + steps, False)):
         reg.residuals = (left + 0.5 * shape,)
         projector = Projector(reg, [Noise(1.0, WHITE)])
