@@ -145,10 +145,7 @@ def prepare_diagnosis(
                 break
             progress("fitting the plain stage again, its command held in steps")
             steps = fitted(hold)
-            # With the same noise, they compare: by themselves, and with a delay beside each.
-            same = _Fitted(steps.regression, here.faults)
-            gained = here.left() - same.left()
-            if gained <= _AS_WELL * late and gained - late + same.late()[0] <= _BETTER * late:
+            if not _held(here, steps, late):
                 break
             here, said = steps, (*said, _STEPS)
         if initial == "unknown" and unswept(here.projector, here.highest()):
@@ -160,12 +157,22 @@ def prepare_diagnosis(
         if drop > max(_LATE, (_ABOUT * here.highest()) ** 2) and late_s < _SKEW * here.scales.interval_s:
             here = _Fitted(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
-    probes, skipped = here.probed
-    baseline = replace(here.regression.baseline, remarks=(*here.regression.baseline.remarks, *said))
+    regression, bench, faults, (probes, skipped) = here.regression, here.bench, here.faults, here.probed
+    baseline = replace(regression.baseline, remarks=(*regression.baseline.remarks, *said))
     progress("learning how rough the density is")
     rough = learn_roughness(here.projector, [column for probe in probes for column in probe.signatures])
-    projector = Projector(here.regression, here.faults.noise, rough)
-    return Prepared(baseline, here.regression, here.bench, projector, tuple(probes), here.faults, tuple(skipped))
+    # What is large and has been used makes room.
+    del here
+    projector = Projector(regression, faults.noise, rough)
+    return Prepared(baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
+
+
+def _held(lines: _Fitted, steps: _Fitted, late: float) -> bool:
+    """Whether a command held in steps explains what a delay, behind lines, takes so much off."""
+    # With the same noise, they compare: by themselves, and with a delay beside each.
+    same = _Fitted(steps.regression, lines.faults)
+    gained = lines.left() - same.left()
+    return gained > _AS_WELL * late or gained - late + same.late()[0] > _BETTER * late
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:
