@@ -103,6 +103,8 @@ class _Fitted:
         left = self.projector.off(self.projector.residual)
         probes = list(probes_of(self.bench, TransportDelay, self.scales))
         scores = rescore(score(self.projector, probes, left), self.beside, left)
+        if not scores:
+            return 0.0, 0.0
         best = max(scores, key=lambda one: one.drop)
         first = best.probe.effects[0]
         assert isinstance(first, TransportDelay)
