@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits._record import Record
-from fits.diagnosis._floor import Band, band_of, floor_of, jitter_s, quantum_um, spikes
+from fits.diagnosis._floor import Band, band_of, floor_of, jitter_s, pooled, quantum_um, spikes
 from fits.diagnosis._noise import Noise, rough_noise_um
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
@@ -89,7 +89,7 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
     quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
     # Rounding is noise that a command at rest does not show.
     least = quantum / 12**0.5
-    noise, found, heights, idle, jitters, bands = [], [], [], [], [], []
+    floors, found, heights, jitters, bands = [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     settling_s = float(_SETTLED / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
     for run, rows, own, residual in zip(
@@ -103,14 +103,15 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)
         heights.append(np.where(bad, left - smooth, 0.0))
-        floor = floor_of(run, smooth, settling_s)
-        noise.append(floor.noise if floor.noise.total_um > least else Noise(least, np.zeros(0)))
-        idle.append(floor.idle)
+        floors.append(floor_of(run, smooth, settling_s))
         rate = np.gradient(run.displacement_um - left, run.record.time_s)
         size, z = jitter_s(smooth[mask], rate[mask], least)
         jitters.append((z, size, np.abs(rate)))
         interval = float(np.median(np.diff(run.record.time_s)))
         bands.append(band_of(smooth[mask], interval, run.record.voltage_V[mask]))
+    floors = pooled(floors)
+    idle = [floor.idle > 0 for floor in floors]
+    noise = [one.noise if one.noise.total_um > least else Noise(least, np.zeros(0)) for one in floors]
     z, size, _ = max(jitters, key=lambda j: j[0])
     if z > _JITTER_Z:
         noise = [

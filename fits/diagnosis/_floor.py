@@ -1,6 +1,7 @@
 """Noise floors, and faults of single samples: what is asked of the data before any physics."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -12,6 +13,8 @@ from fits.diagnosis._noise import Noise, learn_noise, rough_noise_um
 _REST, _IDLE = 24, 150
 # Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
 _COLOURED = 4.0
+# Standard deviations by which noise of runs may differ that is the same.
+_ALIKE = 4.0
 # Mains, and by how much they drift; lines are looked for in stretches of so many samples, and count where no more
 # than this part of the variance is left without them.
 MAINS_Hz, _DRIFT = (50.0, 60.0), 0.002
@@ -36,11 +39,11 @@ class Floor:
     noise
         Its standard deviation and colour.
     idle
-        Whether it was read off idle stretches, or else off the residual.
+        How many idle samples it was read off; 0 where it was read off the residual.
     """
 
     noise: Noise
-    idle: bool
+    idle: int
 
 
 def idle_stretches(voltage_V: np.ndarray, settling: int) -> list[slice]:
@@ -79,11 +82,27 @@ def floor_of(run: StageRun, residual_um: np.ndarray, settling_s: float) -> Floor
         level = float(np.std(joined)) * (len(joined) / max(len(joined) - freedom, 1)) ** 0.5
         correlation = float(np.mean(joined[1:] * joined[:-1]) / max(np.mean(joined**2), 1e-300))
         if abs(correlation) * len(joined) ** 0.5 > _COLOURED and level > 0:
-            return Floor(learn_noise(joined, freedom), True)
+            return Floor(learn_noise(joined, freedom), len(joined))
         if level > 0:
-            return Floor(Noise(level, np.zeros(0)), True)
+            return Floor(Noise(level, np.zeros(0)), len(joined))
     used = residual_um[run.fitted]
-    return Floor(Noise(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um))), np.zeros(0)), False)
+    return Floor(Noise(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um))), np.zeros(0)), 0)
+
+
+def pooled(floors: Sequence[Floor]) -> list[Floor]:
+    """Floors of one sensor: white noise that was read off idle stretches, and is the same in all runs by chance."""
+    white = [floor for floor in floors if floor.idle and len(floor.noise.past) == 0]
+    if len(white) < 2:
+        return list(floors)
+    counts = np.array([floor.idle for floor in white])
+    levels = np.array([floor.noise.innovation_um for floor in white])
+    level = float(np.sqrt(np.average(levels**2, weights=counts)))
+    if np.any(np.abs(levels / level - 1) > _ALIKE / np.sqrt(2 * counts)):
+        return list(floors)
+    return [
+        replace(one, noise=Noise(level, np.zeros(0))) if any(one is other for other in white) else one
+        for one in floors
+    ]
 
 
 def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarray]:

@@ -22,6 +22,8 @@ _FINE = 64
 _EXAMPLES = 120
 # Of central differences along coordinates, which are of the size of one.
 _STEP = 1e-4
+# Part of an unknown of a run that must be left in the samples that count.
+_DEAD = 1e-3
 
 
 # By kind, per run.
@@ -102,7 +104,7 @@ def regress(
         rows.append(both)
         plain = simulate(stage, fine_run)
         late = [np.gradient(plain, run.record.time_s)[:, None]] if baseline.skewed else []
-        own.append(np.concatenate([free[:n], *late], axis=1))
+        own.append(_alive(np.concatenate([free[:n], *late], axis=1), run.fitted))
         residuals.append(run.displacement_um - plain)
         if finer is None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
@@ -119,6 +121,15 @@ def regress(
         cholesky(baseline.prior + 1e-12 * trace * np.eye(len(baseline.prior))),
         through,
     )
+
+
+def _alive(own: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+    """A run's own unknowns without those that have died away before the samples that count: nothing tells them.
+
+    They would be fitted to noise there, and reach far beyond it where they begin.
+    """
+    left = np.linalg.norm(own[fitted], axis=0) > _DEAD * np.linalg.norm(own, axis=0)
+    return np.where(left, own, 0.0)
 
 
 def _slope(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: StageRun) -> np.ndarray:

@@ -53,20 +53,54 @@ class Creep(AbstractEffect):
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Onsets in steps of a decade, from some samples to a tenth of the record."""
-        first = max(10 * scales.interval_s, 0.03)
-        return tuple(
-            (cls(jnp.asarray(0.01), jnp.asarray(onset)),) for onset in _decades(first, scales.duration_s / 10)
-        )
+        return _onsets(cls, scales)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a displacement that was at rest."""
-        moved = signal.values - signal.before
-        ratio = 10 ** (np.arange(-_AHEAD * _PER_DECADE, _BEHIND * _PER_DECADE + 1) / _PER_DECADE)
-        weights = jnp.asarray(np.exp(-1 / ratio) / _PER_DECADE, dtype=moved.dtype)
-        constants = self.onset_s * jnp.asarray(ratio, dtype=moved.dtype)
-        each = jax.vmap(lambda constant: _lowpass(time_s, moved, constant))(constants)
-        total = jnp.sum(weights[:, None] * each, axis=0)
-        return Signal(signal.values + self.gain_per_decade * total, signal.before, signal.hold)
+        crept = _crept(time_s, signal.values - signal.before, self.onset_s)
+        return Signal(signal.values + self.gain_per_decade * crept, signal.before, signal.hold)
+
+
+@register
+class VoltageCreep(AbstractEffect):
+    r"""Creep ahead of the hysteresis: the domains see a voltage that goes on along the logarithm of time.
+
+    .. math:: u \leftarrow u + \gamma \sum_j \frac{e^{-t_0 / \tau_j}}{m} \, \mathrm{LP}_{\tau_j}[u - u(0)]
+
+    Thermal activation switches domains later that would have switched at a larger field, as if the field had grown
+    (Neel's fluctuation field). Unlike `Creep` it knows the branch: what goes on after a move up does so along the
+    branch up, and a controller that holds the position lowers the voltage by `gamma` of the step each decade.
+
+    Attributes
+    ----------
+    gain_per_decade
+        `gamma`: change of the voltage seen, per decade of time, over the step of the voltage before.
+    onset_s
+        `t0`, where creep begins. What lags by less than its bound is a matter of driver, sensor or mechanics.
+    """
+
+    name: ClassVar[str] = "creep"
+    form: ClassVar[str] = "voltage"
+    takes: ClassVar[str] = "V"
+    gives: ClassVar[str] = "V"
+    place: ClassVar[Place] = "driver"
+    strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
+    fingerprint: ClassVar[str] = Creep.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = Creep.confusions
+    experiment: ClassVar[str] = Creep.experiment
+    source: ClassVar[str] = "Neel's fluctuation field; see Bertotti, Hysteresis in Magnetism (1998), ch. 14"
+    gain_per_decade: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
+    onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Onsets as those of `Creep`."""
+        return _onsets(cls, scales)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Add creep to a voltage that was constant."""
+        crept = _crept(time_s, signal.values - signal.before, self.onset_s)
+        return Signal(signal.values + self.gain_per_decade * crept, signal.before, signal.hold)
 
 
 @register
@@ -108,3 +142,18 @@ class KelvinVoigtCreep(AbstractEffect):
         """Add creep to a displacement that was at rest."""
         moved = _lowpass(time_s, signal.values - signal.before, self.time_constant_s)
         return Signal(signal.values + self.gain * moved, signal.before, signal.hold)
+
+
+def _crept(time_s: Times, moved: Float[Array, " t"], onset_s: Float[Array, ""]) -> Float[Array, " t"]:
+    """Answer of all relaxations to a signal from rest, of one per decade to a step of one, shape `(t,)`."""
+    ratio = 10 ** (np.arange(-_AHEAD * _PER_DECADE, _BEHIND * _PER_DECADE + 1) / _PER_DECADE)
+    weights = jnp.asarray(np.exp(-1 / ratio) / _PER_DECADE, dtype=moved.dtype)
+    constants = onset_s * jnp.asarray(ratio, dtype=moved.dtype)
+    each = jax.vmap(lambda constant: _lowpass(time_s, moved, constant))(constants)
+    return jnp.sum(weights[:, None] * each, axis=0)
+
+
+def _onsets(form: type[Any], scales: Scales) -> tuple[tuple[Any, ...], ...]:
+    """Creep of a percent per decade with several onsets."""
+    first = max(10 * scales.interval_s, 0.03)
+    return tuple((form(jnp.asarray(0.01), jnp.asarray(onset)),) for onset in _decades(first, scales.duration_s / 10))
