@@ -130,7 +130,7 @@ class RelaxingHysteresis(AbstractEffect):
 class ActivatedSwitching(AbstractEffect):
     r"""Relays that switch the later, the faster the voltage: thermally activated walls (Eyring's law).
 
-    .. math:: u \leftarrow u - v \, \mathrm{asinh}(\dot u / r)
+    .. math:: u \leftarrow u - v \, \mathrm{asinh}(\mathrm{LP}_{\tau}[\dot u] / r)
 
     The memoryless part of a `Preisach` hysteresis follows at once.
 
@@ -142,6 +142,8 @@ class ActivatedSwitching(AbstractEffect):
         `v`: lag of the switching voltages.
     onset_V_per_s
         `r`: below it the lag is in proportion to the rate, above it to its logarithm.
+    response_s
+        `tau`: time that the walls take to answer to another rate.
     """
 
     name: ClassVar[str] = "rate_dependence"
@@ -157,20 +159,26 @@ class ActivatedSwitching(AbstractEffect):
     inner: AbstractPart
     lag_V: Float[Array, ""] = param(unit="V", scale=0.1, lower=0.0)
     onset_V_per_s: Float[Array, ""] = param(unit="V/s", scale=10.0, lower=1e-3, upper=1e7)
+    response_s: Float[Array, ""] = param(default=2e-4, unit="s", lower=1e-5, upper=0.1)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
-        """Onsets in steps of a decade, down to a ten-thousandth of the fastest rate."""
+        """Onsets in steps of a decade, down to a ten-thousandth of the fastest rate; walls at once and late."""
         if inner is None:
             return ()
         grid = _decades(max(scales.fastest_V_per_s / 10000, 1e-2), scales.fastest_V_per_s / 3)
-        return tuple((cls(inner, jnp.asarray(0.1), jnp.asarray(onset)),) for onset in grid)
+        return tuple(
+            (cls(inner, jnp.asarray(0.1), jnp.asarray(onset), jnp.asarray(response)),)
+            for response in (scales.interval_s / 3, max(_LAG_S, 2 * scales.interval_s))
+            for onset in grid
+        )
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Let the hysteresis see a voltage that stays behind."""
         if signal.values.shape[0] < 2:
             return self.inner.run(time_s, signal, start)
-        behind = signal.values - self.lag_V * jnp.arcsinh(_rate_of(time_s, signal.values) / self.onset_V_per_s)
+        rate = _lowpass(time_s, _rate_of(time_s, signal.values), self.response_s)
+        behind = signal.values - self.lag_V * jnp.arcsinh(rate / self.onset_V_per_s)
         given = self.inner.run(time_s, Signal(behind, signal.before, signal.hold), start)
         law = innermost(self.inner)
         if not isinstance(law, Preisach):
