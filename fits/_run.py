@@ -14,8 +14,10 @@ from microid import Preisach, Staircase, demagnetised, negative_saturation, posi
 # All records pass through the same compiled functions in pieces of this many samples.
 _PIECE = 8192
 _STAIRCASES = (64, 512, 4096)
-# A record has met saturation once it comes this close to an end of the range, as a fraction of the range.
-_NEAR = 1e-3
+# A record has met an end of the range, or an extreme of its own, once it comes this close, as a fraction of the
+# range: the first of these that does not cost most of the samples, as peaks of a smooth command miss an end by a
+# little.
+_NEAR = (1e-3, 3e-3, 1e-2)
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 UNSWEPT = "unswept"
@@ -123,10 +125,14 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
     """
     if initial not in ("unknown", UNSWEPT):
         return np.ones(len(voltage), dtype=bool)
-    near = _NEAR * (upper_V - lower_V)
-    saturated = (voltage <= lower_V + near) | (voltage >= upper_V - near)
-    both = (np.maximum.accumulate(voltage) >= voltage.max()) & (np.minimum.accumulate(voltage) <= voltage.min())
-    return np.maximum.accumulate(both if initial == UNSWEPT else saturated | both)
+    highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
+    found = []
+    for share in _NEAR:
+        near = share * (upper_V - lower_V)
+        saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
+        both = (highest >= voltage.max() - near) & (lowest <= voltage.min() + near)
+        found.append(both if initial == UNSWEPT else saturated | both)
+    return next(known for known in found if 2 * known.sum() >= found[-1].sum())
 
 
 def _walk(voltage: np.ndarray, start: Staircase) -> tuple[tuple[Staircase, ...], np.ndarray, np.ndarray]:

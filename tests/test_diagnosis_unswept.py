@@ -12,9 +12,10 @@ from fits._fit import _resolve
 from fits._result import FitStatus
 from fits._run import UNSWEPT, known_samples
 from fits.diagnosis._candidates import Bench
+from fits.diagnosis._law import Law
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Law, refit
+from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from microid.effects.backlash import Backlash
 

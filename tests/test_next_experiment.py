@@ -12,12 +12,13 @@ from fits._stage_run import prepare_stage_run
 from fits.diagnosis import _baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._experiment import _open, refine, suggest
+from fits.diagnosis._law import Law, law_of
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._path import Limits, limits_of, paces
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._programs import Program, menu
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Law, law_of, refit
+from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._result import FoundCause
 from fits.diagnosis._score import score

@@ -26,11 +26,13 @@ def shared_effects(model: Refit, runs: int) -> list[AbstractEffect]:
     """The effects as a model holds them: strengths that every run has by their mean, and others not at all."""
     found = []
     for law, x in zip(model.laws, model.x, strict=True):
-        each = [law.effect(x, run) for run in range(runs)]
+        # What went on before one run says nothing of the next.
+        nothing = {name: jnp.zeros(()) for name in law.form.history}
+        each = [replace(law.effect(x, run), **nothing) for run in range(runs)]
         if hasattr(each[0], "after_s"):
             # What happened at one instant does not happen again.
             found.append(replace(each[0], **{name: 0 * getattr(each[0], name) for name in law.form.strength}))
-        elif law.each.any():
+        elif law.form.per_run and law.each.any():
             found.append(replace(each[0], **{name: _common(each, name) for name in law.form.strength}))
         else:
             found.append(each[0])

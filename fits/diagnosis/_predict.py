@@ -10,9 +10,9 @@ from scipy.linalg import qr
 from fits._record import Record
 from fits._stage_run import prepare_stage_run
 from fits.diagnosis._candidates import Bench
+from fits.diagnosis._law import Law
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Law
 from fits.diagnosis._regression import regress
 from microid import AbstractEffect
 
@@ -93,7 +93,7 @@ class Predictor:
                 for i in range(law.size):
                     columns.append([(a - b) / _STEP for a, b in zip(out(_moved(h.x, k, i)), at, strict=True)])
                 # Strengths in the new run, which no old run says anything of.
-                columns += [[np.zeros_like(b) for b in at]] * int(_each(law).sum())
+                columns += [[np.zeros_like(b) for b in at]] * int(law.differs.sum())
         signals = np.stack([projector.join(column) for column in columns], axis=1)
         root, inside = projector.root, projector.orthonormal.T @ signals
         outside = projector.off(signals)
@@ -167,7 +167,7 @@ class Predictor:
         starts, at = [], 0
         for h in self.hypotheses:
             starts.append(at)
-            at += 1 + sum(law.size + int(_each(law).sum()) for law in h.laws)
+            at += 1 + sum(law.size + int(law.differs.sum()) for law in h.laws)
         stops = [*starts[1:], at]
         found = []
         for true, fitted in self.pairs:
@@ -180,17 +180,9 @@ class Predictor:
         return max(min(found), 0.0) ** 0.5
 
 
-def _each(law: Law) -> np.ndarray:
-    """Which coordinates of an effect differ from run to run, shape `(k,)`, also where there was one run so far."""
-    strength = [
-        np.full(int(np.prod(info.shape, dtype=int)), info.path in law.form.strength) for info in law.maps[0].table
-    ]
-    return np.concatenate(strength) & law.form.per_run
-
-
 def _in_order(law: Law, moved: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Derivatives in the new run, along the coordinates in the old runs and then along those that are its own."""
-    each = _each(law)
+    each = law.differs
     shared = ~each
     out = [np.zeros_like(moved[0])] * law.size
     # With one run so far, its strengths stand among the others.

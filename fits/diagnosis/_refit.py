@@ -1,19 +1,17 @@
 """Effects fitted to what the baseline leaves, the baseline following along its tangent."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from scipy.linalg import qr
 
 from fits.diagnosis._candidates import Bench
+from fits.diagnosis._law import Law, law_of, remembering, strength_of
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Scored
-from microid import AbstractEffect, Coordinates, ParameterInfo, Sensor
+from microid import AbstractEffect
 
 _STEP = 1e-3
 # Standard deviations that a strength must be away from zero.
@@ -31,85 +29,6 @@ _AROUND = 0.05
 _AWAY_um = 1e9
 # Multiples of the linearised answer from which a fit may start.
 _MORE = (1.0, 3.0, 9.0)
-
-
-def _own(info: ParameterInfo) -> bool:
-    return not info.path.startswith("inner")
-
-
-def _alone(effect: AbstractEffect) -> AbstractEffect:
-    anything = Sensor(jnp.ones(()), jnp.zeros(()))
-    return replace(effect, inner=anything) if hasattr(effect, "inner") else effect  # type: ignore[call-arg]
-
-
-class Law:
-    """The coordinates of one effect in all runs.
-
-    Those of an effect that differs from run to run are what the runs share, then its strengths in each.
-    """
-
-    def __init__(self, effects: Sequence[AbstractEffect]):
-        self.form = type(effects[0])
-        # The part that an effect is put around is put in anew wherever it is simulated.
-        self.maps = [Coordinates(_alone(effect), _own) for effect in effects]
-        vectors = [np.asarray(one.of(_alone(effect))) for one, effect in zip(self.maps, effects, strict=True)]
-        names = [info.path for info in self.maps[0].table]
-        strength = np.concatenate(
-            [np.full(math.prod(info.shape), info.path in self.form.strength) for info in self.maps[0].table]
-        )
-        self.each = strength if self.form.per_run and len(effects) > 1 else np.zeros(len(strength), dtype=bool)
-        self.names = tuple(names)
-        self.start = np.concatenate([vectors[0][~self.each], *(v[self.each] for v in vectors if self.each.any())])
-        if not self.each.any():
-            self.start = vectors[0]
-
-    @property
-    def size(self) -> int:
-        """Number of coordinates."""
-        return len(self.start)
-
-    def vector(self, x: np.ndarray, run: int) -> np.ndarray:
-        """Coordinates of the effect in one run."""
-        if not self.each.any():
-            return x
-        shared, own = int(np.sum(~self.each)), int(np.sum(self.each))
-        full = np.empty(len(self.each))
-        full[~self.each] = x[:shared]
-        full[self.each] = x[shared + run * own : shared + (run + 1) * own]
-        return full
-
-    def effect(self, x: np.ndarray, run: int) -> AbstractEffect:
-        """The effect in one run."""
-        return _at(self.maps[run], jnp.asarray(self.vector(x, run)))
-
-
-@eqx.filter_jit
-def _at(coordinates: Coordinates[AbstractEffect], vector: Float[Array, " k"]) -> AbstractEffect:
-    return coordinates(vector)
-
-
-def _strength(law: Law, x: np.ndarray, run: int) -> np.ndarray:
-    effect = law.effect(x, run)
-    return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
-
-
-def law_of(scored: Scored, runs: int, more: float = 1.0) -> Law:
-    """Start from a probe and the multiples of its signatures that the data ask for, or more of them."""
-    form = type(scored.probe.effects[0])
-    effects: list[AbstractEffect] = []
-    per_run = form.per_run and runs > 1
-    for run in range(runs):
-        first = scored.probe.effects[0]
-        values = {}
-        for name in form.strength:
-            spec = next(i.spec for i in Coordinates(first, _own).table if i.path == name)
-            total = np.zeros(np.shape(getattr(first, name)))
-            for k, effect in enumerate(scored.probe.effects):
-                share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]
-                total = total + more * float(share) * np.asarray(getattr(effect, name))
-            values[name] = jnp.asarray(np.clip(total, spec.lower, spec.upper))
-        effects.append(replace(first, **values) if values else first)
-    return Law(effects)
 
 
 @dataclass(frozen=True)
@@ -180,9 +99,9 @@ class Refit:
         covariance = self.covariance(robust=False)[-law.size :, -law.size :]
         found = False
         for run in range(len(law.maps) if law.each.any() else 1):
-            here = _strength(law, x, run)
+            here = strength_of(law, x, run)
             slope = np.stack(
-                [(_strength(law, x + step, run) - here) / _STEP for step in _STEP * np.eye(law.size)], axis=1
+                [(strength_of(law, x + step, run) - here) / _STEP for step in _STEP * np.eye(law.size)], axis=1
             )
             sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
             found = found or bool(np.any(np.abs(here) > _DETERMINED * sd))
@@ -229,8 +148,12 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
         return _fit(bench, projector, [*model.laws, law], [*model.x, law.start], len(model.laws), basis, rounds)
 
     laws = [law_of(scored, runs, more) for more in (_MORE if type(scored.probe.effects[0]).strength else (1.0,))]
-    best = min(laws, key=lambda law: fit(law, 0).cost)
-    return fit(best, _ROUNDS)
+    found = fit(min(laws, key=lambda law: fit(law, 0).cost), _ROUNDS)
+    if not found.laws[-1].form.history:
+        return found
+    # What went on before the runs is unknown where that explains more than so many coordinates do by chance.
+    unknown = fit(remembering(found.laws[-1], found.x[-1]), _ROUNDS)
+    return unknown if unknown.criterion(projector.count) < found.criterion(projector.count) else found
 
 
 def relocate(bench: Bench, projector: Projector, model: Refit) -> Refit:
@@ -247,7 +170,7 @@ def relocate(bench: Bench, projector: Projector, model: Refit) -> Refit:
             found = [model]
             for way in (-step_s, step_s):
                 here = [law.effect(model.x[k], run) for run in runs]
-                moved = Law([replace(one, after_s=jnp.maximum(one.after_s + way, least_s)) for one in here])  # type: ignore[attr-defined,call-arg]
+                moved = Law([_later(one, way, least_s) for one in here], law.remembers)
                 laws, x = list(model.laws), list(model.x)
                 laws[k], x[k] = moved, moved.start
                 found.append(refit(bench, projector, laws, x, 2))
@@ -257,6 +180,10 @@ def relocate(bench: Bench, projector: Projector, model: Refit) -> Refit:
             model = best
             law = model.laws[k]
     return model
+
+
+def _later(effect: AbstractEffect, more_s: float, least_s: float) -> AbstractEffect:
+    return replace(effect, after_s=jnp.maximum(effect.after_s + more_s, least_s))  # type: ignore[attr-defined,call-arg]
 
 
 def _fit(

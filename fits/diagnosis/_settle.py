@@ -8,9 +8,10 @@ import numpy as np
 
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._faults import find_faults
+from fits.diagnosis._law import Law
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector, learn_roughness
-from fits.diagnosis._refit import Law, Refit, refit, relocate
+from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress
 from fits.diagnosis._through import passed
 
@@ -54,9 +55,8 @@ def stronger(bench: Bench, projector: Projector, model: Refit) -> Settled:
     for k in range(len(model.laws)):
         while (form := model.laws[k].form).finite and form.strength:
             here = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
-            law = Law(
-                [replace(one, **{name: _LARGER * getattr(one, name) for name in form.strength}) for one in here]
-            )
+            more = [replace(one, **{name: _LARGER * getattr(one, name) for name in form.strength}) for one in here]
+            law = Law(more, model.laws[k].remembers)
             laws, x = list(model.laws), list(model.x)
             laws[k], x[k] = law, law.start
             trial = settle(bench, projector, refit(bench, projector, laws, x, 0))

@@ -12,8 +12,9 @@ from scipy import stats
 
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._faults import Fault, Faults
+from fits.diagnosis._law import Law
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Law, Refit
+from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
 from fits.diagnosis._score import Scored
 from fits.diagnosis._select import Cause, Selection, best_of
@@ -120,7 +121,7 @@ def _joined(
 
 def _parameters(law: Law, x: np.ndarray, covariance: np.ndarray) -> tuple[EffectParameter, ...]:
     """Values in their units: of the first run where they differ, the others by their place."""
-    runs = len(law.maps) if law.each.any() else 1
+    runs = len(law.maps) if law.form.per_run and law.each.any() else 1
     found = []
     for run in range(runs):
         slope = np.asarray(jax.jacfwd(lambda v, run=run: law.maps[run].values(_vector(law, v, run)))(jnp.asarray(x)))
@@ -129,7 +130,8 @@ def _parameters(law: Law, x: np.ndarray, covariance: np.ndarray) -> tuple[Effect
         at = 0
         for info in law.maps[run].table:
             size = int(np.prod(info.shape)) if info.shape else 1
-            for k in range(size):
+            # What went on before a run is no property of the rig.
+            for k in range(size if info.path not in law.form.history else 0):
                 name = info.path if size == 1 else f"{info.path}[{k}]"
                 if runs > 1:
                     if info.path in law.form.strength:

@@ -76,6 +76,8 @@ class AbstractEffect(AbstractPart):
         Columns beside time, command and displacement without which there is nothing to see.
     unless
         Columns with which another form of it says what this one guesses.
+    history
+        Names of the fields that say what went on in it before each record; they are zero after a long rest.
     fast
         Whether it is only seen in records that show the dynamics.
     per_run
@@ -106,6 +108,7 @@ class AbstractEffect(AbstractPart):
     form: ClassVar[str] = ""
     needs: ClassVar[tuple[str, ...]] = ()
     unless: ClassVar[tuple[str, ...]] = ()
+    history: ClassVar[tuple[str, ...]] = ()
     fast: ClassVar[bool] = False
     per_run: ClassVar[bool] = False
     finite: ClassVar[bool] = False

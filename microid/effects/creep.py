@@ -10,11 +10,13 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, register
+from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _times_of, register
 from microid.effects._grids import _decades
 
 # Relaxations per decade of time constants, and the decades ahead of the onset and behind it that they cover.
 _PER_DECADE, _AHEAD, _BEHIND = 3, 1, 5
+# Moves before a record that stand for all of them took place so many of its durations ago.
+_RECENT, _OLDER = 0.03, 0.5
 
 
 @register
@@ -33,6 +35,8 @@ class Creep(AbstractEffect):
         `gamma`: creep per decade of time over the step before.
     onset_s
         `t0`, where creep begins. What lags by less than its bound is a matter of driver, sensor or mechanics.
+    recent_um, older_um
+        What goes on of moves before the record, per decade: of some right before it, and of some long before.
     """
 
     name: ClassVar[str] = "creep"
@@ -40,6 +44,7 @@ class Creep(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
+    history: ClassVar[tuple[str, ...]] = ("recent_um", "older_um")
     fingerprint: ClassVar[str] = (
         "After each step the residual goes on in the direction of the step, in proportion to it, along the logarithm "
         "of time or towards a limit."
@@ -49,6 +54,8 @@ class Creep(AbstractEffect):
     source: ClassVar[str] = "PI piezo tutorial: dL (1 + gamma lg(t / 0.1 s)), gamma of 0.01 to 0.02"
     gain_per_decade: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
     onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
+    recent_um: Float[Array, ""] = param(default=0.0, unit="um")
+    older_um: Float[Array, ""] = param(default=0.0, unit="um")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -57,8 +64,9 @@ class Creep(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a displacement that was at rest."""
-        crept = _crept(time_s, signal.values - signal.before, self.onset_s)
-        return Signal(signal.values + self.gain_per_decade * crept, signal.before, signal.hold)
+        crept = self.gain_per_decade * _crept(time_s, signal.values - signal.before, self.onset_s)
+        gone_on = _gone_on(time_s, signal.values.shape[0], self.recent_um, self.older_um)
+        return Signal(signal.values + crept + gone_on, signal.before, signal.hold)
 
 
 @register
@@ -77,6 +85,8 @@ class VoltageCreep(AbstractEffect):
         `gamma`: change of the voltage seen, per decade of time, over the step of the voltage before.
     onset_s
         `t0`, where creep begins. What lags by less than its bound is a matter of driver, sensor or mechanics.
+    recent_V, older_V
+        What goes on of moves before the record, per decade: of some right before it, and of some long before.
     """
 
     name: ClassVar[str] = "creep"
@@ -85,12 +95,15 @@ class VoltageCreep(AbstractEffect):
     gives: ClassVar[str] = "V"
     place: ClassVar[Place] = "driver"
     strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
+    history: ClassVar[tuple[str, ...]] = ("recent_V", "older_V")
     fingerprint: ClassVar[str] = Creep.fingerprint
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
     experiment: ClassVar[str] = Creep.experiment
     source: ClassVar[str] = "Neel's fluctuation field; see Bertotti, Hysteresis in Magnetism (1998), ch. 14"
     gain_per_decade: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
     onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
+    recent_V: Float[Array, ""] = param(default=0.0, unit="V")
+    older_V: Float[Array, ""] = param(default=0.0, unit="V")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -99,8 +112,9 @@ class VoltageCreep(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a voltage that was constant."""
-        crept = _crept(time_s, signal.values - signal.before, self.onset_s)
-        return Signal(signal.values + self.gain_per_decade * crept, signal.before, signal.hold)
+        crept = self.gain_per_decade * _crept(time_s, signal.values - signal.before, self.onset_s)
+        gone_on = _gone_on(time_s, signal.values.shape[0], self.recent_V, self.older_V)
+        return Signal(signal.values + crept + gone_on, signal.before, signal.hold)
 
 
 @register
@@ -115,6 +129,8 @@ class KelvinVoigtCreep(AbstractEffect):
         `a`: creep in the end over the step before.
     time_constant_s
         `tau`.
+    before_um
+        What is still to come, at the start of the record, of moves before it.
     """
 
     name: ClassVar[str] = "creep"
@@ -123,12 +139,14 @@ class KelvinVoigtCreep(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("gain",)
+    history: ClassVar[tuple[str, ...]] = ("before_um",)
     fingerprint: ClassVar[str] = Creep.fingerprint
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
     experiment: ClassVar[str] = Creep.experiment
     source: ClassVar[str] = "Kelvin-Voigt element; see Jung & Gweon, Rev. Sci. Instrum. 71 (2000) 1896"
     gain: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
     time_constant_s: Float[Array, ""] = param(unit="s", lower=0.02, upper=1e5)
+    before_um: Float[Array, ""] = param(default=0.0, unit="um")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -140,8 +158,9 @@ class KelvinVoigtCreep(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a displacement that was at rest."""
-        moved = _lowpass(time_s, signal.values - signal.before, self.time_constant_s)
-        return Signal(signal.values + self.gain * moved, signal.before, signal.hold)
+        moved = self.gain * _lowpass(time_s, signal.values - signal.before, self.time_constant_s)
+        late = -self.before_um * jnp.expm1(-_times_of(time_s, moved.shape[0]) / self.time_constant_s)
+        return Signal(signal.values + moved + late, signal.before, signal.hold)
 
 
 def _crept(time_s: Times, moved: Float[Array, " t"], onset_s: Float[Array, ""]) -> Float[Array, " t"]:
@@ -151,6 +170,15 @@ def _crept(time_s: Times, moved: Float[Array, " t"], onset_s: Float[Array, ""]) 
     constants = onset_s * jnp.asarray(ratio, dtype=moved.dtype)
     each = jax.vmap(lambda constant: _lowpass(time_s, moved, constant))(constants)
     return jnp.sum(weights[:, None] * each, axis=0)
+
+
+def _gone_on(time_s: Times, count: int, recent: Float[Array, ""], older: Float[Array, ""]) -> Float[Array, " t"]:
+    """What goes on of moves before the record, from its first sample on, shape `(t,)`."""
+    if count == 1:
+        return jnp.zeros(1, dtype=recent.dtype)
+    time = _times_of(time_s, count)
+    share = time / time[-1]
+    return recent * jnp.log10(1 + share / _RECENT) + older * jnp.log10(1 + share / _OLDER)
 
 
 def _onsets(form: type[Any], scales: Scales) -> tuple[tuple[Any, ...], ...]:

@@ -101,6 +101,8 @@ class TemperatureDrift(AbstractEffect):
         `alpha`.
     time_constant_s
         `tau`, by which the frame lags behind the sensor of the temperature.
+    before_um
+        What is still to come, at the start of the record, of changes of the temperature before it.
     """
 
     name: ClassVar[str] = "thermal_drift"
@@ -109,6 +111,7 @@ class TemperatureDrift(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "environment"
     strength: ClassVar[tuple[str, ...]] = ("expansion_um_per_K",)
+    history: ClassVar[tuple[str, ...]] = ("before_um",)
     needs: ClassVar[tuple[str, ...]] = ("temperature_degC",)
     fingerprint: ClassVar[str] = ThermalDrift.fingerprint
     confusions: ClassVar[tuple[str, ...]] = ThermalDrift.confusions
@@ -116,6 +119,7 @@ class TemperatureDrift(AbstractEffect):
     source: ClassVar[str] = ThermalDrift.source
     expansion_um_per_K: Float[Array, ""] = param(unit="um/K", scale=0.1)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
+    before_um: Float[Array, ""] = param(default=0.0, unit="um")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -130,5 +134,6 @@ class TemperatureDrift(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the expansion since the first sample."""
         temperature = start.columns["temperature_degC"]
-        followed = _lowpass(time_s, temperature - temperature[0], self.time_constant_s)
-        return Signal(signal.values + self.expansion_um_per_K * followed, signal.before, signal.hold)
+        followed = self.expansion_um_per_K * _lowpass(time_s, temperature - temperature[0], self.time_constant_s)
+        late = -self.before_um * jnp.expm1(-_times_of(time_s, followed.shape[0]) / self.time_constant_s)
+        return Signal(signal.values + followed + late, signal.before, signal.hold)

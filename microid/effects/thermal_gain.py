@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import _as_inexact, array, param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _rate_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _rate_of, _times_of, register
 from microid.effects._grids import _decades
 
 
@@ -25,6 +25,8 @@ class ThermalGain(AbstractEffect):
         `beta`.
     time_constant_s
         `tau`, by which the piezo lags behind the sensor of the temperature.
+    before_K
+        By how much the piezo was warmer than that sensor at the start of the record.
     reference_degC
         `T0`, given.
     zero_um
@@ -37,6 +39,7 @@ class ThermalGain(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("gain_per_K",)
+    history: ClassVar[tuple[str, ...]] = ("before_K",)
     needs: ClassVar[tuple[str, ...]] = ("temperature_degC",)
     fingerprint: ClassVar[str] = (
         "The residual is in proportion to the position, by a factor that grows with heavy driving or with the "
@@ -49,6 +52,7 @@ class ThermalGain(AbstractEffect):
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
     reference_degC: Float[Array, ""] = array()
     zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
+    before_K: Float[Array, ""] = param(default=0.0, unit="K")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -63,7 +67,8 @@ class ThermalGain(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Scale the displacement."""
         above = _lowpass(time_s, start.columns["temperature_degC"] - self.reference_degC, self.time_constant_s)
-        more = self.gain_per_K * above
+        late = self.before_K * jnp.exp(-_times_of(time_s, above.shape[0]) / self.time_constant_s)
+        more = self.gain_per_K * (above + late)
         before = signal.before + more[0] * (signal.before - self.zero_um)
         return Signal(signal.values + more * (signal.values - self.zero_um), before, signal.hold)
 
