@@ -283,6 +283,11 @@ class Weighing:
             correlation.append(correlation_samples([left]))
         return cls(tuple(noise), tuple(correlation))
 
+    def alike(self) -> "Weighing":
+        """As if all runs had the same noise, and no sample any of another."""
+        each = float(np.sqrt(np.mean(np.square(self.noise_um))))
+        return Weighing((each,) * len(self.noise_um), (1.0,) * len(self.noise_um))
+
     @property
     def least_um(self) -> float:
         """The smallest noise, in which the joint problem is measured."""

@@ -25,6 +25,7 @@ from microid import (
     Staircase,
     Start,
     innermost,
+    refined,
 )
 
 # Records are filled up to a power of two, so that those of like length share what was compiled.
@@ -223,8 +224,7 @@ def refine(
     step = (time_s[-1] - time_s[0]) / (n - 1)
     voltage, weight = np.pad(voltage_V, pad, mode="edge"), np.pad(fitted.astype(float), pad)
     share = np.arange((n + pad[1] - 1) * stride + 1) / stride
-    lines = np.interp(share, np.arange(n + pad[1]), voltage)
-    fine_V = lines if hold == "first" else voltage[np.arange(len(share)) // stride]
+    _, fine_V = refined(jnp.ones(()), jnp.asarray(voltage), stride, hold)
     if np.max(np.abs(np.diff(time_s) - step)) <= _EVEN * step:
         time: Any = np.asarray(step / stride)
     else:
@@ -232,7 +232,7 @@ def refine(
         time = np.interp(share, np.arange(n + pad[1]), longer)
     return Samples(
         jnp.asarray(time),
-        jnp.asarray(fine_V),
+        fine_V,
         jnp.asarray(np.pad(displacement_um, pad, mode="edge")),
         jnp.asarray(weight),
         Start(),

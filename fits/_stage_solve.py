@@ -111,12 +111,14 @@ def solve_chain(
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
-        total = weighing.total(sums)
-        here = weighing.cost_um2(runs, [one.residual_um for one in sums])
+        # Far from the answer, what a run leaves says nothing of its noise: weighed by it, one run would be given up.
+        counted = weighing.alike() if rough else weighing
+        total = counted.total(sums)
+        here = counted.cost_um2(runs, [one.residual_um for one in sums])
         while True:
             try:
                 step, columns, better, variance, distance = _step(
-                    chain, total, columns_um, hyper, weighing, stroke_um, damping
+                    chain, total, columns_um, hyper, counted, stroke_um, damping
                 )
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
@@ -128,7 +130,7 @@ def solve_chain(
                 continue
             hyper = better
             prior = prior_precision(chain, hyper, stroke_um)
-            there = weighing.cost_um2(runs, _residuals(chain, z + step, columns, runs))
+            there = counted.cost_um2(runs, _residuals(chain, z + step, columns, runs))
             old = here / variance + columns_um @ prior @ columns_um
             new = there / variance + columns @ prior @ columns
             if new <= old:

@@ -39,6 +39,7 @@ from microid._plant import Mechanics as Mechanics
 from microid._plant import Piezo as Piezo
 from microid._plant import Sensor as Sensor
 from microid._preisach import Preisach as Preisach
+from microid._refine import refined as refined
 from microid._reversible import Reversible as Reversible
 from microid._stage import Stage as Stage
 from microid._stage import Start as Start

@@ -11,6 +11,7 @@ from jaxtyping import Array, Complex, Float
 from microid._linear import Hold, LinearSystem, Times
 from microid._param import ParameterInfo, _as_inexact, parameter_table, static
 from microid._part import AbstractHysteresis, AbstractLinear, AbstractPart, Scene, Signal, _imaginary, _run_linear
+from microid._refine import lines, refined
 
 
 def _maybe_inexact(value: Any) -> Any:
@@ -49,7 +50,8 @@ class Stage(eqx.Module):
     names
         One name per part, no two alike.
     hold
-        How the command runs between samples: `"first"` in lines, `"zero"` in steps.
+        How the command runs between samples: `"first"` in lines, `"zero"` in steps, `"smooth"` along the curves of a
+        spline, which has corners only where single samples show them.
     substeps
         Into how many steps every interval is divided.
     frozen
@@ -77,9 +79,10 @@ class Stage(eqx.Module):
         """Refuse chains that do not fit together."""
         if len(self.names) != len(self.parts) or len(set(self.names)) != len(self.names) or not self.parts:
             raise ValueError(f"a stage needs one part or more and one name for each, no two alike, got {self.names}")
-        if self.hold not in ("first", "zero") or self.substeps < 1:
+        if self.hold not in ("first", "zero", "smooth") or self.substeps < 1:
             raise ValueError(
-                f"hold must be 'first' or 'zero' and substeps positive, got {self.hold!r} and {self.substeps}"
+                "hold must be 'first', 'zero' or 'smooth' and substeps positive, got "
+                f"{self.hold!r} and {self.substeps}"
             )
         unit, giver = "V", "the command"
         for name, part in zip(self.names, self.parts, strict=True):
@@ -120,10 +123,10 @@ class Stage(eqx.Module):
             Measured displacement in um, shape `(t,)`.
         """
         start = Start() if start is None else start
-        time, voltage = _refined(_as_inexact(time_s), _as_inexact(voltage_V), self.substeps, self.hold)
+        time, voltage = refined(_as_inexact(time_s), _as_inexact(voltage_V), self.substeps, self.hold)
         before = voltage[0] if start.rest_V is None else start.rest_V.astype(voltage.dtype)
         signal = Signal(voltage, before, self.hold)
-        beside = {name: _lines(_as_inexact(values), self.substeps) for name, values in (columns or {}).items()}
+        beside = {name: lines(_as_inexact(values), self.substeps) for name, values in (columns or {}).items()}
         scene = Scene(signal, beside, start.memory)
         for link in self._links():
             if isinstance(link, LinearSystem):
@@ -249,21 +252,3 @@ class Stage(eqx.Module):
 
 def _below(path: str, name: str) -> bool:
     return path == name or path.startswith((f"{name}.", f"{name}["))
-
-
-def _refined(
-    time_s: Times, voltage_V: Float[Array, " t"], substeps: int, hold: Hold
-) -> tuple[Times, Float[Array, " r"]]:
-    if substeps == 1:
-        return time_s, voltage_V
-    voltage = _lines(voltage_V, substeps) if hold == "first" else jnp.repeat(voltage_V, substeps)[: 1 - substeps]
-    return time_s / substeps if time_s.ndim == 0 else _lines(time_s, substeps), voltage
-
-
-def _lines(values: Float[Array, " t"], substeps: int) -> Float[Array, " r"]:
-    """Divide the lines between samples."""
-    if substeps == 1:
-        return values
-    share = jnp.arange(substeps, dtype=values.dtype) / substeps
-    inner = values[:-1, None] + jnp.diff(values)[:, None] * share[None, :]
-    return jnp.append(inner.ravel(), values[-1])

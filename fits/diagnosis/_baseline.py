@@ -115,7 +115,7 @@ def fit_baseline(
 ) -> Baseline:
     """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
 
-    The command runs in lines between samples, or with a `hold` of "zero" stays what it is until the next.
+    The command runs in lines between samples, or with another `hold` in steps or curves, as in `Stage`.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def fit_baseline(
         )
 
     # What a step starts is over soon, and slow runs sample it sparsely.
-    many = _FINE if hold == "first" else _FINE_STEPS
+    many = _FINE_STEPS if hold == "zero" else _FINE
     (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, many))
     return Baseline(
         found.chain,

@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from fits._stage_run import StageRun
-from microid import AbstractEffect, AbstractPart, Scene, Signal, Stage, extend, host
+from microid import AbstractEffect, AbstractPart, Scene, Signal, Stage, extend, host, refined
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,13 @@ def simulate(stage: Stage, run: StageRun) -> np.ndarray:
     """Response of a stage to a run that is refined already, in um, shape `(n,)`."""
     values = signals(stage.with_substeps(1), prepare(stage, run))[-1].values
     return np.asarray(values)[:: run.samples.stride][: len(run.record)]
+
+
+def along_curves(run: StageRun) -> StageRun:
+    """The same run, its command along curves between the samples."""
+    stride, voltage = run.samples.stride, run.samples.voltage_V
+    _, curves = refined(jnp.ones(()), voltage[::stride], stride, "smooth")
+    return replace(run, samples=eqx.tree_at(lambda s: s.voltage_V, run.samples, curves))
 
 
 def respond_again(stage: Stage, base: Stage, known: Sequence[Signal], prepared: Prepared) -> np.ndarray:

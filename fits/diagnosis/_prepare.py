@@ -11,12 +11,13 @@ from fits._record import Record
 from fits._run import UNSWEPT
 from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
+from fits.diagnosis._evaluate import along_curves, simulate
 from fits.diagnosis._faults import SINGLE, Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._score import rescore, score
 from fits.diagnosis._unswept import first_ways, unswept
-from microid import EFFECTS, Hold, Scales
+from microid import EFFECTS, Hold, Scales, Stage
 from microid.effects.transport_delay import TransportDelay
 
 # Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
@@ -31,10 +32,16 @@ _SKEWED = (
 )
 # Part of a direction that must be its own.
 _SEEN = 1e-6
-_HOLDS: tuple[Hold, ...] = ("first", "zero")
+# Part of the difference between curves and lines that must be there for it to be looked into.
+_LEAST = 0.2
+_HOLDS: tuple[Hold, ...] = ("first", "smooth", "zero")
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
     "sample; a delay of that length would look the same"
+)
+_CURVES = (
+    "the command is taken to run along curves through its samples, since that leaves less of the displacement than "
+    "lines do"
 )
 _FIRST = (
     "the voltage's first way through its range differs from later ones, as after a rest or a demagnetisation, and "
@@ -46,6 +53,9 @@ _ONE_WAY = (
     "nothing was held out, since the voltage goes through its range both ways only in what would have been: the gain "
     "is not measured"
 )
+
+
+_RUNS = {"smooth": ("along curves", _CURVES), "zero": ("held in steps", _STEPS)}
 
 
 @dataclass(frozen=True)
@@ -110,6 +120,20 @@ class _Fitted:
         assert isinstance(first, TransportDelay)
         return best.drop, float(best.coefficients[0] * first.delay_s)
 
+    def bent(self) -> float:
+        """Decrease of that by a command along curves, as far as the stage's answer to it is in proportion."""
+        baseline = self.regression.baseline
+        curved = [along_curves(run) for run in baseline.finest]
+        stage = baseline.stage
+        smooth = Stage(stage.parts, stage.names, "smooth", 1, stage.frozen)
+        pairs = zip(curved, baseline.finest, strict=True)
+        change = [simulate(smooth, curve) - simulate(stage, line) for curve, line in pairs]
+        column, left = (self.projector.off(one) for one in (self.projector.join(change), self.projector.residual))
+        column, left = (one - self.beside @ (self.beside.T @ one) for one in (column, left))
+        size = float(column @ column)
+        along = float(column @ left)
+        return along**2 / size if size > 0 and _LEAST * size < along else 0.0
+
     def highest(self) -> float:
         """Evidence of the effect that has most."""
         scores = score(self.projector, self.probed[0], self.projector.off(self.projector.residual))
@@ -143,13 +167,16 @@ def prepare_diagnosis(
     progress("simulating every effect")
     for hold in _HOLDS:
         if hold != "first":
-            if not here.regression.baseline.dynamic or (late := here.late()[0]) <= _LATE:
+            if not here.regression.baseline.dynamic:
                 break
-            progress("fitting the plain stage again, its command held in steps")
-            steps = fitted(hold)
-            if not _held(here, steps, late):
-                break
-            here, said = steps, (*said, _STEPS)
+            drop = here.bent() if hold == "smooth" else here.late()[0]
+            if drop <= _LATE:
+                continue
+            progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
+            other = fitted(hold)
+            if not (_curved(here, other) if hold == "smooth" else _held(here, other, drop)):
+                continue
+            here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
         if initial == "unknown" and unswept(here.projector, here.highest()):
             progress("fitting the plain stage again, without the first way of each run")
             initial = UNSWEPT
@@ -167,6 +194,11 @@ def prepare_diagnosis(
     del here
     projector = Projector(regression, faults.noise, rough)
     return Prepared(baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
+
+
+def _curved(lines: _Fitted, curves: _Fitted) -> bool:
+    """Whether a command along curves leaves less than one in lines, beyond chance."""
+    return lines.left() - _Fitted(curves.regression, lines.faults).left() > _LATE
 
 
 def _held(lines: _Fitted, steps: _Fitted, late: float) -> bool:
