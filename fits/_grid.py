@@ -11,6 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 from optimistix import RESULTS
+from scipy.optimize import nnls
 
 from fits._estimate import Estimate
 from fits._evidence import Posterior, effective, maximise_evidence, posterior, renew_noise
@@ -28,6 +29,8 @@ BELIEF_LEVELS = 24
 _SAME_NOISE = 0.02
 _ATOL = 1e-6
 _STEPS = 500
+# Steps per column where one column at a time is bounded or let go.
+_TURNS = 30
 # At least this many columns are bounded at first.
 _FEW = 64
 
@@ -105,10 +108,25 @@ def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
         columns, result = _bounded(belief, jnp.asarray(order))
         left = np.asarray(columns) * scale
-        if result != RESULTS.successful or bounded == size or np.all(left >= -_ATOL):
+        if result != RESULTS.successful:
+            return _one_by_one(belief)
+        if bounded == size or np.all(left >= -_ATOL):
             return jnp.maximum(columns, 0), result
         lowest = np.minimum(lowest, left)
         bounded *= 2
+
+
+def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+    """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
+    precision = np.asarray(belief.precision)
+    scale = np.sqrt(np.diagonal(precision))
+    value, vector = np.linalg.eigh(precision / scale / scale[:, None])
+    root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
+    try:
+        columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_TURNS * len(scale))
+    except RuntimeError:
+        return jnp.maximum(belief.mean, 0), RESULTS.nonlinear_max_steps_reached
+    return jnp.asarray(columns / scale), RESULTS.successful
 
 
 def _bounded(belief: Posterior, which: Int[Array, " k"]) -> tuple[Float[Array, " D"], RESULTS]:

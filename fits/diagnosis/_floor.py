@@ -26,8 +26,9 @@ _WIDE = 0.2
 # A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
 # so far away are much smaller.
 SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
-# A command that moves by more than this part of its range within some samples may cause what looks like a spike.
-_EDGE, _NEAR = 0.02, 6
+# A command that moves, or turns, by more than these parts of its range at one of some samples may cause what looks
+# like a spike.
+_EDGE, _TURN, _NEAR = 0.02, 0.004, 6
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,9 @@ def spikes(run: StageRun, residual_um: np.ndarray, least_um: float = 0.0) -> np.
         around[:-lag] = np.maximum(around[:-lag], size[lag:])
     far &= size > 3 * around
     voltage = run.record.voltage_V
-    moved = np.abs(np.diff(voltage, prepend=voltage[0])) > _EDGE * float(np.ptp(voltage))
+    change = np.diff(voltage, prepend=voltage[0])
+    turned = np.abs(np.diff(change, append=change[-1])) > _TURN * float(np.ptp(voltage))
+    moved = (np.abs(change) > _EDGE * float(np.ptp(voltage))) | turned
     near = np.convolve(moved, np.ones(2 * _NEAR + 1), mode="same") > 0.5
     far &= ~near
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))

@@ -197,8 +197,11 @@ def prepare_diagnosis(
 
 
 def _curved(lines: _Fitted, curves: _Fitted) -> bool:
-    """Whether a command along curves leaves less than one in lines, beyond chance."""
-    return lines.left() - _Fitted(curves.regression, lines.faults).left() > _LATE
+    """Whether a command along curves leaves less than one in lines, beyond chance and beside the best effect, too."""
+    # With the same noise, they compare.
+    same = _Fitted(curves.regression, lines.faults)
+    beside = (lines.left() - lines.highest() ** 2) - (same.left() - same.highest() ** 2)
+    return lines.left() - same.left() > _LATE and beside > 0
 
 
 def _held(lines: _Fitted, steps: _Fitted, late: float) -> bool:

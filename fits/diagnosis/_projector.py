@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from optimistix import RESULTS
 from scipy.linalg import qr, solve_triangular
-from scipy.optimize import minimize, nnls
+from scipy.optimize import minimize
 
 from fits._evidence import Posterior
 from fits._grid import non_negative
+from fits._result import FitError, FitStatus
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._regression import Regression
@@ -177,11 +178,7 @@ class Projector:
             Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
         )
         if result != RESULTS.successful:
-            # Block pivoting may go round in circles, or rounding leave no Cholesky factor; one column at a time is
-            # slow and sure.
-            value, vector = np.linalg.eigh(precision)
-            root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
-            kept, _ = nnls(root, root @ mean, maxiter=30 * len(mean))
+            raise FitError(FitStatus.MAX_STEPS)
         change = np.asarray(kept) - baseline.columns_um
         others = answer[columns:] - follow @ (change - answer[:columns])
         return baseline.moved(others[: self.regression.size - columns], change)
