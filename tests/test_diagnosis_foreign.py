@@ -1,0 +1,150 @@
+"""Rigs run in other ways than the bench's: smooth commands, records that begin in the middle, late trouble."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from optimistix import RESULTS
+from scipy.signal import fftconvolve, lsim
+
+from fits import Record, diagnose
+from fits import _grid as grid
+from fits._evidence import Posterior
+from fits._run import known_samples
+from fits.diagnosis._floor import Floor, pooled
+from fits.diagnosis._noise import Noise
+from fits.diagnosis._regression import _alive
+
+RATE_Hz, FINE = 1000.0, 16
+
+
+def plays(voltage_V):
+    """Displacement of plays of all widths, as a loop from below leaves them."""
+    half_V = np.linspace(0, 50, 500)
+    weight = np.exp(-half_V / 15) / np.sum(np.exp(-half_V / 15))
+    place, out = np.zeros_like(half_V), np.empty(len(voltage_V))
+    for k, voltage in enumerate(voltage_V):
+        place = np.minimum(np.maximum(place, voltage - half_V), voltage + half_V)
+        out[k] = weight @ place
+    return 0.2 * out
+
+
+def turns(levels, count):
+    path = np.r_[0, np.cumsum(np.abs(np.diff(levels)))]
+    return np.interp(np.linspace(0, path[-1], count), path, levels)
+
+
+SLOW_V = turns([0, 100, 0, 80, 20, 100, 40, 70, 30, 90, 0, 60, 10, 100, 0, 50, 5, 75, 25, 100, 0], 2500)
+
+
+def rig(rng, command, duration_s, noise_um):
+    """A record of plays between a driver and a mass on a spring, under a command that is a function of time."""
+    fine = np.arange(round(duration_s * RATE_Hz) * FINE + 1) / (RATE_Hz * FINE)
+    _, driven, _ = lsim(([1.0], [5e-4, 1.0]), command(fine) - command(0.0), fine)
+    static = plays(driven + command(0.0))
+    natural = 2 * np.pi * 180
+    _, moved, _ = lsim(([natural**2], [1.0, 0.1 * natural, natural**2]), static - static[0], fine)
+    reading = (static[0] + moved)[::FINE]
+    return Record(
+        fine[::FINE], command(fine)[::FINE], reading + noise_um * rng.standard_normal(len(reading)), source="rig.csv"
+    )
+
+
+@pytest.mark.slow
+def test_a_smooth_command_is_no_effect(rng):
+    """Swept sines as a function of time, which lines through their samples cut short."""
+
+    def swept(t):
+        rate = 10 + 50 * t
+        return 50 - 42 * np.cos(2 * np.pi * 0.5 * t) - 8 * np.sin(2 * np.pi * t * rate)
+
+    records = [Record(np.arange(2500) / 100, SLOW_V, plays(SLOW_V) + 0.01 * rng.standard_normal(2500), source="a")]
+    records.append(rig(rng, swept, 4.0, 0.01))
+    found = diagnose(records)
+    assert found.verdict == "no_effect"
+    assert found.baseline.hold == "smooth"
+    assert any("along curves" in words for words in found.remarks)
+    assert found.noise_um == pytest.approx(0.01, rel=0.1)
+    assert found.gain.heldout_rms_before_um < 1.3 * 0.01
+
+
+def test_creep_that_was_under_way(rng):
+    """The record begins after moves whose creep goes on: the gain is found all the same."""
+    before = turns([50, 100, 30, 0], 600)
+    voltage = np.concatenate([before, np.zeros(25), SLOW_V])
+    static = plays(voltage)
+    gain, rate = rng.uniform(0.008, 0.015), 50.0
+    age = (np.arange(len(voltage) - 1) + 0.5) / rate
+    crept = gain * fftconvolve(np.diff(static), np.log10(1 + age / 0.1))[: len(voltage) - 1]
+    reading = static + np.r_[0, crept]
+    first = len(before) + 25
+    noisy = reading[first:] + 0.003 * rng.standard_normal(len(SLOW_V))
+    found = diagnose([Record(np.arange(len(SLOW_V)) / rate, SLOW_V, noisy, source="creep.csv")])
+    assert found.causes[0].name == "creep"
+    values = {one.name: one for one in found.causes[0].parameters}
+    assert not any(name.startswith(("recent", "older", "before")) for name in values)
+    if found.causes[0].form == "":
+        assert values["gain_per_decade"].value == pytest.approx(gain, abs=4 * values["gain_per_decade"].sd)
+    # What went on before the record is no part of the stage.
+    part = found.extended["creep"]
+    assert all(float(getattr(part, name)) == 0 for name in type(part).history)
+
+
+def test_what_shows_only_in_what_was_held_out(rng):
+    time = np.arange(2500) / 50
+    reading = plays(SLOW_V) + 0.005 * rng.standard_normal(2500)
+    lost = 2200
+    # From there on, readings are one sample early: one was lost.
+    reading = np.r_[reading[:lost], reading[lost + 1 :], reading[-1]]
+    found = diagnose([Record(time, SLOW_V, reading, source="lost.csv")])
+    assert found.causes
+    assert "dropped_samples" in {found.causes[0].name, *found.causes[0].also_consistent}
+    assert any("what was held out is predicted far worse" in words for words in found.remarks)
+
+
+def test_an_unknown_that_has_died_away_is_none():
+    time = np.arange(2000) / 1000
+    own = np.stack([np.ones(2000), np.exp(-time / 0.02), np.exp(-time / 0.5)], axis=1)
+    kept = _alive(own, time > 0.5)
+    assert np.any(kept != 0, axis=0).tolist() == [True, False, True]
+
+
+def test_one_noise_for_one_sensor(rng):
+    level = rng.uniform(0.01, 0.1)
+    few = [Floor(Noise(level * (1 + 0.5 / n**0.5), np.zeros(0)), n) for n in (200, 20_000)]
+    assert few[0].noise.innovation_um != few[1].noise.innovation_um
+    same = pooled(few)
+    assert same[0].noise.innovation_um == same[1].noise.innovation_um == pytest.approx(level, rel=0.01)
+    other = [few[0], Floor(Noise(2 * level, np.zeros(0)), 20_000)]
+    assert pooled(other) == other
+
+
+def test_an_end_of_the_range_that_peaks_miss_by_a_little():
+    path = np.tile([10.0, 50.0, 99.7, 50.0, 0.3, 50.0], 20)
+    voltage = np.r_[path, 100.0, 0.0]
+    assert known_samples(voltage, 0.0, 100.0).sum() == len(voltage) - 2
+    # Where most is known strictly, an end must be met.
+    assert known_samples(np.r_[100.0, path], 0.0, 100.0).all()
+    assert known_samples(np.r_[99.5, 100.0, path], 0.0, 100.0).sum() == len(path) + 1
+
+
+def test_a_regression_is_bounded_where_block_pivoting_gives_up(rng, monkeypatch):
+    root = rng.standard_normal((60, 12))
+    precision, mean = root.T @ root, rng.standard_normal(12)
+    belief = Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
+    asked = SimpleNamespace(count=0)
+
+    def gives_up(belief, which):
+        asked.count += 1
+        return belief.mean, RESULTS.nonlinear_max_steps_reached
+
+    monkeypatch.setattr(grid, "_bounded", gives_up)
+    found, result = grid.non_negative(belief)
+    assert asked.count == 1
+    assert result == RESULTS.successful
+    slope = precision @ (np.asarray(found) - mean)
+    assert np.all(np.asarray(found) >= 0)
+    # Karush, Kuhn and Tucker's conditions.
+    np.testing.assert_allclose(slope[np.asarray(found) > 0], 0, atol=1e-8)
+    assert np.all(slope > -1e-8)
