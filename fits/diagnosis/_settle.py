@@ -19,6 +19,8 @@ from fits.diagnosis._through import passed
 _OFF = 1.0
 # Multiple of a strength that is tried, and the gain in chi-square for which it is taken.
 _LARGER, _BETTER = 1.5, 10.0
+# Further rounds in which baseline and causes follow each other, at most.
+_AGAIN = 8
 # Rounds beside a density whose zeros stay, and standard deviations below which a coordinate has not moved.
 _BOUNDED, _MOVED = 4, 0.1
 # Noise or roughness that falls by less than this factor is the same.
@@ -42,11 +44,18 @@ def settle(
 ) -> tuple[Bench, Projector, Refit]:
     """Let the baseline follow what effects leave, and fit those again beside it.
 
-    A baseline fitted without them may be far from where it belongs, farther than its tangent reaches.
+    A baseline fitted without them may be far from where it belongs, farther than its tangent reaches: it goes on
+    following for as long as that pays.
     """
     for count in rounds:
         bench, projector = _follow(bench, projector, model)
         model = refit(bench, projector, model.laws, model.x, count)
+    for _ in range(_AGAIN if model.laws else 0):
+        there, beside = _follow(bench, projector, model)
+        moved = refit(there, beside, model.laws, model.x, rounds[-1])
+        if moved.cost > model.cost - _BETTER:
+            break
+        bench, projector, model = there, beside, moved
     return bench, projector, model
 
 
