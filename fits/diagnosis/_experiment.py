@@ -107,7 +107,8 @@ def suggest(
     progress(f"refining {program.words}")
     parameters, z = refine(program, lambda p: predictor.predicted_z(*program.samples(p)), z)
     column = _column(names, ready)
-    if z < _WORTH * present and not column:
+    # What tells nothing is not worth playing.
+    if z < 1.0 or (z < _WORTH * present and not column):
         return None
     time_s, voltage_V = program.samples(parameters)
     return Experiment(time_s, voltage_V, program.words, _purpose(names, z, present), names, z, present, column)

@@ -132,8 +132,8 @@ def _run(run: RunView) -> dict[str, Any]:
         "samples": int(run.time_s.size),
         "fitted_samples": int(np.count_nonzero(run.fitted)),
         "duration_s": _number(run.time_s[-1] - run.time_s[0]) if known else None,
-        "rms_before_um": _number(_rms(run.before_um)),
-        "rms_after_um": _number(_rms(run.after_um)),
+        "rms_before_um": _number(_rms(run.before_um[run.fitted])),
+        "rms_after_um": _number(_rms(run.after_um[run.fitted])),
     }
 
 
