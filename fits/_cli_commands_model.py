@@ -49,8 +49,9 @@ def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) ->
 )
 @click.option(
     "--hold",
-    type=click.Choice(["lines", "steps"]),
-    help="How the command of a stage runs between samples (default lines); a converter that holds it makes steps.",
+    type=click.Choice(["lines", "steps", "curves"]),
+    help="How the command of a stage runs between samples (default lines); a converter that holds it makes steps, a "
+    "smooth one curves.",
 )
 @click.option("--starts", type=click.IntRange(min=1), help="Starts for families whose fit is not convex (default 8).")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the starts (default 0).")

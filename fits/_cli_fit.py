@@ -22,6 +22,9 @@ from fits._report import describe, fit_report
 from fits._result import FitError
 from fits._stage_report import describe_stage, stage_report
 from fits._units import parse_columns
+from microid import Hold
+
+_HOLDS: dict[str, Hold] = {"lines": "first", "steps": "zero", "curves": "smooth"}
 
 
 @dataclass(frozen=True)
@@ -140,5 +143,5 @@ def _stage_options(
             "their order."
         )
     states = (initial[0] if initial else "unknown") if len(initial) < 2 else list(initial)
-    stage = default_stage("zero" if hold == "steps" else "first")
+    stage = default_stage(_HOLDS[hold or "lines"])
     return states, {"loss": loss or "squares", "stage": stage}

@@ -41,8 +41,8 @@ def default_stage(hold: Hold = "first") -> Stage:
     Parameters
     ----------
     hold
-        How the command runs between samples: `first` for lines, `zero` for steps that each begin at a sample and are
-        not seen by it yet.
+        How the command runs between samples: `first` for lines, `smooth` for curves, `zero` for steps that each begin
+        at a sample and are not seen by it yet.
     """
     flat = Preisach(
         GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),

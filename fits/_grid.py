@@ -122,11 +122,13 @@ def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
+    done: Any = RESULTS.successful
+    over: Any = RESULTS.nonlinear_max_steps_reached
     try:
         columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_TURNS * len(scale))
     except RuntimeError:
-        return jnp.maximum(belief.mean, 0), RESULTS.nonlinear_max_steps_reached
-    return jnp.asarray(columns / scale), RESULTS.successful
+        return jnp.maximum(belief.mean, 0), over
+    return jnp.asarray(columns / scale), done
 
 
 def _bounded(belief: Posterior, which: Int[Array, " k"]) -> tuple[Float[Array, " D"], RESULTS]:

@@ -36,6 +36,10 @@ _BAND = 0.75
 _SEEN = 1e-3
 # Evidence for a period in the position, in e-folds of chance, and the part of what is left that it explains.
 _CYCLIC, _PART = 50.0, 0.3
+# Part of the stroke below which a change of the feedforward is rounding.
+_MET = 1e-9
+# Part of the noise variance from which on it is that of rounding.
+_ROUNDED = 0.5
 
 
 def conclude(
@@ -61,10 +65,12 @@ def conclude(
     explained = max(found.plain.cost - found.model.cost, 0.0)
     rest, rest_freedom = together(found.projector, found.model.basis(), found.model.residual, ways)
     period_um, cycle_z, cycle_drop = cycles(found.projector, found.model.residual, bench.plain)
-    rest = max(rest, cycle_drop)
+    noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in found.projector.noise])))
+    # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
+    rounded = ready.faults.quantum_um**2 / 12 > _ROUNDED * noise_um**2
+    rest = max(rest, 0.0 if rounded else cycle_drop)
     misfit = max(explained + max(rest - rest_freedom, 0.0), explained, 1e-300)
     rest_share = (max(rest - rest_freedom, 0.0) / projector.count) ** 0.5
-    noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in found.projector.noise])))
     chance = stats.chi2.sf(rest, rest_freedom)
     left_over = rest_share > _REST and chance < _CHANCE
     share = explained / misfit
@@ -80,7 +86,7 @@ def conclude(
         rest_share = (max(explained + max(rest - rest_freedom, 0.0), 0.0) / projector.count) ** 0.5
         left_over = rest_share > _REST
         extended, compared, effects = _extended(ready, found, None)
-    cyclic = cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)
+    cyclic = not rounded and cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)
     if cyclic:
         remarks.append(
             f"what is left repeats itself every {period_um:.3g} um of the position, as the error of an "
@@ -96,7 +102,7 @@ def conclude(
     # Faults of samples and noise explain nothing that is reproducible, but a narrow band may look as if it were.
     explained_all = any(one.name == "floor_vibration" and one.share_of_misfit > _BAND for one in causes)
     unlike, bursts = irregular(projector, found.plain.residual)
-    if bursts and not kept:
+    if bursts and not kept and not rounded:
         remarks.append("what is left comes in bursts that no effect of the library makes")
         explained_all, left_over = False, True
         excess = found.plain.cost / max(projector.count - projector.freedom, 1.0) - 1
@@ -116,7 +122,9 @@ def conclude(
         moving = [effect for effect in effects if effect.place not in ("time", "sensor", "noise")]
         if moving:
             before, after = feedforward(found.bench, moving)
-            gain = replace(gain, feedforward_before_um=before, feedforward_after_um=after)
+            # A command that is played slowly does not meet what only fast ones do.
+            if before > _MET * baseline.stroke_um:
+                gain = replace(gain, feedforward_before_um=before, feedforward_after_um=after)
         silent = sorted({effect.name for effect in effects if effect.per_run and len(baseline.runs) > 1})
         if silent:
             remarks.append(

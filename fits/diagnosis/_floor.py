@@ -29,6 +29,10 @@ SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
 # A command that moves, or turns, by more than these parts of its range at one of some samples may cause what looks
 # like a spike.
 _EDGE, _TURN, _NEAR = 0.02, 0.004, 6
+# Jitter beside rounding has at least so many times its variance.
+_ROUNDING = 3.0
+# It is one all the same beyond such a multiple of what nearly all of these samples are off by.
+_MOSTLY_NEAR, _BEYOND = 0.98, 4.0
 
 
 @dataclass(frozen=True)
@@ -147,7 +151,9 @@ def spikes(run: StageRun, residual_um: np.ndarray, least_um: float = 0.0) -> np.
     turned = np.abs(np.diff(change, append=change[-1])) > _TURN * float(np.ptp(voltage))
     moved = (np.abs(change) > _EDGE * float(np.ptp(voltage))) | turned
     near = np.convolve(moved, np.ones(2 * _NEAR + 1), mode="same") > 0.5
-    far &= ~near
+    # Where it may, others do so, too.
+    usual = float(np.quantile(size[near], _MOSTLY_NEAR)) if near.any() else 0.0
+    far &= ~near | (size > _BEYOND * usual)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
         if stop - first > _TOGETHER:
@@ -187,7 +193,8 @@ def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float
     slow, quick = order[: len(order) // 2], order[-len(order) // 10 :]
     base = max(float(np.median(square[slow])) / 0.4549, least_um**2)
     more = float(np.median(square[quick])) / 0.4549 - base
-    if more <= 0 or base <= 0 or float(np.mean(speed[quick])) == 0:
+    # Rounding is less where nothing moves, and there its median is not that of normal noise.
+    if more <= _ROUNDING * least_um**2 or base <= 0 or float(np.mean(speed[quick])) == 0:
         return 0.0, 0.0
     # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
     error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
