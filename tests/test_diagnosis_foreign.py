@@ -1,5 +1,6 @@
 """Rigs run in other ways than the bench's: smooth commands, records that begin in the middle, late trouble."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from fits._run import known_samples
 from fits.diagnosis._floor import Floor, pooled
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._regression import _alive
+from fits.diagnosis._regulated import held_creep
 
 RATE_Hz, FINE = 1000.0, 16
 
@@ -101,6 +103,21 @@ def test_what_shows_only_in_what_was_held_out(rng):
     assert found.causes
     assert "dropped_samples" in {found.causes[0].name, *found.causes[0].also_consistent}
     assert any("what was held out is predicted far worse" in words for words in found.remarks)
+
+
+def test_creep_under_a_controller(rng):
+    """A ramp, and then a hold in which the voltage takes back what would go on; and one that holds the voltage."""
+    rate, gain, step = 200.0, rng.uniform(0.005, 0.03), rng.uniform(20, 80)
+    hold_s = np.arange(1, 4001) / rate
+    voltage = np.r_[np.zeros(100), np.linspace(0, step, 200), step * (1 - gain * np.log10(1 + hold_s / 0.005))]
+    place = np.r_[np.zeros(100), np.linspace(0, 10, 200), np.full(4000, 10.0)]
+    place = place + 0.003 * rng.standard_normal(len(place))
+    record = Record(np.arange(len(place)) / rate, voltage, place, source="held.csv")
+    held = held_creep([record])
+    assert held.gain_per_decade == pytest.approx(gain, rel=0.05)
+    still = replace(record, voltage_V=np.r_[voltage[:300], np.full(4000, step)])
+    assert held_creep([still]) is None
+    assert held_creep([Record(np.arange(2500) / 50, SLOW_V, plays(SLOW_V), source="free.csv")]) is None
 
 
 def test_an_unknown_that_has_died_away_is_none():

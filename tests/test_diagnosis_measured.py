@@ -20,3 +20,15 @@ def test_the_cause_is_found_why_a_real_record_predicts_badly():
     lags = {"sensor_lowpass", "transport_delay"}
     assert lags & {name for cause in found.causes for name in (cause.name, *cause.also_consistent)}
     assert found.gain.heldout_rms_after_um < found.gain.heldout_rms_before_um / 2
+
+
+def test_creep_is_read_off_what_a_controller_took_back():
+    # At constant height the voltage falls by 1.5 % of the step with each decade of time.
+    path = DATA / "afm_z_piezo_hold30s.csv"
+    if not path.exists():
+        pytest.skip(f"the measured record {path.name} is not here")
+    found = fits.diagnose([fits.read_csv(path)])
+    assert found.causes[0].name == "creep"
+    gain = next(one for one in found.causes[0].parameters if one.name == "gain_per_decade")
+    assert gain.value == pytest.approx(0.015, rel=0.2)
+    assert any("a controller held the displacement" in words for words in found.remarks)

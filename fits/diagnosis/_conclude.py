@@ -18,6 +18,7 @@ from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
+from fits.diagnosis._regulated import held_creep, told_by
 from fits.diagnosis._result import Diagnosis, RunView, Test
 from fits.diagnosis._select import Selection
 from fits.diagnosis._structure import cycles, further_views, look, together, views
@@ -94,6 +95,9 @@ def conclude(
         )
     faults = name_faults(_beside(ready, found, model, compared) if kept else ready.faults, cyclic)
     causes = causes_of(kept, model, found.projector, found.bench, misfit, faults, ready.faults)
+    if (held := held_creep([run.record for run in baseline.runs])) is not None:
+        causes = told_by(held, causes)
+        remarks.append(held.sentence)
     ahead = suggest(ready, found, causes, duration_s, progress)
     if ahead is None and any(cause.also_consistent for cause in causes):
         remarks.append(

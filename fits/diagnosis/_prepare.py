@@ -15,6 +15,7 @@ from fits.diagnosis._evaluate import along_curves, simulate
 from fits.diagnosis._faults import SINGLE, Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._regression import Regression, regress
+from fits.diagnosis._regulated import held_creep
 from fits.diagnosis._score import rescore, score
 from fits.diagnosis._unswept import first_ways, unswept
 from microid import EFFECTS, Hold, Scales, Stage
@@ -42,6 +43,10 @@ _STEPS = (
 _CURVES = (
     "the command is taken to run along curves through its samples, since that leaves less of the displacement than "
     "lines do"
+)
+_CLOSED = (
+    "a controller held the displacement, and what bends a loop cannot be told from a density there, which is asked "
+    "only along the way that it took"
 )
 _FIRST = (
     "the voltage's first way through its range differs from later ones, as after a rest or a demagnetisation, and "
@@ -187,6 +192,12 @@ def prepare_diagnosis(
             here = _Fitted(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
     regression, bench, faults, (probes, skipped) = here.regression, here.bench, here.faults, here.probed
+    if held_creep(records) is not None:
+        skipped = [
+            *skipped,
+            *((name, _CLOSED) for name in dict.fromkeys(one.name for one in probes) if name != "creep"),
+        ]
+        probes = [one for one in probes if one.name == "creep"]
     baseline = replace(regression.baseline, remarks=(*regression.baseline.remarks, *said))
     progress("learning how rough the density is")
     rough = learn_roughness(here.projector, [column for probe in probes for column in probe.signatures])

@@ -1,0 +1,127 @@
+"""Holds by a controller: the displacement stands, and what the stage does by itself shows in the voltage."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fits._record import Record
+from fits.diagnosis._result import EffectParameter, FoundCause
+
+# A hold lasts so long and has so many samples; meanwhile the displacement keeps within this part of its range, and
+# the voltage moves by more than that part of its own.
+_LONG_s, _SAMPLES, _STANDS, _MOVES = 1.0, 200, 3e-3, 5e-3
+# Times of a hold over which the voltage is read: from so many intervals after its beginning on, in blocks evenly
+# spaced in the logarithm of time, and two decades at least.
+_AFTER, _BLOCKS, _DECADES = 8, 24, 2.0
+# Part of the scatter about its mean that a line over the logarithm of time must explain.
+_STRAIGHT = 0.97
+_GAIN, _TWO_SIDED = "gain_per_decade", 1.96
+
+
+@dataclass(frozen=True)
+class Held:
+    """What a controller took back while it held the displacement.
+
+    Attributes
+    ----------
+    source
+        Of the record.
+    duration_s
+        Of the hold.
+    gain_per_decade, sd
+        Change of the voltage per decade of time over the step before, against it, and its standard deviation.
+    """
+
+    source: str
+    duration_s: float
+    gain_per_decade: float
+    sd: float
+
+    @property
+    def sentence(self) -> str:
+        """What is to be said of it."""
+        return (
+            f"{self.source}: a controller held the displacement for {self.duration_s:.3g} s, in which the voltage "
+            f"went back by {self.gain_per_decade:.2%} of the step before with each decade of time; that is the gain "
+            "of its creep, which the fit cannot tell from a density without slope there"
+        )
+
+
+def told_by(held: Held, causes: Sequence[FoundCause]) -> tuple[FoundCause, ...]:
+    """Put the gain that a hold says into a cause that is creep, ahead of those of the fit."""
+    out = []
+    for cause in causes:
+        if cause.name == "creep":
+            low, high = (max(held.gain_per_decade + way * _TWO_SIDED * held.sd, 0.0) for way in (-1, 1))
+            told = EffectParameter(_GAIN, held.gain_per_decade, held.sd, "1", low, high)
+            fitted = (replace(one, name=f"{one.name}, of the fit") for one in cause.parameters)
+            cause = replace(cause, parameters=(told, *fitted))
+        out.append(cause)
+    return tuple(out)
+
+
+def held_creep(records: Sequence[Record]) -> Held | None:
+    """Read creep off the hold that says most of it; None where no controller held the displacement."""
+    found = [held for record in records for held in _held(record)]
+    return min(found, key=lambda held: held.sd / held.gain_per_decade, default=None)
+
+
+def _held(record: Record) -> list[Held]:
+    assert record.displacement_um is not None
+    time, voltage, place = record.time_s, record.voltage_V, record.displacement_um
+    close, apart = _STANDS * float(np.ptp(place)), _MOVES * float(np.ptp(voltage))
+    out = []
+    for first, stop in _standing(place, close):
+        if stop - first < _SAMPLES or time[stop - 1] - time[first] < _LONG_s:
+            continue
+        if np.ptp(voltage[first:stop]) < apart or np.ptp(np.diff(voltage[first:stop])) == 0:
+            continue
+        # The step before began at the other extreme, and ended where the voltage turned back.
+        before = voltage[: first + 1]
+        far = before[np.argmax(np.abs(before - voltage[first]))]
+        first += int(np.argmax(np.abs(voltage[first:stop] - far)))
+        age = time[first:stop] - time[first]
+        step = float(voltage[first] - far)
+        late = age > _AFTER * float(np.median(np.diff(time)))
+        decades = np.log10(age[late][-1] / age[late][0]) if late.any() else 0.0
+        if step == 0 or decades < _DECADES:
+            continue
+        slope, sd, straight = _line(np.log10(age[late]), voltage[first:stop][late])
+        if straight > _STRAIGHT and -slope / step > 0:
+            out.append(Held(record.source, float(age[-1]), -slope / step, sd / abs(step)))
+    return out
+
+
+def _standing(place: np.ndarray, close: float) -> list[tuple[int, int]]:
+    """Longest stretches within which values keep within a band, one after the other."""
+    found, first = [], 0
+    while first + _SAMPLES <= len(place):
+        if np.ptp(place[first : first + _SAMPLES]) > close:
+            first += _SAMPLES // 8
+            continue
+        low, high = np.minimum.accumulate(place[first:]), np.maximum.accumulate(place[first:])
+        away = np.flatnonzero(high - low > close)
+        stop = first + (int(away[0]) if len(away) else len(place) - first)
+        # Windows are laid in steps: the stretch may have begun before.
+        lowest, highest = place[first:stop].min(), place[first:stop].max()
+        off = np.flatnonzero(np.maximum(place[:first], highest) - np.minimum(place[:first], lowest) > close)
+        found.append((int(off[-1]) + 1 if len(off) else 0, stop))
+        first = stop
+    return found
+
+
+def _line(along: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
+    """Slope over blocks that are evenly spaced, its standard deviation, and the part of the scatter explained."""
+    edges = np.linspace(along[0], along[-1], _BLOCKS + 1)
+    block = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, _BLOCKS - 1)
+    seen = [k for k in range(_BLOCKS) if np.any(block == k)]
+    x = np.array([along[block == k].mean() for k in seen])
+    y = np.array([values[block == k].mean() for k in seen])
+    design = np.stack([np.ones_like(x), x - x.mean()], axis=1)
+    answer, *_ = np.linalg.lstsq(design, y, rcond=None)
+    left = y - design @ answer
+    # Neighbouring blocks err alike: only every other is taken to be of its own.
+    variance = 2 * float(left @ left) / max(len(x) - 2, 1)
+    sd = float(np.sqrt(variance / np.sum((x - x.mean()) ** 2)))
+    return float(answer[1]), sd, 1 - float(left @ left) / float(np.sum((y - y.mean()) ** 2) + 1e-300)
