@@ -130,7 +130,8 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
     for share in _NEAR:
         near = share * (upper_V - lower_V)
         saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
-        both = (highest >= voltage.max() - near) & (lowest <= voltage.min() + near)
+        own = near if found else 0.0
+        both = (highest >= voltage.max() - own) & (lowest <= voltage.min() + own)
         found.append(both if initial == UNSWEPT else saturated | both)
     return next(known for known in found if 2 * known.sum() >= found[-1].sum())
 

@@ -41,11 +41,11 @@ def refined(time_s: Times, values: Float[Array, " t"], substeps: int, hold: Hold
     if hold == "zero":
         finer = jnp.repeat(values, substeps)[: 1 - substeps]
     else:
-        finer = lines(values, substeps) if hold == "first" else _curves(values, substeps)
-    return time_s / substeps if time_s.ndim == 0 else lines(time_s, substeps), finer
+        finer = _lines(values, substeps) if hold == "first" else _curves(values, substeps)
+    return time_s / substeps if time_s.ndim == 0 else _lines(time_s, substeps), finer
 
 
-def lines(values: Float[Array, " t"], substeps: int) -> Float[Array, " r"]:
+def _lines(values: Float[Array, " t"], substeps: int) -> Float[Array, " r"]:
     """Divide the lines between samples."""
     if substeps == 1:
         return values
@@ -62,7 +62,7 @@ def _curves(values: Float[Array, " t"], substeps: int) -> Float[Array, " r"]:
     """
     count = values.shape[0]
     if count < 3:
-        return lines(values, substeps)
+        return _lines(values, substeps)
     second = jnp.pad(jnp.diff(values, 2), 1)
     size = jnp.pad(jnp.abs(second), _FAR)
     apart = [sign * k for k in range(_NEAR, _FAR + 1) for sign in (-1, 1)]

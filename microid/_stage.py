@@ -11,7 +11,7 @@ from jaxtyping import Array, Complex, Float
 from microid._linear import Hold, LinearSystem, Times
 from microid._param import ParameterInfo, _as_inexact, parameter_table, static
 from microid._part import AbstractHysteresis, AbstractLinear, AbstractPart, Scene, Signal, _imaginary, _run_linear
-from microid._refine import lines, refined
+from microid._refine import _lines, refined
 
 
 def _maybe_inexact(value: Any) -> Any:
@@ -126,7 +126,7 @@ class Stage(eqx.Module):
         time, voltage = refined(_as_inexact(time_s), _as_inexact(voltage_V), self.substeps, self.hold)
         before = voltage[0] if start.rest_V is None else start.rest_V.astype(voltage.dtype)
         signal = Signal(voltage, before, self.hold)
-        beside = {name: lines(_as_inexact(values), self.substeps) for name, values in (columns or {}).items()}
+        beside = {name: _lines(_as_inexact(values), self.substeps) for name, values in (columns or {}).items()}
         scene = Scene(signal, beside, start.memory)
         for link in self._links():
             if isinstance(link, LinearSystem):

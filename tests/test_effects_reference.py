@@ -321,50 +321,6 @@ def test_creep_goes_on_along_the_logarithm():
     np.testing.assert_allclose(crept[1:], line[1:], atol=0.01 * line[-1])
 
 
-def test_voltage_creep_is_what_a_controller_takes_back():
-    time = 2e-3 * np.arange(20_000)
-    step = np.where(time > 0, 50.0, 0.0)
-    crept = through(BY_NAME["creep", "voltage"](0.015, 0.1), 2e-3, step) - step
-    line = 0.015 * 50 * np.log10(1 + time / 0.1)
-    np.testing.assert_allclose(crept[1:], line[1:], atol=0.01 * line[-1])
-
-
-def test_creep_of_moves_before_the_record(rng):
-    """A record that begins in the middle of a longer one, told what was going on."""
-    time = 5e-3 * np.arange(4000)
-    ago, tau, height = 0.5 * time[-1], rng.uniform(1, 5), rng.uniform(5, 20)
-    rest = np.full(len(time), height)
-    late = 0.02 * height * np.exp(-ago / tau)
-    found = through(BY_NAME["creep", "kelvin_voigt"](0.02, tau, late), 5e-3, rest) - height
-    longer = 0.02 * height * (1 - np.exp(-(time + ago) / tau))
-    np.testing.assert_allclose(found, longer - longer[0], atol=1e-9)
-    found = through(BY_NAME["creep", ""](0.02, 0.01, 0.0, 0.02 * height), 5e-3, rest) - height
-    longer = 0.02 * height * np.log10(1 + (time + ago) / 0.01)
-    np.testing.assert_allclose(found, longer - longer[0], atol=2e-3 * height * 0.02)
-    warmth = 20 + np.cumsum(rng.standard_normal(len(time))) / 50
-    drift = BY_NAME["thermal_drift", "temperature"](0.3, tau)
-    whole = through(drift, 5e-3, rest, temperature_degC=warmth)
-    cut = len(time) // 2
-    # What is still to come of changes so far: those that the lag has not followed yet.
-    left = 0.3 * (warmth[cut] - warmth[0]) - (whole[cut] - height)
-    second = through(eqx.tree_at(lambda d: d.before_um, drift, left), 5e-3, rest[cut:], temperature_degC=warmth[cut:])
-    np.testing.assert_allclose(second - height, whole[cut:] - whole[cut], atol=1e-9)
-
-
-def test_walls_that_take_their_time(rng):
-    model = random_model(rng)
-    low, high = float(model.density.lower_V), float(model.density.upper_V)
-    command = wander(rng, 400, low + 0.1 * (high - low), high - 0.1 * (high - low))
-    lag, onset, late = 0.01 * (high - low), 5.0, 3e-3
-    rate = np.gradient(command, 1e-3)
-    _, slow, _ = signal.lsim(([1.0], [late, 1.0]), rate - rate[0], 1e-3 * np.arange(400))
-    behind = command - lag * np.arcsinh((slow + rate[0]) / onset)
-    found = through(BY_NAME["rate_dependence", "activated"](model, lag, onset, late), 1e-3, command)
-    walls = through(model, 1e-3, behind, before=command[0])
-    slope = np.asarray(model.reversible(jnp.asarray(command)) - model.reversible(jnp.asarray(behind)))
-    np.testing.assert_allclose(found, walls + slope, atol=1e-9)
-
-
 def test_noise_has_the_variance_that_is_said(rng):
     n = 200_000
     time = 1e-3 * np.arange(n)

@@ -12,6 +12,9 @@ from jaxtyping import Array, Float
 from fits.diagnosis._score import Scored
 from microid import AbstractEffect, Coordinates, ParameterInfo, Sensor
 
+# Part of a bound within which a coordinate is at it.
+_BOUND = 1e-3
+
 
 def _alone(effect: AbstractEffect) -> AbstractEffect:
     anything = Sensor(jnp.ones(()), jnp.zeros(()))
@@ -65,6 +68,19 @@ class Law:
         full[~self.each] = x[:shared]
         full[self.each] = x[shared + run * own : shared + (run + 1) * own]
         return full
+
+    def pinned(self, x: np.ndarray) -> bool:
+        """Whether a strength is all that it can be, or a time as short: then the effect stands in for another."""
+        values, at = np.asarray(self.maps[0].values(jnp.asarray(self.vector(x, 0)))), 0
+        for info in self.maps[0].table:
+            size, spec = math.prod(info.shape), info.spec
+            here = values[at : at + size]
+            at += size
+            if info.path in self.form.strength and np.any(here > spec.upper - _BOUND * abs(spec.upper)):
+                return True
+            if info.path == "time_constant_s" and np.any(here < (1 + _BOUND) * spec.lower):
+                return True
+        return False
 
     def effect(self, x: np.ndarray, run: int) -> AbstractEffect:
         """The effect in one run."""

@@ -92,10 +92,12 @@ class Refit:
         return np.where(seen[:, None] & seen, scaled, np.diag(np.where(seen, 0.0, _ANYTHING)))
 
     def determined(self) -> bool:
-        """Whether the data determine the strength of the last effect, in some run at least."""
+        """Whether the data determine the strength of the last effect, in some run at least, within its bounds."""
         law, x = self.laws[-1], self.x[-1]
         if not law.form.strength:
             return True
+        if law.pinned(x):
+            return False
         covariance = self.covariance(robust=False)[-law.size :, -law.size :]
         found = False
         for run in range(len(law.maps) if law.each.any() else 1):

@@ -15,6 +15,8 @@ from microid.effects._grids import _decades
 
 # Relaxations per decade of time constants, and the decades ahead of the onset and behind it that they cover.
 _PER_DECADE, _AHEAD, _BEHIND = 3, 1, 5
+# What creeps more than this per decade, or than that in all, is no piezo's creep but some other lag.
+_MOST, _MOST_IN_ALL = 0.1, 0.5
 # Moves before a record that stand for all of them took place so many of its durations ago.
 _RECENT, _OLDER = 0.03, 0.5
 
@@ -52,7 +54,7 @@ class Creep(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("thermal_drift", "mount_relaxation", "rate_dependence")
     experiment: ClassVar[str] = "Steps up and down, each held for three decades of time."
     source: ClassVar[str] = "PI piezo tutorial: dL (1 + gamma lg(t / 0.1 s)), gamma of 0.01 to 0.02"
-    gain_per_decade: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
+    gain_per_decade: Float[Array, ""] = param(unit="1", lower=0.0, upper=_MOST)
     onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
     recent_um: Float[Array, ""] = param(default=0.0, unit="um")
     older_um: Float[Array, ""] = param(default=0.0, unit="um")
@@ -100,7 +102,7 @@ class VoltageCreep(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
     experiment: ClassVar[str] = Creep.experiment
     source: ClassVar[str] = "Neel's fluctuation field; see Bertotti, Hysteresis in Magnetism (1998), ch. 14"
-    gain_per_decade: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
+    gain_per_decade: Float[Array, ""] = param(unit="1", lower=0.0, upper=_MOST)
     onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
     recent_V: Float[Array, ""] = param(default=0.0, unit="V")
     older_V: Float[Array, ""] = param(default=0.0, unit="V")
@@ -144,7 +146,7 @@ class KelvinVoigtCreep(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
     experiment: ClassVar[str] = Creep.experiment
     source: ClassVar[str] = "Kelvin-Voigt element; see Jung & Gweon, Rev. Sci. Instrum. 71 (2000) 1896"
-    gain: Float[Array, ""] = param(unit="1", scale=0.01, lower=0.0)
+    gain: Float[Array, ""] = param(unit="1", lower=0.0, upper=_MOST_IN_ALL)
     time_constant_s: Float[Array, ""] = param(unit="s", lower=0.02, upper=1e5)
     before_um: Float[Array, ""] = param(default=0.0, unit="um")
 
