@@ -126,7 +126,7 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
     if initial not in ("unknown", UNSWEPT):
         return np.ones(len(voltage), dtype=bool)
     highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
-    found = []
+    found: list[np.ndarray] = []
     for share in _NEAR:
         near = share * (upper_V - lower_V)
         saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)

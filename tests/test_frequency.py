@@ -98,8 +98,8 @@ def test_a_long_run_of_periods_becomes_the_periodic_response(rng):
     fine = 16 * 128
     voltage = multisine(rng, 128, np.arange(3, 20), 1.0, 1, 2)[0]
     path = 16 * np.fft.irfft(np.fft.rfft(voltage, axis=0), fine, axis=0)
-    time_s = np.arange(12 * fine) * INTERVAL_s / 16
-    expected = lsim(StateSpace(*state_space(*parts)), np.tile(path, (12, 1)), time_s)[1][-fine::16]
+    time_s = np.arange(60 * fine) * INTERVAL_s / 16
+    expected = lsim(StateSpace(*state_space(*parts)), np.tile(path, (60, 1)), time_s)[1][-fine::16]
     np.testing.assert_allclose(
         modes.respond_periodically(jnp.asarray(voltage), INTERVAL_s), expected, atol=2e-3 * np.ptp(expected)
     )

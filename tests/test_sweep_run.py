@@ -234,10 +234,13 @@ def test_stopped_between_any_two_writes_it_goes_on(finished, tmp_path, monkeypat
         run_sweep(sweep, str(out))
     monkeypatch.setattr("os.replace", replace)
     # The threads that write go on for a moment, since the process has not really died.
+    before = None
     for _ in range(100):
-        if not list(out.rglob("*.partial")):
+        there = set(out.rglob("*"))
+        if there == before and not any(path.suffix == ".partial" for path in there):
             break
-        time.sleep(0.05)
+        before = there
+        time.sleep(0.2)
     run_sweep(sweep, str(out), resume=(out / "about.json").exists())
     assert table(out).equals(table(whole))
 
