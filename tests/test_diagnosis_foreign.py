@@ -58,11 +58,11 @@ def test_a_smooth_command_is_no_effect(rng):
     """Swept sines as a function of time, which lines through their samples cut short."""
 
     def swept(t):
-        rate = 10 + 50 * t
+        rate = 10 + 80 * t
         return 50 - 42 * np.cos(2 * np.pi * 0.5 * t) - 8 * np.sin(2 * np.pi * t * rate)
 
     records = [Record(np.arange(2500) / 100, SLOW_V, plays(SLOW_V) + 0.01 * rng.standard_normal(2500), source="a")]
-    records.append(rig(rng, swept, 4.0, 0.01))
+    records.append(rig(rng, swept, 2.5, 0.01))
     found = diagnose(records)
     assert found.verdict == "no_effect"
     assert found.baseline.hold == "smooth"

@@ -16,6 +16,8 @@ SINGLE = ("outliers", "quantisation", "timestamp_jitter", "floor_vibration")
 # So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
 _SPIKES, _PART = 3, 0.3
 _JITTER_Z, _BAND_Z = 8.0, 8.0
+# A band is one of a resonance from this quality on; what is broader wanders, or jumps.
+_NARROW = 2.5
 # E-folds after which a motion has settled.
 _SETTLED = 8.0
 
@@ -169,7 +171,8 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
         known = (("jitter_s", faults.jitter_s, sd, "s"),)
         found.append(Fault("timestamp_jitter", faults.jitter_z, known, faults.jitter_um**2))
     band = faults.band
-    if band.z > _BAND_Z and band.size_um**2 > _PART / 3 * total and not band.mains:
+    narrow = band.z > _BAND_Z and band.quality > _NARROW
+    if narrow and band.size_um**2 > _PART / 3 * total and not band.mains:
         found.append(
             Fault(
                 "floor_vibration",

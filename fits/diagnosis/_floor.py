@@ -30,7 +30,7 @@ SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
 # like a spike.
 _EDGE, _TURN, _NEAR = 0.02, 0.004, 6
 # Jitter beside rounding has at least so many times its variance.
-_ROUNDING = 3.0
+_ROUNDING = 10.0
 # It is one all the same beyond such a multiple of what nearly all of these samples are off by.
 _MOSTLY_NEAR, _BEYOND = 0.98, 4.0
 
