@@ -17,7 +17,7 @@ SINGLE = ("outliers", "quantisation", "timestamp_jitter", "floor_vibration")
 _SPIKES, _PART = 3, 0.3
 _JITTER_Z, _BAND_Z = 8.0, 8.0
 # A band is one of a resonance from this quality on; what is broader wanders, or jumps.
-_NARROW = 2.5
+_NARROW = 1.5
 # E-folds after which a motion has settled.
 _SETTLED = 8.0
 
