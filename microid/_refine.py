@@ -1,5 +1,8 @@
 """What a sampled command does between its samples: steps, lines or curves."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -54,6 +57,7 @@ def _lines(values: Float[Array, " t"], substeps: int) -> Float[Array, " r"]:
     return jnp.append(inner.ravel(), values[-1])
 
 
+@partial(jax.jit, static_argnames="substeps")
 def _curves(values: Float[Array, " t"], substeps: int) -> Float[Array, " r"]:
     """Divide the curves through samples, which have corners where these say so.
 
