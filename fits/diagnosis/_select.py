@@ -22,6 +22,11 @@ _USUAL = ("creep",)
 # Differences of the criterion, and standard deviations after projecting one effect off another, within which two
 # effects are not told apart.
 _SAME, _APART = 10.0, 4.0
+# Standard deviations beyond which effects are told apart if one of them leaves no more than noise, which varies by
+# so many standard deviations.
+_CLEAR, _CHANCE = 8.0, 3.0
+# Effects that the baseline follows to tell them apart.
+_NEAREST = 4
 # Part of a cause's signature by which its model may be off, and by which it may be off along its confusions.
 _INEXACT, _CONFUSED = 0.06, 0.6
 # An effect that makes the square of the errors in what was held out so many times larger is none, and one with
@@ -39,12 +44,13 @@ _WORTH = 0.4
 
 @dataclass(frozen=True)
 class Rival:
-    """An effect fitted in place of a cause."""
+    """An effect fitted in place of a cause; its cost is that once the baseline has followed, where that was tried."""
 
     name: str
     refit: Refit
     criterion: float
     apart: float
+    cost: float
 
 
 @dataclass(frozen=True)
@@ -168,7 +174,8 @@ def select(
             continue
         first, beside = _leader(bench, projector, probes, model, fitted, best_of(open_), taken & once)
         drop = model.cost - first.refit.cost
-        rivals = _rivals(first, fitted, max(drop, 0.0))
+        exact = first.cost < projector.count - projector.freedom + _CHANCE * (2 * projector.count) ** 0.5
+        rivals = _rivals(first, fitted, max(drop, 0.0), exact)
         usual = next((rival for rival in rivals if rival.name in _USUAL and first.name not in _USUAL), None)
         if usual is not None and not any(run.held_out.any() for run in bench.baseline.runs):
             # Of effects that these records cannot tell apart, and nothing else can, the one that every rig has.
@@ -243,13 +250,14 @@ def _leader(
     return best, chosen
 
 
-def _rivals(first: Rival, fitted: Sequence[Rival], drop: float) -> tuple[Rival, ...]:
+def _rivals(first: Rival, fitted: Sequence[Rival], drop: float, exact: bool) -> tuple[Rival, ...]:
     """Effects that explain the same about as well as the cause, which takes so much off the sum of squares."""
     found = []
+    # A model that leaves no more than noise is off by little.
+    most = min(_tolerance(drop), _CLEAR) if exact else _tolerance(drop)
     for other in fitted:
         # What the cause explains beyond the other: no more than models of effects are off by.
-        apart = max(other.refit.cost - first.refit.cost, 0.0) ** 0.5
-        most = max(_APART, 2 * _INEXACT * drop**0.5)
+        apart = max(other.cost - first.cost, 0.0) ** 0.5
         if other is not first and (other.criterion - first.criterion < _SAME or apart < most):
             found.append(replace(other, apart=apart))
     return tuple(found)
@@ -287,8 +295,32 @@ def _contest(
                 continue
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
-    order = sorted(fitted, key=lambda name: fitted[name].criterion(projector.count))
-    return [Rival(name, fitted[name], fitted[name].criterion(projector.count), 0.0) for name in order]
+    return _ranked(
+        bench,
+        projector,
+        [Rival(name, one, one.criterion(projector.count), 0.0, one.cost) for name, one in fitted.items()],
+        model.cost,
+    )
+
+
+def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: float) -> list[Rival]:
+    """Put effects in order: those about as good by what they leave once the baseline has followed each."""
+    order = sorted(fitted, key=lambda one: one.criterion)
+    if not order:
+        return order
+    most = _tolerance(before - order[0].cost) ** 2
+    near = [one for one in order if one.cost - order[0].cost < most][:_NEAREST]
+    if len(near) < 2:
+        return order
+    for one in near:
+        end = settled(bench, projector, one.refit)[-1]
+        order[order.index(one)] = replace(one, cost=end.cost, criterion=end.criterion(projector.count))
+    return sorted(order, key=lambda one: one.criterion)
+
+
+def _tolerance(drop: float) -> float:
+    """Standard deviations within which an effect is another that takes so much off the sum of squares."""
+    return max(_APART, 2 * _INEXACT * max(drop, 0.0) ** 0.5)
 
 
 def _whole(bench: Bench, model: Refit) -> bool:
