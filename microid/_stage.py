@@ -50,8 +50,8 @@ class Stage(eqx.Module):
     names
         One name per part, no two alike.
     hold
-        How the command runs between samples: `"first"` in lines, `"zero"` in steps, `"smooth"` along the curves of a
-        spline, which has corners only where single samples show them.
+        How the command runs between samples: `"first"` in lines, `"zero"` in steps, `"smooth"` along
+        band-limited curves, which have corners only where single samples show them.
     substeps
         Into how many steps every interval is divided.
     frozen

@@ -192,7 +192,7 @@ def prepare_diagnosis(
             here = _Fitted(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
     regression, bench, faults, (probes, skipped) = here.regression, here.bench, here.faults, here.probed
-    if held_creep(records) is not None:
+    if all(held_creep([record]) is not None for record in records):
         skipped = [
             *skipped,
             *((name, _CLOSED) for name in dict.fromkeys(one.name for one in probes) if name != "creep"),
