@@ -293,21 +293,26 @@ class Weighing:
         """The smallest noise, in which the joint problem is measured."""
         return min(self.noise_um)
 
+    @property
+    def shares(self) -> list[float]:
+        """Independent samples of the quietest run that a sample of each run is worth.
+
+        All are taken for equally correlated: a run fitted worse is correlated more, and by its own would be given up.
+        """
+        each = float(np.exp(np.mean(np.log(self.correlation))))
+        return [(self.least_um / noise) ** 2 / each for noise in self.noise_um]
+
     def total(self, sums: Sequence[RunSums]) -> Moments:
-        """Moments of all runs, each sample counted as a share of an independent one of the quietest run."""
-        scaled = [
-            one.moments.scaled((self.least_um / noise) ** 2 / correlation, 1.0)
-            for one, noise, correlation in zip(sums, self.noise_um, self.correlation, strict=True)
-        ]
+        """Moments of all runs."""
+        scaled = [one.moments.scaled(share, 1.0) for one, share in zip(sums, self.shares, strict=True)]
         return sum(scaled[1:], start=scaled[0])
 
     def cost_um2(self, runs: Sequence[StageRun], residuals: Sequence[np.ndarray]) -> float:
         """Sum of squares that goes with `total`."""
         cost = 0.0
-        for run, residual, noise, correlation in zip(runs, residuals, self.noise_um, self.correlation, strict=True):
+        for run, residual, share in zip(runs, residuals, self.shares, strict=True):
             weight = np.asarray(run.samples.weight)[: len(residual)]
-            square = float(np.sum(weight * residual**2))
-            cost += square * (self.least_um / noise) ** 2 / correlation
+            cost += share * float(np.sum(weight * residual**2))
         return cost
 
 

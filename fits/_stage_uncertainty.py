@@ -131,12 +131,12 @@ class Precision:
         here = jnp.asarray(self.solved.z), jnp.asarray(self.solved.columns_um)
         out = []
         weighing = self.solved.weighing
-        for run, noise, correlation in zip(self.solved.runs, weighing.noise_um, weighing.correlation, strict=True):
+        for run, share in zip(self.solved.runs, weighing.shares, strict=True):
             slope = along(self.chain, *here, run, (answer[:size], answer[size:])).T
             weight = np.asarray(run.samples.weight)[: len(run.record)]
             slope = slope - np.average(slope, axis=1, weights=weight)[:, None]
             # The other half of the weight goes to the residual that this is multiplied by.
-            out.append(slope * np.sqrt(weight) / (noise**2 * correlation))
+            out.append(slope * np.sqrt(weight) * share / weighing.least_um**2)
         return out
 
     def covariance(self, influence: Sequence[np.ndarray]) -> np.ndarray:
