@@ -1,7 +1,7 @@
 """A whole stage as a regression: linear in the columns of its hysteresis, linearised in its other parameters."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -267,26 +267,30 @@ class Weighing:
         Standard deviation of each run's residual.
     correlation
         Samples of each run that are worth one independent one.
+    counted
+        The same, as its samples are counted.
     """
 
     noise_um: tuple[float, ...]
     correlation: tuple[float, ...]
+    counted: tuple[float, ...]
 
     @classmethod
-    def of(cls, runs: Sequence[StageRun], residuals: Sequence[np.ndarray]) -> "Weighing":
-        """Weigh runs by what a fit leaves of them."""
+    def of(cls, runs: Sequence[StageRun], residuals: Sequence[np.ndarray], *counted: float) -> "Weighing":
+        """Weigh runs by what a fit leaves of them, all equally correlated unless `counted` is given."""
         noise, correlation = [], []
         for run, residual in zip(runs, residuals, strict=True):
             left = residual[run.fitted]
             weight = np.asarray(run.samples.weight)[: len(residual)][run.fitted]
             noise.append(float(np.sqrt(np.average(left**2, weights=weight))))
             correlation.append(correlation_samples([left]))
-        return cls(tuple(noise), tuple(correlation))
+        each = float(np.exp(np.mean(np.log(correlation))))
+        return cls(tuple(noise), tuple(correlation), counted or (each,) * len(noise))
 
     def alike(self) -> "Weighing":
         """As if all runs had the same noise, and no sample any of another."""
-        each = float(np.sqrt(np.mean(np.square(self.noise_um))))
-        return Weighing((each,) * len(self.noise_um), (1.0,) * len(self.noise_um))
+        noise = (float(np.sqrt(np.mean(np.square(self.noise_um)))),) * len(self.noise_um)
+        return replace(self, noise_um=noise, counted=(1.0,) * len(noise))
 
     @property
     def least_um(self) -> float:
@@ -295,12 +299,8 @@ class Weighing:
 
     @property
     def shares(self) -> list[float]:
-        """Independent samples of the quietest run that a sample of each run is worth.
-
-        All are taken for equally correlated: a run fitted worse is correlated more, and by its own would be given up.
-        """
-        each = float(np.exp(np.mean(np.log(self.correlation))))
-        return [(self.least_um / noise) ** 2 / each for noise in self.noise_um]
+        """Independent samples of the quietest run that a sample of each run is worth."""
+        return [(self.least_um / noise) ** 2 / each for noise, each in zip(self.noise_um, self.counted, strict=True)]
 
     def total(self, sums: Sequence[RunSums]) -> Moments:
         """Moments of all runs."""
@@ -311,8 +311,7 @@ class Weighing:
         """Sum of squares that goes with `total`."""
         cost = 0.0
         for run, residual, share in zip(runs, residuals, self.shares, strict=True):
-            weight = np.asarray(run.samples.weight)[: len(residual)]
-            cost += share * float(np.sum(weight * residual**2))
+            cost += share * float(np.sum(np.asarray(run.samples.weight)[: len(residual)] * residual**2))
         return cost
 
 

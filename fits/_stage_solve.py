@@ -106,19 +106,20 @@ def solve_chain(
         If it does not become stationary and must.
     """
     damping = _DAMPING
+    counted: tuple[float, ...] = ()
     for number in range(_ROUGH if rough else _ROUNDS):
-        runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None)
+        runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
         # Far from the answer, what a run leaves says nothing of its noise: weighed by it, one run would be given up.
-        counted = weighing.alike() if rough else weighing
-        total = counted.total(sums)
-        here = counted.cost_um2(runs, [one.residual_um for one in sums])
+        weights = weighing.alike() if rough else weighing
+        total = weights.total(sums)
+        here = weights.cost_um2(runs, [one.residual_um for one in sums])
         while True:
             try:
                 step, columns, better, variance, distance = _step(
-                    chain, total, columns_um, hyper, counted, stroke_um, damping
+                    chain, total, columns_um, hyper, weights, stroke_um, damping
                 )
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
@@ -130,7 +131,7 @@ def solve_chain(
                 continue
             hyper = better
             prior = prior_precision(chain, hyper, stroke_um)
-            there = counted.cost_um2(runs, _residuals(chain, z + step, columns, runs))
+            there = weights.cost_um2(runs, _residuals(chain, z + step, columns, runs))
             old = here / variance + columns_um @ prior @ columns_um
             new = there / variance + columns @ prior @ columns
             if new <= old:
@@ -146,8 +147,12 @@ def solve_chain(
             break
         if damping > _HIGHEST and not rough:
             raise FitError(FitStatus.NOT_STATIONARY)
+        if distance < _STATIONARY and not rough and not counted and len(runs) > 1:
+            # What is fitted worse is correlated more: run after run would be given up if this were asked again.
+            counted = weighing.correlation
+            continue
         if distance < _STATIONARY:
-            runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None)
+            runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted)
             return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
     if rough or anyway:
         return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
@@ -171,13 +176,19 @@ def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
 
 
 def _gather(
-    chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun], loss: str, free: bool
+    chain: Chain,
+    z: np.ndarray,
+    columns_um: np.ndarray,
+    runs: Sequence[StageRun],
+    loss: str,
+    free: bool,
+    counted: tuple[float, ...],
 ) -> tuple[Sequence[StageRun], list[RunSums], Weighing]:
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
         runs = [robust(run, residual) for run, residual in zip(runs, left, strict=True)]
     sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
-    return runs, sums, Weighing.of(runs, [one.residual_um for one in sums])
+    return runs, sums, Weighing.of(runs, [one.residual_um for one in sums], *counted)
 
 
 def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun]) -> list[np.ndarray]:
