@@ -154,6 +154,9 @@ def test_spikes_are_found_and_ringing_is_not(rng):
     where = 300 + 400 * np.arange(8)
     left[where] += rng.choice([-1, 1], 8) * rng.uniform(0.6, 3.0, 8)
     assert set(np.flatnonzero(spikes(run_of(np.sin(time), left), left))) == set(where)
+    # By chance, one has another close by.
+    left[where[::3] + 7] += 1.0
+    assert set(np.flatnonzero(spikes(run_of(np.sin(time), left), left))) == {*where, *(where[::3] + 7)}
 
 
 def test_a_last_digit_is_found_and_noise_has_none(rng):
@@ -167,9 +170,11 @@ def test_jitter_is_noise_that_grows_with_the_speed(rng):
     speed = 500 * np.cos(2 * np.pi * time)
     quiet = 0.02 * rng.standard_normal(len(time))
     assert jitter_s(quiet, speed)[1] < 8
-    size, z = jitter_s(quiet + 1e-4 * speed * rng.standard_normal(len(time)), speed)
+    assert jitter_s(quiet, speed)[2] < 0.5e-4
+    size, z, most = jitter_s(quiet + 1e-4 * speed * rng.standard_normal(len(time)), speed)
     assert z > 8
     assert size == pytest.approx(1e-4, rel=0.25)
+    assert most > 1e-4
 
 
 def test_hum_is_no_part_of_the_floor(rng):

@@ -29,8 +29,9 @@ from microid import AbstractEffect, Stage
 _SHARE = 0.65
 # What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
 _REST, _CHANCE = 0.3, 1e-6
-# What was kept aside must not be predicted so many times worse, in squares.
-_WORSE = 1.1
+# What was kept aside must not be predicted so many times worse, in squares; or not worse at all by causes with no more
+# evidence than this, in standard deviations, which what else is not simulated may lend.
+_WORSE, _WEAK = 1.1, 8.0
 # Part of the noise above which a narrow band is what is seen in every way of looking.
 _BAND = 0.75
 # A way of looking has seen something below this probability by chance.
@@ -79,7 +80,8 @@ def conclude(
     extended, compared, effects = _extended(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
     checked = _worse(compared[: len(baseline.runs)])
-    if kept and (share < _SHARE or checked > _WORSE):
+    weak = max((cause.z for cause in kept), default=0.0) < _WEAK
+    if kept and (share < _SHARE or checked > (1.0 if weak else _WORSE)):
         suspects = ", ".join(cause.name for cause in kept)
         why = f"explains only {share:.0%} of what is left" if share < _SHARE else "predicts what was kept aside worse"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")

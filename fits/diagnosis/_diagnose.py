@@ -19,6 +19,8 @@ from fits.diagnosis._unswept import FirstWaysError
 _CHECK = 0.12
 # Mean square of the errors in what was held out, in noise variances, that no chance explains.
 _UNLIKE = 1.5
+# Evidence of a cause that is found there, in standard deviations: less does not make up for having nothing held out.
+_STRONG = 8.0
 _ALL = (
     "what was held out is predicted far worse than noise allows, and the causes show only there: it was used to find "
     "them, so that the gain is not measured on new data"
@@ -100,7 +102,7 @@ def diagnose(
         progress("asking again with what was held out, which noise does not explain")
         whole = prepare_diagnosis(records, (), 0.0, initial, progress)
         beside = selected(whole, False)
-        if beside.causes:
+        if max((cause.z for cause in beside.causes), default=0.0) > _STRONG:
             said = (*whole.baseline.remarks, _ALL)
             ready, found = replace(whole, baseline=replace(whole.baseline, remarks=said)), beside
     return conclude(ready, found, [*records, *aside], false_alarm, progress, duration_s)

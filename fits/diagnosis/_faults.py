@@ -107,18 +107,20 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
         heights.append(np.where(bad, left - smooth, 0.0))
         floors.append(floor_of(run, smooth, settling_s))
         rate = np.gradient(run.displacement_um - left, run.record.time_s)
-        size, z = jitter_s(smooth[mask], rate[mask], least)
-        jitters.append((z, size, np.abs(rate)))
+        size, z, most = jitter_s(smooth[mask], rate[mask], least)
+        jitters.append((z, size, np.abs(rate), most))
         interval = float(np.median(np.diff(run.record.time_s)))
         bands.append(band_of(smooth[mask], interval, run.record.voltage_V[mask]))
     floors = pooled(floors)
     idle = [floor.idle > 0 for floor in floors]
     noise = [one.noise if one.noise.total_um > least else Noise(least, np.zeros(0)) for one in floors]
-    z, size, _ = max(jitters, key=lambda j: j[0])
+    z, size, _, _ = max(jitters, key=lambda j: j[0])
+    # One recorder took all runs: what only one of them shows is something else.
+    z = z if size / 2 < min(most for _, _, _, most in jitters) else 0.0
     if z > _JITTER_Z:
         noise = [
             replace(n, spread=np.sqrt(1 + (size * rate / n.innovation_um) ** 2))
-            for n, (_, _, rate) in zip(noise, jitters, strict=True)
+            for n, (_, _, rate, _) in zip(noise, jitters, strict=True)
         ]
     # What may be hum in one run may be told from it in another.
     band = max(bands, key=lambda one: (not one.mains, one.z))
@@ -130,7 +132,7 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
         else "idle stretches where there are any, and the fastest changes of the residual elsewhere"
     )
     size = size if z > _JITTER_Z else 0.0
-    made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate in jitters]) ** 2)))
+    made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
     return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, rank_filter
 
 from fits._stage_run import StageRun
 from fits.diagnosis._noise import Noise, learn_noise, rough_noise_um
@@ -31,6 +31,8 @@ SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
 _EDGE, _TURN, _NEAR = 0.02, 0.004, 6
 # Jitter beside rounding has at least so many times its variance.
 _ROUNDING = 10.0
+# Standard deviations beyond which the variance that a jitter makes is not.
+_SURE = 4.0
 # It is one all the same beyond such a multiple of what nearly all of these samples are off by.
 _MOSTLY_NEAR, _BEYOND = 0.98, 4.0
 
@@ -139,13 +141,11 @@ def spikes(run: StageRun, residual_um: np.ndarray, least_um: float = 0.0) -> np.
     spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")
     spread = np.maximum(spread, 1.4826 * float(np.median(np.abs(off))))
     far = np.abs(off) > np.maximum(SPIKE * spread, least_um + 1e-300)
-    # What rings has neighbours as large; what is alone has none.
+    # What rings has neighbours as large; what is alone has none, or one of its kind by chance.
     size = np.abs(off)
-    around = np.zeros_like(size)
-    for lag in range(_TOGETHER + 1, _ALONE + 1):
-        around[lag:] = np.maximum(around[lag:], size[:-lag])
-        around[:-lag] = np.maximum(around[:-lag], size[lag:])
-    far &= size > 3 * around
+    # In two dimensions: in one, SciPy 1.17 takes a footprint with a gap for one without.
+    beside = np.abs(np.arange(-_ALONE, _ALONE + 1))[None] > _TOGETHER
+    far &= size > 3 * rank_filter(size[None], -2, footprint=beside, mode="nearest")[0]
     voltage = run.record.voltage_V
     change = np.diff(voltage, prepend=voltage[0])
     turned = np.abs(np.diff(change, append=change[-1])) > _TURN * float(np.ptp(voltage))
@@ -180,8 +180,8 @@ def quantum_um(values_um: np.ndarray) -> float:
     return spacing if float(np.mean(off < 0.1)) > 0.95 else 0.0
 
 
-def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float = 0.0) -> tuple[float, float]:
-    """Jitter of the instants of sampling, and its evidence in standard deviations.
+def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float = 0.0) -> tuple[float, float, float]:
+    """Jitter of the instants of sampling, its evidence in standard deviations, and the most that it may be.
 
     Noise that grows with the speed, from sample to sample: the variance of the residual about its neighbours is
     compared with the square of the speed.
@@ -193,14 +193,17 @@ def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float
     slow, quick = order[: len(order) // 2], order[-len(order) // 10 :]
     base = max(float(np.median(square[slow])) / 0.4549, least_um**2)
     more = float(np.median(square[quick])) / 0.4549 - base
-    # Rounding is less where nothing moves, and there its median is not that of normal noise.
-    if more <= _ROUNDING * least_um**2 or base <= 0 or float(np.mean(speed[quick])) == 0:
-        return 0.0, 0.0
-    # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
-    error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
     # The slower half jitters, too.
     faster = float(np.median(speed[quick]) - np.median(speed[slow]))
-    return float((more / faster) ** 0.5) if faster > 0 else 0.0, float(more / error)
+    if base <= 0 or faster <= 0:
+        return 0.0, 0.0, float("inf")
+    # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
+    error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
+    most = float((max(more + _SURE * error, 0.0) / faster) ** 0.5)
+    # Rounding is less where nothing moves, and there its median is not that of normal noise.
+    if more <= _ROUNDING * least_um**2:
+        return 0.0, 0.0, most
+    return float((more / faster) ** 0.5), float(more / error), most
 
 
 @dataclass(frozen=True)
