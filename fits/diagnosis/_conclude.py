@@ -29,8 +29,8 @@ from microid import AbstractEffect, Stage
 _SHARE = 0.65
 # What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
 _REST, _CHANCE = 0.3, 1e-6
-# What was kept aside must not be predicted so many times worse, in squares; or not worse at all by causes with no more
-# evidence than this, in standard deviations, which what else is not simulated may lend.
+# What was kept aside must not be predicted so many times worse, in squares; or not worse at all by causes with less
+# evidence than this, in standard deviations: what else is not simulated may lend them as much.
 _WORSE, _WEAK = 1.1, 8.0
 # Part of the noise above which a narrow band is what is seen in every way of looking.
 _BAND = 0.75
