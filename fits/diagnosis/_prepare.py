@@ -14,14 +14,11 @@ from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scal
 from fits.diagnosis._evaluate import along_curves, simulate
 from fits.diagnosis._faults import SINGLE, Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness
-from fits.diagnosis._refit import nothing, refit_beside
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._regulated import held_creep
-from fits.diagnosis._score import Scored, rescore, score
-from fits.diagnosis._settle import settle
+from fits.diagnosis._score import rescore, score
 from fits.diagnosis._unswept import first_ways, unswept
 from microid import EFFECTS, Hold, Scales, Stage
-from microid.effects.clock_mismatch import ClockMismatch
 from microid.effects.transport_delay import TransportDelay
 
 # Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
@@ -128,21 +125,6 @@ class _Fitted:
         assert isinstance(first, TransportDelay)
         return best.drop, float(best.coefficients[0] * first.delay_s)
 
-    def drifting(self) -> Scored | None:
-        """The clock's own evidence, where it has about as much as any effect."""
-        probes = list(probes_of(self.bench, ClockMismatch, self.scales))
-        scores = score(self.projector, probes, self.projector.off(self.projector.residual))
-        best = max(scores, key=lambda one: one.z, default=None)
-        return best if best is not None and best.drop > _LATE and best.z > _ABOUT * self.highest() else None
-
-    def timed(self) -> float:
-        """Sum of squares that is left once a clock that drifts through whole samples, and the stage, are fitted."""
-        clock = self.drifting()
-        model = nothing(self.bench, self.projector)
-        if clock is None:
-            return model.cost
-        return settle(self.bench, self.projector, refit_beside(self.bench, self.projector, model, clock))[-1].cost
-
     def bent(self) -> float:
         """Decrease of that by a command along curves, as far as the stage's answer to it is in proportion."""
         baseline = self.regression.baseline
@@ -193,13 +175,11 @@ def prepare_diagnosis(
             if not here.regression.baseline.dynamic:
                 break
             drop = here.bent() if hold == "smooth" else here.late()[0]
-            # A clock that drifts hides, through its samples, what is late.
-            drifts = hold == "zero" and here.drifting() is not None
-            if drop <= _LATE and not drifts:
+            if drop <= _LATE:
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
             other = fitted(hold)
-            if not (_curved(here, other) if hold == "smooth" else _held(here, other, drop, drifts)):
+            if not (_curved(here, other) if hold == "smooth" else _held(here, other, drop)):
                 continue
             here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
         if initial == "unknown" and unswept(here.projector, here.highest()):
@@ -235,14 +215,12 @@ def _curved(lines: _Fitted, curves: _Fitted) -> bool:
     return lines.left() - same.left() > _LATE and beside > 0
 
 
-def _held(lines: _Fitted, steps: _Fitted, late: float, drifts: bool) -> bool:
-    """Whether a command held in steps explains what a delay, behind lines, takes so much off, or a clock does not."""
+def _held(lines: _Fitted, steps: _Fitted, late: float) -> bool:
+    """Whether a command held in steps explains what a delay, behind lines, takes so much off."""
     # With the same noise, they compare: by themselves, and with a delay beside each.
     same = _Fitted(steps.regression, lines.faults)
     gained = lines.left() - same.left()
-    if late > _LATE and (gained > _AS_WELL * late or gained - late + same.late()[0] > _BETTER * late):
-        return True
-    return drifts and same.timed() < lines.timed() - _LATE
+    return gained > _AS_WELL * late or gained - late + same.late()[0] > _BETTER * late
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from fits.diagnosis._prepare import Prepared
 
 _TWO_SIDED = 1.96
+# Standard deviations from zero beyond which a run shows an effect.
+_SHOWS = 2.0
 # A class of effects that cannot be told apart names at most so many others.
 _OTHERS = 2
 
@@ -120,33 +122,40 @@ def _joined(
 
 
 def _parameters(law: Law, x: np.ndarray, covariance: np.ndarray) -> tuple[EffectParameter, ...]:
-    """Values in their units: of the first run where they differ, the others by their place."""
+    """Values in their units: of each run in which the effect shows where runs differ, the others by their place."""
     runs = len(law.maps) if law.form.per_run and law.each.any() else 1
-    found = []
+    shared: list[EffectParameter] = []
+    own: list[list[EffectParameter]] = []
     for run in range(runs):
         slope = np.asarray(jax.jacfwd(lambda v, run=run: law.maps[run].values(_vector(law, v, run)))(jnp.asarray(x)))
         values = np.asarray(law.maps[run].values(jnp.asarray(law.vector(x, run))))
         sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
-        at = 0
+        at, mine = 0, []
         for info in law.maps[run].table:
             size = int(np.prod(info.shape)) if info.shape else 1
+            differs = runs > 1 and info.path in law.form.strength
             # What went on before a run is no property of the rig.
             for k in range(size if info.path not in law.form.history else 0):
                 name = info.path if size == 1 else f"{info.path}[{k}]"
-                if runs > 1:
-                    if info.path in law.form.strength:
-                        name = f"{name} in run {run + 1}"
-                    elif run:
-                        continue
                 value, spread = float(values[at + k]), float(sd[at + k])
                 low, high = value - _TWO_SIDED * spread, value + _TWO_SIDED * spread
-                found.append(
-                    EffectParameter(
-                        name, value, spread, info.spec.unit, max(low, info.spec.lower), min(high, info.spec.upper)
-                    )
+                one = EffectParameter(
+                    f"{name} in run {run + 1}" if differs else name,
+                    value,
+                    spread,
+                    info.spec.unit,
+                    max(low, info.spec.lower),
+                    min(high, info.spec.upper),
                 )
+                if differs:
+                    mine.append(one)
+                elif run == 0:
+                    shared.append(one)
             at += size
-    return tuple(found)
+        own.append(mine)
+    # At its bound a strength has no standard deviation to speak of: a run without the effect says nothing of it.
+    showing = [mine for mine in own if any(abs(one.value) > _SHOWS * one.sd for one in mine)] or own
+    return (*(one for mine in showing for one in mine), *shared)
 
 
 def _vector(law: Law, x: Float[Array, " k"], run: int) -> Float[Array, " c"]:
