@@ -11,6 +11,7 @@ from fits import Record
 from fits._stage_run import prepare_stage_run
 from fits.diagnosis import _baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
+from fits.diagnosis._contest import Rival
 from fits.diagnosis._experiment import _open, refine, suggest
 from fits.diagnosis._law import Law, law_of
 from fits.diagnosis._noise import Noise
@@ -22,7 +23,7 @@ from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._result import FoundCause
 from fits.diagnosis._score import score
-from fits.diagnosis._select import Cause, Rival, select
+from fits.diagnosis._select import Cause, select
 from microid import EFFECTS
 
 MOST = 3000

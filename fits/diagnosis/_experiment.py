@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fits.diagnosis._contest import best_of
 from fits.diagnosis._path import limits_of
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._programs import Program, menu
 from fits.diagnosis._refit import law_of
 from fits.diagnosis._result import Experiment, FoundCause
-from fits.diagnosis._select import Selection, best_of
+from fits.diagnosis._select import Selection
 from microid import Mechanics
 
 if TYPE_CHECKING:

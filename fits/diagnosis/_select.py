@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._candidates import Bench, Probe
+from fits.diagnosis._contest import INEXACT, SAME, WORTH, Rival, best_of, contest, tolerance
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
 from fits.diagnosis._score import Family, Scored, rescore, score
@@ -13,44 +14,20 @@ from fits.diagnosis._settle import Settled, bounded, finely, quieter, settled, s
 from fits.diagnosis._unswept import FirstWaysError, unswept
 from microid import EFFECTS
 
-# Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
-_LEADERS, _FORMS = 5, 2
 # Causes that are sought, at most, and laws in all, as some causes come several times.
-_MOST, _LAWS = 4, 6
+_MOST, _LAWS = 4, 8
 # Effects that every piezo has.
 _USUAL = ("creep",)
-# Differences of the criterion, and standard deviations after projecting one effect off another, within which two
-# effects are not told apart.
-_SAME, _APART = 10.0, 4.0
 # Standard deviations beyond which effects are told apart if one of them leaves no more than noise, which varies by
 # so many standard deviations.
 _CLEAR, _CHANCE = 8.0, 3.0
-# Effects that the baseline follows to tell them apart.
-_NEAREST = 4
-# Part of a cause's signature by which its model may be off, and by which it may be off along its confusions.
-_INEXACT, _CONFUSED = 0.06, 0.6
-# An effect that makes the square of the errors in what was held out so many times larger is none, and one with
-# little evidence against the rest of the misfit is one if it makes it so much smaller.
-_WORSE, _BETTER = 1.2, 0.85
+# Part of a cause's signature by which its model may be off along its confusions, and along any column of the records:
+# what is slow in both agrees by chance.
+_CONFUSED, _COLUMN = 0.6, 0.15
 # Part of what a cause explains by itself that must be left of it once all is fitted together.
 _REAL = 0.3
-# Evidence that a cause must have against what else is left, in standard deviations.
-_SURE = 3.0
 # Scores above this share of the best may be those of the cause, if so much of what it explains is left for another.
 _NEAR, _FURTHER = 0.95, 0.15
-# Scores below this share of the best are not worth a fit.
-_WORTH = 0.4
-
-
-@dataclass(frozen=True)
-class Rival:
-    """An effect fitted in place of a cause; its cost is that once the baseline has followed, where that was tried."""
-
-    name: str
-    refit: Refit
-    criterion: float
-    apart: float
-    cost: float
 
 
 @dataclass(frozen=True)
@@ -116,14 +93,6 @@ class Selection:
     finest: bool = False
 
 
-def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
-    """The highest score of each effect, the highest first."""
-    found: dict[str, Scored] = {}
-    for one in sorted(scores, key=lambda s: -s.z):
-        found.setdefault(one.name, one)
-    return found
-
-
 def select(
     bench: Bench,
     projector: Projector,
@@ -155,8 +124,7 @@ def select(
         open_ = [
             one
             for one in left
-            if one.name not in (taken & once) | refused
-            and one.z > explained * (_CONFUSED if _confusable(one, taken) else _INEXACT)
+            if one.name not in (taken & once) | refused and one.z > explained * _inexact(one, taken)
         ]
         if not open_:
             break
@@ -168,9 +136,9 @@ def select(
         if guessed and causes and unswept(projector, top, model):
             raise FirstWaysError
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
-        fitted = _contest(bench, projector, model, open_, top, explained)
+        fitted = contest(bench, projector, model, open_, explained, _LAWS - len(causes))
         if not fitted:
-            refused |= {one.name for one in open_ if one.z > _WORTH * top}
+            refused |= {one.name for one in open_ if one.z > WORTH * top}
             continue
         first, beside = _leader(bench, projector, probes, model, fitted, best_of(open_), taken & once)
         drop = model.cost - first.refit.cost
@@ -195,7 +163,8 @@ def select(
             # The cause was taken for noise, too: all is asked again beside what noise there is.
             afresh = Projector(first_projector.regression, less, projector.roughness)
             return select(first_bench, afresh, probes, false_alarm, rng, progress, guessed, again - 1)
-        causes.append(Cause(first.name, z, family.p(z), rivals, drop))
+        new = len(model.laws) - len(causes)
+        causes += [Cause(first.name, z, family.p(z), rivals, drop / new)] * new
         basis = model.basis()
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
         family = Family(left, rng)
@@ -245,7 +214,7 @@ def _leader(
             continue
         trial = settled(bench, projector, one.refit)
         _, pair = further(one, trial)
-        if pair < cost - _SAME:
+        if pair < cost - SAME:
             best, chosen, cost = one, trial, pair
     return best, chosen
 
@@ -254,84 +223,21 @@ def _rivals(first: Rival, fitted: Sequence[Rival], drop: float, exact: bool) -> 
     """Effects that explain the same about as well as the cause, which takes so much off the sum of squares."""
     found = []
     # A model that leaves no more than noise is off by little.
-    most = min(_tolerance(drop), _CLEAR) if exact else _tolerance(drop)
+    most = min(tolerance(drop), _CLEAR) if exact else tolerance(drop)
     for other in fitted:
         # What the cause explains beyond the other: no more than models of effects are off by.
         apart = max(other.cost - first.cost, 0.0) ** 0.5
-        if other is not first and (other.criterion - first.criterion < _SAME or apart < most):
+        if other is not first and (other.criterion - first.criterion < SAME or apart < most):
             found.append(replace(other, apart=apart))
     return tuple(found)
 
 
-def _confusable(one: Scored, causes: Collection[str]) -> bool:
-    """Whether an effect is mistaken for one of some others, by what is known of them."""
-    own = set(type(one.probe.effects[0]).confusions)
-    return any(form.name in causes and (one.name in form.confusions or form.name in own) for form in EFFECTS)
-
-
-def _contest(
-    bench: Bench, projector: Projector, model: Refit, scores: Sequence[Scored], top: float, explained: float
-) -> list[Rival]:
-    """Fit the leaders beside what is there already, the best first."""
-    names = [name for name, one in best_of(scores).items() if one.z > _WORTH * top][:_LEADERS]
-    fitted: dict[str, Refit] = {}
-    bare = Projector(projector.regression, projector.noise)
-    before = bare.ahead(model.change_um)
-    for name in names:
-        own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
-        tried: dict[type, int] = {}
-        for one in own:
-            form = type(one.probe.effects[0])
-            if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < _WORTH * own[0].z:
-                continue
-            tried[form] = tried.get(form, 0) + 1
-            found = refit_beside(bench, projector, model, one)
-            if not all(np.all(np.isfinite(change)) for change in found.change_um):
-                continue
-            # What does not stand out of the rest of the misfit must show in what was kept aside.
-            plain = one.sure > (_SURE if one.z > 2 * _INEXACT * explained else 2 * _SURE)
-            most = _WORSE if plain else _BETTER
-            if bare.ahead(found.change_um) > most * before or not found.determined() or not _whole(bench, found):
-                continue
-            if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
-                fitted[name] = found
-    return _ranked(
-        bench,
-        projector,
-        [Rival(name, one, one.criterion(projector.count), 0.0, one.cost) for name, one in fitted.items()],
-        model.cost,
-    )
-
-
-def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: float) -> list[Rival]:
-    """Put effects in order: those about as good by what they leave once the baseline has followed each."""
-    order = sorted(fitted, key=lambda one: one.criterion)
-    if not order:
-        return order
-    most = _tolerance(before - order[0].cost) ** 2
-    near = [one for one in order if one.cost - order[0].cost < most][:_NEAREST]
-    if len(near) < 2:
-        return order
-    for one in near:
-        end = settled(bench, projector, one.refit)[-1]
-        order[order.index(one)] = replace(one, cost=end.cost, criterion=end.criterion(projector.count))
-    return sorted(order, key=lambda one: one.criterion)
-
-
-def _tolerance(drop: float) -> float:
-    """Standard deviations within which an effect is another that takes so much off the sum of squares."""
-    return max(_APART, 2 * _INEXACT * max(drop, 0.0) ** 0.5)
-
-
-def _whole(bench: Bench, model: Refit) -> bool:
-    """Whether what is counted in sampling intervals is nearer to one than to none in some run, for the last law."""
-    law, x = model.laws[-1], model.x[-1]
-    found = not law.form.counted
-    for run, one in enumerate(bench.prepared):
-        interval_s = float(np.median(np.diff(one.run.record.time_s)))
-        effect = law.effect(x, run)
-        found = found or any(abs(float(getattr(effect, name))) > interval_s / 2 for name in law.form.counted)
-    return found
+def _inexact(one: Scored, causes: Collection[str]) -> float:
+    """Part of what some causes explain that an effect beside them must exceed, by what it is mistaken for."""
+    form = type(one.probe.effects[0])
+    if any(f.name in causes and (one.name in f.confusions or f.name in form.confusions) for f in EFFECTS):
+        return _CONFUSED
+    return _COLUMN if form.needs else INEXACT
 
 
 def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Refit) -> tuple[list[Cause], Refit]:
@@ -343,7 +249,7 @@ def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Re
             without = refit(bench, projector, laws, [x for i, x in enumerate(model.x) if i != k], 3)
             trials.append((without.criterion(projector.count), k, without))
         criterion, k, without = min(trials, key=lambda t: t[0])
-        if criterion > model.criterion(projector.count) + _SAME:
+        if criterion > model.criterion(projector.count) + SAME:
             break
         causes = [cause for i, cause in enumerate(causes) if i != k]
         model = without

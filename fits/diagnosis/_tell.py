@@ -11,13 +11,14 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from fits.diagnosis._candidates import Bench
+from fits.diagnosis._contest import best_of
 from fits.diagnosis._faults import Fault, Faults
 from fits.diagnosis._law import Law
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
 from fits.diagnosis._score import Scored
-from fits.diagnosis._select import Cause, Selection, best_of
+from fits.diagnosis._select import Cause, Selection
 from microid import EFFECTS
 
 if TYPE_CHECKING:

@@ -48,9 +48,10 @@ class DroppedSamples(AbstractEffect):
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
-        """One sample lost at one of twelve instants."""
+        """One sample lost at one of twelve instants of the longest record, and of the shortest."""
         lost = jnp.asarray(scales.interval_s)
-        instants = scales.duration_s * (np.arange(_INSTANTS) + 0.5) / _INSTANTS
+        each = (np.arange(_INSTANTS) + 0.5) / _INSTANTS
+        instants = np.unique(np.outer([scales.shortest_s, scales.duration_s], each))
         return tuple((cls(lost, jnp.asarray(float(instant))),) for instant in instants)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
