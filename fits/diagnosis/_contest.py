@@ -25,8 +25,9 @@ INEXACT = 0.06
 # An effect that makes the square of the errors in what was held out so many times larger is none, and one with
 # little evidence against the rest of the misfit is one if it makes it so much smaller.
 _WORSE, _BETTER = 1.2, 0.85
-# Evidence that a cause must have against what else is left, in standard deviations.
-_SURE = 3.0
+# Evidence that a cause must have against what else is left, in standard deviations; and what is beyond doubt: so
+# many of them, and so much of what there is to be explained. A second cause may show in what was held out most.
+_SURE, _PLAIN, _MOST = 3.0, 30.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ def contest(
             # What does not stand out of the rest of the misfit must show in what was kept aside.
             plain = one.sure > (_SURE if one.z > 2 * INEXACT * explained else 2 * _SURE)
             most = _WORSE if plain else _BETTER
+            if one.sure > _PLAIN and model.cost - found.cost > _MOST * (model.cost - projector.count):
+                most = np.inf
             if bare.ahead(found.change_um) > most * before or not found.determined() or not _whole(bench, found):
                 continue
             found = _counted(bench, projector, found, own, len(model.laws) + laws)

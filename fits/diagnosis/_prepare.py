@@ -125,6 +125,11 @@ class _Fitted:
         assert isinstance(first, TransportDelay)
         return best.drop, float(best.coefficients[0] * first.delay_s)
 
+    def behind(self) -> float:
+        """The same decrease, if that is a delay and no lead."""
+        drop, late_s = self.late()
+        return drop if late_s > 0 else 0.0
+
     def bent(self) -> float:
         """Decrease of that by a command along curves, as far as the stage's answer to it is in proportion."""
         baseline = self.regression.baseline
@@ -174,7 +179,7 @@ def prepare_diagnosis(
         if hold != "first":
             if not here.regression.baseline.dynamic:
                 break
-            drop = here.bent() if hold == "smooth" else here.late()[0]
+            drop = here.bent() if hold == "smooth" else here.behind()
             if drop <= _LATE:
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
@@ -220,7 +225,7 @@ def _held(lines: _Fitted, steps: _Fitted, late: float) -> bool:
     # With the same noise, they compare: by themselves, and with a delay beside each.
     same = _Fitted(steps.regression, lines.faults)
     gained = lines.left() - same.left()
-    return gained > _AS_WELL * late or gained - late + same.late()[0] > _BETTER * late
+    return gained > _AS_WELL * late or gained - late + same.behind() > _BETTER * late
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:
