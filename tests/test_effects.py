@@ -1,6 +1,7 @@
 """Physical effects: nothing where they are zero, and otherwise finite, differentiable and in their places."""
 
 import functools
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -238,3 +239,14 @@ def test_what_may_come_twice_has_names_of_its_own():
     once = examples(BY_NAME["slew_limit", ""])[0]
     with pytest.raises(ValueError, match="slew_limit"):
         fx.extend(fx.extend(plain_stage(), once), once)
+
+
+def test_losses_are_sought_within_the_shortest_record():
+    """Beside slow loops of a minute, a fast record takes seconds: losses all over it are simulated."""
+    short_s, long_s = 2.5, 60.0
+    sizes = replace(scales(), shortest_s=short_s, duration_s=long_s)
+    probes = BY_NAME["dropped_samples", ""].probes(sizes, None)
+    instants = np.sort([float(one.after_s) for (one,) in probes])
+    for length in (short_s, long_s):
+        inside = np.r_[0, instants[instants < length], length]
+        assert np.diff(inside).max() < length / 6

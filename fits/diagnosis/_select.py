@@ -16,6 +16,8 @@ from microid import EFFECTS
 
 # Causes that are sought, at most, and laws in all, as some causes come several times.
 _MOST, _LAWS = 4, 8
+# Effects that the command has no part in: what one of them leaves looks like none that it has.
+_ALONE = ("mains_hum",)
 # Effects that every piezo has.
 _USUAL = ("creep",)
 # Standard deviations beyond which effects are told apart if one of them leaves no more than noise, which varies by
@@ -120,11 +122,14 @@ def select(
     while len({cause.name for cause in causes}) < _MOST and len(causes) < _LAWS:
         taken = {cause.name for cause in causes}
         # Models of effects are not exact: what one leaves may look like another, above all like its confusions.
-        explained = max(plain.cost - model.cost, 0.0) ** 0.5
+        whole = max(plain.cost - model.cost, 0.0)
+        alone = sum(cause.drop for cause in causes if cause.name in _ALONE)
+        explained = max(whole - alone, 0.0) ** 0.5
         open_ = [
             one
             for one in left
-            if one.name not in (taken & once) | refused and one.z > explained * _inexact(one, taken)
+            if one.name not in (taken & once) | refused
+            and one.z > (whole**0.5 if one.name in _ALONE else explained) * _inexact(one, taken)
         ]
         if not open_:
             break
