@@ -181,14 +181,17 @@ def test_derivatives_are_those_of_finite_differences(name, rng):
         parts = [np.reshape(p, np.shape(leaf)) for p, leaf in zip(np.split(x, splits), leaves, strict=True)]
         return play(*jax.tree.unflatten(treedef, parts), start)
 
-    expected = central_differences(function, flat, 1e-6 * np.maximum(np.abs(flat), 1e-2))
+    step = 1e-6 * np.maximum(np.abs(flat), 1e-2)
+    expected = central_differences(function, flat, step)
     one, other = (
         np.concatenate([np.reshape(x, (SAMPLES, -1)) for x in jax.tree.leaves(jac)], axis=1)
         for jac in (forward, reverse)
     )
     scale = np.abs(expected).max(axis=0) + 1e-3
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-11 * scale.max())
-    assert np.all(np.abs(one - expected).max(axis=0) < 1e-5 * scale)
+    # Of an element that only slips nothing depends on its stiffness, but for the rounding of the differences.
+    rounding = 4 * np.finfo(float).eps * np.abs(function(flat)).max() / step
+    assert np.all(np.abs(one - expected).max(axis=0) < 1e-5 * scale + rounding)
 
 
 @pytest.mark.parametrize("name", LAWS)
