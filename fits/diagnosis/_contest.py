@@ -7,7 +7,7 @@ import numpy as np
 
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, refit_beside
+from fits.diagnosis._refit import Refit, refit_beside, relocate
 from fits.diagnosis._score import Scored, rescore
 from fits.diagnosis._settle import settled
 
@@ -24,7 +24,7 @@ _NEAREST = 4
 INEXACT = 0.06
 # An effect that makes the square of the errors in what was held out so many times larger is none, and one with
 # little evidence against the rest of the misfit is one if it makes it so much smaller.
-_WORSE, _BETTER = 1.2, 0.85
+_WORSE, _BETTER, _SHOWN = 1.2, 0.85, 1.0
 # Evidence that a cause must have against what else is left, in standard deviations; and what is beyond doubt: so
 # many of them, and so much of what there is to be explained. A second cause may show in what was held out most.
 _SURE, _PLAIN, _MOST = 3.0, 30.0, 0.5
@@ -67,7 +67,7 @@ def contest(
             if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < WORTH * own[0].z:
                 continue
             tried[form] = tried.get(form, 0) + 1
-            found = refit_beside(bench, projector, model, one)
+            found = relocate(bench, projector, refit_beside(bench, projector, model, one), len(model.laws))
             if not all(np.all(np.isfinite(change)) for change in found.change_um):
                 continue
             # What does not stand out of the rest of the misfit must show in what was kept aside.
@@ -75,7 +75,11 @@ def contest(
             most = _WORSE if plain else _BETTER
             if one.sure > _PLAIN and model.cost - found.cost > _MOST * (model.cost - projector.count):
                 most = np.inf
-            if bare.ahead(found.change_um) > most * before or not found.determined() or not _whole(bench, found):
+            if not found.determined():
+                # Of what is only there, what was kept aside must show something, too.
+                most = _SHOWN
+            ahead = bare.ahead(found.change_um)
+            if ahead > most * before or not found.determined(False) or not _whole(bench, found):
                 continue
             found = _counted(bench, projector, found, own, len(model.laws) + laws)
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):

@@ -51,8 +51,18 @@ class Law:
     @property
     def differs(self) -> np.ndarray:
         """Which coordinates differ from run to run if there are several, shape `(k,)`."""
-        own = (*(self.form.strength if self.form.per_run else ()), *self.form.history)
-        return np.concatenate([np.full(math.prod(info.shape), info.path in own) for info in self.maps[0].table])
+        return self._of((*(self.form.strength if self.form.per_run else ()), *self.form.history))
+
+    @property
+    def strengths(self) -> np.ndarray:
+        """Which coordinates are strengths, shape `(size,)`."""
+        strong = self._of(self.form.strength)
+        if not self.each.any():
+            return strong
+        return np.concatenate([strong[~self.each], np.tile(strong[self.each], len(self.maps))])
+
+    def _of(self, paths: Sequence[str]) -> np.ndarray:
+        return np.concatenate([np.full(math.prod(info.shape), info.path in paths) for info in self.maps[0].table])
 
     @property
     def size(self) -> int:

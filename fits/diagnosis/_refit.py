@@ -91,20 +91,26 @@ class Refit:
         scaled = plain * wider * wider[:, None] if robust else plain
         return np.where(seen[:, None] & seen, scaled, np.diag(np.where(seen, 0.0, _ANYTHING)))
 
-    def determined(self) -> bool:
-        """Whether the data determine the strength of the last effect, in some run at least, within its bounds."""
+    def determined(self, whatever: bool = True) -> bool:
+        """Whether the data determine the strength of the last effect, in some run at least, within its bounds.
+
+        It is determined whatever its other coordinates are, as its time constant, or else beside them as they were
+        found: where an effect is weak, the records may show no more than that it is there.
+        """
         law, x = self.laws[-1], self.x[-1]
         if not law.form.strength:
             return True
         if law.pinned(x):
             return False
-        covariance = self.covariance(robust=False)[-law.size :, -law.size :]
+        varied = np.arange(law.size) if whatever else np.flatnonzero(law.strengths)
+        before = self.tangent.shape[1] - law.size
+        beside = replace(self, tangent=self.tangent[:, [*range(before), *(before + varied)]])
+        covariance = beside.covariance(robust=False)[before:, before:]
         found = False
         for run in range(len(law.maps) if law.each.any() else 1):
             here = strength_of(law, x, run)
-            slope = np.stack(
-                [(strength_of(law, x + step, run) - here) / _STEP for step in _STEP * np.eye(law.size)], axis=1
-            )
+            moves = _STEP * np.eye(law.size)[varied]
+            slope = np.stack([(strength_of(law, x + move, run) - here) / _STEP for move in moves], axis=1)
             sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
             found = found or bool(np.any(np.abs(here) > _DETERMINED * sd))
         return found
@@ -158,8 +164,8 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
     return unknown if unknown.criterion(projector.count) < found.criterion(projector.count) else found
 
 
-def relocate(bench: Bench, projector: Projector, model: Refit) -> Refit:
-    """Look for a better instant of what happened at one, farther than a fit's steps see.
+def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -> Refit:
+    """Look for a better instant of what happened at one, farther than a fit's steps see, in laws from the `first` on.
 
     The sum of squares over the instant is jagged where the stage rings: better ones are tried on both sides, nearer
     and nearer.
@@ -167,7 +173,8 @@ def relocate(bench: Bench, projector: Projector, model: Refit) -> Refit:
     runs = range(len(bench.prepared))
     step_s = _AROUND * min(one.run.record.duration_s for one in bench.prepared)
     least_s = min(float(np.median(np.diff(one.run.record.time_s))) for one in bench.prepared)
-    for k, law in enumerate(model.laws):
+    for k in range(first, len(model.laws)):
+        law = model.laws[k]
         while hasattr(law.effect(model.x[k], 0), "after_s") and step_s > least_s:
             found = [model]
             for way in (-step_s, step_s):

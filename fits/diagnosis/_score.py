@@ -113,7 +113,8 @@ def evidence(columns: np.ndarray, residual: np.ndarray, positive: bool) -> tuple
 
 def _evidence(gram: np.ndarray, cross: np.ndarray, positive: bool) -> tuple[float, np.ndarray, float]:
     k = len(cross)
-    scale = np.sqrt(np.diagonal(gram)) + 1e-300
+    # What shows nowhere has no multiple: rounding over nothing would be one.
+    scale = np.where(np.diagonal(gram) > 0, np.sqrt(np.diagonal(gram)), 1.0)
     normal = gram / scale[:, None] / scale[None, :]
     coefficients = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ (cross / scale) / scale
     if positive and k == 1 and coefficients[0] < 0:
