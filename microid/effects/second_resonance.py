@@ -56,7 +56,7 @@ class SecondResonance(AbstractEffect):
         """Frequencies from 1.15 to 6 times the first resonance, close enough for the peaks between them to be met."""
         if scales.resonance_Hz is None or inner is None:
             return ()
-        first, last = 1.15 * scales.resonance_Hz, min(6 * scales.resonance_Hz, 0.2 / scales.interval_s)
+        first, last = 1.15 * scales.resonance_Hz, min(6 * scales.resonance_Hz, 0.45 / scales.interval_s)
         grid = np.geomspace(first, last, 40) if last > first else np.zeros(0)
         share, damping = jnp.asarray(0.01), jnp.asarray(0.03)
         return tuple((cls(inner, share, jnp.asarray(float(frequency)), damping),) for frequency in grid)
