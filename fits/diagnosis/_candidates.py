@@ -55,9 +55,11 @@ class Bench:
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
         """Those that a run may be asked about: none that is its own and too fast for its samples."""
-        interval_s = float(np.median(np.diff(prepared.run.record.time_s)))
+        record = prepared.run.record
+        interval_s = float(np.median(np.diff(record.time_s)))
+        effects = [effect.seen(interval_s, record.duration_s) for effect in effects]
         if not self.resonance_Hz * interval_s > _PERIOD:
-            return list(effects)
+            return effects
         return [effect for effect in effects if not (effect.fast and effect.per_run)]
 
     def change(

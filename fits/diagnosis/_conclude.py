@@ -87,7 +87,8 @@ def conclude(
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
         model, kept = found.plain, ()
         rest_share = (max(explained + max(rest - rest_freedom, 0.0), 0.0) / projector.count) ** 0.5
-        left_over = rest_share > _REST
+        # What is beyond chance is there, however small it is.
+        left_over = rest_share > _REST or not weak
         extended, compared, effects = _extended(ready, found, None)
     cyclic = not rounded and cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)
     if cyclic:

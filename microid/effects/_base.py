@@ -138,6 +138,10 @@ class AbstractEffect(AbstractPart):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Pass a signal on; `start` is the `Scene` of the record."""
 
+    def seen(self, interval_s: float, duration_s: float) -> Self:
+        """What is left of it to be asked about in a record with this time between samples and this duration."""
+        return self
+
 
 # Every form of every effect, in the order of the files.
 EFFECTS: list[type[AbstractEffect]] = []
