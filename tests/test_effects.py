@@ -250,3 +250,35 @@ def test_losses_are_sought_within_the_shortest_record():
     for length in (short_s, long_s):
         inside = np.r_[0, instants[instants < length], length]
         assert np.diff(inside).max() < length / 6
+
+
+def test_second_modes_are_sought_wherever_samples_show_them():
+    sizes = replace(scales(), resonance_Hz=100.0, interval_s=1 / 900)
+    inner = plain_stage()["mechanics"]
+    for form in ("", "added"):
+        at_Hz = np.array(
+            [float(one.frequency_Hz) for (one,) in BY_NAME["second_resonance", form].probes(sizes, inner)]
+        )
+        # Up to six times the first, but for what lies above half the sampling rate.
+        for mode_Hz in np.linspace(120, 400, 20):
+            assert np.min(np.abs(at_Hz - mode_Hz)) < 0.03 * mode_Hz
+        assert at_Hz.max() < 450
+
+
+@pytest.mark.parametrize("mains_Hz", [50, 60])
+def test_lines_that_samples_turn_into_a_drift_are_left_out(mains_Hz, rng):
+    """How often each line seems to go round is counted at the samples, for mains as slow and fast as they come."""
+    hum = BY_NAME["mains_hum", f"{mains_Hz}_Hz"](jnp.ones(3), jnp.ones(3), jnp.asarray(float(mains_Hz)))
+    for rate_Hz in (*rng.uniform(20, 2000, 30), 2 * mains_Hz, mains_Hz, 3 * mains_Hz, 1.5 * mains_Hz):
+        time_s = np.arange(int(rate_Hz * rng.choice([0.5, 5.0, 50.0]))) / rate_Hz
+        periods = np.empty((3, 41))
+        for h in range(3):
+            for k, share in enumerate(np.linspace(-0.002, 0.002, 41)):
+                line = np.exp(2j * np.pi * (h + 1) * mains_Hz * (1 + share) * time_s)
+                periods[h, k] = abs(np.angle(np.vdot(line[:-1], line[1:]))) * (len(line) - 1) / (2 * np.pi)
+        seen = np.asarray(hum.seen(1 / rate_Hz, time_s[-1]).cosine_um)
+        np.testing.assert_array_equal(seen, np.asarray(hum.seen(1 / rate_Hz, time_s[-1]).sine_um))
+        for h in range(3):
+            least = periods[h].min()
+            if abs(least - 3) > 0.5:
+                assert seen[h] == (least > 3), (rate_Hz, h, least)

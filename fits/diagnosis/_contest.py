@@ -7,14 +7,14 @@ import numpy as np
 
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, refit_beside, relocate
+from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
 from fits.diagnosis._score import Scored, rescore
 from fits.diagnosis._settle import settled
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
 _LEADERS, _FORMS = 5, 2
-# Scores below this share of the best are not worth a fit.
-WORTH = 0.4
+# Scores below this share of the best are not worth a fit, or below that of an effect that the best is mistaken for.
+WORTH, _CONFUSED = 0.4, 0.2
 # Differences of the criterion, and standard deviations after projecting one effect off another, within which two
 # effects are not told apart.
 SAME, _APART = 10.0, 4.0
@@ -55,7 +55,10 @@ def contest(
     """Fit the leaders beside what is there and explains so much, the best first; none as more than `laws`."""
     best = best_of(scores)
     top = max(one.z for one in scores)
-    names = [name for name, one in best.items() if one.z > WORTH * top][:_LEADERS]
+    first = next(iter(best.values())).probe.effects[0]
+    names = [name for name, one in best.items() if one.z > (_CONFUSED if name in first.confusions else WORTH) * top][
+        :_LEADERS
+    ]
     fitted: dict[str, Refit] = {}
     bare = Projector(projector.regression, projector.noise)
     before = bare.ahead(model.change_um)
@@ -94,15 +97,26 @@ def contest(
 
 def _counted(bench: Bench, projector: Projector, found: Refit, own: Sequence[Scored], most: int) -> Refit:
     """Add what happens one at a time, as a loss of samples, for as long as that pays: several look like a drift."""
+    first = len(found.laws) - 1
     while found.laws[-1].form.counted and len(found.laws) < most:
-        left = rescore(own, found.basis(), found.residual)
-        more = refit_beside(bench, projector, found, max(left, key=lambda one: one.z))
+        more = _one_more(bench, projector, found, own)
         if not (more.determined() and _whole(bench, more)):
             break
         if more.criterion(projector.count) > found.criterion(projector.count) - SAME:
             break
-        found = more
+        for _ in range(first, len(more.laws)):
+            # Alone it stood for all of them: each in turn is put where the others leave most.
+            laws, x = ([*one[:first], *one[first + 1 :]] for one in (more.laws, more.x))
+            moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), own)
+            more = min(more, moved, key=lambda one: one.cost)
+        found = relocate(bench, projector, more, first)
     return found
+
+
+def _one_more(bench: Bench, projector: Projector, model: Refit, own: Sequence[Scored]) -> Refit:
+    left = rescore(own, model.basis(), model.residual)
+    more = refit_beside(bench, projector, model, max(left, key=lambda one: one.z))
+    return relocate(bench, projector, more, len(model.laws))
 
 
 def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: float) -> list[Rival]:

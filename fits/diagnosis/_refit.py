@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import jax.numpy as jnp
 import numpy as np
@@ -165,7 +166,7 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
 
 
 def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -> Refit:
-    """Look for a better instant of what happened at one, farther than a fit's steps see, in laws from the `first` on.
+    """Look for better instants of what happened at one, farther than a fit's steps see, in laws from the `first` on.
 
     The sum of squares over the instant is jagged where the stage rings: better ones are tried on both sides, nearer
     and nearer.
@@ -173,21 +174,19 @@ def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -
     runs = range(len(bench.prepared))
     step_s = _AROUND * min(one.run.record.duration_s for one in bench.prepared)
     least_s = min(float(np.median(np.diff(one.run.record.time_s))) for one in bench.prepared)
-    for k in range(first, len(model.laws)):
-        law = model.laws[k]
-        while hasattr(law.effect(model.x[k], 0), "after_s") and step_s > least_s:
-            found = [model]
-            for way in (-step_s, step_s):
-                here = [law.effect(model.x[k], run) for run in runs]
-                moved = Law([_later(one, way, least_s) for one in here], law.remembers)
-                laws, x = list(model.laws), list(model.x)
-                laws[k], x[k] = moved, moved.start
-                found.append(refit(bench, projector, laws, x, 2))
-            best = min(found, key=lambda one: one.cost)
-            if best is model:
-                step_s /= 2
-            model = best
-            law = model.laws[k]
+    at = [k for k in range(first, len(model.laws)) if hasattr(model.laws[k].effect(model.x[k], 0), "after_s")]
+    while at and step_s > least_s:
+        found = [model]
+        for k, way in product(at, (-step_s, step_s)):
+            here = [model.laws[k].effect(model.x[k], run) for run in runs]
+            moved = Law([_later(one, way, least_s) for one in here], model.laws[k].remembers)
+            laws, x = list(model.laws), list(model.x)
+            laws[k], x[k] = moved, moved.start
+            found.append(refit(bench, projector, laws, x, 2))
+        best = min(found, key=lambda one: one.cost)
+        if best is model:
+            step_s /= 2
+        model = best
     return model
 
 

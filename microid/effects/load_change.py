@@ -87,10 +87,10 @@ class LoadChangeWithin(AbstractEffect):
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
-        """One percent more, from nine instants of the shortest record on."""
+        """One percent more, from many instants of the shortest record on, as it may ring for a short while only."""
         if scales.resonance_Hz is None or inner is None:
             return ()
-        instants = scales.shortest_s * np.arange(1, 10) / 10
+        instants = scales.shortest_s * np.arange(1, 20) / 20
         return tuple((cls(inner, jnp.asarray(0.01), jnp.asarray(float(at))),) for at in instants)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:

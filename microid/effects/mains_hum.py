@@ -128,7 +128,8 @@ def _seen(effect: Any, mains_Hz: float, interval_s: float, duration_s: float) ->
     seen = (shifted_Hz - _TOLERANCE * lines_Hz) * duration_s > _PERIODS
     if seen.all():
         return effect
-    return replace(effect, cosine_um=effect.cosine_um * seen, sine_um=effect.sine_um * seen)
+    share = seen.astype(float)
+    return replace(effect, cosine_um=effect.cosine_um * share, sine_um=effect.sine_um * share)
 
 
 def _hum(

@@ -1,0 +1,158 @@
+"""Which effects explain most: planted in what a plain stage leaves, by NumPy and the virtual bench."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from data_synth._mechanics import Mechanics, Mode
+from fits import Record
+from fits._design import Grid
+from fits._fit_stage import default_stage
+from fits._stage_moments import Chain
+from fits._stage_run import place_of_hysteresis, prepare_stage_run
+from fits._stage_uncertainty import offsets_out
+from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._candidates import Bench, probes_of, scales_of
+from fits.diagnosis._contest import INEXACT, best_of, contest
+from fits.diagnosis._law import Law
+from fits.diagnosis._noise import Noise
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import Refit, nothing
+from fits.diagnosis._regression import regress
+from fits.diagnosis._score import score
+from fits.diagnosis._select import _inexact, select
+from microid import EFFECTS
+from microid.effects.aging import Aging
+
+LEVELS, RANGE_V, NOISE_UM = 10, (0.0, 100.0), 0.01
+RATE_HZ = 4000.0
+
+
+def stage_on(rng, records):
+    """A plain stage whose density is drawn at random, as if it had been fitted to these records."""
+    stage = default_stage()
+    grid = Grid(*RANGE_V, LEVELS)
+    chain = Chain(offsets_out(stage, True), place_of_hysteresis(stage), grid)
+    columns_um = np.random.default_rng(rng).uniform(0.2, 1.0, grid.columns)
+    runs, fine = (
+        tuple(prepare_stage_run(record, RANGE_V, "negative", 0.0, stride) for record in records) for stride in (4, 16)
+    )
+    z = np.asarray(chain.coordinates.of(stage))
+    prior = np.eye(grid.columns)
+    return Baseline(chain, z, columns_um, prior, 10.0, RANGE_V, runs, (), runs, (), fine, (), fine, (), True, ())
+
+
+def made(rng, plant):
+    """What a diagnosis has in hand, where `plant` makes what was measured of time, command and plain response."""
+    seed = int(rng.integers(2**31))
+    slow_s, fast_s = np.arange(900) / 45.0, np.arange(4000) / RATE_HZ
+    slow_V = 50 + 50 * np.cos(2 * np.pi * 0.3 * slow_s) * (1 - 0.03 * slow_s)
+    fast_V = 50 + 40 * np.sin(2 * np.pi * (10 + 150 * fast_s) * fast_s)
+    bare = [Record(t, v, v / 10, source=name) for name, t, v in (("slow", slow_s, slow_V), ("fast", fast_s, fast_V))]
+    bench = Bench(stage_on(seed, bare), finest=True)
+    entering_um = [np.asarray(known[-2].values) for known in bench.known]
+    measured = [
+        Record(one.time_s, one.voltage_V, out + NOISE_UM * rng.standard_normal(len(out)), source=one.source)
+        for one, out in zip(bare, plant(bench, entering_um), strict=True)
+    ]
+    bench = Bench(stage_on(seed, measured))
+    projector = Projector(regress(bench.baseline), [Noise(NOISE_UM, np.zeros(0))] * 2, (0.02, 0.05))
+    return SimpleNamespace(bench=bench, projector=projector, scales=scales_of(bench, NOISE_UM))
+
+
+def asked(case, *names):
+    forms = [form for form in EFFECTS if form.name in names]
+    return [probe for form in forms for probe in probes_of(case.bench, form, case.scales)]
+
+
+def first_of(case, *names):
+    model = nothing(case.bench, case.projector)
+    scores = score(case.projector, asked(case, *names), model.residual)
+    return contest(case.bench, case.projector, model, scores, 0.0, 8)[0]
+
+
+def test_a_load_put_on_within_a_record_is_found_to_a_few_samples(rng):
+    # The sum of squares over the instant is jagged: from the nearest probe, a fit ends in another of its minima.
+    at_s, mass = rng.uniform(0.15, 0.3), rng.uniform(1.01, 1.03)
+
+    def plant(bench, entering_um):
+        fine_s = np.arange(len(entering_um[1])) / RATE_HZ / bench.prepared[1].run.samples.stride
+        mechanics = bench.stage.parts[-1]
+        mode = Mode(float(mechanics.natural_frequency_Hz), float(mechanics.damping_ratio))
+        with_, without = (
+            Mechanics(mode, load=load).respond(entering_um[1], fine_s) for load in ((mass, at_s), (1.0, at_s))
+        )
+        change = (with_ - without)[:: bench.prepared[1].run.samples.stride][:4000]
+        return [bench.plain[0], bench.plain[1] + float(mechanics.gain) * change]
+
+    found = first_of(made(rng, plant), "load_change", "stiffness_hardening")
+    effect = found.refit.effects(1)[0]
+    print(at_s, mass, float(effect.after_s), float(effect.mass_ratio))
+    assert found.name == "load_change"
+    assert abs(float(effect.after_s) - at_s) < 10 / RATE_HZ
+    assert float(effect.mass_ratio) == pytest.approx(mass - 1, rel=0.2)
+
+
+def test_two_losses_are_no_drift_of_the_clock(rng):
+    lost = np.sort(rng.choice(np.arange(600, 3400, 400), 2, replace=False))
+
+    def plant(bench, entering_um):
+        # Readings come earlier by one sample after each loss.
+        k = np.arange(4000)
+        ahead = k + (k[:, None] >= lost).sum(1)
+        return [bench.plain[0], bench.plain[1][np.minimum(ahead, 3999)]]
+
+    found = first_of(made(rng, plant), "dropped_samples", "clock_mismatch")
+    instants = np.sort([float(effect.after_s) for effect in found.refit.effects(1)]) * RATE_HZ
+    print(lost, instants, found.cost, [float(e.dropped_s) * RATE_HZ for e in found.refit.effects(1)])
+    assert found.name == "dropped_samples"
+    assert len(instants) == 2
+    assert np.all(np.abs(instants - lost) < 10)
+
+
+def test_hum_raises_no_bar_for_what_the_command_makes(rng):
+    delay_s = float(rng.uniform(3e-4, 4e-4))
+
+    def plant(bench, entering_um):
+        # The hum explains so much that a part of it would hide what is late, were it a model of the same misfit.
+        times = [np.asarray(one.run.record.time_s) for one in bench.prepared]
+        late = [np.interp(t - delay_s, t, p) for t, p in zip(times, bench.plain, strict=True)]
+        return [p + 0.5 * np.cos(2 * np.pi * 50 * t + rng.uniform(0, 6)) for t, p in zip(times, late, strict=True)]
+
+    case = made(rng, plant)
+    probes = asked(case, "mains_hum", "transport_delay")
+    plain = best_of(score(case.projector, probes, nothing(case.bench, case.projector).residual))
+    found = select(case.bench, case.projector, probes, 0.01, rng, lambda _: None)
+    print({name: one.z for name, one in plain.items()}, [(cause.name, cause.z) for cause in found.causes])
+    assert [cause.name for cause in found.causes] == ["mains_hum", "transport_delay"]
+    assert found.causes[1].z < INEXACT * found.causes[0].z
+
+
+def test_a_further_column_must_explain_more_beside_a_cause():
+    column, plain = (
+        SimpleNamespace(probe=SimpleNamespace(effects=(object.__new__(form),)), name=form.name)
+        for form in EFFECTS
+        if (form.name, form.form) in {("cross_coupling", ""), ("slew_limit", "")}
+    )
+    assert _inexact(column, {"thermal_drift"}) > _inexact(plain, {"thermal_drift"})
+
+
+@pytest.mark.parametrize(("z", "there"), [(8.0, True), (1.0, False)])
+def test_a_weak_cause_may_show_only_as_a_product(rng, z, there):
+    # Long before a time constant is over, a strength and that constant show by their ratio alone.
+    law = Law([Aging(jnp.asarray(0.01), jnp.asarray(500.0))])
+    strength = np.asarray(law.strengths)
+    assert strength.sum() == 1
+    along = rng.standard_normal(1000)
+    tangent = np.empty((1000, law.size))
+    # So long that its strength is so many standard deviations, and another coordinate does nearly the same.
+    step = 1e-4
+    slope = (float(law.effect(law.start + step * strength, 0).gain_per_decade) - 0.01) / step
+    along *= z * slope / 0.01 / np.linalg.norm(along)
+    tangent[:, strength] = along[:, None]
+    tangent[:, ~strength] = (along + 1e-3 * rng.standard_normal(1000))[:, None]
+    one = Refit((law,), (law.start,), (), rng.standard_normal(1000), tangent, 1000.0)
+    assert not one.determined()
+    assert one.determined(False) == there
