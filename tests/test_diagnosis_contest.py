@@ -47,7 +47,7 @@ def stage_on(rng, records):
 def made(rng, plant):
     """What a diagnosis has in hand, where `plant` makes what was measured of time, command and plain response."""
     seed = int(rng.integers(2**31))
-    slow_s, fast_s = np.arange(900) / 45.0, np.arange(4000) / RATE_HZ
+    slow_s, fast_s = np.arange(3300) / 165.0, np.arange(4000) / RATE_HZ
     slow_V = 50 + 50 * np.cos(2 * np.pi * 0.3 * slow_s) * (1 - 0.03 * slow_s)
     fast_V = 50 + 40 * np.sin(2 * np.pi * (10 + 150 * fast_s) * fast_s)
     bare = [Record(t, v, v / 10, source=name) for name, t, v in (("slow", slow_s, slow_V), ("fast", fast_s, fast_V))]
@@ -73,7 +73,7 @@ def first_of(case, *names):
     return contest(case.bench, case.projector, model, scores, 0.0, 8)[0]
 
 
-def test_a_load_put_on_within_a_record_is_found_to_a_few_samples(rng):
+def test_a_load_put_on_within_a_record_is_found_to_a_period_of_the_ringing(rng):
     # The sum of squares over the instant is jagged: from the nearest probe, a fit ends in another of its minima.
     at_s, mass = rng.uniform(0.15, 0.3), rng.uniform(1.01, 1.03)
 
@@ -91,7 +91,7 @@ def test_a_load_put_on_within_a_record_is_found_to_a_few_samples(rng):
     effect = found.refit.effects(1)[0]
     print(at_s, mass, float(effect.after_s), float(effect.mass_ratio))
     assert found.name == "load_change"
-    assert abs(float(effect.after_s) - at_s) < 10 / RATE_HZ
+    assert abs(float(effect.after_s) - at_s) < 0.01
     assert float(effect.mass_ratio) == pytest.approx(mass - 1, rel=0.2)
 
 
@@ -109,7 +109,7 @@ def test_two_losses_are_no_drift_of_the_clock(rng):
     print(lost, instants, found.cost, [float(e.dropped_s) * RATE_HZ for e in found.refit.effects(1)])
     assert found.name == "dropped_samples"
     assert len(instants) == 2
-    assert np.all(np.abs(instants - lost) < 10)
+    assert np.all(np.abs(instants - lost) < 40)
 
 
 def test_hum_raises_no_bar_for_what_the_command_makes(rng):
