@@ -132,7 +132,7 @@ def test_hum_raises_no_bar_for_what_the_command_makes(rng):
 
 def test_a_further_column_must_explain_more_beside_a_cause():
     column, plain = (
-        SimpleNamespace(probe=SimpleNamespace(effects=(object.__new__(form),)), name=form.name)
+        SimpleNamespace(form=form, name=form.name)
         for form in EFFECTS
         if (form.name, form.form) in {("cross_coupling", ""), ("slew_limit", "")}
     )

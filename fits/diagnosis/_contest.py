@@ -55,7 +55,7 @@ def contest(
     """Fit the leaders beside what is there and explains so much, the best first; none as more than `laws`."""
     best = best_of(scores)
     top = max(one.z for one in scores)
-    first = next(iter(best.values())).probe.effects[0]
+    first = next(iter(best.values())).form
     names = [name for name, one in best.items() if one.z > (_CONFUSED if name in first.confusions else WORTH) * top][
         :_LEADERS
     ]
@@ -66,7 +66,7 @@ def contest(
         own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
         tried: dict[type, int] = {}
         for one in own:
-            form = type(one.probe.effects[0])
+            form = one.form
             if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < WORTH * own[0].z:
                 continue
             tried[form] = tried.get(form, 0) + 1

@@ -118,7 +118,7 @@ def remembering(law: Law, x: np.ndarray) -> Law:
 
 def law_of(scored: Scored, runs: int, more: float = 1.0) -> Law:
     """Start from a probe and the multiples of its signatures that the data ask for, or more of them."""
-    form = type(scored.probe.effects[0])
+    form = scored.form
     effects: list[AbstractEffect] = []
     per_run = form.per_run and runs > 1
     for run in range(runs):

@@ -156,7 +156,7 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
     def fit(law: Law, rounds: int) -> Refit:
         return _fit(bench, projector, [*model.laws, law], [*model.x, law.start], len(model.laws), basis, rounds)
 
-    laws = [law_of(scored, runs, more) for more in (_MORE if type(scored.probe.effects[0]).strength else (1.0,))]
+    laws = [law_of(scored, runs, more) for more in (_MORE if scored.form.strength else (1.0,))]
     found = fit(min(laws, key=lambda law: fit(law, 0).cost), _ROUNDS)
     if not found.laws[-1].form.history:
         return found

@@ -8,6 +8,7 @@ from scipy import stats
 
 from fits.diagnosis._candidates import Probe
 from fits.diagnosis._projector import Projector
+from microid import AbstractEffect
 
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
@@ -51,6 +52,11 @@ class Scored:
     def name(self) -> str:
         """Name of the effect."""
         return self.probe.name
+
+    @property
+    def form(self) -> type[AbstractEffect]:
+        """Which model of it."""
+        return type(self.probe.effects[0])
 
 
 def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -> tuple[Scored, ...]:

@@ -125,12 +125,8 @@ def select(
         whole = max(plain.cost - model.cost, 0.0)
         alone = sum(cause.drop for cause in causes if cause.name in _ALONE)
         explained = max(whole - alone, 0.0) ** 0.5
-        open_ = [
-            one
-            for one in left
-            if one.name not in (taken & once) | refused
-            and one.z > (whole**0.5 if one.name in _ALONE else explained) * _inexact(one, taken)
-        ]
+        bars = {one.form: (whole**0.5 if one.name in _ALONE else explained) * _inexact(one, taken) for one in left}
+        open_ = [one for one in left if one.name not in (taken & once) | refused and one.z > bars[one.form]]
         if not open_:
             break
         top = max(one.z for one in open_)
@@ -159,7 +155,8 @@ def select(
             refused.add(first.name)
             continue
         z = max(drop, 0.0) ** 0.5
-        if family.p(z / sigma) >= false_alarm:
+        if family.p(z / sigma) >= false_alarm or z <= bars[first.refit.laws[-1].form]:
+            # It explains less than its score promised.
             refused.add(first.name)
             continue
         bench, projector, model = beside
@@ -239,10 +236,9 @@ def _rivals(first: Rival, fitted: Sequence[Rival], drop: float, exact: bool) -> 
 
 def _inexact(one: Scored, causes: Collection[str]) -> float:
     """Part of what some causes explain that an effect beside them must exceed, by what it is mistaken for."""
-    form = type(one.probe.effects[0])
-    if any(f.name in causes and (one.name in f.confusions or f.name in form.confusions) for f in EFFECTS):
+    if any(f.name in causes and (one.name in f.confusions or f.name in one.form.confusions) for f in EFFECTS):
         return _CONFUSED
-    return _COLUMN if form.needs else INEXACT
+    return _COLUMN if one.form.needs else INEXACT
 
 
 def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Refit) -> tuple[list[Cause], Refit]:
