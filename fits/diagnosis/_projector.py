@@ -58,7 +58,7 @@ class Projector:
         shared = self._joined_rows(
             [np.concatenate([rows, *(k[i] for k in rough)], axis=1) for i, rows in enumerate(regression.rows)]
         )
-        blocks = [shared, self._own_rows(regression.own)]
+        blocks = [shared, self.own_rows]
         if more:
             blocks.append(np.stack([self.join(column) for column in more], axis=1))
         matrix = np.concatenate(blocks, axis=1)
@@ -105,7 +105,10 @@ class Projector:
     def _joined_rows(self, signals: Sequence[np.ndarray]) -> np.ndarray:
         return self.join(signals)
 
-    def _own_rows(self, own: Sequence[np.ndarray]) -> np.ndarray:
+    @property
+    def own_rows(self) -> np.ndarray:
+        """The runs' own unknowns, whitened and joined, shape `(rows, k)`."""
+        own = self.regression.own
         out = np.zeros((self.count + self._priors, sum(o.shape[1] for o in own)))
         row = at = 0
         for o, noise, mask in zip(own, self.noise, self.masks, strict=True):

@@ -10,7 +10,7 @@ from fits.diagnosis._contest import INEXACT, SAME, WORTH, Rival, best_of, contes
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
 from fits.diagnosis._score import Family, Scored, rescore, score
-from fits.diagnosis._settle import Settled, bounded, finely, quieter, settled, smoother, stronger
+from fits.diagnosis._settle import Settled, bounded, finely, renewed, resmoothed, settled, smoother, stronger
 from fits.diagnosis._unswept import FirstWaysError, unswept
 from microid import EFFECTS
 
@@ -105,7 +105,7 @@ def select(
     guessed: bool = False,
     again: int = 2,
 ) -> Selection:
-    """Add effects one at a time until chance explains the rest; where they are less noise, begin again so often.
+    """Add effects one at a time until chance explains the rest; where they passed for noise, begin again so often.
 
     Raises
     ------
@@ -160,10 +160,9 @@ def select(
             refused.add(first.name)
             continue
         bench, projector, model = beside
-        less = quieter(projector, model) if again else None
-        if less is not None:
-            # The cause was taken for noise, too: all is asked again beside what noise there is.
-            afresh = Projector(first_projector.regression, less, projector.roughness)
+        afresh = renewed(first_projector, projector, model) if again else None
+        if afresh is not None:
+            # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
             return select(first_bench, afresh, probes, false_alarm, rng, progress, guessed, again - 1)
         new = len(model.laws) - len(causes)
         causes += [Cause(first.name, z, family.p(z), rivals, drop / new)] * new
@@ -171,7 +170,7 @@ def select(
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
         family = Family(left, rng)
     causes, model = _backward(bench, projector, causes, model)
-    bench, projector, model = smoother(*stronger(bench, projector, model))
+    bench, projector, model = resmoothed(*smoother(*stronger(bench, projector, model)))
     model, finest = finely(bench, projector, model)
     bench, projector, model = bounded(bench, projector, model, finest)
     return Selection(tuple(causes), model, plain, scores, left, family, bench, projector, first_projector, finest)

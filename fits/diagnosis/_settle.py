@@ -9,10 +9,10 @@ import numpy as np
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._faults import find_faults
 from fits.diagnosis._law import Law
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress
+from fits.diagnosis._smoothness import smoothed
 from fits.diagnosis._through import passed
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
@@ -25,6 +25,8 @@ _AGAIN = 8
 _BOUNDED, _MOVED = 4, 0.1
 # Noise or roughness that falls by less than this factor is the same.
 _LESS = 0.8
+# Factor of the prior's precision from which on what a cause does was taken for roughness of the density.
+_SMOOTHER = 10.0
 
 Settled: TypeAlias = tuple[Bench, Projector, Refit]
 
@@ -121,6 +123,22 @@ def smoother(bench: Bench, projector: Projector, model: Refit) -> Settled:
     return settled(bench, Projector(projector.regression, projector.noise, less), model)
 
 
+def resmoothed(bench: Bench, projector: Projector, model: Refit) -> Settled:
+    """Fit the causes again beside a density as smooth as it is beside them, unless that predicts worse."""
+    if not model.laws:
+        return bench, projector, model
+    afresh = smoothed(projector, model.change_um)
+    if not np.trace(afresh.regression.baseline.prior) > np.trace(projector.regression.baseline.prior):
+        # What the causes leave is no roughness.
+        return bench, projector, model
+    moved = settled(Bench(afresh.regression.baseline), afresh, model)
+    before, after = (
+        Projector(there.regression, there.noise).ahead(one.change_um)
+        for there, one in ((projector, model), moved[1:])
+    )
+    return (bench, projector, model) if after > before else moved
+
+
 def finely(bench: Bench, projector: Projector, model: Refit) -> tuple[Refit, bool]:
     """Fit the causes again with many steps between samples, where few are off by more than chance."""
     if not model.laws:
@@ -133,8 +151,16 @@ def finely(bench: Bench, projector: Projector, model: Refit) -> tuple[Refit, boo
     return refit(finer, projector, model.laws, model.x, 4), True
 
 
-def quieter(projector: Projector, model: Refit) -> tuple[Noise, ...] | None:
-    """The noise of the runs beside the causes, where there is less of it than was thought."""
+def renewed(first: Projector, projector: Projector, model: Refit) -> Projector | None:
+    """The projector without causes, with noise and smoothness as they are beside them, where either was misjudged."""
     found = find_faults(projector.regression, model.change_um).noise
     less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
-    return tuple(found) if any(less) else None
+    noise = tuple(found) if any(less) else projector.noise
+    smooth = smoothed(Projector(projector.regression, noise, projector.roughness), model.change_um).regression
+    old, new = (np.trace(one.baseline.prior) for one in (first.regression, smooth))
+    if not any(less) and not new > _SMOOTHER * old:
+        return None
+    if not new > _SMOOTHER * old:
+        return Projector(first.regression, noise, first.roughness)
+    baseline = replace(first.regression.baseline, prior=smooth.baseline.prior)
+    return Projector(replace(first.regression, baseline=baseline, root=smooth.root), noise, first.roughness)

@@ -1,0 +1,46 @@
+"""How smooth the density is once causes are known: what they do was roughness of the density before."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import cholesky, qr
+
+from fits._evidence import maximise_evidence
+from fits._moments import Moments
+from fits._prior import Hyper, interpolation, roughness
+from fits._stage_solve import prior_precision
+from fits.diagnosis._projector import Projector
+
+# Levels that are enough to find how smooth a density is.
+_LEVELS = 16
+
+
+def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector:
+    """The same beside a density as smooth as is most probable under what causes change in each run, shape `(n,)`.
+
+    Maximises the evidence for the columns as `solve_grid` does, with the noise as it was found, and the coordinates
+    and the runs' own unknowns free.
+    """
+    regression = projector.regression
+    baseline, count = regression.baseline, projector.count
+    size, stroke_um = len(baseline.columns_um), baseline.stroke_um
+    joined = projector.join(list(regression.rows))[:count]
+    target = (projector.residual - projector.join(change_um))[:count] + joined[:, :size] @ baseline.columns_um
+    others = np.concatenate([joined[:, size:], projector.own_rows[:count]], axis=1)
+    scale = np.linalg.norm(others, axis=0)
+    basis, _ = qr(others[:, scale > 0] / scale[scale > 0], mode="economic")
+    columns = joined[:, :size] * stroke_um
+    columns, target = (one - basis @ (basis.T @ one) for one in (columns, target))
+    left = np.asarray(float(count - basis.shape[1]))
+    moments = Moments(columns.T @ columns, columns.T @ target, np.asarray(target @ target), left)
+    rough, levels = roughness(baseline.chain.levels), baseline.chain.levels
+    if levels > _LEVELS:
+        fewer = interpolation(_LEVELS, levels)
+        moments, rough = moments.project(fewer), rough.project(fewer)
+    start = replace(Hyper.start(), log_variance=jnp.zeros(()))
+    prior = prior_precision(baseline.chain, maximise_evidence(moments, rough, start), stroke_um)
+    root = cholesky(prior + 1e-12 * np.trace(prior) / size * np.eye(size))
+    moved = replace(regression, baseline=replace(baseline, prior=prior), root=root)
+    return Projector(moved, projector.noise, projector.roughness)
