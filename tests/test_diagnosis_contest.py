@@ -13,6 +13,7 @@ from fits._fit_stage import default_stage
 from fits._stage_moments import Chain
 from fits._stage_run import place_of_hysteresis, prepare_stage_run
 from fits._stage_uncertainty import offsets_out
+from fits.diagnosis import _select
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._contest import INEXACT, best_of, contest
@@ -30,34 +31,40 @@ LEVELS, RANGE_V, NOISE_UM = 10, (0.0, 100.0), 0.01
 RATE_HZ = 4000.0
 
 
-def stage_on(rng, records):
+def stage_on(rng, records, smooth):
     """A plain stage whose density is drawn at random, as if it had been fitted to these records."""
     stage = default_stage()
     grid = Grid(*RANGE_V, LEVELS)
     chain = Chain(offsets_out(stage, True), place_of_hysteresis(stage), grid)
     columns_um = np.random.default_rng(rng).uniform(0.2, 1.0, grid.columns)
+    prior = np.eye(grid.columns)
+    if smooth:
+        i, j = np.tril_indices(LEVELS)
+        a, b, c = np.random.default_rng(rng).uniform(0.1, 0.3, 3) / LEVELS
+        columns_um = np.concatenate([0.2 + a * i + b * j, 0.3 + c * np.arange(LEVELS)])
+        # As rough as a misfit makes it believed.
+        prior *= 1e-4
     runs, fine = (
         tuple(prepare_stage_run(record, RANGE_V, "negative", 0.0, stride) for record in records) for stride in (4, 16)
     )
     z = np.asarray(chain.coordinates.of(stage))
-    prior = np.eye(grid.columns)
     return Baseline(chain, z, columns_um, prior, 10.0, RANGE_V, runs, (), runs, (), fine, (), fine, (), True, ())
 
 
-def made(rng, plant):
+def made(rng, plant, smooth=False):
     """What a diagnosis has in hand, where `plant` makes what was measured of time, command and plain response."""
     seed = int(rng.integers(2**31))
     slow_s, fast_s = np.arange(3300) / 165.0, np.arange(4000) / RATE_HZ
     slow_V = 50 + 50 * np.cos(2 * np.pi * 0.3 * slow_s) * (1 - 0.03 * slow_s)
     fast_V = 50 + 40 * np.sin(2 * np.pi * (10 + 150 * fast_s) * fast_s)
     bare = [Record(t, v, v / 10, source=name) for name, t, v in (("slow", slow_s, slow_V), ("fast", fast_s, fast_V))]
-    bench = Bench(stage_on(seed, bare), finest=True)
+    bench = Bench(stage_on(seed, bare, smooth), finest=True)
     entering_um = [np.asarray(known[-2].values) for known in bench.known]
     measured = [
         Record(one.time_s, one.voltage_V, out + NOISE_UM * rng.standard_normal(len(out)), source=one.source)
         for one, out in zip(bare, plant(bench, entering_um), strict=True)
     ]
-    bench = Bench(stage_on(seed, measured))
+    bench = Bench(stage_on(seed, measured, smooth))
     projector = Projector(regress(bench.baseline), [Noise(NOISE_UM, np.zeros(0))] * 2, (0.02, 0.05))
     return SimpleNamespace(bench=bench, projector=projector, scales=scales_of(bench, NOISE_UM))
 
@@ -128,6 +135,35 @@ def test_hum_raises_no_bar_for_what_the_command_makes(rng):
     print({name: one.z for name, one in plain.items()}, [(cause.name, cause.z) for cause in found.causes])
     assert [cause.name for cause in found.causes] == ["mains_hum", "transport_delay"]
     assert found.causes[1].z < INEXACT * found.causes[0].z
+
+
+def test_a_density_is_smooth_again_beside_the_cause(rng, monkeypatch):
+    delay_s = float(rng.uniform(2e-4, 4e-4))
+
+    def plant(bench, entering_um):
+        times = [np.asarray(one.run.record.time_s) for one in bench.prepared]
+        return [np.interp(t - delay_s, t, p) for t, p in zip(times, bench.plain, strict=True)]
+
+    case = made(rng, plant, smooth=True)
+    truth_um = case.bench.baseline.columns_um
+    probes = asked(case, "transport_delay")
+
+    def found():
+        one = select(case.bench, case.projector, probes, 0.01, np.random.default_rng(0), lambda _: None)
+        assert [cause.name for cause in one.causes] == ["transport_delay"]
+        bare = Projector(one.projector.regression, one.projector.noise)
+        moved = bare.move(bare.residual - bare.join(one.model.change_um))
+        sd = np.sqrt(np.diagonal(one.model.covariance(robust=False)))[0]
+        return np.linalg.norm(moved.columns_um - truth_um), float(one.model.effects(1)[0].delay_s), sd
+
+    off, found_s, sd = found()
+    monkeypatch.setattr(_select, "renewed", lambda *_: None)
+    monkeypatch.setattr(_select, "resmoothed", lambda *settled: settled)
+    off_before, found_before_s, sd_before = found()
+    print(off, off_before, delay_s, found_s, found_before_s, sd, sd_before)
+    assert off < 0.5 * off_before
+    assert sd < sd_before
+    assert found_s == pytest.approx(delay_s, rel=0.05)
 
 
 def test_a_further_column_must_explain_more_beside_a_cause():
