@@ -25,8 +25,9 @@ from fits.diagnosis._structure import cycles, further_views, look, together, vie
 from fits.diagnosis._tell import bounds, causes_of
 from microid import AbstractEffect, Stage
 
-# Causes explain at least this part of what is reproducible, or the true ones are not in the library.
-_SHARE = 0.65
+# Causes explain at least this part of what is reproducible, or the true ones are not in the library; with less than
+# the second part they have nothing to do with it.
+_SHARE, _RATHER = 0.65, 0.3
 # What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
 _REST, _CHANCE = 0.3, 1e-6
 # What was kept aside must not be predicted so many times worse, in squares; or not worse at all by causes with less
@@ -87,8 +88,8 @@ def conclude(
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
         model, kept = found.plain, ()
         rest_share = (max(explained + max(rest - rest_freedom, 0.0), 0.0) / projector.count) ** 0.5
-        # What is beyond chance is there, however small it is.
-        left_over = rest_share > _REST or not weak
+        # What is beyond chance is there, however small it is, unless nearly all of the rest is of another kind.
+        left_over = rest_share > _REST or not (weak or share < _RATHER)
         extended, compared, effects = _extended(ready, found, None)
     cyclic = not rounded and cycle_z > _CYCLIC and cycle_drop > _PART * max(rest - rest_freedom, cycle_drop)
     if cyclic:
