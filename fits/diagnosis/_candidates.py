@@ -14,6 +14,8 @@ from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host
 _STEP = 1e-2
 # Part of a period of the resonance between samples, beyond which a run does not resolve it.
 _PERIOD = 0.25
+# Periods of a line in a record, as its samples show it, below which it is a drift as well.
+_PERIODS = 3
 
 
 class Bench:
@@ -57,7 +59,7 @@ class Bench:
         """Those that a run may be asked about: none that is its own and too fast for its samples."""
         record = prepared.run.record
         interval_s = float(np.median(np.diff(record.time_s)))
-        effects = [effect.seen(interval_s, record.duration_s) for effect in effects]
+        effects = [without_drifts(effect, interval_s, record.duration_s) for effect in effects]
         if not self.resonance_Hz * interval_s > _PERIOD:
             return effects
         return [effect for effect in effects if not (effect.fast and effect.per_run)]
@@ -157,6 +159,17 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
                 columns.append(tuple(change))
         if all(np.all(np.isfinite(c)) for column in columns for c in column):
             yield Probe(tuple(group), tuple(columns), one_sided(form))
+
+
+def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float) -> AbstractEffect:
+    """An effect without the lines that samples so far apart may turn into a drift of a record of this duration."""
+    lines_Hz = np.array(effect.lines_Hz)
+    # Samples shift a frequency by a multiple of their rate.
+    shifted_Hz = np.abs(lines_Hz - np.round(lines_Hz * interval_s) / interval_s)
+    seen = (shifted_Hz - effect.tolerance * lines_Hz) * duration_s > _PERIODS
+    if seen.all():
+        return effect
+    return replace(effect, **{name: getattr(effect, name) * seen.astype(float) for name in effect.strength})
 
 
 def _scaled(effect: AbstractEffect, share: float) -> AbstractEffect:

@@ -88,6 +88,9 @@ class AbstractEffect(AbstractPart):
         Whether there may be several of them in a record.
     counted
         Names of the fields that are whole sampling intervals.
+    lines_Hz, tolerance
+        Frequencies of the lines whose amplitudes are the entries of its strengths, and the part by which those may be
+        off: samples may turn a line into a drift.
     fingerprint
         What it leaves in the residual of the plain stage, one sentence.
     confusions
@@ -114,6 +117,8 @@ class AbstractEffect(AbstractPart):
     finite: ClassVar[bool] = False
     repeats: ClassVar[bool] = False
     counted: ClassVar[tuple[str, ...]] = ()
+    lines_Hz: ClassVar[tuple[float, ...]] = ()
+    tolerance: ClassVar[float] = 0.0
 
     @classmethod
     @abc.abstractmethod
@@ -137,10 +142,6 @@ class AbstractEffect(AbstractPart):
     @abc.abstractmethod
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Pass a signal on; `start` is the `Scene` of the record."""
-
-    def seen(self, interval_s: float, duration_s: float) -> Self:
-        """What is left of it to be asked about in a record with this time between samples and this duration."""
-        return self
 
 
 # Every form of every effect, in the order of the files.

@@ -1,6 +1,5 @@
 """Mains hum: lines at the frequency of the mains and its multiples."""
 
-from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
@@ -15,8 +14,6 @@ from microid.effects._base import AbstractEffect, Place, Scales, _times_of, regi
 _HARMONICS, _MOST = 3, 11
 # By which the mains may run fast or slow.
 _TOLERANCE = 0.002
-# Periods of a line in a record, as its samples show it, below which it is a drift as well.
-_PERIODS = 3
 
 
 @register
@@ -42,6 +39,8 @@ class MainsHum(AbstractEffect):
     per_run: ClassVar[bool] = True
     # Its frequency is another one in the next record.
     repeats: ClassVar[bool] = True
+    lines_Hz: ClassVar[tuple[float, ...]] = (50.0, 100.0, 150.0)
+    tolerance: ClassVar[float] = _TOLERANCE
     fingerprint: ClassVar[str] = (
         "Lines in the spectrum at multiples of 50 or 60 Hz, also at rest, whatever the command."
     )
@@ -60,10 +59,6 @@ class MainsHum(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the lines."""
         return _hum(time_s, signal, self.cosine_um, self.sine_um, self.frequency_Hz)
-
-    def seen(self, interval_s: float, duration_s: float) -> Self:
-        """Without the lines that the samples may turn into a drift."""
-        return _seen(self, 50.0, interval_s, duration_s)
 
 
 @register
@@ -87,6 +82,8 @@ class MainsHum60(AbstractEffect):
     per_run: ClassVar[bool] = True
     # Its frequency is another one in the next record.
     repeats: ClassVar[bool] = True
+    lines_Hz: ClassVar[tuple[float, ...]] = (60.0, 120.0, 180.0)
+    tolerance: ClassVar[float] = _TOLERANCE
     fingerprint: ClassVar[str] = MainsHum.fingerprint
     confusions: ClassVar[tuple[str, ...]] = MainsHum.confusions
     experiment: ClassVar[str] = MainsHum.experiment
@@ -104,10 +101,6 @@ class MainsHum60(AbstractEffect):
         """Add the lines."""
         return _hum(time_s, signal, self.cosine_um, self.sine_um, self.frequency_Hz)
 
-    def seen(self, interval_s: float, duration_s: float) -> Self:
-        """Without the lines that the samples may turn into a drift."""
-        return _seen(self, 60.0, interval_s, duration_s)
-
 
 def _lines(cls: Any, scales: Scales, mains_Hz: float) -> tuple[tuple[Any, ...], ...]:
     seen = [h for h in range(1, _HARMONICS + 1) if 2.2 * h * mains_Hz * scales.interval_s < 1]
@@ -119,17 +112,6 @@ def _lines(cls: Any, scales: Scales, mains_Hz: float) -> tuple[tuple[Any, ...], 
         lines = [none.at[h - 1].set(0.01) for h in seen]
         groups.append(tuple(effect for line in lines for effect in (cls(line, none, at), cls(none, line, at))))
     return tuple(groups) if seen else ()
-
-
-def _seen(effect: Any, mains_Hz: float, interval_s: float, duration_s: float) -> Any:
-    lines_Hz = mains_Hz * np.arange(1, _HARMONICS + 1)
-    # Samples shift a frequency by a multiple of their rate.
-    shifted_Hz = np.abs(lines_Hz - np.round(lines_Hz * interval_s) / interval_s)
-    seen = (shifted_Hz - _TOLERANCE * lines_Hz) * duration_s > _PERIODS
-    if seen.all():
-        return effect
-    share = seen.astype(float)
-    return replace(effect, cosine_um=effect.cosine_um * share, sine_um=effect.sine_um * share)
 
 
 def _hum(
