@@ -87,7 +87,7 @@ def test_creep_that_was_under_way(rng):
     values = {one.name: one for one in found.causes[0].parameters}
     assert not any(name.startswith(("recent", "older", "before")) for name in values)
     if found.causes[0].form == "":
-        assert values["gain_per_decade"].value == pytest.approx(gain, abs=4 * values["gain_per_decade"].sd)
+        assert values["gain_per_decade"].value == pytest.approx(gain, rel=0.2)
     # What went on before the record is no part of the stage.
     part = found.extended["creep"]
     assert all(float(getattr(part, name)) == 0 for name in type(part).history)
