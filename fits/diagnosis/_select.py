@@ -10,7 +10,17 @@ from fits.diagnosis._contest import INEXACT, SAME, WORTH, Rival, best_of, contes
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
 from fits.diagnosis._score import Family, Scored, rescore, score
-from fits.diagnosis._settle import Settled, bounded, finely, renewed, resmoothed, settled, smoother, stronger
+from fits.diagnosis._settle import (
+    Settled,
+    bounded,
+    confirmed,
+    finely,
+    renewed,
+    resmoothed,
+    settled,
+    smoother,
+    stronger,
+)
 from fits.diagnosis._unswept import FirstWaysError, unswept
 from microid import EFFECTS
 
@@ -163,7 +173,10 @@ def select(
         afresh = renewed(first_projector, projector, model) if again else None
         if afresh is not None:
             # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
-            return select(first_bench, afresh, probes, false_alarm, rng, progress, guessed, again - 1)
+            found = select(first_bench, afresh, probes, false_alarm, rng, progress, guessed, again - 1)
+            if found.causes and confirmed(found.projector, found.model):
+                return found
+            again = 0
         new = len(model.laws) - len(causes)
         causes += [Cause(first.name, z, family.p(z), rivals, drop / new)] * new
         basis = model.basis()

@@ -26,7 +26,7 @@ _BOUNDED, _MOVED = 4, 0.1
 # Noise or roughness that falls by less than this factor is the same.
 _LESS = 0.8
 # Factor of the prior's precision from which on what a cause does was taken for roughness of the density.
-_SMOOTHER = 10.0
+_SMOOTHER = 1000.0
 
 Settled: TypeAlias = tuple[Bench, Projector, Refit]
 
@@ -128,7 +128,7 @@ def resmoothed(bench: Bench, projector: Projector, model: Refit) -> Settled:
     if not model.laws:
         return bench, projector, model
     afresh = smoothed(projector, model.change_um)
-    if not np.trace(afresh.regression.baseline.prior) > np.trace(projector.regression.baseline.prior):
+    if not _stiffness(afresh) > _SMOOTHER * _stiffness(projector):
         # What the causes leave is no roughness.
         return bench, projector, model
     moved = settled(Bench(afresh.regression.baseline), afresh, model)
@@ -156,11 +156,22 @@ def renewed(first: Projector, projector: Projector, model: Refit) -> Projector |
     found = find_faults(projector.regression, model.change_um).noise
     less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
     noise = tuple(found) if any(less) else projector.noise
-    smooth = smoothed(Projector(projector.regression, noise, projector.roughness), model.change_um).regression
-    old, new = (np.trace(one.baseline.prior) for one in (first.regression, smooth))
-    if not any(less) and not new > _SMOOTHER * old:
-        return None
-    if not new > _SMOOTHER * old:
-        return Projector(first.regression, noise, first.roughness)
+    beside = smoothed(Projector(projector.regression, noise, projector.roughness), model.change_um)
+    is_smoother = _stiffness(beside) > _SMOOTHER * _stiffness(first)
+    if not is_smoother:
+        return Projector(first.regression, noise, first.roughness) if any(less) else None
+    smooth = beside.regression
     baseline = replace(first.regression.baseline, prior=smooth.baseline.prior)
     return Projector(replace(first.regression, baseline=baseline, root=smooth.root), noise, first.roughness)
+
+
+def confirmed(projector: Projector, model: Refit) -> bool:
+    """Whether beside the causes that a smoother density led to, the density is as smooth."""
+    return bool(_SMOOTHER * _stiffness(smoothed(projector, model.change_um)) > _stiffness(projector))
+
+
+def _stiffness(projector: Projector) -> float:
+    """Of the density alone: the reversible slope, in other units, would drown it."""
+    baseline = projector.regression.baseline
+    weights = baseline.chain.size - baseline.chain.levels
+    return float(np.trace(baseline.prior[:weights, :weights]))
