@@ -22,7 +22,7 @@ from fits._prior import Hyper, interpolation, roughness
 from fits._run import Run, simulate_run
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
-_EVIDENCE_LEVELS = 16
+EVIDENCE_LEVELS = 16
 # And this many to say how sure predictions are; finer perturbations move no displacement.
 BELIEF_LEVELS = 24
 # Noise that changes by less, in the logarithm of its variance, is not worth another factorisation.
@@ -73,8 +73,8 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
-    if data.grid.levels > _EVIDENCE_LEVELS:
-        basis = interpolation(_EVIDENCE_LEVELS, data.grid.levels)
+    if data.grid.levels > EVIDENCE_LEVELS:
+        basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
         few, even = moments.project(basis), rough.project(basis)
         hyper = maximise_evidence(few, even, start)
         belief = posterior(moments, rough, hyper)

@@ -191,4 +191,4 @@ def test_a_weak_cause_may_show_only_as_a_product(rng, z, there):
     tangent[:, ~strength] = (along + 1e-3 * rng.standard_normal(1000))[:, None]
     one = Refit((law,), (law.start,), (), rng.standard_normal(1000), tangent, 1000.0)
     assert not one.determined()
-    assert one.determined(False) == there
+    assert one.determined(marginally=False) == there

@@ -82,7 +82,7 @@ def contest(
                 # Of what is only there, what was kept aside must show something, too.
                 most = _SHOWN
             ahead = bare.ahead(found.change_um)
-            if ahead > most * before or not found.determined(False) or not _whole(bench, found):
+            if ahead > most * before or not found.determined(marginally=False) or not _whole(bench, found):
                 continue
             found = _counted(bench, projector, found, own, len(model.laws) + laws)
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):

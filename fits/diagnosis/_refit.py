@@ -92,18 +92,18 @@ class Refit:
         scaled = plain * wider * wider[:, None] if robust else plain
         return np.where(seen[:, None] & seen, scaled, np.diag(np.where(seen, 0.0, _ANYTHING)))
 
-    def determined(self, whatever: bool = True) -> bool:
+    def determined(self, marginally: bool = True) -> bool:
         """Whether the data determine the strength of the last effect, in some run at least, within its bounds.
 
-        It is determined whatever its other coordinates are, as its time constant, or else beside them as they were
-        found: where an effect is weak, the records may show no more than that it is there.
+        Marginally, whatever its other coordinates are, as its time constant, or else beside them as they were found:
+        where an effect is weak, the records may show no more than that it is there.
         """
         law, x = self.laws[-1], self.x[-1]
         if not law.form.strength:
             return True
         if law.pinned(x):
             return False
-        varied = np.arange(law.size) if whatever else np.flatnonzero(law.strengths)
+        varied = np.arange(law.size) if marginally else np.flatnonzero(law.strengths)
         before = self.tangent.shape[1] - law.size
         beside = replace(self, tangent=self.tangent[:, [*range(before), *(before + varied)]])
         covariance = beside.covariance(robust=False)[before:, before:]

@@ -110,7 +110,6 @@ def regress(
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
             for kind, part in zip(kinds, _along(fine, baseline, run, bases, around), strict=True):
                 kind.append(part)
-    trace = np.trace(baseline.prior) / len(baseline.prior)
     return Regression(
         baseline,
         tuple(run.fitted for run in runs),
@@ -118,9 +117,14 @@ def regress(
         tuple(own),
         tuple(tuple(kind) for kind in kinds) if finer is None else finer,
         tuple(residuals),
-        cholesky(baseline.prior + 1e-12 * trace * np.eye(len(baseline.prior))),
+        root_of(baseline.prior),
         through,
     )
+
+
+def root_of(prior: np.ndarray) -> np.ndarray:
+    """Root, in 1/um, of a prior precision of columns, in 1/um^2, both of shape `(D, D)`."""
+    return cholesky(prior + 1e-12 * np.trace(prior) / len(prior) * np.eye(len(prior)))
 
 
 def _alive(own: np.ndarray, fitted: np.ndarray) -> np.ndarray:

@@ -160,7 +160,7 @@ def select(
             # Of effects that these records cannot tell apart, and nothing else can, the one that every rig has.
             rivals = (replace(first, apart=usual.apart), *(rival for rival in rivals if rival is not usual))
             first, beside = usual, settled(bench, projector, usual.refit)
-        if not beside[-1].determined(False) or model.cost - beside[-1].cost < _REAL * drop:
+        if not beside[-1].determined(marginally=False) or model.cost - beside[-1].cost < _REAL * drop:
             # Its strength is anybody's guess, or what it explains is out of reach where all is fitted together.
             refused.add(first.name)
             continue

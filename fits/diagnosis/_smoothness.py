@@ -5,23 +5,22 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import cholesky, qr
+from scipy.linalg import qr
 
 from fits._evidence import maximise_evidence
+from fits._grid import EVIDENCE_LEVELS
 from fits._moments import Moments
 from fits._prior import Hyper, interpolation, roughness
 from fits._stage_solve import prior_precision
 from fits.diagnosis._projector import Projector
-
-# Levels that are enough to find how smooth a density is.
-_LEVELS = 16
+from fits.diagnosis._regression import root_of
 
 
 def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector:
     """The same beside a density as smooth as is most probable under what causes change in each run, shape `(n,)`.
 
-    Maximises the evidence for the columns as `solve_grid` does, with the noise as it was found, and the coordinates
-    and the runs' own unknowns free.
+    Maximises the evidence for the columns as `solve_grid` does, from the noise as it was found, the coordinates and
+    the runs' own unknowns free (MacKay, Neural Computation 4 (1992) 415).
     """
     regression = projector.regression
     baseline, count = regression.baseline, projector.count
@@ -36,11 +35,10 @@ def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector
     left = np.asarray(float(count - basis.shape[1]))
     moments = Moments(columns.T @ columns, columns.T @ target, np.asarray(target @ target), left)
     rough, levels = roughness(baseline.chain.levels), baseline.chain.levels
-    if levels > _LEVELS:
-        fewer = interpolation(_LEVELS, levels)
+    if levels > EVIDENCE_LEVELS:
+        fewer = interpolation(EVIDENCE_LEVELS, levels)
         moments, rough = moments.project(fewer), rough.project(fewer)
     start = replace(Hyper.start(), log_variance=jnp.zeros(()))
     prior = prior_precision(baseline.chain, maximise_evidence(moments, rough, start), stroke_um)
-    root = cholesky(prior + 1e-12 * np.trace(prior) / size * np.eye(size))
-    moved = replace(regression, baseline=replace(baseline, prior=prior), root=root)
+    moved = replace(regression, baseline=replace(baseline, prior=prior), root=root_of(prior))
     return Projector(moved, projector.noise, projector.roughness)
