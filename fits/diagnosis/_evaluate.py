@@ -5,11 +5,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fits._record import Record
 from fits._stage_run import StageRun
 from microid import AbstractEffect, AbstractPart, Scene, Signal, Stage, extend, host, refined
+
+# Samples of all records from which on programs make room for each other.
+_LONG = 20_000
 
 
 @dataclass(frozen=True)
@@ -77,3 +82,13 @@ def with_effects(stage: Stage, effects: Sequence[AbstractEffect]) -> Stage:
 def _rehosted(effect: AbstractEffect, stage: Stage) -> AbstractEffect:
     place = host(type(effect), stage)
     return effect if place is None else replace(effect, inner=stage.parts[place])  # type: ignore[call-arg]
+
+
+def drop_programs(records: Sequence[Record]) -> None:
+    """Give back the memory of all compiled programs, where records are long.
+
+    A program is compiled for runs of one length, those of short runs serve the next diagnosis as well; and several
+    hundred of them take as much memory as long records do.
+    """
+    if sum(len(record) for record in records) >= _LONG:
+        jax.clear_caches()

@@ -11,7 +11,7 @@ from fits._record import Record
 from fits._run import UNSWEPT
 from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
-from fits.diagnosis._evaluate import along_curves, simulate
+from fits.diagnosis._evaluate import along_curves, drop_programs, simulate
 from fits.diagnosis._faults import SINGLE, Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._regression import Regression, regress
@@ -174,6 +174,7 @@ def prepare_diagnosis(
 
     progress("fitting the plain stage")
     here = fitted("first")
+    drop_programs(records)
     progress("simulating every effect")
     for hold in _HOLDS:
         if hold != "first":
@@ -183,7 +184,9 @@ def prepare_diagnosis(
             if drop <= _LATE:
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
+            drop_programs(records)
             other = fitted(hold)
+            drop_programs(records)
             if not (_curved(here, other) if hold == "smooth" else _held(here, other, drop)):
                 continue
             here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
@@ -208,6 +211,7 @@ def prepare_diagnosis(
     rough = learn_roughness(here.projector, [column for probe in probes for column in probe.signatures])
     # What is large and has been used makes room.
     del here
+    drop_programs(records)
     projector = Projector(regression, faults.noise, rough)
     return Prepared(baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
 
