@@ -19,6 +19,8 @@ _ROUNDS, _ROUGH = 40, 12
 _DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
 # A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
 _STATIONARY = 0.02
+# Variance of the noise below which, in squares of the stroke, all is rounding.
+_ROUNDING = 1e-20
 # Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
 _HUBER = 1.345
 LOSSES = ("squares", "huber")
@@ -227,6 +229,9 @@ def _step(
     columns = np.asarray(solution.columns) * stroke_um
     step = answer - follow @ columns
     variance = float(jnp.exp(solution.hyper.log_variance)) * stroke_um**2
+    if not variance > _ROUNDING * stroke_um**2:
+        # The search for the noise went astray.
+        raise FitError(FitStatus.NONFINITE)
     prior = scale_free(prior_precision(chain, solution.hyper, stroke_um), columns)
     information = marginal_information(total, chain.size, prior, variance)
     return step, columns, solution.hyper, variance, float(step @ information @ step / len(step)) ** 0.5

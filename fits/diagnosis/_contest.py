@@ -78,11 +78,12 @@ def contest(
             most = _WORSE if plain else _BETTER
             if one.sure > _PLAIN and model.cost - found.cost > _MOST * (model.cost - projector.count):
                 most = np.inf
-            if not found.determined():
+            alone = found.is_noise(projector) and not model.is_noise(projector)
+            if not found.determined(alone=alone):
                 # Of what is only there, what was kept aside must show something, too.
                 most = _SHOWN
             ahead = bare.ahead(found.change_um)
-            if ahead > most * before or not found.determined(marginally=False) or not _whole(bench, found):
+            if ahead > most * before or not found.determined(False, alone) or not _whole(bench, found):
                 continue
             found = _counted(bench, projector, found, own, len(model.laws) + laws)
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):

@@ -19,6 +19,8 @@ from fits.diagnosis._regression import Regression
 _ROUGHEST = 0.5
 # Squares of singular values of the tangent, over the largest, below which the runs show nothing.
 _SHOWN = 1e-10
+# The farthest that a coordinate moves at a time.
+_FARTHEST = 3.0
 
 
 class Projector:
@@ -165,26 +167,37 @@ class Projector:
 
     def move(self, joined: np.ndarray) -> Baseline:
         """The baseline moved so that it follows a joined signal best, with columns that stay non-negative."""
+        baseline, held = self.regression.baseline, 1.0
+        while True:
+            dz, columns_um = self._followed(joined, held)
+            if np.all(np.abs(dz) < _FARTHEST):
+                return baseline.moved(dz, columns_um - baseline.columns_um)
+            # What the runs hardly show at this place says little of places far away.
+            held *= 10
+
+    def _followed(self, joined: np.ndarray, held: float) -> tuple[np.ndarray, np.ndarray]:
+        """Steps of coordinates that a precision holds, and non-negative columns, that follow a joined signal."""
         baseline = self.regression.baseline
         columns = baseline.chain.size
-        answer = self._answer(joined)
         gram = self.root.T @ self.root
+        cross = gram @ self._answer(joined)
         live = self._live[columns:]
+        coordinate = np.arange(len(live)) < self.regression.size - columns
         own = gram[columns:, columns:][np.ix_(live, live)]
-        own = own + 1e-12 * np.diag(np.diagonal(own))
-        follow = np.zeros((len(live), columns))
+        own = own + np.diag(1e-12 * np.diagonal(own) + held * coordinate[live])
+        alone, follow = np.zeros(len(live)), np.zeros((len(live), columns))
+        alone[live] = np.linalg.solve(own, cross[columns:][live])
         follow[live] = np.linalg.solve(own, gram[columns:, :columns][live])
         precision = gram[:columns, :columns] - gram[:columns, columns:] @ follow
         precision = (precision + precision.T) / 2 + 1e-12 * np.diag(np.diagonal(precision))
-        mean = baseline.columns_um + answer[:columns]
+        mean = baseline.columns_um + np.linalg.solve(precision, cross[:columns] - follow.T @ cross[columns:])
         kept, result = non_negative(
             Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
         )
         if result != RESULTS.successful:
             raise FitError(FitStatus.MAX_STEPS)
-        change = np.asarray(kept) - baseline.columns_um
-        others = answer[columns:] - follow @ (change - answer[:columns])
-        return baseline.moved(others[: self.regression.size - columns], change)
+        others = alone - follow @ (np.asarray(kept) - baseline.columns_um)
+        return others[coordinate], np.asarray(kept)
 
 
 def learn_roughness(

@@ -17,6 +17,8 @@ from microid import AbstractEffect
 _STEP = 1e-3
 # Standard deviations that a strength must be away from zero.
 _DETERMINED = 3.0
+# Standard deviations by which a sum of squares of noise varies.
+_CHANCE = 3.0
 # Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
 _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
@@ -92,14 +94,19 @@ class Refit:
         scaled = plain * wider * wider[:, None] if robust else plain
         return np.where(seen[:, None] & seen, scaled, np.diag(np.where(seen, 0.0, _ANYTHING)))
 
-    def determined(self, marginally: bool = True) -> bool:
+    def is_noise(self, projector: Projector) -> bool:
+        """Whether what is left is no more than noise."""
+        return self.cost < projector.count - projector.freedom + _CHANCE * (2 * projector.count) ** 0.5
+
+    def determined(self, marginally: bool = True, alone: bool = False) -> bool:
         """Whether the data determine the strength of the last effect, in some run at least, within its bounds.
 
         Marginally, whatever its other coordinates are, as its time constant, or else beside them as they were found:
-        where an effect is weak, the records may show no more than that it is there.
+        where an effect is weak, the records may show no more than that it is there. An effect that is as strong as
+        can be stands in for another, unless it `alone` leaves nothing but noise of what was more.
         """
         law, x = self.laws[-1], self.x[-1]
-        if not law.form.strength:
+        if not law.form.strength or (alone and law.pinned(x)):
             return True
         if law.pinned(x):
             return False

@@ -30,9 +30,8 @@ _MOST, _LAWS = 4, 8
 _ALONE = ("mains_hum",)
 # Effects that every piezo has.
 _USUAL = ("creep",)
-# Standard deviations beyond which effects are told apart if one of them leaves no more than noise, which varies by
-# so many standard deviations.
-_CLEAR, _CHANCE = 8.0, 3.0
+# Standard deviations beyond which effects are told apart if one of them leaves no more than noise.
+_CLEAR = 8.0
 # Part of a cause's signature by which its model may be off along its confusions, and along any column of the records:
 # what is slow in both agrees by chance.
 _CONFUSED, _COLUMN = 0.6, 0.15
@@ -153,14 +152,14 @@ def select(
             continue
         first, beside = _leader(bench, projector, probes, model, fitted, best_of(open_), taken & once)
         drop = model.cost - first.refit.cost
-        exact = first.cost < projector.count - projector.freedom + _CHANCE * (2 * projector.count) ** 0.5
-        rivals = _rivals(first, fitted, max(drop, 0.0), exact)
+        rivals = _rivals(first, fitted, max(drop, 0.0), beside[-1].is_noise(beside[1]))
         usual = next((rival for rival in rivals if rival.name in _USUAL and first.name not in _USUAL), None)
         if usual is not None and not any(run.held_out.any() for run in bench.baseline.runs):
             # Of effects that these records cannot tell apart, and nothing else can, the one that every rig has.
             rivals = (replace(first, apart=usual.apart), *(rival for rival in rivals if rival is not usual))
             first, beside = usual, settled(bench, projector, usual.refit)
-        if not beside[-1].determined(marginally=False) or model.cost - beside[-1].cost < _REAL * drop:
+        alone = beside[-1].is_noise(beside[1]) and not model.is_noise(projector)
+        if not beside[-1].determined(False, alone) or model.cost - beside[-1].cost < _REAL * drop:
             # Its strength is anybody's guess, or what it explains is out of reach where all is fitted together.
             refused.add(first.name)
             continue

@@ -6,7 +6,9 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench
+from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._faults import find_faults
 from fits.diagnosis._law import Law
 from fits.diagnosis._projector import Projector, learn_roughness
@@ -23,6 +25,11 @@ _LARGER, _BETTER = 1.5, 10.0
 _AGAIN = 8
 # Rounds beside a density whose zeros stay, and standard deviations below which a coordinate has not moved.
 _BOUNDED, _MOVED = 4, 0.1
+# Derivative of all samples along a coordinate, in noise, that does not show, and what a change must change in them to
+# be seen; the distance to its scale is halved at most so often for that.
+_ASLEEP, _AWAKE, _HALVES = 1.0, 5.0, 16
+# A sum of squares that grows by this factor there is that of a fit gone astray.
+_ASTRAY = 1.5
 # Noise or roughness that falls by less than this factor is the same.
 _LESS = 0.8
 # Factor of the prior's precision from which on what a cause does was taken for roughness of the density.
@@ -34,6 +41,11 @@ Settled: TypeAlias = tuple[Bench, Projector, Refit]
 def settled(bench: Bench, projector: Projector, model: Refit) -> Settled:
     """Let baseline and causes follow each other, unless that makes it worse."""
     moved = settle(bench, projector, relocate(bench, projector, model))
+    awake = _awoken(projector, moved[-1])
+    if awake is not None:
+        there = _at(awake, projector, moved[-1])
+        trial = settle(*there, refit(*there, moved[-1].laws, moved[-1].x, 4))
+        moved = trial if trial[-1].cost < moved[-1].cost else moved
     if moved[-1].cost > model.cost:
         # A baseline that moved without the roughness beyond its grid may have moved away.
         here = refit(bench, projector, model.laws, model.x, 4)
@@ -89,10 +101,13 @@ def bounded(bench: Bench, projector: Projector, model: Refit, finest: bool) -> S
         free = np.concatenate([columns_um > 0, np.ones(regression.size - len(columns_um), dtype=bool)])
         if free.all():
             break
+        last = bench, projector, model
         bench, projector = moved
         rows = tuple(np.where(free, one, 0.0) for one in regression.rows)
         held = Projector(replace(regression, rows=rows), projector.noise, projector.roughness)
         before, model = np.concatenate(model.x), refit(bench, held, model.laws, model.x, 4)
+        if not model.cost < _ASTRAY * last[-1].cost:
+            return last
         sd = np.sqrt(np.diagonal(model.covariance()))
         if np.all(np.abs(np.concatenate(model.x) - before) <= _MOVED * sd):
             break
@@ -103,12 +118,35 @@ def _follow(bench: Bench, projector: Projector, model: Refit, finest: bool = Fal
     """Move the baseline to where the causes leave it."""
     # What roughness beyond the grid would explain is not put into the grid.
     bare = Projector(projector.regression, projector.noise)
-    moved = bare.move(bare.residual - bare.join(model.change_um))
-    effects = [model.effects(run) for run in range(len(bench.prepared))]
+    return _at(bare.move(bare.residual - bare.join(model.change_um)), projector, model, finest)
+
+
+def _at(baseline: Baseline, projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
+    effects = [model.effects(run) for run in range(len(baseline.runs))]
     # What is finer than the grid hardly changes, but where derivatives go through effects.
     plain = not any(projector.regression.through) and not any(map(passed, effects))
-    regression = regress(moved, projector.regression.finer if plain else None, effects)
+    regression = regress(baseline, projector.regression.finer if plain else None, effects)
     return Bench(regression.baseline, finest=finest), Projector(regression, projector.noise, projector.roughness)
+
+
+def _awoken(projector: Projector, model: Refit) -> Baseline | None:
+    """The baseline with coordinates that no longer show, as of a driver without delay, brought back until they do.
+
+    An effect that is not simulated may drive them there, and no tangent leads back.
+    """
+    regression = projector.regression
+    baseline, columns = regression.baseline, regression.baseline.chain.size
+    shown = np.linalg.norm(projector.join([rows[:, columns:] for rows in regression.rows]), axis=0)
+    if not model.laws or np.all(shown > _ASLEEP):
+        return None
+    back = np.where(shown > _ASLEEP, 0.0, -baseline.z)
+    plain = [run.displacement_um - left for run, left in zip(baseline.runs, regression.residuals, strict=True)]
+    for k in range(1, _HALVES):
+        there = baseline.moved(back * (1 - 0.5**k), 0.0)
+        off = [simulate(there.stage, run) - one for run, one in zip(baseline.fine, plain, strict=True)]
+        if float(np.linalg.norm(projector.join(off))) > _AWAKE:
+            return there
+    return None
 
 
 def smoother(bench: Bench, projector: Projector, model: Refit) -> Settled:
