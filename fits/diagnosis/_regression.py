@@ -14,7 +14,7 @@ from fits._stage_moments import Chain, linearise, pieces
 from fits._stage_run import StageRun
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import simulate, with_effects
-from fits.diagnosis._through import behind, dressed, passed
+from fits.diagnosis._through import answering, behind, dressed, passed
 from microid import AbstractEffect
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
@@ -82,7 +82,8 @@ def regress(
     finer
         Structure finer than its grid, from a baseline nearby and under the same effects; computed by default.
     effects
-        Per run, those beside which the baseline moves: the derivatives go through them where that matters.
+        Per run, those beside which the baseline moves: the derivatives along coordinates go through all that answer
+        to the stage, those along columns where that matters.
     """
     chain, runs, z = baseline.chain, baseline.runs, jnp.asarray(baseline.z)
     assert chain.grid is not None
@@ -91,12 +92,13 @@ def regress(
     rows, own, residuals = [], [], []
     kinds: list[list[np.ndarray]] = [[] for _ in bases]
     stage = baseline.stage
-    for run, fine_run, there in zip(runs, baseline.fine, through, strict=True):
+    beside = tuple(map(answering, effects)) if effects else ((),) * len(runs)
+    for run, fine_run, there, own_effects in zip(runs, baseline.fine, through, beside, strict=True):
         here = dressed(chain, baseline.z, there)
         _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
-        both[:, chain.size :] = _slope(baseline, there, fine_run) if there else slope[:n]
+        both[:, chain.size :] = _slope(baseline, own_effects, fine_run) if own_effects else slope[:n]
         for first, columns in pieces(here, z, run, True):
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         around = both[:, : chain.size] @ baseline.columns_um

@@ -15,6 +15,8 @@ from microid import PLACES, AbstractEffect, Coordinates, Signal, Stage
 
 # Directions that are passed on at a time.
 _TOGETHER = 64
+# Places of effects that are added to whatever the stage does.
+_ALONE = ("environment", "noise")
 
 
 class _Dressed(eqx.Module):
@@ -37,6 +39,14 @@ def passed(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
     return tuple(
         one for one in effects if one.finite and not hasattr(one, "inner") and PLACES.index(one.place) <= last
     )
+
+
+def answering(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
+    """Those that do not act by themselves: what they change moves with driver and mechanics.
+
+    A lag of the sensor and one of the driver do nearly the same, so that to tell them apart takes exact derivatives.
+    """
+    return tuple(one for one in effects if one.place not in _ALONE)
 
 
 def dressed(chain: Chain, z: np.ndarray, effects: tuple[AbstractEffect, ...]) -> Chain:
