@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fits.diagnosis._contest import best_of
-from fits.diagnosis._path import limits_of
+from fits.diagnosis._path import limits_of, repeated
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._programs import Program, menu
 from fits.diagnosis._refit import law_of
@@ -17,8 +17,9 @@ from microid import Mechanics
 if TYPE_CHECKING:
     from fits.diagnosis._prepare import Prepared
 
-# Samples of a program: as many as are played virtually, some twenty times, in a bearable time.
-_MOST = 4096
+# Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
+# is repeated so often, if it is short.
+_MOST, _TIMES = 4096, 4
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
 # A class of effects that cannot be told apart counts so many others.
@@ -96,7 +97,7 @@ def suggest(
     baseline = ready.baseline
     resonance = next((float(p.natural_frequency_Hz) for p in baseline.stage.parts if isinstance(p, Mechanics)), None)
     limits = limits_of([run.record for run in baseline.runs], baseline.range_V, resonance, duration_s)
-    predictor = Predictor(ready.bench, ready.projector, hypotheses, pairs)
+    predictor = Predictor(found.bench, found.projector, hypotheses, pairs)
     present = predictor.present_z
     programs = menu(limits, _MOST)
     if not programs:
@@ -107,12 +108,17 @@ def suggest(
     program, z = programs[chosen], scores[chosen]
     progress(f"refining {program.words}")
     parameters, z = refine(program, lambda p: predictor.predicted_z(*program.samples(p)), z)
+    time_s, voltage_V = program.samples(parameters)
+    times = min(_TIMES, int(limits.duration_s / (1.1 * program.limits.duration_s)))
+    if times > 1:
+        time_s, voltage_V = repeated(program.limits, (time_s, voltage_V), times)
+        z = predictor.predicted_z(time_s, voltage_V)
     column = _column(names, ready)
     # What tells nothing is not worth playing.
     if z < 1.0 or (z < _WORTH * present and not column):
         return None
-    time_s, voltage_V = program.samples(parameters)
-    return Experiment(time_s, voltage_V, program.words, _purpose(names, z, present), names, z, present, column)
+    words = program.words if times < 2 else f"{program.words}, {times} times over"
+    return Experiment(time_s, voltage_V, words, _purpose(names, z, present), names, z, present, column)
 
 
 Question = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]

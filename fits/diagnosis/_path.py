@@ -153,3 +153,12 @@ def _slowed(voltage_V: np.ndarray, most_V: float) -> np.ndarray:
         now += min(max(wanted - now, -most_V), most_V)
         out.append(now)
     return np.asarray(out)
+
+
+def repeated(limits: Limits, samples: Samples, times: int) -> Samples:
+    """A program over and over, and between as fast from its end to its beginning as the rig can."""
+    _, voltage_V = samples
+    back = int(np.ceil(abs(voltage_V[0] - voltage_V[-1]) / (limits.fastest_V_per_s * limits.interval_s)))
+    way_V = np.linspace(voltage_V[-1], voltage_V[0], max(back, 1) + 1)[1:-1]
+    whole_V = np.concatenate([np.tile(np.concatenate([voltage_V, way_V]), times - 1), voltage_V])
+    return limits.interval_s * np.arange(len(whole_V)), whole_V

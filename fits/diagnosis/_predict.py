@@ -128,7 +128,9 @@ class Predictor:
             finest_aside=none,
             fine_aside=none,
         )
-        regression, bench = regress(alone), Bench(alone)
+        # As far as the first hypothesis goes, so do the derivatives.
+        first = self._effects(self.hypotheses[0], self._vectors[0])
+        regression, bench = regress(alone, None, (first,)), Bench(alone)
         noise = self._noise(float(time_s[1] - time_s[0]))
         shared = [regression.rows[0], *(regression.finer[kind][0] for kind in self._kinds)]
         columns = []
@@ -146,11 +148,11 @@ class Predictor:
         rows -= own @ (own.T @ rows)
         return rows.T @ rows
 
+    def _effects(self, h: Hypothesis, vectors: Sequence[np.ndarray]) -> list[AbstractEffect]:
+        return [law.maps[self._like](jnp.asarray(v)) for law, v in zip(h.laws, vectors, strict=True)]
+
     def _respond(self, bench: Bench, h: Hypothesis, vectors: Sequence[np.ndarray]) -> np.ndarray:
-        effects: list[AbstractEffect] = [
-            law.maps[self._like](jnp.asarray(v)) for law, v in zip(h.laws, vectors, strict=True)
-        ]
-        return bench.respond([effects])[0]
+        return bench.respond([self._effects(h, vectors)])[0]
 
     def _noise(self, interval_s: float) -> Noise:
         """Noise of the run that was sampled most alike; white where none was."""

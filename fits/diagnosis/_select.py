@@ -31,7 +31,7 @@ _ALONE = ("mains_hum",)
 # Effects that every piezo has.
 _USUAL = ("creep",)
 # Standard deviations beyond which effects are told apart if one of them leaves no more than noise.
-_CLEAR = 8.0
+_CLEAR = 5.0
 # Part of a cause's signature by which its model may be off along its confusions, and along any column of the records:
 # what is slow in both agrees by chance.
 _CONFUSED, _COLUMN = 0.6, 0.15
