@@ -213,6 +213,21 @@ def test_a_narrow_band_is_found(rng):
     assert found.size_um == pytest.approx(0.1, rel=0.35)
 
 
+def test_a_band_of_many_weak_bins_is_found_and_is_no_hum(rng):
+    n, rate = 3600, 64.0
+    voltage = 50 + 50 * np.sin(2 * np.pi * 0.05 * np.arange(n) / rate)
+    # Sampling makes 8 Hz of the second harmonic of 60 Hz.
+    found = band_of(
+        0.05 * rng.standard_normal(n) + 0.1 * narrow(rng, 8 + rng.uniform(-1, 1), 10, rate, n), 1 / rate, voltage
+    )
+    assert found.z > 20
+    assert not found.mains
+    assert found.frequency_Hz == pytest.approx(8, rel=0.25)
+    assert found.size_um == pytest.approx(0.1, rel=0.35)
+    hum = np.cos(2 * np.pi * 120 * np.arange(n) / rate + rng.uniform(0, 6))
+    assert band_of(0.05 * rng.standard_normal(n) + 0.1 * hum, 1 / rate, voltage).mains
+
+
 def test_what_is_no_vibration_is_no_narrow_band(rng):
     n, rate = 20_000, 500.0
     time = np.arange(n) / rate
@@ -222,6 +237,9 @@ def test_what_is_no_vibration_is_no_narrow_band(rng):
     # Part of a chirp, and a multiple of what the command plays.
     passing = 0.5 * np.sin(2 * np.pi * 20 * time) * np.exp(-np.minimum(((time - 20) / 1.5) ** 2, 50))
     assert band_of(white + passing, 1 / rate, voltage).z < 8
+    # A band of noise that fades, as what the model misses of a loop that does.
+    fading = narrow(rng, 20, 10, rate, n) * np.exp(-time / 3)
+    assert band_of(white + 0.5 * fading, 1 / rate, voltage).z < 8
     loops = 50 + 50 * np.sin(2 * np.pi * 5 * time)
     assert band_of(white + 0.3 * np.sin(2 * np.pi * 15 * time), 1 / rate, loops).z < 8
 

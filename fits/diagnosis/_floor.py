@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter, rank_filter
+from scipy.ndimage import median_filter, rank_filter, uniform_filter1d
 
 from fits._stage_run import StageRun
 from fits.diagnosis._noise import Noise, learn_noise, rough_noise_um
@@ -23,6 +23,10 @@ _LONG, _MOSTLY = 60, 0.7
 _STEADY_s = 1.5
 # A narrow band lies within this part of its frequency on either side.
 _WIDE = 0.2
+# Bins that a band may have, the room that it needs in bins of its width, how many times more evidence a broad one
+# must have, and the share of the mean power that nearly every eighth of a record has. No line has so many bins.
+_BROAD = 16
+_WIDTHS, _ROOM, _MORE, _WEAKEST = (1, 4, 16, 64), 12, 3.0, 0.25
 # A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
 # so far away are much smaller.
 SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
@@ -208,7 +212,7 @@ def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float
 
 @dataclass(frozen=True)
 class Band:
-    """The strongest narrow band of a residual: middle, size (rms) and its sd, quality, and evidence."""
+    """The strongest narrow band of a residual: middle, size (rms) and its sd, quality, evidence, and bins."""
 
     frequency_Hz: float
     size_um: float
@@ -216,11 +220,14 @@ class Band:
     quality: float
     z: float
     rate_Hz: float = 0.0
+    bins: int = 1
 
     @property
     def mains(self) -> bool:
         """Whether it is near a line of mains, or near what sampling makes of one, or is nothing at all."""
         rate, own = self.rate_Hz, _DRIFT * 4
+        if self.bins >= _BROAD:
+            return False
         return rate == 0 or any(
             abs(self.frequency_Hz - abs((k * line + rate / 2) % rate - rate / 2))
             < own * k * line + self.frequency_Hz / 60
@@ -247,12 +254,9 @@ def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -
     inside = (frequency > max(2.0, 5 * frequency[1])) & (frequency < min(200.0, 0.45 / interval_s))
     if inside.sum() < 20:
         return none
-    wide = 2 * (len(power) // 16) + 1
-    around = np.maximum(median_filter(power, wide, mode="nearest") / 0.693, 1e-300)
-    best = int(np.argmax(np.where(inside, power / around, 0.0)))
-    chance = float(np.log(inside.sum())) - power[best] / around[best]
+    best, wide, chance, around = _strongest(power, inside)
     # A loop played again and again has lines at multiples of its frequency.
-    lines = median_filter(played, wide, mode="nearest")
+    lines = median_filter(played, 2 * (len(power) // 16) + 1, mode="nearest")
     for k in range(1, 13):
         at = round(best / k)
         near = slice(max(at - 2, 1), at + 3)
@@ -262,6 +266,8 @@ def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -
     swing = np.exp(-2j * np.pi * frequency[best] * interval_s * np.arange(n)) * (residual_um - residual_um.mean())
     blocks = np.array([np.abs(block.sum()) ** 2 for block in np.array_split(swing, 8)])
     if np.sort(blocks)[-2:].sum() > 0.85 * blocks.sum():
+        return none
+    if wide > 1 and not _steady(residual_um, best / n, 2 * wide / n):
         return none
     low = np.searchsorted(frequency, frequency[best] * (1 - _WIDE))
     high = max(np.searchsorted(frequency, frequency[best] * (1 + _WIDE)), best + 4)
@@ -279,4 +285,35 @@ def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -
         float(frequency[best] / width),
         max(-2 * chance, 0.0) ** 0.5,
         1 / interval_s,
+        wide,
     )
+
+
+def _strongest(power: np.ndarray, inside: np.ndarray) -> tuple[int, int, float, np.ndarray]:
+    """Bin of the strongest band, its width in bins, log-probability of as much by chance, and what is around.
+
+    One bin, or the mean of some where that is more by far: one of noise may be low in the very middle of a band.
+    """
+    found = []
+    for wide in _WIDTHS:
+        if _ROOM * wide > inside.sum():
+            break
+        reach = max(len(power) // 16, _ROOM * wide // 2)
+        around = np.maximum(median_filter(power, 2 * reach + 1, mode="reflect") / 0.693, 1e-300)
+        ratio = np.where(inside, uniform_filter1d(power, wide), 0.0) / around
+        best = int(np.argmax(ratio))
+        # Chernoff's bound of the mean of exponential variables, of which the window leaves half; exact for one.
+        high = max(float(ratio[best]), 1.0)
+        above = high if wide == 1 else wide / 2 * (high - 1 - np.log(high))
+        found.append((best, wide, float(np.log(inside.sum() / wide)) - above, around))
+    narrow, broad = found[0], min(found, key=lambda one: one[2])
+    return broad if broad[2] < _MORE * min(narrow[2], -1.0) else narrow
+
+
+def _steady(values: np.ndarray, middle: float, width: float) -> bool:
+    """Whether what is in a band, in parts of the sampling rate, is as strong throughout as noise of that width."""
+    spectrum = np.fft.rfft(values - values.mean())
+    frequency = np.fft.rfftfreq(len(values))
+    part = np.fft.irfft(np.where(np.abs(frequency - middle) < width / 2, spectrum, 0.0), len(values))
+    blocks = np.sort([float(block @ block) for block in np.array_split(part, 8)])
+    return bool(blocks[1] > _WEAKEST * blocks.mean())
