@@ -192,3 +192,19 @@ def test_a_weak_cause_may_show_only_as_a_product(rng, z, there):
     one = Refit((law,), (law.start,), (), rng.standard_normal(1000), tangent, 1000.0)
     assert not one.determined()
     assert one.determined(marginally=False) == there
+
+
+def test_an_effect_at_its_bound_is_a_cause_only_if_nothing_is_left(rng):
+    count, weak = 1000, Law([Aging(jnp.asarray(0.01), jnp.asarray(500.0))])
+    bound = next(info.spec.upper for info in weak.maps[0].table if info.path in Aging.strength)
+    law = Law([Aging(jnp.asarray(0.9999 * bound), jnp.asarray(500.0))])
+    tangent = rng.standard_normal((count, law.size))
+    assert law.pinned(law.start)
+    assert not weak.pinned(weak.start)
+    noise = SimpleNamespace(count=count, freedom=10.0)
+    for cost, alone in ((1000.0, True), (1500.0, False)):
+        one = Refit((law,), (law.start,), (), rng.standard_normal(count), tangent, cost)
+        # 990 values of noise vary by 45.
+        assert one.is_noise(noise) == alone
+        assert not one.determined()
+        assert one.determined(alone=alone) == alone

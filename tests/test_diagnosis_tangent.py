@@ -1,5 +1,7 @@
 """The tangent of a stage with effects that level off, against differences of whole simulations."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,11 +13,19 @@ from fits._stage_moments import Chain
 from fits._stage_run import place_of_hysteresis, prepare_stage_run
 from fits._stage_uncertainty import offsets_out
 from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import simulate, with_effects
+from fits.diagnosis._law import Law
+from fits.diagnosis._noise import Noise
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
+from fits.diagnosis._settle import settled
 from fits.diagnosis._through import passed
 from microid.effects.backlash import Backlash
+from microid.effects.clock_mismatch import ClockMismatch
 from microid.effects.driver_saturation import DriverSaturation
+from microid.effects.sensor_lowpass import SensorLowpass
 from microid.effects.slew_limit import SlewLimit
 from microid.effects.transport_delay import TransportDelay
 
@@ -98,3 +108,58 @@ def test_what_is_finer_than_the_grid_goes_through_it_too(rng):
 def test_only_effects_that_level_off_ahead_of_the_mechanics_are_gone_through():
     late = TransportDelay(jnp.asarray(1e-3))
     assert passed([*EFFECTS.values(), late]) == tuple(EFFECTS.values())
+
+
+@pytest.mark.parametrize("effect", [TransportDelay(jnp.asarray(5e-4)), SensorLowpass(jnp.asarray(5e-4))])
+def test_derivatives_along_the_driver_go_through_what_comes_after(effect, rng):
+    baseline = baseline_of(rng)
+    p = len(baseline.z)
+    beside, plain = (regress(baseline, None, [own, own]) for own in ([effect], []))
+    dz = 1e-4 * rng.standard_normal(p)
+    run = baseline.fine[1]
+    ahead, behind = (simulate(with_effects(baseline.moved(way * dz, 0.0).stage, [effect]), run) for way in (1, -1))
+    truth = (ahead - behind) / 2
+    said, without = (np.linalg.norm(one.rows[1][:, -p:] @ dz - truth) for one in (beside, plain))
+    print(f"off by {said / np.linalg.norm(truth):.2e}, the plain one by {without / np.linalg.norm(truth):.2e}")
+    assert said < 1e-3 * np.linalg.norm(truth)
+    assert without > 0.02 * np.linalg.norm(truth)
+
+
+def test_a_baseline_moves_no_farther_than_its_tangent_holds(rng):
+    baseline = baseline_of(rng)
+    # A driver without delay: no derivative leads away from there.
+    asleep = baseline.moved(np.array([-14.0, *np.zeros(len(baseline.z) - 1)]), 0.0)
+    projector = Projector(regress(asleep), [Noise(0.01, np.zeros(0))] * 2)
+    pull = projector.join([rng.standard_normal(len(run.record)) for run in asleep.runs])
+    moved = projector.move(1e4 * pull)
+    assert np.all(np.isfinite(moved.z))
+    assert np.all(np.abs(moved.z - asleep.z) < 4)
+
+
+def test_a_driver_that_was_fitted_away_comes_back_beside_the_cause(rng):
+    truth, late = baseline_of(rng), ClockMismatch(jnp.asarray(rng.uniform(500.0, 1000.0)))
+    records = [
+        Record(
+            run.record.time_s,
+            run.record.voltage_V,
+            simulate(with_effects(truth.stage, [late]), run) + 0.01 * rng.standard_normal(len(run.record)),
+            source=run.record.source,
+        )
+        for run in truth.fine
+    ]
+    runs, fine = (
+        tuple(prepare_stage_run(record, RANGE_V, "negative", 0.0, stride) for record in records) for stride in (4, 16)
+    )
+    here = replace(truth, runs=runs, coarse=runs, finest=fine, fine=fine)
+    asleep = here.moved(np.array([-14.0, *np.zeros(len(here.z) - 1)]), 0.0)
+    law = Law([late, late])
+
+    def from_(start):
+        bench, projector = Bench(start), Projector(regress(start), [Noise(0.01, np.zeros(0))] * 2)
+        found, _, model = settled(bench, projector, refit(bench, projector, [law], [law.start], 4))
+        print(truth.z, found.baseline.z, float(late.rate_ppm), float(model.effects(1)[0].rate_ppm), model.cost)
+        return found.baseline.z[0], model.cost
+
+    (back, cost), (_, least) = from_(asleep), from_(here)
+    assert back == pytest.approx(truth.z[0], abs=1.0)
+    assert cost < least + 25

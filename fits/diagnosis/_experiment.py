@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
 # is repeated so often, if it is short.
-_MOST, _TIMES = 4096, 4
+_MOST, _TIMES = 4096, 2
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
 # A class of effects that cannot be told apart counts so many others.
@@ -117,7 +117,7 @@ def suggest(
     # What tells nothing is not worth playing.
     if z < 1.0 or (z < _WORTH * present and not column):
         return None
-    words = program.words if times < 2 else f"{program.words}, {times} times over"
+    words = program.words if times < 2 else f"{program.words}, twice over"
     return Experiment(time_s, voltage_V, words, _purpose(names, z, present), names, z, present, column)
 
 
