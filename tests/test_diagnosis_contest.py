@@ -24,8 +24,9 @@ from fits.diagnosis._refit import Refit, nothing
 from fits.diagnosis._regression import regress
 from fits.diagnosis._score import score
 from fits.diagnosis._select import _inexact, select
-from microid import EFFECTS
+from microid import EFFECTS, Sensor
 from microid.effects.aging import Aging
+from microid.effects.voltage_dependent_capacitance import VoltageDependentCapacitance
 
 LEVELS, RANGE_V, NOISE_UM = 10, (0.0, 100.0), 0.01
 RATE_HZ = 4000.0
@@ -195,9 +196,18 @@ def test_a_weak_cause_may_show_only_as_a_product(rng, z, there):
 
 
 def test_an_effect_at_its_bound_is_a_cause_only_if_nothing_is_left(rng):
-    count, weak = 1000, Law([Aging(jnp.asarray(0.01), jnp.asarray(500.0))])
-    bound = next(info.spec.upper for info in weak.maps[0].table if info.path in Aging.strength)
-    law = Law([Aging(jnp.asarray(0.9999 * bound), jnp.asarray(500.0))])
+    count = 1000
+    # Its slope goes to 0.9 at most.
+    weak, law = (
+        Law(
+            [
+                VoltageDependentCapacitance(
+                    Sensor(jnp.ones(()), jnp.zeros(())), jnp.asarray(slope), *[jnp.ones(())] * 2
+                )
+            ]
+        )
+        for slope in (0.1, 0.8999)
+    )
     tangent = rng.standard_normal((count, law.size))
     assert law.pinned(law.start)
     assert not weak.pinned(weak.start)
