@@ -35,7 +35,7 @@ PAIRS = (
 )
 _NONE_PER_EFFECT = 4
 # A worker keeps every program that it has compiled, and is replaced before they fill the memory.
-_TASKS_PER_WORKER = 8
+_TASKS_PER_WORKER = 4
 
 
 def source_digest() -> str:

@@ -2,12 +2,16 @@
 
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
+from fits import Record
 from fits.diagnosis._candidates import Probe
+from fits.diagnosis._evaluate import drop_programs
 from fits.diagnosis._floor import band_of, floor_of, jitter_s, quantum_um, spikes
 from fits.diagnosis._noise import Noise, learn_noise
 from fits.diagnosis._projector import Projector, learn_roughness
@@ -258,3 +262,21 @@ def test_evidence_beside_a_misfit_is_worth_less(rng):
         (found,) = score(projector, [probe([(shape,)])], projector.off(projector.residual))
         assert found.z > 4
         assert (found.sure > 0.6 * found.z) == trusted
+
+
+def test_programs_make_room_where_records_are_long():
+    traced = []
+
+    @jax.jit
+    def program(x):
+        traced.append(1)
+        return x + 1
+
+    def traces_after(n):
+        drop_programs([Record(np.arange(float(n)), np.zeros(n), np.zeros(n), source="run")] * 2)
+        program(jnp.ones(3))
+        return len(traced)
+
+    program(jnp.ones(3))
+    assert traces_after(1000) == 1
+    assert traces_after(10_000) == 2

@@ -8,13 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.backend import get_backend
 
 from fits._record import Record
 from fits._stage_run import StageRun
 from microid import AbstractEffect, AbstractPart, Scene, Signal, Stage, extend, host, refined
 
-# Samples of all records from which on programs make room for each other.
-_LONG = 20_000
+# Samples of all records, and number of programs of some 5 MB each, from which on programs make room for each other.
+_LONG, _MANY = 20_000, 800
 
 
 @dataclass(frozen=True)
@@ -85,10 +86,10 @@ def _rehosted(effect: AbstractEffect, stage: Stage) -> AbstractEffect:
 
 
 def drop_programs(records: Sequence[Record]) -> None:
-    """Give back the memory of all compiled programs, where records are long.
+    """Give back the memory of all compiled programs, where records are long or programs are many.
 
     A program is compiled for runs of one length, those of short runs serve the next diagnosis as well; and several
     hundred of them take as much memory as long records do.
     """
-    if sum(len(record) for record in records) >= _LONG:
+    if sum(len(record) for record in records) >= _LONG or len(get_backend().live_executables()) > _MANY:
         jax.clear_caches()
