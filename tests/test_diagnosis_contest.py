@@ -13,10 +13,10 @@ from fits._fit_stage import default_stage
 from fits._stage_moments import Chain
 from fits._stage_run import place_of_hysteresis, prepare_stage_run
 from fits._stage_uncertainty import offsets_out
-from fits.diagnosis import _select
+from fits.diagnosis import _contest, _select
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
-from fits.diagnosis._contest import INEXACT, best_of, contest
+from fits.diagnosis._contest import INEXACT, Rival, best_of, contest
 from fits.diagnosis._law import Law
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
@@ -118,6 +118,28 @@ def test_two_losses_are_no_drift_of_the_clock(rng):
     assert found.name == "dropped_samples"
     assert len(instants) == 2
     assert np.all(np.abs(instants - lost) < 40)
+
+
+def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(monkeypatch):
+    # What each leaves along the tangent, and in the end: as for a lag hidden in a rig (seed 673166).
+    ends = {"transport_delay": (10804.0, 10793.0), "sensor_lowpass": (10995.0, 10713.0), "aging": (10995.0, 10000.0)}
+    forms = {form.name: form for form in EFFECTS}
+
+    def settled(bench, projector, model):
+        cost = ends[model.laws[0].form.name][1]
+        return bench, projector, SimpleNamespace(cost=cost, criterion=lambda count: cost)
+
+    monkeypatch.setattr(_contest, "settled", settled)
+    fitted = [
+        Rival(name, SimpleNamespace(laws=[SimpleNamespace(form=forms[name])]), cost, 0.0, cost)
+        for name, (cost, _) in ends.items()
+    ]
+    order = _contest._ranked(None, SimpleNamespace(count=10560), fitted, 17464.0)
+    assert [(one.name, one.cost) for one in order] == [
+        ("sensor_lowpass", 10713.0),
+        ("transport_delay", 10793.0),
+        ("aging", 10995.0),
+    ]
 
 
 def test_hum_raises_no_bar_for_what_the_command_makes(rng):

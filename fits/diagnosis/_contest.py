@@ -18,8 +18,9 @@ WORTH, _CONFUSED = 0.4, 0.2
 # Differences of the criterion, and standard deviations after projecting one effect off another, within which two
 # effects are not told apart.
 SAME, _APART = 10.0, 4.0
-# Effects that the baseline follows to tell them apart.
-_NEAREST = 4
+# Effects that the baseline follows to tell them apart, and part of what the best explains by which one that it is
+# mistaken for may be behind before: the plain stage has already given way to the one and not to the other.
+_NEAREST, _BEHIND = 4, 0.1
 # Part of a cause's signature by which its model may be off.
 INEXACT = 0.06
 # An effect that makes the square of the errors in what was held out so many times larger is none, and one with
@@ -125,8 +126,14 @@ def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: flo
     order = sorted(fitted, key=lambda one: one.criterion)
     if not order:
         return order
-    most = tolerance(before - order[0].cost) ** 2
-    near = [one for one in order if one.cost - order[0].cost < most][:_NEAREST]
+    drop, first = before - order[0].cost, order[0].refit.laws[-1].form
+
+    def reach(one: Rival) -> float:
+        form = one.refit.laws[-1].form
+        alike = form.name in first.confusions or first.name in form.confusions
+        return max(tolerance(drop) ** 2, _BEHIND * drop if alike else 0.0)
+
+    near = [one for one in order if one.cost - order[0].cost < reach(one)][:_NEAREST]
     if len(near) < 2:
         return order
     for one in near:
