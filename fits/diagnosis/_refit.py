@@ -178,23 +178,36 @@ def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -
     The sum of squares over the instant is jagged where the stage rings: better ones are tried on both sides, nearer
     and nearer.
     """
-    runs = range(len(bench.prepared))
+    at = [k for k in range(first, len(model.laws)) if hasattr(model.laws[k].effect(model.x[k], 0), "after_s")]
+    if not at:
+        return model
+    # So far some may only have been followed along their tangent, or beside another baseline.
+    model = refit(bench, projector, model.laws, model.x, 2)
     step_s = _AROUND * min(one.run.record.duration_s for one in bench.prepared)
     least_s = min(float(np.median(np.diff(one.run.record.time_s))) for one in bench.prepared)
-    at = [k for k in range(first, len(model.laws)) if hasattr(model.laws[k].effect(model.x[k], 0), "after_s")]
-    while at and step_s > least_s:
-        found = [model]
-        for k, way in product(at, (-step_s, step_s)):
-            here = [model.laws[k].effect(model.x[k], run) for run in runs]
-            moved = Law([_later(one, way, least_s) for one in here], model.laws[k].remembers)
-            laws, x = list(model.laws), list(model.x)
-            laws[k], x[k] = moved, moved.start
-            found.append(refit(bench, projector, laws, x, 2))
-        best = min(found, key=lambda one: one.cost)
-        if best is model:
+    while step_s > least_s:
+        tried = [_moved(bench, projector, model, k, way, least_s) for k, way in product(at, (-step_s, step_s))]
+        best = min(tried, key=lambda one: one.cost)
+        better = refit(bench, projector, best.laws, best.x, 2) if best.cost < model.cost else model
+        if better.cost < model.cost:
+            model = better
+        else:
             step_s /= 2
-        model = best
     return model
+
+
+def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: float, least_s: float) -> Refit:
+    """Fit a law at another instant; all others stay, and follow along their tangent."""
+    laws, x = list(model.laws), list(model.x)
+    here = [laws[k].effect(x[k], run) for run in range(len(bench.prepared))]
+    laws[k] = Law([_later(one, way_s, least_s) for one in here], laws[k].remembers)
+    x[k] = laws[k].start
+    order = [*(i for i in range(len(laws)) if i != k), k]
+    owner = np.repeat(np.arange(len(laws)), [law.size for law in model.laws])
+    basis = replace(model, tangent=model.tangent[:, owner != k]).basis()
+    found = _fit(bench, projector, [laws[i] for i in order], [x[i] for i in order], len(laws) - 1, basis, 2)
+    back = np.argsort(order)
+    return replace(found, laws=tuple(found.laws[i] for i in back), x=tuple(found.x[i] for i in back))
 
 
 def _later(effect: AbstractEffect, more_s: float, least_s: float) -> AbstractEffect:
