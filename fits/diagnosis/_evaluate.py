@@ -14,8 +14,8 @@ from fits._record import Record
 from fits._stage_run import StageRun
 from microid import AbstractEffect, AbstractPart, Scene, Signal, Stage, extend, host, refined
 
-# Samples of all records, and number of programs of some 5 MB each, from which on programs make room for each other.
-_LONG, _MANY = 20_000, 800
+# Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
+_LONG, _MANY = 20_000, 500
 
 
 @dataclass(frozen=True)
