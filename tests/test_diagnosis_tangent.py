@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lsim
 
 from fits import Record
 from fits._design import Grid
@@ -17,6 +18,7 @@ from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import simulate, with_effects
 from fits.diagnosis._law import Law
 from fits.diagnosis._noise import Noise
+from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
@@ -163,3 +165,52 @@ def test_a_driver_that_was_fitted_away_comes_back_beside_the_cause(rng):
     (back, cost), (_, least) = from_(asleep), from_(here)
     assert back == pytest.approx(truth.z[0], abs=1.0)
     assert cost < least + 25
+
+
+def answer_um(tau_s, natural_Hz, damping, lag_s, late_s, time_s, voltage_V):
+    """Of a stage without hysteresis of 0.1 um/V, exactly: poles, and steps of which a delay is a multiple."""
+    w = 2 * np.pi * natural_Hz
+    poles = np.polymul(np.polymul([tau_s, 1], [lag_s, 1]), [1 / w**2, 2 * damping / w, 1])
+    many = 16
+    fine_s = np.linspace(time_s[0], time_s[-1], many * (len(time_s) - 1) + 1)
+    _, out, _ = lsim(([0.1], np.trim_zeros(poles, "f")), np.interp(fine_s, time_s, voltage_V), fine_s)
+    behind = round(late_s / (fine_s[1] - fine_s[0]))
+    return np.concatenate([np.zeros(behind), out])[: len(out) : many]
+
+
+def test_a_delay_and_a_lag_are_told_apart_by_as_much_as_is_predicted(rng):
+    interval_s, noise_um = 1e-3, 0.01
+    # Nothing but an offset is seen in the runs at hand, and the density is known.
+    base = baseline_of(rng)
+    grid = base.chain.grid
+    columns_um = np.r_[np.zeros(grid.columns - LEVELS), np.full(LEVELS, 10.0)]
+    rest = Record(interval_s * np.arange(300), np.zeros(300), np.zeros(300), source="rest")
+    coarse, fine = ((prepare_stage_run(rest, RANGE_V, "negative", 0.0, stride),) for stride in (4, 16))
+    prior = 1e9 * np.eye(grid.columns)
+    known = Baseline(
+        base.chain, base.z, columns_um, prior, 10.0, RANGE_V, coarse, (), coarse, (), fine, (), fine, (), True, ()
+    )
+    bench, projector = Bench(known), Projector(regress(known), [Noise(noise_um, np.zeros(0))])
+    late_s = interval_s / 16 * int(rng.integers(4, 12))
+    laws = [Law([one]) for one in (SensorLowpass(jnp.asarray(late_s)), TransportDelay(jnp.asarray(late_s)))]
+    lag, delay = (Hypothesis((law,), (law.start,)) for law in laws)
+    predictor = Predictor(bench, projector, (lag, delay), ((0, 1),))
+    assert predictor.present_z < 0.1
+    # Steps as fast as the samples allow.
+    time_s = interval_s * np.arange(600)
+    voltage_V = np.where(np.arange(600) < 20, 0.0, 60.0 * (np.arange(600) // 7 % 2))
+    exact = [1e-3, 100.0, 0.1]
+    true = answer_um(*exact, late_s, 0.0, time_s, voltage_V)
+    other = answer_um(*exact, 0.0, late_s, time_s, voltage_V)
+    ends = [answer_um(*exact, 0.0, late_s + way * interval_s / 16, time_s, voltage_V) for way in (1, -1)]
+    rows = [np.ones(600), ends[0] - ends[1]]
+    for k in range(3):
+        moved = [[*exact[:k], exact[k] * (1 + way), *exact[k + 1 :]] for way in (1e-4, -1e-4)]
+        ends = [answer_um(*one, 0.0, late_s, time_s, voltage_V) for one in moved]
+        rows.append((ends[0] - ends[1]) / 2e-4)
+    matrix, off = np.stack(rows, axis=1), true - other
+    follow = np.linalg.lstsq(matrix / np.linalg.norm(matrix, axis=0), off, rcond=None)[0]
+    expected = np.linalg.norm(off - matrix / np.linalg.norm(matrix, axis=0) @ follow) / noise_um
+    said = predictor.predicted_z(time_s, voltage_V)
+    print(f"late by {late_s:.2g} s: {said:.2f} predicted, {expected:.2f} exactly")
+    assert said == pytest.approx(expected, rel=0.05)

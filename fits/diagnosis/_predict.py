@@ -1,6 +1,6 @@
 """What a run that was not measured yet would add: the information of the old runs plus that of a virtual one."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._regression import regress
+from fits.diagnosis._regression import Kinds, Regression, regress
+from fits.diagnosis._through import passed
 from microid import AbstractEffect
 
 _STEP = 1e-3
@@ -42,7 +43,7 @@ class Predictor:
     Parameters
     ----------
     bench, projector
-        Of the runs at hand.
+        Of the runs at hand, beside the first hypothesis.
     hypotheses
         Of what the stage has.
     pairs
@@ -60,13 +61,17 @@ class Predictor:
         self.hypotheses, self.pairs = tuple(hypotheses), tuple(pairs)
         records = [one.run.record for one in bench.prepared]
         # Where an effect differs from run to run, it will be as it was in the longest.
+        self._runs = range(len(records))
         self._like = int(np.argmax([record.duration_s for record in records]))
         self._vectors = [[law.vector(x, self._like) for law, x in zip(h.laws, h.x, strict=True)] for h in hypotheses]
         self._extra = {name: np.asarray(values) for name, values in records[self._like].extra.items()}
         self._kinds = [kind for kind, size in enumerate(projector.roughness) if size > 0]
         regression = projector.regression
         self._shared = regression.size + sum(regression.finer[kind][0].shape[1] for kind in self._kinds)
-        self._old = self._old_gram()
+        # What driver and mechanics can follow depends on what comes after them, and so on what is fitted.
+        fitted = sorted({fitted for _, fitted in self.pairs})
+        columns = self._old_columns()
+        self._old = {k: self._old_gram(self._beside(k), columns) for k in fitted}
 
     @property
     def present_z(self) -> float:
@@ -75,11 +80,21 @@ class Predictor:
 
     def predicted_z(self, time_s: np.ndarray, voltage_V: np.ndarray) -> float:
         """The same after a run with this command, shape `(n,)` each."""
-        return self._worst(self._old + self._new_gram(time_s, voltage_V))
+        new = self._new_grams(time_s, voltage_V)
+        return self._worst({k: gram + new[k] for k, gram in self._old.items()})
 
-    def _old_gram(self) -> np.ndarray:
-        """Gram matrix of what runs share and of the signals, each run's own unknowns eliminated."""
-        projector, runs = self.projector, range(len(self.bench.prepared))
+    def _beside(self, k: int) -> Projector:
+        """The projector beside a hypothesis."""
+        projector, h = self.projector, self.hypotheses[k]
+        if k == 0:
+            return projector
+        effects = [[law.effect(x, run) for law, x in zip(h.laws, h.x, strict=True)] for run in self._runs]
+        regression = regress(self.bench.baseline, _same(projector.regression, effects), effects)
+        return Projector(regression, projector.noise, projector.roughness)
+
+    def _old_columns(self) -> list[list[np.ndarray]]:
+        """Of all hypotheses, what they change in the runs at hand, and the derivatives of that."""
+        runs = self._runs
         columns: list[list[np.ndarray]] = []
         for h in self.hypotheses:
 
@@ -94,6 +109,10 @@ class Predictor:
                     columns.append([(a - b) / _STEP for a, b in zip(out(_moved(h.x, k, i)), at, strict=True)])
                 # Strengths in the new run, which no old run says anything of.
                 columns += [[np.zeros_like(b) for b in at]] * int(law.differs.sum())
+        return columns
+
+    def _old_gram(self, projector: Projector, columns: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+        """Gram matrix of what runs share and of the signals, each run's own unknowns eliminated."""
         signals = np.stack([projector.join(column) for column in columns], axis=1)
         root, inside = projector.root, projector.orthonormal.T @ signals
         outside = projector.off(signals)
@@ -104,8 +123,8 @@ class Predictor:
         keep = np.r_[0 : self._shared, size : len(gram)]
         return _eliminated(gram, keep)
 
-    def _new_gram(self, time_s: np.ndarray, voltage_V: np.ndarray) -> np.ndarray:
-        """The same of a run with this command alone."""
+    def _new_grams(self, time_s: np.ndarray, voltage_V: np.ndarray) -> dict[int, np.ndarray]:
+        """The same of a run with this command alone, beside each hypothesis that is fitted."""
         baseline = self.bench.baseline
         n = len(time_s)
         share = np.linspace(0, 1, n)
@@ -113,7 +132,9 @@ class Predictor:
             name: np.interp(share, np.linspace(0, 1, len(values)), values) for name, values in self._extra.items()
         }
         record = Record(time_s, voltage_V, np.zeros(n), extra, source="the next run")
-        run = prepare_stage_run(record, baseline.range_V, "unknown", 0.0, 1, hold=baseline.stage.hold)
+        # With steps between the samples that are too long, a lag and a delay differ by what both are off.
+        stride = baseline.finest[self._like].samples.stride
+        run = prepare_stage_run(record, baseline.range_V, "unknown", 0.0, stride, hold=baseline.stage.hold)
         # What is known of the columns beforehand counts with the old runs.
         only, none = (run,), ()
         alone = replace(
@@ -128,11 +149,7 @@ class Predictor:
             finest_aside=none,
             fine_aside=none,
         )
-        # As far as the first hypothesis goes, so do the derivatives.
-        first = self._effects(self.hypotheses[0], self._vectors[0])
-        regression, bench = regress(alone, None, (first,)), Bench(alone)
-        noise = self._noise(float(time_s[1] - time_s[0]))
-        shared = [regression.rows[0], *(regression.finer[kind][0] for kind in self._kinds)]
+        bench, noise = Bench(alone), self._noise(float(time_s[1] - time_s[0]))
         columns = []
         for h, vectors in zip(self.hypotheses, self._vectors, strict=True):
             at = self._respond(bench, h, vectors)
@@ -142,11 +159,16 @@ class Predictor:
                     (self._respond(bench, h, _moved(vectors, k, i)) - at) / _STEP for i in range(len(vectors[k]))
                 ]
                 columns += _in_order(law, moved)
-        joined = np.concatenate([*shared, np.stack(columns, axis=1)], axis=1)
-        rows = noise.whiten(joined)[run.fitted]
-        own, _ = qr(noise.whiten(regression.own[0])[run.fitted], mode="economic")
-        rows -= own @ (own.T @ rows)
-        return rows.T @ rows
+        grams, last = {}, None
+        for k in self._old:
+            effects = [self._effects(self.hypotheses[k], self._vectors[k])]
+            last = regress(alone, None if last is None else _same(last, effects), effects)
+            shared = [last.rows[0], *(last.finer[kind][0] for kind in self._kinds)]
+            rows = noise.whiten(np.concatenate([*shared, np.stack(columns, axis=1)], axis=1))[run.fitted]
+            own, _ = qr(noise.whiten(last.own[0])[run.fitted], mode="economic")
+            rows -= own @ (own.T @ rows)
+            grams[k] = rows.T @ rows
+        return grams
 
     def _effects(self, h: Hypothesis, vectors: Sequence[np.ndarray]) -> list[AbstractEffect]:
         return [law.maps[self._like](jnp.asarray(v)) for law, v in zip(h.laws, vectors, strict=True)]
@@ -163,9 +185,9 @@ class Predictor:
         colour = noise.past if ratios[nearest] < np.log(_LIKE) else np.zeros(0)
         return Noise(noise.innovation_um if len(colour) else noise.total_um, colour)
 
-    def _worst(self, gram: np.ndarray) -> float:
+    def _worst(self, grams: Mapping[int, np.ndarray]) -> float:
         """The smallest difference of all pairs, off what the stage and the fitted hypothesis can follow."""
-        left = _eliminated(gram, np.arange(self._shared, len(gram)))
+        rest = {k: _eliminated(gram, np.arange(self._shared, len(gram))) for k, gram in grams.items()}
         starts, at = [], 0
         for h in self.hypotheses:
             starts.append(at)
@@ -173,6 +195,7 @@ class Predictor:
         stops = [*starts[1:], at]
         found = []
         for true, fitted in self.pairs:
+            left = rest[fitted]
             # Difference of the two, then the coordinates of the fitted one.
             pick = np.zeros((len(left), stops[fitted] - starts[fitted]))
             pick[starts[true], 0], pick[starts[fitted], 0] = 1.0, -1.0
@@ -180,6 +203,11 @@ class Predictor:
             small = pick.T @ left @ pick
             found.append(float(_eliminated(small, np.arange(1))[0, 0]))
         return max(min(found), 0.0) ** 0.5
+
+
+def _same(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -> Kinds | None:
+    """What is finer than the grid, if it is the same beside other effects."""
+    return None if any(regression.through) or any(map(passed, effects)) else regression.finer
 
 
 def _in_order(law: Law, moved: Sequence[np.ndarray]) -> list[np.ndarray]:
