@@ -63,7 +63,7 @@ def test_programs_stay_within_range_rate_and_duration(rng):
                 early = voltage_V[: int(0.6 * len(voltage_V))]
                 top = np.flatnonzero(early > rig.upper_V - 0.01 * (rig.upper_V - rig.lower_V))[0]
                 assert early[top:].min() < rig.lower_V + 0.01 * (rig.upper_V - rig.lower_V)
-    assert len(played) == 8
+    assert len(played) == 9
 
 
 def test_no_program_fits_into_too_short_a_time(rng):

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from fits.diagnosis._prepare import Prepared
 
 # Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
-# is repeated so often, if it is short.
-_MOST, _TIMES = 4096, 2
+# is repeated if it is short, so often at most, until it tells by so many standard deviations: by chance it may be
+# a few less in the end.
+_MOST, _TIMES, _PLENTY = 4096, 4, 12.0
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
 # A class of effects that cannot be told apart counts so many others.
@@ -28,9 +29,11 @@ _OTHERS = 2
 _ALIKE, _WORTH = 0.95, 1.02
 # Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
 _PROBE, _LENGTHS = 0.05, (0.4, 0.15)
-_ROUNDS = 1
+_ROUNDS = 2
 # Below so many standard deviations effects are not told apart.
 _APART = 3.0
+
+_OVER = {2: "twice", 3: "three times", 4: "four times"}
 
 _COLUMNS = (
     (
@@ -87,7 +90,8 @@ def suggest(
     Returns
     -------
     Experiment
-        None where every cause is told from all others or nothing is suspected, and where no program would help.
+        None where every cause is told from all others or nothing is suspected, and where no program and no further
+        column would help.
     """
     question = _open(ready, found, causes)
     if question is None:
@@ -109,15 +113,17 @@ def suggest(
     progress(f"refining {program.words}")
     parameters, z = refine(program, lambda p: predictor.predicted_z(*program.samples(p)), z)
     time_s, voltage_V = program.samples(parameters)
-    times = min(_TIMES, int(limits.duration_s / (1.1 * program.limits.duration_s)))
-    if times > 1:
-        time_s, voltage_V = repeated(program.limits, (time_s, voltage_V), times)
+    times, once = 1, (time_s, voltage_V)
+    most = min(_TIMES, int(limits.duration_s / (1.1 * program.limits.duration_s)))
+    while times < most and z < _PLENTY:
+        times += 1
+        time_s, voltage_V = repeated(program.limits, once, times)
         z = predictor.predicted_z(time_s, voltage_V)
     column = _column(names, ready)
-    # What tells nothing is not worth playing.
-    if z < 1.0 or (z < _WORTH * present and not column):
+    # What tells nothing is not worth playing, but for a further column.
+    if not column and (z < 1.0 or z < _WORTH * present):
         return None
-    words = program.words if times < 2 else f"{program.words}, twice over"
+    words = program.words if times < 2 else f"{program.words}, {_OVER[times]} over"
     return Experiment(time_s, voltage_V, words, _purpose(names, z, present), names, z, present, column)
 
 

@@ -91,11 +91,14 @@ def repeat_after_wait(limits: Limits, low_V: float, high_V: float, wait_s: float
     return path.samples()
 
 
-def steps(limits: Limits, base_V: float, height_V: float, dwell_s: float) -> Samples:
-    """Steps of three heights from a voltage near the bottom, over and over, with edges as fast as the rig."""
+def steps(limits: Limits, base_V: float, height_V: float, decade: float) -> Samples:
+    """Steps of three heights from a voltage near the bottom, over and over, with edges as fast as the rig.
+
+    Each level is held for `10**decade` seconds, and four samples at least.
+    """
     path = Path(limits)
     path.within(base_V, 0.03 * limits.duration_s)
-    dwell_s = max(dwell_s, 4 * limits.interval_s)
+    dwell_s = max(10.0**decade, 4 * limits.interval_s)
     heights = (height_V, height_V / 4, height_V / 2)
     for k in range(int(path.left_s / dwell_s) + 1):
         path.to(base_V + (heights[k // 2 % 3] if k % 2 == 0 else 0.0))
@@ -174,7 +177,10 @@ def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[tup
     bottom, bias, top = (tuple(at[k : k + 3].tolist()) for k in (0, 3, 6))
     swing = (0.05 * span, 0.15 * span, 0.5 * span)
     period = 2 * PER_PERIOD * limits.interval_s
-    beat = 4 / (limits.resonance_Hz or 1 / (0.05 * whole))
+    # Steps let the stage ring, as long as a period or so, or move on before it has begun to.
+    height = (0.1 * span, 0.5 * span, 0.9 * span)
+    ringing = float(np.log10(1 / limits.resonance_Hz if limits.resonance_Hz else 0.0125 * whole))
+    shortest, longest = float(np.log10(4 * limits.interval_s)), max(ringing + 1, float(np.log10(0.05 * whole)))
     return [
         (
             "a rest after one loop",
@@ -188,7 +194,7 @@ def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[tup
             [
                 bias,
                 (0.0, 0.3 * span, 0.4 * span),
-                (0.02 * span, 0.08 * span, 0.2 * span),
+                (0.02 * span, 0.1 * span, 0.4 * span),
                 (0.2 * limits.highest_Hz, 0.9 * limits.highest_Hz, limits.highest_Hz),
             ],
         ),
@@ -199,10 +205,11 @@ def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[tup
             repeat_after_wait,
             [bottom, top, (0.05 * whole, 0.3 * whole, 0.7 * whole)],
         ),
+        ("fast steps of three heights near the bottom", steps, [bottom, height, (shortest, ringing, longest)]),
         (
-            "fast steps of three heights near the bottom",
+            "fast steps of three heights near the bottom in quick succession",
             steps,
-            [bottom, (0.1 * span, 0.4 * span, 0.6 * span), (0.1 * beat, beat, max(4 * beat, 0.05 * whole))],
+            [bottom, height, (shortest, max(ringing - 1, shortest), longest)],
         ),
         (
             "a slow loop before and twice after a burst of hard driving",
