@@ -78,9 +78,9 @@ def report(rows: Sequence[Row], settings: Row, seed: int) -> str:
         parts.append(_outside(outside))
     if pairs:
         parts.append(_pairs(pairs))
-    asked = [row for row in done if row.get("again")]
-    if asked:
-        parts.append(_again(asked))
+    open_ = [row for row in done if row["hidden"] != "none" and row["causes"] and row["causes"][0]["also"]]
+    if open_:
+        parts.append(_again(open_))
     parts.append(_undone([row for row in rows if "verdict" not in row]))
     return "\n\n".join(part for part in parts if part)
 
@@ -248,19 +248,18 @@ def _pairs(pairs: dict[str, list[Row]]) -> str:
 
 
 def _again(rows: list[Row]) -> str:
-    lines = [
-        [
-            row["hidden"],
-            str(row["seed"]),
-            " or ".join([row["causes"][0]["name"], *row["causes"][0]["also"]]),
-            " or ".join([row["again"]["first"] or "nothing", *row["again"]["also"]]),
-            "yes" if row["again"]["resolved"] else "no",
-        ]
-        for row in rows
-    ]
-    resolved = sum(row["again"]["resolved"] for row in rows)
+    lines, resolved = [], 0
+    for row in rows:
+        again = row.get("again")
+        line = [row["hidden"], str(row["seed"]), " or ".join([row["causes"][0]["name"], *row["causes"][0]["also"]])]
+        if again is None:
+            lines.append([*line, "-", "no experiment", "no"])
+            continue
+        resolved += again["resolved"]
+        after = " or ".join([again["first"] or "nothing", *again["also"]])
+        lines.append([*line, f"{again['predicted_z']:.1f}", after, "yes" if again["resolved"] else "no"])
     text = "## The suggested experiment, played on the same rig\n\nResolved: " + _share(resolved, len(rows))
-    return text + "\n\n" + _table(["hidden", "seed", "before", "after", "resolved"], lines)
+    return text + "\n\n" + _table(["hidden", "seed", "before", "sd apart, predicted", "after", "resolved"], lines)
 
 
 def _undone(rows: list[Row]) -> str:
