@@ -13,8 +13,8 @@ from microid._everett import Everett, _window
 from microid._memory import Memory, Staircase, _as_entries, negative_saturation, remember
 from microid._preisach import Preisach
 
-# Halving a bracket this often leaves no digit of it; Newton's steps rarely need ten.
-_HALVINGS = 64
+# Steps at most: half as many halvings leave no digit of a bracket, and Newton's steps rarely need ten.
+_STEPS = 128
 
 
 class Inversion(eqx.Module):
@@ -119,17 +119,17 @@ def _roots(
 
         def more(carry: tuple[Array, Array, Array, Array, Array]) -> Bool[Array, ""]:
             _, _, _, step, count = carry
-            return (count < _HALVINGS) & (step != 0)
+            return (count < _STEPS) & (step != 0)
 
         def closer(carry: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array, Array]:
-            low, high, x, _, count = carry
+            low, high, x, last, count = carry
             value, slope = jax.jvp(rise, (x,), (jnp.ones_like(x),))
             off = value - target
             low, high = jnp.where(off <= 0, x, low), jnp.where(off >= 0, x, high)
             newton = x - off / slope
-            inside = (newton >= low) & (newton <= high)
-            # Newton's step, unless it leaves the bracket or has had its chance.
-            new = jnp.where(inside & (count < _HALVINGS // 2), newton, (low + high) / 2)
+            # Newton's step, unless it leaves the bracket or goes to and fro between pieces: it is not half the last.
+            good = (newton >= low) & (newton <= high) & (2 * jnp.abs(newton - x) <= jnp.abs(last))
+            new = jnp.where(good, newton, (low + high) / 2)
             new = jnp.where(jnp.abs(off) <= rounding_um, x, new)
             # What is not a number must not end in the middle of the bracket.
             new = jnp.where(jnp.isnan(off), off, new)
@@ -138,7 +138,7 @@ def _roots(
         low = jnp.where(up, x0, surface.lower_V)
         high = jnp.where(up, surface.upper_V, x0)
         guess = jnp.clip(path[k - 1], low, high)
-        begin = (low, high, guess, jnp.ones_like(guess), jnp.asarray(0, dtype=jnp.int32))
+        begin = (low, high, guess, 2 * (surface.upper_V - surface.lower_V), jnp.asarray(0, dtype=jnp.int32))
         return path.at[k].set(lax.while_loop(more, closer, begin)[2])
 
     path = jnp.zeros(m, level_um.dtype).at[:lead].set(before_V)
