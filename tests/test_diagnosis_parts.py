@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from fits import Record
@@ -15,7 +16,7 @@ from fits.diagnosis._evaluate import drop_programs
 from fits.diagnosis._floor import band_of, floor_of, jitter_s, quantum_um, spikes
 from fits.diagnosis._noise import Noise, learn_noise
 from fits.diagnosis._projector import Projector, learn_roughness
-from fits.diagnosis._score import Family, score
+from fits.diagnosis._score import Family, evidence, score
 from microid import EFFECTS
 
 WHITE = np.zeros(0)
@@ -280,3 +281,15 @@ def test_programs_make_room_where_records_are_long():
     program(jnp.ones(3))
     assert traces_after(1000) == 1
     assert traces_after(10_000) == 2
+
+
+def test_what_cannot_be_negative_is_no_evidence_where_it_would_have_to_be(rng):
+    for k in (1, 2, 3):
+        columns = rng.standard_normal((200, k)) + 0.3 * rng.standard_normal((200, 1))
+        residual = rng.standard_normal(200) + columns @ rng.normal(0, 0.2, k)
+        expected, left = nnls(columns, residual)
+        z, multiples, drop = evidence(columns, residual, True)
+        assert multiples == pytest.approx(expected, abs=1e-6)
+        assert drop == pytest.approx(residual @ residual - left**2, abs=1e-6)
+        assert z == pytest.approx(max(drop - max(np.sum(expected > 0) - 1, 0), 0) ** 0.5, abs=1e-6)
+        assert evidence(columns, -columns @ np.ones(k), True)[0] == 0

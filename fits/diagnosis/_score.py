@@ -15,6 +15,8 @@ _DRAWS = 2000
 _BLIND = 0.003
 # Samples that are taken to err alike.
 _BLOCK = 25
+# Rounds in which signatures whose multiples are not negative follow each other.
+_SWEEPS = 30
 
 
 @dataclass(frozen=True)
@@ -118,15 +120,34 @@ def evidence(columns: np.ndarray, residual: np.ndarray, positive: bool) -> tuple
 
 
 def _evidence(gram: np.ndarray, cross: np.ndarray, positive: bool) -> tuple[float, np.ndarray, float]:
-    k = len(cross)
     # What shows nowhere has no multiple: rounding over nothing would be one.
     scale = np.where(np.diagonal(gram) > 0, np.sqrt(np.diagonal(gram)), 1.0)
     normal = gram / scale[:, None] / scale[None, :]
-    coefficients = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ (cross / scale) / scale
-    if positive and k == 1 and coefficients[0] < 0:
-        return 0.0, np.zeros(1), 0.0
-    drop = float(coefficients @ cross)
-    return max(drop - (k - 1), 0.0) ** 0.5, coefficients, drop
+    multiples = _multiples(normal, (cross / scale)[:, None], positive)
+    z, drop = _size(normal, (cross / scale)[:, None], multiples)
+    return float(z[0]), multiples[:, 0] / scale, float(drop[0])
+
+
+def _multiples(gram: np.ndarray, cross: np.ndarray, positive: bool) -> np.ndarray:
+    """Best multiples of signatures, whose `gram` has a diagonal of ones and zeros, shape `(k, draws)`.
+
+    Where none may be negative, one at a time is put where the others leave it (coordinate descent): signatures of
+    different runs have little in common.
+    """
+    if not positive:
+        return np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ cross
+    found = np.zeros_like(cross)
+    for _ in range(_SWEEPS if len(gram) > 1 else 1):
+        for k, row in enumerate(gram):
+            found[k] = np.maximum(found[k] + cross[k] - row @ found, 0.0) if row[k] > 0 else 0.0
+    return found
+
+
+def _size(gram: np.ndarray, cross: np.ndarray, multiples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations and decreases: chance gives one of it to each signature in use but one."""
+    drop = np.einsum("ij,ij->j", multiples, 2 * cross - gram @ multiples)
+    chance = np.maximum(np.count_nonzero(multiples, axis=0) - 1, 0)
+    return np.sqrt(np.maximum(drop - chance, 0.0)), drop
 
 
 class Family:
@@ -145,13 +166,8 @@ class Family:
         for one in scored:
             stop = at + one.columns.shape[1]
             own, cross = gram[at:stop, at:stop], draws[at:stop]
-            k = stop - at
-            if k == 1:
-                z = cross[0] if one.probe.positive else np.abs(cross[0])
-            else:
-                drop = np.einsum("ij,ij->j", cross, np.linalg.pinv(own, rcond=1e-10, hermitian=True) @ cross)
-                z = np.sqrt(np.maximum(drop - (k - 1), 0))
-            largest = np.maximum(largest, z)
+            multiples = _multiples(own, cross, one.probe.positive)
+            largest = np.maximum(largest, _size(own, cross, multiples)[0])
             at = stop
         self.largest = np.sort(largest)
 
