@@ -28,6 +28,8 @@ from microid import AbstractEffect, Stage
 # Causes explain at least this part of what is reproducible, or the true ones are not in the library; with less than
 # the second part they have nothing to do with it.
 _SHARE, _RATHER = 0.65, 0.3
+# Standard deviations by which a sum of squares exceeds its mean by chance.
+_SPREAD = 3.0
 # What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
 _REST, _CHANCE = 0.3, 1e-6
 # What was kept aside must not be predicted so many times worse, in squares; or not worse at all by causes with less
@@ -65,14 +67,15 @@ def conclude(
     none = np.zeros((len(found.plain.residual), 0))
     seen = look(projector, none, found.plain.residual, [*ways, *further_views(baseline.runs)])
     # What the causes explain and what is left to be seen in any way is what there is to be explained.
-    explained = max(found.plain.cost - found.model.cost, 0.0)
+    explained = found.explained
     rest, rest_freedom = together(found.projector, found.model.basis(), found.model.residual, ways)
     period_um, cycle_z, cycle_drop = cycles(found.projector, found.model.residual, bench.plain)
     noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in found.projector.noise])))
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
     rounded = ready.faults.quantum_um**2 / 12 > _ROUNDED * noise_um**2
     rest = max(rest, 0.0 if rounded else cycle_drop)
-    misfit = max(explained + max(rest - rest_freedom, 0.0), explained, 1e-300)
+    beyond = max(rest - rest_freedom - _SPREAD * (2 * rest_freedom) ** 0.5, 0.0)
+    misfit = max(explained + beyond, 1e-300)
     rest_share = (max(rest - rest_freedom, 0.0) / projector.count) ** 0.5
     chance = stats.chi2.sf(rest, rest_freedom)
     left_over = rest_share > _REST and chance < _CHANCE

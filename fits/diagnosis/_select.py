@@ -86,6 +86,8 @@ class Selection:
         Chance of the largest score.
     bench, projector
         Of the baseline as it is beside the causes.
+    explained
+        What they take off the sum of squares beside a baseline that may do all that it may without them.
     finest
         Whether the causes were simulated with many steps between samples in the end.
     first
@@ -101,6 +103,7 @@ class Selection:
     bench: Bench
     projector: Projector
     first: Projector
+    explained: float = 0.0
     finest: bool = False
 
 
@@ -182,10 +185,14 @@ def select(
         left = rescore(score(projector, probes, model.residual), basis, model.residual)
         family = Family(left, rng)
     causes, model = _backward(bench, projector, causes, model)
+    explained = plain.cost - model.cost
     bench, projector, model = resmoothed(*smoother(*stronger(bench, projector, model)))
     model, finest = finely(bench, projector, model)
     bench, projector, model = bounded(bench, projector, model, finest)
-    return Selection(tuple(causes), model, plain, scores, left, family, bench, projector, first_projector, finest)
+    # In the end the density is smoother and nowhere negative, which costs something by itself.
+    explained = max(explained, plain.cost - model.cost, 0.0)
+    at = bench, projector, first_projector
+    return Selection(tuple(causes), model, plain, scores, left, family, *at, explained, finest)
 
 
 def _leader(
