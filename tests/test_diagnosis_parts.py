@@ -293,3 +293,4 @@ def test_what_cannot_be_negative_is_no_evidence_where_it_would_have_to_be(rng):
         assert drop == pytest.approx(residual @ residual - left**2, abs=1e-6)
         assert z == pytest.approx(max(drop - max(np.sum(expected > 0) - 1, 0), 0) ** 0.5, abs=1e-6)
         assert evidence(columns, -columns @ np.ones(k), True)[0] == 0
+        assert evidence(1e-3 * columns, residual, True, 0.1)[0] < 0.1

@@ -32,9 +32,11 @@ _SHARE, _RATHER = 0.65, 0.3
 _SPREAD = 3.0
 # What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
 _REST, _CHANCE = 0.3, 1e-6
-# What was kept aside must not be predicted so many times worse, in squares; or not worse at all by causes with less
-# evidence than this, in standard deviations: what else is not simulated may lend them as much.
+# What was kept aside must not be predicted so many times worse, in squares; or not worse beyond chance by causes with
+# less evidence than this, in standard deviations: what else is not simulated may lend them as much.
 _WORSE, _WEAK = 1.1, 8.0
+# Standard deviations from which on a difference is more than chance, and samples that are taken to err alike.
+_SURELY, _BLOCK = 1.5, 25
 # Part of the noise above which a narrow band is what is seen in every way of looking.
 _BAND = 0.75
 # A way of looking has seen something below this probability by chance.
@@ -83,9 +85,8 @@ def conclude(
     progress("extending the stage")
     extended, compared, effects = _extended(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
-    checked = _worse(compared[: len(baseline.runs)])
     weak = max((cause.z for cause in kept), default=0.0) < _WEAK
-    if kept and (share < _SHARE or checked > (1.0 if weak else _WORSE)):
+    if kept and (share < _SHARE or _worse(compared[: len(baseline.runs)], weak)):
         suspects = ", ".join(cause.name for cause in kept)
         why = f"explains only {share:.0%} of what is left" if share < _SHARE else "predicts what was kept aside worse"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
@@ -205,16 +206,19 @@ def _beside(ready: Prepared, found: Selection, model: Refit, compared: Sequence[
     return replace(now, spikes=standing, heights_um=ready.faults.heights_um)
 
 
-def _worse(compared: Sequence[Compared]) -> float:
-    """Mean square error of the extended stage over the plain one's, in what was kept aside of the fitted runs."""
+def _worse(compared: Sequence[Compared], weak: bool) -> bool:
+    """Whether the extended stage predicts what was kept aside of the fitted runs worse than the plain one."""
     held = [one for one in compared if one.held_out.any()]
     if not held:
-        return 0.0
+        return False
     before, after = (
-        np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)])
+        np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)]) ** 2
         for pick in ([one.before_um for one in held], [one.after_um for one in held])
     )
-    return float(np.mean(after**2) / np.mean(before**2))
+    if np.sum(after) > _WORSE * np.sum(before):
+        return True
+    sums = np.add.reduceat(after - before, np.arange(0, len(before), _BLOCK))
+    return bool(weak and np.sum(sums) > _SURELY * np.linalg.norm(sums - np.mean(sums)))
 
 
 def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:

@@ -17,6 +17,9 @@ _BLIND = 0.003
 _BLOCK = 25
 # Rounds in which signatures whose multiples are not negative follow each other.
 _SWEEPS = 30
+# Multiple of a signature of finite size, as of a gap, beyond which it is none: what would have to be so much larger
+# to show is not seen in the records.
+_LARGEST = 30.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ def _scored(probe: Probe, columns: np.ndarray, residual: np.ndarray, raw: float)
     if left < _BLIND:
         # What the baseline follows but for rounding cannot be asked about.
         return Scored(probe, np.zeros_like(columns), 0.0, 0.0, np.zeros(columns.shape[1]), 0.0, left)
-    z, coefficients, drop = evidence(columns, residual, probe.positive)
+    z, coefficients, drop = evidence(columns, residual, probe.positive, _most(probe))
     return Scored(probe, columns, z, _sure(columns @ coefficients, residual), coefficients, drop, left)
 
 
@@ -113,22 +116,25 @@ def _sure(along: np.ndarray, residual: np.ndarray) -> float:
     return float(along @ along / max(float(np.linalg.norm(blocks)), 1e-300)) if np.any(along) else 0.0
 
 
-def evidence(columns: np.ndarray, residual: np.ndarray, positive: bool) -> tuple[float, np.ndarray, float]:
-    """Standard deviations, coefficients, and decrease of the sum of squares."""
+def _most(probe: Probe) -> float:
+    """The largest multiple of its signatures that means anything."""
+    return _LARGEST if probe.effects[0].finite else np.inf
+
+
+def evidence(
+    columns: np.ndarray, residual: np.ndarray, positive: bool, most: float = np.inf
+) -> tuple[float, np.ndarray, float]:
+    """Standard deviations, coefficients up to `most` where they are positive, and decrease of the sum of squares."""
     gram, cross = columns.T @ columns, columns.T @ residual
-    return _evidence(gram, cross, positive)
-
-
-def _evidence(gram: np.ndarray, cross: np.ndarray, positive: bool) -> tuple[float, np.ndarray, float]:
     # What shows nowhere has no multiple: rounding over nothing would be one.
     scale = np.where(np.diagonal(gram) > 0, np.sqrt(np.diagonal(gram)), 1.0)
     normal = gram / scale[:, None] / scale[None, :]
-    multiples = _multiples(normal, (cross / scale)[:, None], positive)
+    multiples = _multiples(normal, (cross / scale)[:, None], positive, most * scale)
     z, drop = _size(normal, (cross / scale)[:, None], multiples)
     return float(z[0]), multiples[:, 0] / scale, float(drop[0])
 
 
-def _multiples(gram: np.ndarray, cross: np.ndarray, positive: bool) -> np.ndarray:
+def _multiples(gram: np.ndarray, cross: np.ndarray, positive: bool, most: np.ndarray) -> np.ndarray:
     """Best multiples of signatures, whose `gram` has a diagonal of ones and zeros, shape `(k, draws)`.
 
     Where none may be negative, one at a time is put where the others leave it (coordinate descent): signatures of
@@ -139,7 +145,7 @@ def _multiples(gram: np.ndarray, cross: np.ndarray, positive: bool) -> np.ndarra
     found = np.zeros_like(cross)
     for _ in range(_SWEEPS if len(gram) > 1 else 1):
         for k, row in enumerate(gram):
-            found[k] = np.maximum(found[k] + cross[k] - row @ found, 0.0) if row[k] > 0 else 0.0
+            found[k] = np.clip(found[k] + cross[k] - row @ found, 0.0, most[k]) if row[k] > 0 else 0.0
     return found
 
 
@@ -166,7 +172,7 @@ class Family:
         for one in scored:
             stop = at + one.columns.shape[1]
             own, cross = gram[at:stop, at:stop], draws[at:stop]
-            multiples = _multiples(own, cross, one.probe.positive)
+            multiples = _multiples(own, cross, one.probe.positive, _most(one.probe) * scale[at:stop])
             largest = np.maximum(largest, _size(own, cross, multiples)[0])
             at = stop
         self.largest = np.sort(largest)

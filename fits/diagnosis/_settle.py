@@ -39,14 +39,17 @@ Settled: TypeAlias = tuple[Bench, Projector, Refit]
 
 
 def settled(bench: Bench, projector: Projector, model: Refit) -> Settled:
-    """Let baseline and causes follow each other, unless that makes it worse."""
+    """Let baseline and causes follow each other, unless that makes it worse by more than what is next to nothing.
+
+    Where the baseline has to move far, what its tangent says of an effect that it nearly follows is better than true.
+    """
     moved = settle(bench, projector, relocate(bench, projector, model))
     awake = _awoken(projector, moved[-1])
     if awake is not None:
         there = _at(awake, projector, moved[-1])
         trial = settle(*there, refit(*there, moved[-1].laws, moved[-1].x, 4))
         moved = trial if trial[-1].cost < moved[-1].cost else moved
-    if moved[-1].cost > model.cost:
+    if moved[-1].cost > model.cost + _BETTER:
         # A baseline that moved without the roughness beyond its grid may have moved away.
         here = refit(bench, projector, model.laws, model.x, 4)
         moved = moved if moved[-1].cost < here.cost else (bench, projector, here)
