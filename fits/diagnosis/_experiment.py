@@ -107,24 +107,31 @@ def suggest(
     if not programs:
         return None
     scores = [predictor.predicted_z(*program.samples(program.start)) for program in programs]
+    column = _column(names, ready)
+    asked = predictor
+    if column and max(scores) < 1.0:
+        # Only the column tells: what shows the first of them best is played with it.
+        asked = Predictor(found.bench, found.projector, (hypotheses[0], hypotheses[0].without(names[0])), ((0, 1),))
+        scores = [asked.predicted_z(*program.samples(program.start)) for program in programs]
     near = [k for k, z in enumerate(scores) if z >= _ALIKE * max(scores)]
     chosen = min(near, key=lambda k: (programs[k].limits.duration_s, -scores[k]))
     program, z = programs[chosen], scores[chosen]
     progress(f"refining {program.words}")
-    parameters, z = refine(program, lambda p: predictor.predicted_z(*program.samples(p)), z)
+    parameters, z = refine(program, lambda p: asked.predicted_z(*program.samples(p)), z)
     time_s, voltage_V = program.samples(parameters)
     times, once = 1, (time_s, voltage_V)
     most = min(_TIMES, int(limits.duration_s / (1.1 * program.limits.duration_s)))
     while times < most and z < _PLENTY:
         times += 1
         time_s, voltage_V = repeated(program.limits, once, times)
+        z = asked.predicted_z(time_s, voltage_V)
+    if asked is not predictor:
         z = predictor.predicted_z(time_s, voltage_V)
-    column = _column(names, ready)
     # What tells nothing is not worth playing, but for a further column.
     if not column and (z < 1.0 or z < _WORTH * present):
         return None
     words = program.words if times < 2 else f"{program.words}, {_OVER[times]} over"
-    return Experiment(time_s, voltage_V, words, _purpose(names, z, present), names, z, present, column)
+    return Experiment(time_s, voltage_V, words, _purpose(names, z, present, column), names, z, present, column)
 
 
 Question = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
@@ -198,7 +205,7 @@ def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) 
     return best, top
 
 
-def _purpose(names: tuple[str, ...], z: float, present: float) -> str:
+def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> str:
     words = [name.replace("_", " ") for name in names]
     if len(words) == 1:
         return (
@@ -206,6 +213,8 @@ def _purpose(names: tuple[str, ...], z: float, present: float) -> str:
             f"records at hand show it by {present:.1f}."
         )
     listed = " and ".join([", ".join(words[:-1]), words[-1]])
+    if z < _APART and column:
+        return f"No program within the limits tells {listed} apart by itself: record this one with a further column."
     if z < _APART:
         return (
             f"No program within the rig's limits would tell {listed} apart for sure; this one comes nearest, with "

@@ -36,6 +36,11 @@ class Hypothesis:
         """Names of the effects."""
         return tuple(law.form.name for law in self.laws)
 
+    def without(self, name: str) -> "Hypothesis":
+        """The same without an effect."""
+        kept = [k for k, other in enumerate(self.names) if other != name]
+        return Hypothesis(tuple(self.laws[k] for k in kept), tuple(self.x[k] for k in kept))
+
 
 class Predictor:
     """Predicts how well hypotheses are told apart after one more run.

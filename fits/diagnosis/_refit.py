@@ -24,6 +24,8 @@ _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
 # the runs do not show.
 _UNSEEN, _ANYTHING = 1e-4, 1e6
+# Multiple of a rig's range by which it may have moved at most before a run.
+_FARTHER = 2.0
 # Samples that are taken to err alike.
 _BLOCK = 25
 # Part of the shortest record by which another instant is tried at first.
@@ -114,14 +116,23 @@ class Refit:
         before = self.tangent.shape[1] - law.size
         beside = replace(self, tangent=self.tangent[:, [*range(before), *(before + varied)]])
         covariance = beside.covariance(robust=False)[before:, before:]
-        found = False
-        for run in range(len(law.maps) if law.each.any() else 1):
-            here = strength_of(law, x, run)
-            moves = _STEP * np.eye(law.size)[varied]
-            slope = np.stack([(strength_of(law, x + move, run) - here) / _STEP for move in moves], axis=1)
-            sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
-            found = found or bool(np.any(np.abs(here) > _DETERMINED * sd))
-        return found
+        runs = range(len(law.maps) if law.each.any() else 1)
+        strengths = [_strength(law, x, run, varied, covariance) for run in runs]
+        return any(bool(np.any(np.abs(here) > _DETERMINED * sd)) for here, sd in strengths)
+
+    def possible(self, bench: Bench) -> bool:
+        """Whether what went on in the last effect before the runs is no more than moves of the rig leave behind."""
+        law, x = self.laws[-1], self.x[-1]
+        reach = bench.baseline.stroke_um if law.form.takes == "um" else float(np.ptp(bench.baseline.range_V))
+        before = self.tangent.shape[1] - law.size
+        covariance = self.covariance()[before:, before:]
+        for run in range(len(law.maps)):
+            here, sd = _strength(law, x, run, np.arange(law.size), covariance)
+            most = _FARTHER * reach * float(np.max(np.abs(here) + _DETERMINED * sd))
+            effect = law.effect(x, run)
+            if any(float(np.max(np.abs(getattr(effect, name)))) > most for name in law.form.history):
+                return False
+        return True
 
     def basis(self) -> np.ndarray:
         """Orthonormal columns that span the tangent."""
@@ -130,6 +141,15 @@ class Refit:
         scaled = self.tangent / (np.linalg.norm(self.tangent, axis=0) + 1e-300)
         q, r, _ = qr(scaled, mode="economic", pivoting=True)
         return q[:, np.abs(np.diagonal(r)) > 1e-6]
+
+
+def _strength(
+    law: Law, x: np.ndarray, run: int, varied: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Strengths of an effect in a run, and their standard deviations by the covariance of the varied coordinates."""
+    here, moves = strength_of(law, x, run), _STEP * np.eye(law.size)[varied]
+    slope = np.stack([(strength_of(law, x + move, run) - here) / _STEP for move in moves], axis=1)
+    return here, np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
 
 
 def nothing(bench: Bench, projector: Projector) -> Refit:
@@ -169,7 +189,8 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
         return found
     # What went on before the runs is unknown where that explains more than so many coordinates do by chance.
     unknown = fit(remembering(found.laws[-1], found.x[-1]), _ROUNDS)
-    return unknown if unknown.criterion(projector.count) < found.criterion(projector.count) else found
+    better = unknown.criterion(projector.count) < found.criterion(projector.count)
+    return unknown if better and unknown.possible(bench) else found
 
 
 def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -> Refit:
