@@ -24,8 +24,8 @@ _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
 # the runs do not show.
 _UNSEEN, _ANYTHING = 1e-4, 1e6
-# Multiple of a rig's range by which it may have moved at most before a run.
-_FARTHER = 2.0
+# Multiple of a rig's range by which it may have moved at most before a run, and that of a room's temperature.
+_FARTHER, _ROOM_K = 2.0, 5.0
 # Samples that are taken to err alike.
 _BLOCK = 25
 # Part of the shortest record by which another instant is tried at first.
@@ -123,12 +123,14 @@ class Refit:
     def possible(self, bench: Bench) -> bool:
         """Whether what went on in the last effect before the runs is no more than moves of the rig leave behind."""
         law, x = self.laws[-1], self.x[-1]
-        reach = bench.baseline.stroke_um if law.form.takes == "um" else float(np.ptp(bench.baseline.range_V))
+        if not law.form.moved:
+            return True
+        spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": _ROOM_K}
         before = self.tangent.shape[1] - law.size
         covariance = self.covariance()[before:, before:]
         for run in range(len(law.maps)):
             here, sd = _strength(law, x, run, np.arange(law.size), covariance)
-            most = _FARTHER * reach * float(np.max(np.abs(here) + _DETERMINED * sd))
+            most = _FARTHER * spans[law.form.moved] * float(np.max(np.abs(here) + _DETERMINED * sd))
             effect = law.effect(x, run)
             if any(float(np.max(np.abs(getattr(effect, name)))) > most for name in law.form.history):
                 return False

@@ -78,6 +78,9 @@ class AbstractEffect(AbstractPart):
         Columns with which another form of it says what this one guesses.
     history
         Names of the fields that say what went on in it before each record; they are zero after a long rest.
+    moved
+        Unit of what may have moved before a record, `um`, `V` or `K`: no more goes on of it than the strength times
+        its range. Empty where the history is that itself.
     fast
         Whether it is only seen in records that show the dynamics.
     per_run
@@ -112,6 +115,7 @@ class AbstractEffect(AbstractPart):
     needs: ClassVar[tuple[str, ...]] = ()
     unless: ClassVar[tuple[str, ...]] = ()
     history: ClassVar[tuple[str, ...]] = ()
+    moved: ClassVar[str] = ""
     fast: ClassVar[bool] = False
     per_run: ClassVar[bool] = False
     finite: ClassVar[bool] = False

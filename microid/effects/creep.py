@@ -47,6 +47,7 @@ class Creep(AbstractEffect):
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
     history: ClassVar[tuple[str, ...]] = ("recent_um", "older_um")
+    moved: ClassVar[str] = "um"
     fingerprint: ClassVar[str] = (
         "After each step the residual goes on in the direction of the step, in proportion to it, along the logarithm "
         "of time or towards a limit."
@@ -98,6 +99,7 @@ class VoltageCreep(AbstractEffect):
     place: ClassVar[Place] = "driver"
     strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
     history: ClassVar[tuple[str, ...]] = ("recent_V", "older_V")
+    moved: ClassVar[str] = "V"
     fingerprint: ClassVar[str] = Creep.fingerprint
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
     experiment: ClassVar[str] = Creep.experiment
@@ -142,6 +144,7 @@ class KelvinVoigtCreep(AbstractEffect):
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("gain",)
     history: ClassVar[tuple[str, ...]] = ("before_um",)
+    moved: ClassVar[str] = "um"
     fingerprint: ClassVar[str] = Creep.fingerprint
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
     experiment: ClassVar[str] = Creep.experiment

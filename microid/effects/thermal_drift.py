@@ -112,6 +112,7 @@ class TemperatureDrift(AbstractEffect):
     place: ClassVar[Place] = "environment"
     strength: ClassVar[tuple[str, ...]] = ("expansion_um_per_K",)
     history: ClassVar[tuple[str, ...]] = ("before_um",)
+    moved: ClassVar[str] = "K"
     needs: ClassVar[tuple[str, ...]] = ("temperature_degC",)
     fingerprint: ClassVar[str] = ThermalDrift.fingerprint
     confusions: ClassVar[tuple[str, ...]] = ThermalDrift.confusions
