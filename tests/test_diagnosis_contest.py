@@ -127,7 +127,7 @@ def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(m
 
     def settled(bench, projector, model):
         cost = ends[model.laws[0].form.name][1]
-        return bench, projector, SimpleNamespace(cost=cost, criterion=lambda count: cost)
+        return bench, projector, SimpleNamespace(cost=cost, criterion=lambda _: cost, possible=lambda _: True)
 
     monkeypatch.setattr(_contest, "settled", settled)
     fitted = [

@@ -138,6 +138,9 @@ def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: flo
         return order
     for one in near:
         end = settled(bench, projector, one.refit)[-1]
+        if not end.possible(bench):
+            order.remove(one)
+            continue
         order[order.index(one)] = replace(one, cost=end.cost, criterion=end.criterion(projector.count))
     return sorted(order, key=lambda one: one.criterion)
 

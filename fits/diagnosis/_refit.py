@@ -123,7 +123,7 @@ class Refit:
     def possible(self, bench: Bench) -> bool:
         """Whether what went on in the last effect before the runs is no more than moves of the rig leave behind."""
         law, x = self.laws[-1], self.x[-1]
-        if not law.form.moved:
+        if not law.form.moved or not law.remembers:
             return True
         spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": _ROOM_K}
         before = self.tangent.shape[1] - law.size
