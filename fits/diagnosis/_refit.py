@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
+from fits._stage_run import columns_beside
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law, law_of, remembering, strength_of
 from fits.diagnosis._projector import Projector
@@ -24,8 +25,8 @@ _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
 # the runs do not show.
 _UNSEEN, _ANYTHING = 1e-4, 1e6
-# Multiple of a rig's range by which it may have moved at most before a run, and that of a room's temperature.
-_FARTHER, _ROOM_K = 2.0, 5.0
+# Multiple of its range in the runs by which a rig may have moved at most before one, and the least of a room's.
+_FARTHER, _ROOM_K = 2.0, 0.5
 # Samples that are taken to err alike.
 _BLOCK = 25
 # Part of the shortest record by which another instant is tried at first.
@@ -125,7 +126,9 @@ class Refit:
         law, x = self.laws[-1], self.x[-1]
         if not law.form.moved or not law.remembers:
             return True
-        spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": _ROOM_K}
+        columns = [columns_beside(run.record) for run in bench.baseline.runs]
+        room_K = [float(np.ptp(beside.get("temperature_degC", 0.0))) for beside in columns]
+        spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": max(_ROOM_K, *room_K)}
         before = self.tangent.shape[1] - law.size
         covariance = self.covariance()[before:, before:]
         for run in range(len(law.maps)):
