@@ -127,8 +127,8 @@ class Refit:
         if not law.form.moved or not law.remembers:
             return True
         columns = [columns_beside(run.record) for run in bench.baseline.runs]
-        room_K = [float(np.ptp(beside.get("temperature_degC", 0.0))) for beside in columns]
-        spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": max(_ROOM_K, *room_K)}
+        room_K = max(_ROOM_K, *(float(np.ptp(beside.get("temperature_degC", 0.0))) for beside in columns))
+        spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": room_K}
         before = self.tangent.shape[1] - law.size
         covariance = self.covariance()[before:, before:]
         for run in range(len(law.maps)):
