@@ -20,7 +20,7 @@ from fits.diagnosis._contest import INEXACT, Rival, best_of, contest
 from fits.diagnosis._law import Law
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, nothing
+from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._score import score
 from fits.diagnosis._select import _inexact, select
@@ -140,6 +140,24 @@ def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(m
         ("transport_delay", 10793.0),
         ("aging", 10995.0),
     ]
+
+
+@pytest.mark.parametrize("change_um", [0.2, 30.0])
+def test_a_settling_mount_is_no_creep_from_before(rng, change_um):
+    constant_s = float(rng.uniform(3, 8))
+
+    def plant(bench, entering_um):
+        times = [np.asarray(one.run.record.time_s) for one in bench.prepared]
+        return [bench.plain[0] + change_um * (1 - np.exp(-times[0] / constant_s)), bench.plain[1]]
+
+    case = made(rng, plant)
+    form = next(form for form in EFFECTS if form.form == "kelvin_voigt")
+    law = Law([form(*map(jnp.asarray, (1e-3, constant_s, before_um))) for before_um in (change_um, 0.0)], True)
+    found = refit(case.bench, case.projector, [law], [law.start], 4)
+    assert found.is_noise(case.projector)
+    assert found.effects(0)[0].before_um == pytest.approx(change_um, rel=0.3)
+    # Thrice the stroke is no creep of moves within it; how much there is the slow waves of these runs say roughly.
+    assert found.possible(case.bench) == (change_um < 1)
 
 
 def test_hum_raises_no_bar_for_what_the_command_makes(rng):

@@ -130,7 +130,7 @@ class Refit:
         room_K = max(_ROOM_K, *(float(np.ptp(beside.get("temperature_degC", 0.0))) for beside in columns))
         spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": room_K}
         before = self.tangent.shape[1] - law.size
-        covariance = self.covariance()[before:, before:]
+        covariance = self.covariance(robust=False)[before:, before:]
         for run in range(len(law.maps)):
             here, sd = _strength(law, x, run, np.arange(law.size), covariance)
             most = _FARTHER * spans[law.form.moved] * float(np.max(np.abs(here) + _DETERMINED * sd))

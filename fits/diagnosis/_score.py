@@ -19,7 +19,7 @@ _BLOCK = 25
 _SWEEPS = 30
 # Multiple of a signature of finite size, as of a gap, beyond which it is none: what would have to be so much larger
 # to show is not seen in the records.
-_LARGEST = 30.0
+_LARGEST = 300.0
 
 
 @dataclass(frozen=True)
