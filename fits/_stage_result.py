@@ -5,14 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fits._columns import PATH, columns_beside
 from fits._errors import DataError
 from fits._metrics import Errors
 from fits._record import Record
 from fits._result import FitStatus, Prediction, RunReport, pool, refuse_outside
 from fits._stage_run import (
-    PATH,
     StageRun,
-    columns_beside,
     gain_ahead,
     place_of_hysteresis,
     prepare_stage_run,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits._columns import columns_beside
 from fits._errors import DataError
 from fits._record import Record
 from fits._run import UNSWEPT, initial_state, known_samples
@@ -170,39 +171,6 @@ def prepare_stage_run(
     ahead = 1.0 if gain is None else gain
     memory = _roomy(initial_state(initial, ahead * lower, ahead * upper))
     return StageRun(record, eqx.tree_at(lambda s: s.start.memory, samples, memory, is_leaf=_none), known, fitted)
-
-
-# Correlation beyond which a column is another reading of the same.
-_ALIKE = 0.99
-PATH = "path_V"
-"""Name of a column that says through how many volts the command went before each sample, other records included."""
-
-
-def columns_beside(record: Record) -> dict[str, np.ndarray]:
-    """Further columns of a record under the names that effects know, shape `(n,)` each.
-
-    A name that begins with `temp`, or is in degrees, is `temperature_degC`; another one in a unit of length is the
-    second axis, `other_um`, unless it goes with the time, the voltage or the displacement: that is another reading
-    of this axis. `path_V` is itself. A column that does not change shows nothing.
-    """
-    found: dict[str, np.ndarray] = {}
-    for name, values in record.extra.items():
-        low = name.lower()
-        if name == PATH:
-            found[name] = values
-            continue
-        if np.ptp(values) == 0 or not np.all(np.isfinite(values)):
-            continue
-        if low.startswith("temp") or low.endswith(("_degc", "_temperature_k", "_temperature_c")):
-            found.setdefault("temperature_degC", values)
-        elif low.endswith(("_um", "_nm", "_mm", "_m")) and not _of_this_axis(record, values):
-            found.setdefault("other_um", values)
-    return found
-
-
-def _of_this_axis(record: Record, values: np.ndarray) -> bool:
-    own = [record.time_s, record.voltage_V, record.displacement_um]
-    return any(abs(np.corrcoef(values, one)[0, 1]) > _ALIKE for one in own if one is not None and np.ptp(one) > 0)
 
 
 def _none(value: Any) -> bool:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import fits
-from fits._stage_run import columns_beside
+from fits._columns import columns_beside
 from microid import Dahl, Driver, Mechanics, Sensor, Stage
 from microid.effects import EFFECTS, extend
 
@@ -20,7 +20,8 @@ def test_columns_are_known_by_their_names_and_other_readings_are_not_taken(rng):
     warm, other = 20 + np.linspace(0, 1, 400) ** 2, np.sin(np.arange(400) / 7)
     own = record(rng)
     taken = columns_beside(record(rng, temperature_C=warm, y_um=other))
-    np.testing.assert_array_equal(taken["temperature_degC"], warm)
+    np.testing.assert_array_equal(taken["temperature_degC"][1:], warm[1:])
+    assert taken["temperature_degC"][0] == pytest.approx(warm[0], abs=1e-4)
     np.testing.assert_array_equal(taken["other_um"], other)
     others = {
         "raw_nm": 1e3 * own.displacement_um,
@@ -31,6 +32,18 @@ def test_columns_are_known_by_their_names_and_other_readings_are_not_taken(rng):
         "still_um": np.full(400, 3.0),
     }
     assert columns_beside(record(rng, **others)) == {}
+
+
+def test_the_noise_of_the_first_temperature_is_no_step(rng):
+    # The end of a line through n readings is off by 2 / sqrt(n) of their noise (ordinary least squares).
+    time_s = np.arange(100_000) / 100
+    off = []
+    for _ in range(50):
+        warm = 20 + 0.01 * time_s + 0.1 * rng.standard_normal(len(time_s))
+        own = fits.Record(time_s, np.sin(time_s), np.sin(time_s), {"temperature_C": warm})
+        off.append(columns_beside(own)["temperature_degC"][0] - 20)
+    expected = 0.1 * 2 / 2000**0.5
+    assert 0.6 * expected < np.sqrt(np.mean(np.square(off))) < 1.5 * expected
 
 
 def test_a_stage_with_an_effect_of_a_column_asks_for_it(rng):

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from fits._columns import PATH
 from fits._design import columns_of
 from fits._errors import DataError
 from fits._fit import choose_grid
@@ -17,7 +18,7 @@ from fits._record import Record
 from fits._result import FitError
 from fits._run import prepare_run
 from fits._stage_moments import Chain
-from fits._stage_run import PATH, StageRun, prepare_stage_run
+from fits._stage_run import StageRun, prepare_stage_run
 from fits._stage_solve import prior_precision
 from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._noise import rough_noise_um

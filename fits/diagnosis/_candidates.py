@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits._stage_run import columns_beside
+from fits._columns import columns_beside
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import Prepared, prepare, respond_again, signals, with_effects
 from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
-from fits._stage_run import columns_beside
+from fits._columns import columns_beside
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law, law_of, remembering, strength_of
 from fits.diagnosis._projector import Projector

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from fits._stage_run import StageRun, columns_beside
+from fits._columns import columns_beside
+from fits._stage_run import StageRun
 from fits.diagnosis._projector import Projector
 
 _WAVES, _POWERS = 12, 4
