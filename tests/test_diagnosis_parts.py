@@ -80,7 +80,7 @@ def test_the_projection_is_generalised_least_squares(rng):
 
 def probe(signatures, positive=False):
     effect = next(form for form in EFFECTS if form.name == "thermal_drift")
-    return Probe((SimpleNamespace(name=effect.name),), tuple(signatures), positive)
+    return Probe((SimpleNamespace(name=effect.name, finite=False),), tuple(signatures), positive)
 
 
 def test_scores_are_standard_normal_where_there_is_nothing(rng):
