@@ -35,7 +35,7 @@ _REST, _CHANCE = 0.3, 1e-6
 # What was kept aside must not be predicted so many times worse, in squares; or not worse beyond chance by causes with
 # less evidence than this, in standard deviations: what else is not simulated may lend them as much.
 _WORSE, _WEAK = 1.1, 8.0
-# Standard deviations from which on a difference is more than chance, and samples that are taken to err alike.
+# Standard deviations from which on a difference counts, and samples that are taken to err alike.
 _SURELY, _BLOCK = 1.5, 25
 # Part of the noise above which a narrow band is what is seen in every way of looking.
 _BAND = 0.75
