@@ -145,7 +145,9 @@ def test_what_cannot_be_done_is_said(rng, tmp_path):
     controller = Controller(model, tmp_path)
     controller.start("negative")
     found_V, status = controller.inverse(np.array([highest_um + 1, lowest_um - 1, np.inf, np.nan, highest_um]))
-    np.testing.assert_array_equal(found_V, [upper_V, lower_V, upper_V, upper_V, upper_V])
+    # What is out of reach ends on the limit itself; what is just within reach is found, to rounding.
+    np.testing.assert_array_equal(found_V[:4], [upper_V, lower_V, upper_V, upper_V])
+    np.testing.assert_allclose(found_V[4], upper_V, rtol=1e-13)
     np.testing.assert_array_equal(status, [CLIPPED, CLIPPED, CLIPPED, NOT_A_NUMBER, 0])
     found_um, status = controller.forward(np.array([lower_V - 1, np.nan, upper_V + 1, lower_V]))
     np.testing.assert_allclose(found_um, [lowest_um, lowest_um, highest_um, lowest_um], rtol=0, atol=1e-11)
