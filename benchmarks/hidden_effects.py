@@ -127,6 +127,7 @@ def answer(task: tuple[str, int, dict[str, Any]]) -> dict[str, Any]:
             for cause in found.causes
         ],
         "heldout_um": [float(gain.heldout_rms_before_um), float(gain.heldout_rms_after_um)],
+        "remarks": list(found.remarks),
         "next_experiment": None if found.next_experiment is None else found.next_experiment.kind,
         "again": again,
     }

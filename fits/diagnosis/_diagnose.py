@@ -10,7 +10,7 @@ from fits._errors import DataError
 from fits._record import Record, refuse_repeats
 from fits._run import UNSWEPT
 from fits.diagnosis._conclude import conclude
-from fits.diagnosis._prepare import Prepared, prepare_diagnosis
+from fits.diagnosis._prepare import HOLDS, Prepared, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis
 from fits.diagnosis._select import Selection, select
 from fits.diagnosis._unswept import FirstWaysError
@@ -98,6 +98,14 @@ def diagnose(
         initial = UNSWEPT
         ready = prepare_diagnosis(records, aside, fraction, initial, progress)
         found = selected(ready, False)
+    if ready.doubted and not found.model.is_noise(found.projector):
+        progress("asking again with the command in lines between samples")
+        lines = prepare_diagnosis(records, aside, fraction, initial, progress, HOLDS[:1])
+        try:
+            beside = selected(lines, initial == "unknown")
+            ready, found = (lines, beside) if beside.left_um < found.left_um else (ready, found)
+        except FirstWaysError:
+            progress("a first way from an unknown state explains what is left then")
     if not found.causes and not aside and ready.projector.ahead(found.model.change_um) > _UNLIKE:
         progress("asking again with what was held out, which noise does not explain")
         whole = prepare_diagnosis(records, (), 0.0, initial, progress)

@@ -35,7 +35,7 @@ _SKEWED = (
 _SEEN = 1e-6
 # Part of the difference between curves and lines that must be there for it to be looked into.
 _LEAST = 0.2
-_HOLDS: tuple[Hold, ...] = ("first", "smooth", "zero")
+HOLDS: tuple[Hold, ...] = ("first", "smooth", "zero")
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
     "sample; a delay of that length would look the same"
@@ -65,7 +65,10 @@ _RUNS = {"smooth": ("along curves", _CURVES), "zero": ("held in steps", _STEPS)}
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that scores and fits need: the fitted baseline, its regression, noise and probes."""
+    """All that scores and fits need: the fitted baseline, its regression, noise and probes.
+
+    `doubted` says that the command was not taken for lines, by less evidence than there was of some effect.
+    """
 
     baseline: Baseline
     regression: Regression
@@ -74,6 +77,7 @@ class Prepared:
     probes: tuple[Probe, ...]
     faults: Faults
     skipped: tuple[tuple[str, str], ...]
+    doubted: bool = False
 
 
 @dataclass(frozen=True)
@@ -156,8 +160,12 @@ def prepare_diagnosis(
     fraction: float,
     initial: str,
     progress: Callable[[str], None],
+    holds: Sequence[Hold] = HOLDS,
 ) -> Prepared:
-    """Fit the plain stage, learn the noise, and simulate every probe of every effect."""
+    """Fit the plain stage, learn the noise, and simulate every probe of every effect.
+
+    How the command runs between samples is chosen among `holds`, of which lines are the first.
+    """
     said: tuple[str, ...] = (_FIRST,) if initial == UNSWEPT else ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, _ONE_WAY)
@@ -176,7 +184,8 @@ def prepare_diagnosis(
     here = fitted("first")
     drop_programs(records)
     progress("simulating every effect")
-    for hold in _HOLDS:
+    doubted = False
+    for hold in holds:
         if hold != "first":
             if not here.regression.baseline.dynamic:
                 break
@@ -189,6 +198,7 @@ def prepare_diagnosis(
             drop_programs(records)
             if not (_curved(here, other) if hold == "smooth" else _held(here, other, drop)):
                 continue
+            doubted = doubted or drop < here.highest() ** 2
             here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
         if initial == "unknown" and unswept(here.projector, here.highest()):
             progress("fitting the plain stage again, without the first way of each run")
@@ -213,7 +223,7 @@ def prepare_diagnosis(
     del here
     drop_programs(records)
     projector = Projector(regression, faults.noise, rough)
-    return Prepared(baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
+    return Prepared(baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped), doubted)
 
 
 def _curved(lines: _Fitted, curves: _Fitted) -> bool:
