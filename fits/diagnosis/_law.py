@@ -33,11 +33,13 @@ class Law:
         The effect in each run.
     remembers
         Whether what went on in it before each run is unknown, or else nothing.
+    held
+        Parameters that stay as they are.
     """
 
-    def __init__(self, effects: Sequence[AbstractEffect], remembers: bool = False):
+    def __init__(self, effects: Sequence[AbstractEffect], remembers: bool = False, held: Sequence[str] = ()):
         self.form, self.remembers = type(effects[0]), remembers
-        closed = () if remembers else self.form.history
+        closed = (*held, *(() if remembers else self.form.history))
         # The part that an effect is put around is put in anew wherever it is simulated.
         self.maps = [Coordinates(_alone(effect), lambda info: _free(info, closed)) for effect in effects]
         vectors = [np.asarray(one.of(_alone(effect))) for one, effect in zip(self.maps, effects, strict=True)]
@@ -60,6 +62,20 @@ class Law:
         if not self.each.any():
             return strong
         return np.concatenate([strong[~self.each], np.tile(strong[self.each], len(self.maps))])
+
+    @property
+    def shapes(self) -> dict[str, int]:
+        """Numbers of the coordinates that all runs share and that are no strengths, by their parameters."""
+        found, at, own = {}, 0, self.each.any()
+        for info in self.maps[0].table:
+            differs = info.path in self.form.history or (info.path in self.form.strength and self.form.per_run)
+            if own and differs:
+                continue
+            size = math.prod(info.shape)
+            if size == 1 and info.path not in (*self.form.strength, *self.form.history):
+                found[info.path] = at
+            at += size
+        return found
 
     def _of(self, paths: Sequence[str]) -> np.ndarray:
         return np.concatenate([np.full(math.prod(info.shape), info.path in paths) for info in self.maps[0].table])

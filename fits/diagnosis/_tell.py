@@ -14,6 +14,7 @@ from fits.diagnosis._candidates import Bench
 from fits.diagnosis._contest import best_of
 from fits.diagnosis._faults import Fault, Faults
 from fits.diagnosis._law import Law
+from fits.diagnosis._profiled import profiled
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
@@ -47,7 +48,7 @@ def causes_of(
     covariance, at = model.covariance(), 0
     total = float(np.mean([n.total_um**2 for n in projector.noise]))
     runs = len(bench.prepared)
-    for cause, law, x in zip(causes, model.laws, model.x, strict=True):
+    for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
         own = covariance[at : at + law.size, at : at + law.size]
         at += law.size
         form = law.form
@@ -58,9 +59,11 @@ def causes_of(
         rms = seen * _rms(alone, projector)
         told[cause.name] = count = told.get(cause.name, 0) + 1
         weight[cause.name] = weight.get(cause.name, 0.0) + cause.drop / projector.count * total
+        along = profiled(bench, projector, model, number, own)
+        parameters = _parameters(law, x, own, along)
         if count > 1:
             again = next(k for k, one in enumerate(found) if one.name == cause.name)
-            found[again] = _joined(found[again], _parameters(law, x, own), count, cause.drop / misfit, rms)
+            found[again] = _joined(found[again], parameters, count, cause.drop / misfit, rms)
             continue
         found.append(
             FoundCause(
@@ -69,7 +72,7 @@ def causes_of(
                 tuple(rival.name for rival in cause.rivals[:_OTHERS]),
                 cause.z,
                 cause.p_family,
-                _parameters(law, x, own),
+                parameters,
                 float(min(1.0, cause.drop / misfit)),
                 rms,
                 form.fingerprint,
@@ -122,8 +125,14 @@ def _joined(
     )
 
 
-def _parameters(law: Law, x: np.ndarray, covariance: np.ndarray) -> tuple[EffectParameter, ...]:
-    """Values in their units: of each run in which the effect shows where runs differ, the others by their place."""
+def _parameters(
+    law: Law, x: np.ndarray, covariance: np.ndarray, along: Sequence[tuple[float, np.ndarray]]
+) -> tuple[EffectParameter, ...]:
+    """Values in their units: of each run in which the effect shows where runs differ, the others by their place.
+
+    They reach as far, to either side, as the coordinates `along` which the law was followed, each so many standard
+    deviations away.
+    """
     runs = len(law.maps) if law.form.per_run and law.each.any() else 1
     shared: list[EffectParameter] = []
     own: list[list[EffectParameter]] = []
@@ -131,6 +140,10 @@ def _parameters(law: Law, x: np.ndarray, covariance: np.ndarray) -> tuple[Effect
         slope = np.asarray(jax.jacfwd(lambda v, run=run: law.maps[run].values(_vector(law, v, run)))(jnp.asarray(x)))
         values = np.asarray(law.maps[run].values(jnp.asarray(law.vector(x, run))))
         sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
+        below = above = sd
+        for away, there in along:
+            moved = np.asarray(law.maps[run].values(jnp.asarray(law.vector(there, run))))
+            below, above = np.maximum(below, (values - moved) / away), np.maximum(above, (moved - values) / away)
         at, mine = 0, []
         for info in law.maps[run].table:
             size = int(np.prod(info.shape)) if info.shape else 1
@@ -138,12 +151,12 @@ def _parameters(law: Law, x: np.ndarray, covariance: np.ndarray) -> tuple[Effect
             # What went on before a run is no property of the rig.
             for k in range(size if info.path not in law.form.history else 0):
                 name = info.path if size == 1 else f"{info.path}[{k}]"
-                value, spread = float(values[at + k]), float(sd[at + k])
-                low, high = value - _TWO_SIDED * spread, value + _TWO_SIDED * spread
+                value, less, more = float(values[at + k]), float(below[at + k]), float(above[at + k])
+                low, high = value - _TWO_SIDED * less, value + _TWO_SIDED * more
                 one = EffectParameter(
                     f"{name} in run {run + 1}" if differs else name,
                     value,
-                    spread,
+                    max(less, more),
                     info.spec.unit,
                     max(low, info.spec.lower),
                     min(high, info.spec.upper),
