@@ -165,8 +165,10 @@ def _unconstrain(spec: ParameterSpec, value: Float[Array, "..."]) -> Float[Array
     # A value on its bound lies at infinity; a millionth of the scale inside is where solvers can start.
     margin = 1e-6
     if low and high:
-        fraction = (value - spec.lower) / (spec.upper - spec.lower)
-        fraction = jnp.clip(fraction, margin, 1 - margin)
+        width = spec.upper - spec.lower
+        fraction = (value - spec.lower) / width
+        # Bounds may be many decades apart, as those of a time constant.
+        fraction = jnp.clip(fraction, margin * min(1.0, spec.scale / width), 1 - margin)
         return jnp.log(fraction) - jnp.log1p(-fraction)
     if low:
         return _softplus_inverse(jnp.maximum((value - spec.lower) / spec.scale, margin))

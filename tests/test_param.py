@@ -139,7 +139,17 @@ def test_values_on_a_bound_start_just_inside(rng):
     built = coordinates(coordinates.of(model))
     np.testing.assert_allclose(np.asarray(built.below) + 1, 0.5e-6, rtol=1e-6)
     np.testing.assert_allclose(4 - np.asarray(built.above), 3e-6, rtol=1e-6)
-    np.testing.assert_allclose(np.abs(np.asarray(built.between) - [-2, 6]), 8e-6, rtol=1e-6)
+    np.testing.assert_allclose(np.abs(np.asarray(built.between) - [-2, 6]), [1e-6, 8e-6], rtol=1e-6)
+
+
+def test_values_between_bounds_many_decades_apart_come_back(rng):
+    class Wide(eqx.Module):
+        time_constant_s: jax.Array = m.param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
+
+    for value in 10 ** rng.uniform(-2.5, 5.5, 20):
+        model = Wide(value)
+        coordinates = m.Coordinates(model)
+        np.testing.assert_allclose(coordinates(coordinates.of(model)).time_constant_s, value, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
