@@ -1,0 +1,91 @@
+"""Intervals of the parameters of causes where records hardly show one of them, against SciPy's filter."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from test_diagnosis_contest import NOISE_UM, stage_on
+
+from fits import Record
+from fits.diagnosis._candidates import Bench
+from fits.diagnosis._law import Law
+from fits.diagnosis._noise import Noise
+from fits.diagnosis._profiled import profiled
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import refit
+from fits.diagnosis._regression import regress
+from fits.diagnosis._tell import _parameters
+from microid import EFFECTS
+
+STEP_S, COUNT = 0.01, 3300
+
+
+def lagging(warm_K, lag_s):
+    """What follows a temperature with a lag, in lines between samples."""
+    keep = np.exp(-STEP_S / lag_s)
+    late = (1 - keep) * lag_s / STEP_S
+    return lfilter([1 - late, late - keep], [1, -keep], warm_K - warm_K[0])
+
+
+def drifting(rng, expansion_um_per_K, lag_s):
+    """A law fitted to a drift that was planted in what a plain stage leaves, and what it was fitted with."""
+    seed = int(rng.integers(2**31))
+    time_s = STEP_S * np.arange(COUNT)
+    voltage_V = 50 + 50 * np.cos(2 * np.pi * 0.3 * time_s) * (1 - 0.01 * time_s)
+    # Its first value is read off a line through the first readings.
+    periods_s, phases = rng.uniform([12, 25], [16, 40]), rng.uniform(0, 2 * np.pi, 2)
+    warm_K = 20 + 0.3 * np.sin(2 * np.pi * time_s[:, None] / periods_s + phases).sum(1)
+    beside = {"temperature_degC": warm_K}
+    bare = [Record(time_s, voltage_V, voltage_V / 10, beside, source="slow")]
+    plain = Bench(stage_on(seed, bare, False)).plain[0]
+    planted = expansion_um_per_K * lagging(warm_K, lag_s)
+    measured = [replace_(bare[0], plain + planted + NOISE_UM * rng.standard_normal(COUNT))]
+    bench = Bench(stage_on(seed, measured, False))
+    projector = Projector(regress(bench.baseline), [Noise(NOISE_UM, np.zeros(0))], (0.0, 0.0))
+    form = next(one for one in EFFECTS if (one.name, one.form) == ("thermal_drift", "temperature"))
+    law = Law([form(jnp.asarray(expansion_um_per_K), jnp.asarray(lag_s))])
+    return SimpleNamespace(
+        bench=bench, projector=projector, warm_K=warm_K, model=refit(bench, projector, [law], [law.start])
+    )
+
+
+def replace_(record, displacement_um):
+    return Record(record.time_s, record.voltage_V, displacement_um, record.extra, source=record.source)
+
+
+def followed(case):
+    law, x = case.model.laws[0], case.model.x[0]
+    covariance = case.model.covariance()
+    along = profiled(case.bench, case.projector, case.model, 0, covariance)
+    return covariance, along, [law.effect(there, 0) for _, there in along], law, x
+
+
+def test_a_lag_that_does_not_show_is_followed_as_far_as_it_may_be(rng):
+    case = drifting(rng, 0.004, 5.0)
+    covariance, along, effects, law, x = followed(case)
+    left = case.projector.off(case.projector.residual)
+    costs, sizes = [], []
+    for effect in effects:
+        # For each lag, the best expansion by ordinary least squares, and what it leaves.
+        column = case.projector.off(case.projector.join([lagging(case.warm_K, float(effect.time_constant_s))]))
+        sizes.append(column @ left / (column @ column))
+        costs.append(left @ left - (column @ left) ** 2 / (column @ column))
+    lowest = min(case.model.cost, *costs)
+    away = np.maximum(np.sqrt(np.array(costs) - lowest), 3)
+    assert len(along) > 4
+    np.testing.assert_allclose([one for one, _ in along], away, atol=0.05)
+    np.testing.assert_allclose([float(e.expansion_um_per_K) for e in effects], sizes, rtol=0.02, atol=1e-4)
+    # What is reported reaches as far.
+    expansion = _parameters(law, x, covariance, along)[0]
+    above = max((size - expansion.value) / far for size, far in zip(sizes, away, strict=True))
+    assert expansion.upper >= expansion.value + 1.9 * above
+
+
+def test_what_shows_well_is_not_followed(rng):
+    case = drifting(rng, 2.0, 5.0)
+    covariance, along, _, law, x = followed(case)
+    assert along == []
+    value, sd = (getattr(_parameters(law, x, covariance, along)[1], name) for name in ("value", "sd"))
+    assert value == pytest.approx(5.0, abs=5 * sd)
