@@ -64,15 +64,15 @@ class Law:
         return np.concatenate([strong[~self.each], np.tile(strong[self.each], len(self.maps))])
 
     @property
-    def shapes(self) -> dict[str, int]:
-        """Numbers of the coordinates that all runs share and that are no strengths, by their parameters."""
+    def common(self) -> dict[str, int]:
+        """Numbers of the coordinates that all runs share, by parameter; without what went on before the runs."""
         found, at, own = {}, 0, self.each.any()
         for info in self.maps[0].table:
             differs = info.path in self.form.history or (info.path in self.form.strength and self.form.per_run)
             if own and differs:
                 continue
             size = math.prod(info.shape)
-            if size == 1 and info.path not in (*self.form.strength, *self.form.history):
+            if size == 1 and info.path not in self.form.history:
                 found[info.path] = at
             at += size
         return found

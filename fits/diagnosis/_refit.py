@@ -22,6 +22,8 @@ _DETERMINED = 3.0
 _CHANCE = 3.0
 # Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
 _ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
+# Factor by which that is shortened where it was too far.
+_SHORTER = 4.0
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
 # the runs do not show.
 _UNSEEN, _ANYTHING = 1e-4, 1e6
@@ -291,7 +293,7 @@ def _fit(
     at = joined(flat)
     residual = left(at)
     jacobian = slope(flat, at) if rounds else np.zeros((len(residual), len(flat)))
-    damping = 1e-3
+    damping, farthest = 1e-3, _FARTHEST
     for _ in range(rounds):
         cost = float(residual @ residual)
         scale = np.linalg.norm(jacobian, axis=0) + 1e-300
@@ -299,14 +301,17 @@ def _fit(
         moved = False
         for _ in range(4):
             step = -np.linalg.solve(gram + damping * np.eye(len(flat)), cross) / scale
-            # No coordinate moves by more than a few e-folds at a time; one at its bound holds no other back.
-            step = np.clip(step, -_FARTHEST, _FARTHEST)
+            # No coordinate moves by more than a few e-folds at a time, or than less where that was too far, as near a
+            # bound; one at its bound holds no other back.
+            step = np.clip(step, -farthest, farthest)
             ahead = joined(flat + step)
             trial = left(ahead)
             if float(trial @ trial) < cost:
                 flat, at, residual, damping, moved = flat + step, ahead, trial, damping / 10, True
+                farthest = min(_SHORTER * farthest, _FARTHEST)
                 break
             damping *= 10
+            farthest = min(farthest, float(np.max(np.abs(step)))) / _SHORTER
         if not moved or cost - float(residual @ residual) < _ENOUGH:
             break
         jacobian = slope(flat, at)
