@@ -17,7 +17,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._tell import _parameters
-from microid import EFFECTS
+from microid import EFFECTS, Driver
 
 STEP_S, COUNT = 0.01, 3300
 
@@ -89,3 +89,18 @@ def test_what_shows_well_is_not_followed(rng):
     assert along == []
     value, sd = (getattr(_parameters(law, x, covariance, along)[1], name) for name in ("value", "sd"))
     assert value == pytest.approx(5.0, abs=5 * sd)
+
+
+def test_a_fit_finds_its_way_from_near_a_bound():
+    # Here a Gauss-Newton step, cut to the farthest that is allowed, goes beyond the optimum to where all is worse.
+    column = np.linspace(-1e3, 1e3, 50)
+    form = next(one for one in EFFECTS if one.name == "voltage_dependent_capacitance")
+    law = Law([form(Driver(1e-3), jnp.asarray(0.886), jnp.zeros(()), jnp.ones(()))])
+    bench = SimpleNamespace(
+        prepared=[None],
+        plain=[np.zeros(50)],
+        respond=lambda effects: [float(own[0].slope) * column for own in effects],
+    )
+    projector = SimpleNamespace(residual=0.8 * column, off=lambda joined: joined, join=lambda signals: signals[0])
+    found = refit(bench, projector, [law], [law.start])
+    assert float(law.effect(found.x[0], 0).slope) == pytest.approx(0.8, abs=1e-3)

@@ -13,7 +13,7 @@ from fits.diagnosis._score import Scored
 from microid import AbstractEffect, Coordinates, ParameterInfo, Sensor
 
 # Part of a bound within which a coordinate is at it.
-_BOUND = 1e-3
+_BOUND = 1e-2
 
 
 def _alone(effect: AbstractEffect) -> AbstractEffect:

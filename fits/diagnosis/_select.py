@@ -135,6 +135,7 @@ def select(
     family = Family(scores, rng)
     causes: list[Cause] = []
     refused: set[str] = set()
+    stood_in: set[str] = set()
     first_bench, first_projector = bench, projector
     once = {form.name for form in EFFECTS if not form.repeats}
     while len({cause.name for cause in causes}) < _MOST and len(causes) < _LAWS:
@@ -171,6 +172,7 @@ def select(
         if not beside[-1].determined(False, alone) or model.cost - beside[-1].cost < _REAL * drop:
             # Its strength is anybody's guess, or what it explains is out of reach where all is fitted together.
             refused.add(first.name)
+            stood_in |= {first.name} if beside[-1].laws[-1].pinned(beside[-1].x[-1]) else set()
             continue
         z = max(drop, 0.0) ** 0.5
         if family.p(z / sigma) >= false_alarm or z <= bars[first.refit.laws[-1].form]:
@@ -178,6 +180,8 @@ def select(
             refused.add(first.name)
             continue
         bench, projector, model = beside
+        # What stood in for this cause, as strong or as short as can be, has not been asked about itself.
+        refused, stood_in = refused - stood_in, set()
         afresh = renewed(first_projector, projector, model) if again else None
         if afresh is not None:
             # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
