@@ -80,8 +80,9 @@ def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -
         own = slice(at, at + len(probe.signatures))
         at = own.stop
         columns = off[:, own]
-        # A line that sampling turns into a constant, for example: what is left of it is rounding.
-        columns[:, _squares(columns) < _BLIND**2 * raw[own]] = 0.0
+        # A line that sampling turns into a constant, for example: what is left of it is rounding. Or what has died
+        # away so far that its square is nothing.
+        columns[:, _squares(columns) <= _BLIND**2 * raw[own]] = 0.0
         found.append(_scored(probe, columns, residual, float(np.sum(raw[own])) ** 0.5))
     return tuple(found)
 
@@ -161,7 +162,8 @@ class Family:
 
     def __init__(self, scored: Sequence[Scored], rng: np.random.Generator):
         columns = np.concatenate([one.columns for one in scored], axis=1)
-        scale = np.linalg.norm(columns, axis=0) + 1e-300
+        scale = np.linalg.norm(columns, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
         columns = columns / scale
         gram = columns.T @ columns
         value, vector = np.linalg.eigh(gram)
