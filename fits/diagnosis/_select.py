@@ -199,6 +199,8 @@ def select(
     bench, projector, model = resmoothed(*smoother(*stronger(bench, projector, model)))
     model, finest = finely(bench, projector, model)
     bench, projector, model = bounded(bench, projector, model, finest)
+    # One may have come to nothing since.
+    causes, model = _backward(bench, projector, causes, model)
     # In the end the density is smoother and nowhere negative, which costs something by itself.
     explained = max(explained, plain.cost - model.cost, 0.0)
     at = bench, projector, first_projector
