@@ -198,6 +198,8 @@ def select(
     explained = plain.cost - model.cost
     bench, projector, model = resmoothed(*smoother(*stronger(bench, projector, model)))
     model, finest = finely(bench, projector, model)
+    # What is asked of the causes from here on is asked as they were fitted.
+    bench = Bench(bench.baseline, finest=True) if finest else bench
     bench, projector, model = bounded(bench, projector, model, finest)
     # One may have come to nothing since.
     causes, model = _backward(bench, projector, causes, model)
