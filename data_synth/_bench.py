@@ -307,9 +307,11 @@ class _Stage:
 
     def _plainly(self, played: _Played) -> FloatArray:
         rig, hysteresis = self.rig, self._hysteresis
-        hysteresis.play(played.history_V)
         if self.plant is None:
+            hysteresis.play(played.history_V)
             return rig.reversible(played.voltage_V) + hysteresis.play(played.voltage_V)
+        for turn_V in played.history_V:
+            hysteresis.glide(np.array([turn_V]))
         return self.plant.respond(
             played.voltage_V,
             played.sample_rate_Hz,

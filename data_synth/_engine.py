@@ -101,7 +101,8 @@ class Player:
         for before_V, known_V, known_um in self._played:
             if np.array_equal(before_V, history_V) and np.array_equal(known_V, path_V):
                 return known_um
-        self._hysteresis.play(history_V)
+        for turn_V in history_V:
+            self._hysteresis.glide(np.array([turn_V]))
         spacing_V = _SPACING * (self.situation.rig.upper_V - self.situation.rig.lower_V)
         irreversible_um = np.concatenate(
             [_glide(self._hysteresis, run_V, spacing_V) for run_V in monotone_runs(path_V, float(history_V[-1]))]

@@ -70,6 +70,26 @@ def test_relay_sums_converge_to_the_everett_integral_at_second_order(rng):
     assert errors_um[-1] < 1e-3 * exact_um[0]
 
 
+def test_gliding_relays_remember_where_the_voltage_turned(rng):
+    """Not the edge of a cell before: chirps turn thousands of times, and a part of a cell each time adds up to a lead."""
+    rig = small_rig(rng)
+    density = rig.irreversible
+    sizes, errors_um = np.array([25, 50, 100, 200]), []
+    pairs_V = [np.sort(rng.uniform(5, 115, 2))[::-1] for _ in range(12)]
+    exact_um = np.array([everett_um(density, high_V, low_V) for high_V, low_V in pairs_V])
+    for n in sizes:
+        fallen_um = []
+        for high_V, low_V in pairs_V:
+            relays = ds.RelayGrid(density, int(n))
+            fallen_um.append(relays.glide(np.array([high_V]))[0] - relays.glide(np.array([low_V]))[0])
+        errors_um.append(np.array(fallen_um) - exact_um)
+    worst_um = np.abs(errors_um).max(axis=1)
+    order = -np.polyfit(np.log(sizes), np.log(worst_um), 1)[0]
+    print(f"order {order:.3f}, worst {worst_um} um of {exact_um}")
+    assert order > 1.5
+    assert worst_um[-1] < 2e-4 * rig.stroke_um
+
+
 def test_within_a_cell_the_staircase_converges_at_first_order(rng):
     rig = small_rig(rng)
     voltage_V = np.linspace(rig.lower_V, rig.upper_V, 4001)
