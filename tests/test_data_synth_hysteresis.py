@@ -71,7 +71,7 @@ def test_relay_sums_converge_to_the_everett_integral_at_second_order(rng):
 
 
 def test_gliding_relays_remember_where_the_voltage_turned(rng):
-    """Not the edge of a cell before: chirps turn thousands of times, and a part of a cell each time adds up to a lead."""
+    """Not the edge of a cell before: chirps turn often, and a part of a cell each time adds up to a lead."""
     rig = small_rig(rng)
     density = rig.irreversible
     sizes, errors_um = np.array([25, 50, 100, 200]), []
