@@ -102,7 +102,8 @@ class Law:
             size, spec = math.prod(info.shape), info.spec
             here = values[at : at + size]
             at += size
-            if info.path in self.form.strength and np.any(here > spec.upper - _BOUND * abs(spec.upper)):
+            below = spec.lower * (1 - _BOUND) if spec.lower < 0 else -np.inf
+            if info.path in self.form.strength and np.any((here > spec.upper * (1 - _BOUND)) | (here < below)):
                 return True
             if info.path == "time_constant_s" and np.any(here < (1 + _BOUND) * spec.lower):
                 return True

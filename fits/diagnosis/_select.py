@@ -15,6 +15,7 @@ from fits.diagnosis._settle import (
     bounded,
     confirmed,
     finely,
+    released,
     renewed,
     resmoothed,
     settled,
@@ -200,7 +201,7 @@ def select(
     model, finest = finely(bench, projector, model)
     # What is asked of the causes from here on is asked as they were fitted.
     bench = Bench(bench.baseline, finest=True) if finest else bench
-    bench, projector, model = bounded(bench, projector, model, finest)
+    bench, projector, model = bounded(*released(bench, projector, model, finest), finest)
     # One may have come to nothing since.
     causes, model = _backward(bench, projector, causes, model)
     # In the end the density is smoother and nowhere negative, which costs something by itself.

@@ -21,6 +21,8 @@ from fits.diagnosis._through import passed
 _OFF = 1.0
 # Multiple of a strength that is tried, and the gain in chi-square for which it is taken.
 _LARGER, _BETTER = 1.5, 10.0
+# Part of its bound from which what ended there is tried again, and rounds in which the baseline follows that first.
+_WEAKER, _FIRST = 0.8, 2
 # Further rounds in which baseline and causes follow each other, at most.
 _AGAIN = 8
 # Rounds beside a density whose zeros stay, and standard deviations below which a coordinate has not moved.
@@ -88,6 +90,29 @@ def stronger(bench: Bench, projector: Projector, model: Refit) -> Settled:
             trial = settle(bench, projector, refit(bench, projector, laws, x, 0))
             if trial[-1].cost > model.cost - _BETTER:
                 break
+            bench, projector, model = trial
+    return bench, projector, model
+
+
+def released(bench: Bench, projector: Projector, model: Refit, finest: bool) -> Settled:
+    """Try weaker what is as strong as can be, the baseline following before it is fitted, unless that is worse.
+
+    Along a valley that a driver and its capacitance share, a fit may run into the bound, where it has no derivative.
+    """
+    for k, law in enumerate(model.laws):
+        if not (law.form.strength and law.pinned(model.x[k])):
+            continue
+        effects = [law.effect(model.x[k], run) for run in range(len(law.maps))]
+        less = [replace(one, **{name: _WEAKER * getattr(one, name) for name in law.form.strength}) for one in effects]
+        laws, x = list(model.laws), list(model.x)
+        laws[k] = Law(less, law.remembers)
+        x[k] = laws[k].start
+        trial = bench, projector, refit(bench, projector, laws, x, 0)
+        for _ in range(_FIRST):
+            there = _follow(*trial, finest)
+            trial = *there, refit(*there, laws, x, 0)
+        trial = *there, refit(*there, laws, x, 4)
+        if trial[-1].cost < model.cost:
             bench, projector, model = trial
     return bench, projector, model
 
