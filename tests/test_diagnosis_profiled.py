@@ -16,6 +16,7 @@ from fits.diagnosis._profiled import profiled
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
+from fits.diagnosis._settle import released
 from fits.diagnosis._tell import _parameters
 from microid import EFFECTS, Driver
 
@@ -107,3 +108,42 @@ def test_a_fit_finds_its_way_from_near_a_bound():
     projector = SimpleNamespace(residual=0.8 * column, off=lambda joined: joined, join=lambda signals: signals[0])
     found = refit(bench, projector, [law], [law.start])
     assert float(law.effect(found.x[0], 0).slope) == pytest.approx(0.8, abs=1e-3)
+
+
+def at_slope(value, truth):
+    """A capacitance of some slope, in records that show another."""
+    column = np.linspace(-1e3, 1e3, 50)
+    form = next(one for one in EFFECTS if one.name == "voltage_dependent_capacitance")
+    law = Law([form(Driver(1e-3), jnp.asarray(value), jnp.zeros(()), jnp.ones(()))])
+    bench = SimpleNamespace(
+        prepared=[None],
+        plain=[np.zeros(50)],
+        respond=lambda effects: [float(own[0].slope) * column for own in effects],
+    )
+    projector = SimpleNamespace(residual=truth * column, off=lambda joined: joined, join=lambda signals: signals[0])
+    return bench, projector, refit(bench, projector, [law], [law.start], 0)
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_what_ended_at_its_bound_is_tried_weaker_where_the_baseline_follows(way, monkeypatch):
+    # Beside the baseline as it is, the bound is best; beside one that has followed something weaker, that is.
+    stuck = at_slope(way * (0.9 - 1e-9), way * 2.0)
+    freed = at_slope(way * 0.7, way * 0.7)[:2]
+    monkeypatch.setattr("fits.diagnosis._settle._follow", lambda *_: freed)
+    assert stuck[-1].laws[0].pinned(stuck[-1].x[0])
+    *at, model = released(*stuck, False)
+    assert float(model.laws[0].effect(model.x[0], 0).slope) == pytest.approx(way * 0.7, abs=1e-3)
+    assert tuple(at) == freed
+
+
+def test_at_a_bound_where_weaker_is_worse_it_stays(monkeypatch):
+    stuck = at_slope(0.9 - 1e-9, 1.0)
+    worse = at_slope(0.9 - 1e-9, 5.0)[:2]
+    monkeypatch.setattr("fits.diagnosis._settle._follow", lambda *_: worse)
+    assert released(*stuck, False) == stuck
+
+
+def test_what_is_not_at_its_bound_stays(monkeypatch):
+    inside = at_slope(0.7, 2.0)
+    monkeypatch.setattr("fits.diagnosis._settle._follow", lambda *_: at_slope(0.5, 0.5)[:2])
+    assert released(*inside, False) == inside
