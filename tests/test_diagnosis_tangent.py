@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.signal import lsim
 
 from fits import Record
@@ -214,3 +215,24 @@ def test_a_delay_and_a_lag_are_told_apart_by_as_much_as_is_predicted(rng):
     said = predictor.predicted_z(time_s, voltage_V)
     print(f"late by {late_s:.2g} s: {said:.2f} predicted, {expected:.2f} exactly")
     assert said == pytest.approx(expected, rel=0.05)
+
+
+def test_what_readings_at_jittering_instants_change_in_the_mean_is_followed(rng):
+    """Many readings of SciPy's spline through the response, each at an instant of its own, and their mean."""
+    baseline = replace(baseline_of(rng), blurred=True)
+    regression = regress(baseline)
+    run = baseline.fine[1]
+    plain, time_s = simulate(baseline.stage, run), run.record.time_s
+    jitter_s = rng.uniform(0.1, 0.3) * (time_s[1] - time_s[0])
+    spline = CubicSpline(time_s, plain)
+    off_s = jitter_s * rng.standard_normal((4000, 1))
+    # In pairs that are as early as late, so that the first order is gone.
+    mean = np.mean([spline(time_s + d) + spline(time_s - d) for d in off_s], axis=0) / 2
+    own = regression.own[1]
+    assert own.shape[1] == regress(replace(baseline, blurred=False)).own[1].shape[1] + 1
+    inside = slice(20, -20)
+    change, column = (mean - plain)[inside], own[inside, -1]
+    size = column @ change / (column @ column)
+    assert size == pytest.approx(np.mean(off_s**2) / 2, rel=0.1)
+    left = change - size * column
+    assert np.linalg.norm(left) < 0.2 * np.linalg.norm(change)

@@ -76,6 +76,8 @@ class Baseline:
         What the user should know, one sentence each.
     skewed
         Whether the readings of a run may be late or early by a small part of the sampling interval.
+    blurred
+        Whether instants jitter, so that in the mean a run reads its second derivative, too.
     """
 
     chain: Chain
@@ -95,6 +97,7 @@ class Baseline:
     dynamic: bool
     remarks: tuple[str, ...]
     skewed: bool = False
+    blurred: bool = False
 
     @property
     def stage(self) -> Stage:

@@ -209,6 +209,8 @@ def prepare_diagnosis(
         if drop > max(_LATE, (_ABOUT * here.highest()) ** 2) and late_s < _SKEW * here.scales.interval_s:
             here = _Fitted(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
+    if here.faults.jitter_s > 0:
+        here = _Fitted(regress(replace(here.regression.baseline, blurred=True)), here.faults)
     regression, bench, faults, (probes, skipped) = here.regression, here.bench, here.faults, here.probed
     if all(held_creep([record]) is not None for record in records):
         skipped = [

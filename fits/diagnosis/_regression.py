@@ -105,8 +105,11 @@ def regress(
         both[:, : chain.size] = behind(here, baseline.z, run, around, both[:, : chain.size])
         rows.append(both)
         plain = simulate(stage, fine_run)
-        late = [np.gradient(plain, run.record.time_s)[:, None]] if baseline.skewed else []
-        own.append(_alive(np.concatenate([free[:n], *late], axis=1), run.fitted))
+        speed = np.gradient(plain, run.record.time_s)[:, None]
+        late = [speed] if baseline.skewed else []
+        # With an instant off by d, a reading is y + d y' + d^2 y'' / 2: the first is noise, the second is not.
+        blur = [np.gradient(speed[:, 0], run.record.time_s)[:, None]] if baseline.blurred else []
+        own.append(_alive(np.concatenate([free[:n], *late, *blur], axis=1), run.fitted))
         residuals.append(run.displacement_um - plain)
         if finer is None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
