@@ -149,18 +149,20 @@ def _drive(command_V: FloatArray, tau_s: float | Callable[[float], float] | None
 
 def _drive_stepwise(command_V: FloatArray, tau_s: Callable[[float], float], situation: Situation) -> FloatArray:
     step_s, straight = situation.step_s, situation.plant.hold == "first"
-    now_V = before_V = float(command_V[0])
-    voltage_V = [now_V]
-    for next_V in command_V[1:].tolist():
-        if next_V == before_V == now_V:
-            voltage_V.append(now_V)
-            continue
-        tau = tau_s(now_V)
-        decay = math.exp(-step_s / tau)
+
+    def ahead(now_V: float, before_V: float, next_V: float, tau: float) -> float:
         # Where the command goes on along a straight line, the voltage lags it by slope times tau.
         lag_V = (next_V - before_V) / step_s * tau if straight else 0.0
         start_V = before_V if straight else next_V
-        now_V = next_V - lag_V + (now_V - start_V + lag_V) * decay
+        return next_V - lag_V + (now_V - start_V + lag_V) * math.exp(-step_s / tau)
+
+    now_V = before_V = float(command_V[0])
+    voltage_V = [now_V]
+    for next_V in command_V[1:].tolist():
+        if not next_V == before_V == now_V:
+            # The time constant of the middle of the step, where that would lead with the one of its beginning.
+            middle_V = (now_V + ahead(now_V, before_V, next_V, tau_s(now_V))) / 2
+            now_V = ahead(now_V, before_V, next_V, tau_s(middle_V))
         voltage_V.append(now_V)
         before_V = next_V
     return np.array(voltage_V)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy.signal import detrend
 
 import data_synth as ds
 from data_synth._effect import REGISTRY
+from data_synth._engine import _drive
 from data_synth._mechanics import Mechanics, Mode
 
 ALL = (*ds.EFFECTS, *ds.OUTSIDE)
@@ -192,6 +194,37 @@ def test_hardening_is_duffings_equation(rng):
     exact = solve_ivp(change, (0, time_s[-1]), [found_um[0], 0], t_eval=time_s, rtol=1e-9, atol=1e-9, max_step=2e-5)
     np.testing.assert_allclose(found_um, exact.y[0], atol=2e-3)
     assert np.abs(found_um - Mechanics(Mode(110.0, zeta)).respond(static_um, time_s)).max() > 0.1
+
+
+@pytest.mark.parametrize("hold", ["first", "zero"])
+def test_a_capacitance_that_changes_with_the_voltage_is_its_differential_equation(hold, rng):
+    tau_s, share, rate_Hz, steps = 1e-3, 0.8 * rng.choice([-1, 1]), 4000.0, 16
+    command_V = 60 + 60 * np.sin(2 * np.pi * rng.uniform(100, 400) * np.arange(60) / rate_Hz + rng.uniform(0, 6))
+    time_s = np.arange(59 * steps + 1) / (rate_Hz * steps)
+    if hold == "first":
+        fine_V = np.interp(time_s, time_s[::steps], command_V)
+    else:
+        fine_V = np.append(command_V[0], np.repeat(command_V[:-1], steps))
+    situation = SimpleNamespace(step_s=time_s[1], plant=SimpleNamespace(hold=hold))
+
+    def of(voltage_V):
+        return tau_s * (1 + share * (voltage_V - 60) / 60)
+
+    driven_V = _drive(fine_V, of, situation)
+    expected_V, now_V = [command_V[0]], command_V[0]
+    for k in range(59):
+        way_V = command_V[k + 1] - command_V[k] if hold == "first" else 0.0
+        solved = solve_ivp(
+            lambda t, v, k=k, way_V=way_V: (command_V[k] + way_V * t * rate_Hz - v) / of(v),
+            (0, 1 / rate_Hz),
+            [now_V],
+            method="LSODA",
+            rtol=1e-10,
+            atol=1e-10,
+        )
+        now_V = float(solved.y[0, -1])
+        expected_V.append(now_V)
+    np.testing.assert_allclose(driven_V[::steps], expected_V, rtol=0, atol=0.02)
 
 
 def test_a_load_lowers_the_note_of_the_stage(rng, seed):
