@@ -236,7 +236,9 @@ def test_a_record_starts_at_rest_in_its_history(seed):
     bench = ds.simulate(dataclasses.replace(scenario, runs=runs), seed)
     for record in bench.records:
         hysteresis = bench.rig.hysteresis()
-        hysteresis.play(record.history_V)
+        # With a plant the voltage has no jumps, and a reversal within a cell of the relays is remembered there.
+        for turn_V in record.history_V:
+            hysteresis.glide(np.array([turn_V]))
         (rest_um,) = bench.rig.reversible(record.voltage_V[:1]) + hysteresis.glide(record.voltage_V[:1])
         np.testing.assert_allclose(record.true_displacement_um, rest_um, rtol=0, atol=1e-9)
 
