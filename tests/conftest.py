@@ -1,7 +1,6 @@
 """Strict numerics for every test, and randomness that prints itself."""
 
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +8,8 @@ import jax
 import matplotlib as mpl
 import numpy as np
 import pytest
+from _seed import seed_of
+from hypothesis import settings
 
 # For notebooks and commands that tests start: threads of several processes wait for each other in a busy loop.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -16,6 +17,9 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 mpl.use("Agg")
+settings.register_profile("fixed", derandomize=True)
+if os.environ.get("MICROID_SEED") != "fresh":
+    settings.load_profile("fixed")
 
 
 # Every compiled function maps some memory, of which a process on Linux may have 65530 pieces. Beyond that it crashes.
@@ -32,11 +36,9 @@ def _few_mappings() -> Iterator[None]:
 
 
 @pytest.fixture
-def seed() -> int:
-    """A fresh seed, printed when the test fails; MICROID_SEED replays it."""
-    value = int(os.environ.get("MICROID_SEED") or secrets.randbelow(2**31))
-    print(f"replay with MICROID_SEED={value}")
-    return value
+def seed(request: pytest.FixtureRequest) -> int:
+    """The test's own seed, printed when the test fails; MICROID_SEED=fresh draws another, a number replays it."""
+    return seed_of(request.node.nodeid)
 
 
 @pytest.fixture

@@ -53,7 +53,7 @@ def rig(rng, command, duration_s, noise_um):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_smooth_command_is_no_effect(rng):
     """Swept sines as a function of time, which lines through their samples cut short."""
 

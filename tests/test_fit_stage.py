@@ -1,12 +1,12 @@
 """A whole stage identified from slow and fast runs of an independent bench, and runs that cannot be."""
 
 import dataclasses
-import secrets
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _seed import seed_of
 
 import data_synth
 import fits
@@ -87,8 +87,7 @@ class Rig:
 
 @pytest.fixture(scope="module")
 def rig():
-    seed = secrets.randbelow(2**31)
-    print(f"rig of seed {seed}")
+    seed = seed_of("test_fit_stage")
     rng = np.random.default_rng(seed)
     tau, frequency, damping = 10 ** rng.uniform(-3.7, -2.8), rng.uniform(80, 150), rng.uniform(0.02, 0.1)
     bench = data_synth.simulate(
@@ -218,10 +217,8 @@ def test_runs_of_different_rigs_are_refused(rig):
 
 
 @pytest.mark.parametrize("tau", [4e-3, 1e-4], ids=["slow driver", "driver faster than a sample"])
-def test_a_command_held_in_steps_is_fitted(tau):
+def test_a_command_held_in_steps_is_fitted(tau, seed):
     """Slow loops lag by what a slow driver takes, and whole samples see nothing of a quick one."""
-    seed = secrets.randbelow(2**31)
-    print(f"rig of seed {seed}")
     text = SCENARIO.format(tau=tau, frequency=120.0, damping=0.05).replace("[plant]", '[plant]\nhold = "zero"')
     bench = data_synth.simulate(data_synth.parse_scenario(text), seed)
     runs = [Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in bench.records[:2]]

@@ -1,13 +1,12 @@
 """The whole question on fresh rigs: an effect is hidden, the command sees only CSVs, and then the truth is opened."""
 
 import json
-import os
-import secrets
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from _command import files, run
+from _seed import seed_of
 from test_diagnosis_report import violations
 
 import data_synth
@@ -22,8 +21,7 @@ SAMPLES = {"slow_samples": 2500, "fast_samples": 4000}
 
 def diagnosed(folder, effects, *options):
     """Hide effects in a fresh rig, and diagnose its CSVs; the truth stays in a folder of its own."""
-    seed = int(os.environ.get("MICROID_SEED") or secrets.randbelow(2**31))
-    print(f"{effects}: replay with MICROID_SEED={seed}")
+    seed = seed_of(f"test_hidden_effect {effects}")
     bench = data_synth.hidden(effects, seed=seed, **SAMPLES)
     runs, truth = folder / "runs", folder / "truth"
     data_synth.write(bench, runs)

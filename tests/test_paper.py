@@ -1,7 +1,6 @@
 """`microid paper`: the adapter and the gains against transcriptions, tables by hand, and a short run of it all."""
 
 import json
-import os
 import re
 
 import jax
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _command import files, refused, run
+from _seed import seed_of
 
 import data_synth as ds
 import fits._cli_paper as paper
@@ -153,8 +153,7 @@ SHORT = {
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     """The command with fewer schemes and one axis, without the pictures that other commands draw."""
-    seed = int(os.environ.get("MICROID_SEED") or np.random.default_rng().integers(2**31))
-    print(f"replay with MICROID_SEED={seed}")
+    seed = seed_of("test_paper")
     out = tmp_path_factory.mktemp("paper") / "new" / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "PAPER", SHORT)
@@ -283,7 +282,7 @@ def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
     assert files(tmp_path) == []
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_all_of_it_is_no_worse_than_the_paper_but_where_it_is_known_to_be(tmp_path, seed):
     """Each scheme, axis and picture once, against what the paper prints."""
     result = run("paper", "--out", tmp_path / "out", "--seeds", 1, "--seed", seed % 2**32, "--quiet")

@@ -82,7 +82,7 @@ def test_what_a_worker_cannot_read_refuses_that_worker(monkeypatch):
     assert "No space left" in answer.refused
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_killed_worker_and_a_killed_scheduler_lose_no_row(scheduler, tmp_path, monkeypatch, seed):
     first, address, worker = scheduler
     sweep, out = parsed(small(seed, rows=3000)), tmp_path / "out"

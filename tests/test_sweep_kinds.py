@@ -166,7 +166,7 @@ def test_a_batch_of_fits_finds_the_noise_and_the_loops(seed):
     np.testing.assert_allclose(np.diff(found.outputs["loops_um"]), 0.3 * 5, rtol=0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_batch_of_fits_agrees_with_fits_one_by_one(seed):
     batch = compute_chunk(parsed(FIT.format(seed=seed, method="batch")), 0).outputs
     alone = compute_chunk(parsed(FIT.format(seed=seed, method="one_by_one")), 0).outputs

@@ -127,7 +127,7 @@ def test_rows_one_by_one_ask_for_their_own_options(monkeypatch, seed):
     assert weights[0, :4].tolist() == [0.0, 6.0, 7.0, 12.0]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_row_one_by_one_is_that_of_fit(seed):
     options = 'method = "one_by_one"\n'
     sweep = parsed(text(seed, words(["unknown", "negative"]), LEVELS.format(levels=[6, 9]), options=options))

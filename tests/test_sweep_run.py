@@ -4,7 +4,6 @@ import contextlib
 import errno
 import json
 import os
-import secrets
 import shutil
 import subprocess
 import sys
@@ -15,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from _command import OFF, refused, run
+from _seed import seed_of
 from _sweeps import parsed, small, stage_um
 
 from fits import DataError
@@ -35,9 +35,8 @@ def table(folder):
 
 @pytest.fixture(scope="module")
 def once(tmp_path_factory):
-    """One sweep with fresh draws for all tests; MICROID_SEED replays it."""
-    drawn = int(os.environ.get("MICROID_SEED") or secrets.randbelow(2**31))
-    print(f"replay with MICROID_SEED={drawn}")
+    """One sweep for all tests."""
+    drawn = seed_of("test_sweep_run")
     sweep, folder = parsed(small(drawn)), tmp_path_factory.mktemp("sweep") / "whole"
     run_sweep(sweep, str(folder))
     return sweep, folder

@@ -8,6 +8,7 @@ import pytest
 from _models import densities_of, limits_V, random_model
 from _plant_reference import driver_and_mechanics, van_loan
 from _reference import central_differences
+from _seed import seed_of
 
 import fits
 import microid as m
@@ -114,7 +115,7 @@ def test_the_steepest_slope_is_that_of_the_major_loop(rng):
 @pytest.fixture(scope="module")
 def tuned():
     """One search over three plants for a step, and all that went into it."""
-    rng = np.random.default_rng()
+    rng = np.random.default_rng(seed_of("test_tune"))
     plants, reference = drawn(rng), a_step(rng)
     noise = rng.normal(0, 0.01, SAMPLES)
     pid = fits.relay_start([stage_of(*one) for one in plants], T)
