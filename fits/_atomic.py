@@ -5,7 +5,7 @@ import errno
 import gzip
 import os
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,9 @@ def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
     atomic_write_bytes(path, text.encode())
 
 
-def write_csv(path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]]) -> None:
+def write_csv(
+    path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]], comments: Sequence[str] = ()
+) -> None:
     """Write columns as CSV, with as many digits as reading them back exactly takes.
 
     Parameters
@@ -85,6 +87,8 @@ def write_csv(path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]])
         File to write; a name that ends in ``.gz`` is compressed.
     columns
         Header to values, each of shape (n,).
+    comments
+        Lines before the header, each written behind ``#``, which the reader passes over.
 
     Raises
     ------
@@ -97,6 +101,7 @@ def write_csv(path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]])
     with atomic_path(path) as temporary:
         opener: Any = gzip.open if temporary.suffix == ".gz" else open
         with opener(temporary, "wt", encoding="utf-8", newline="") as file:
+            file.writelines(f"# {' '.join(comment.split())}\n" for comment in comments)
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(columns)
             writer.writerows(zip(*lists, strict=True))  # csv writes floats by repr, which is exact

@@ -15,6 +15,7 @@ from fits._atomic import atomic_path, write_csv
 from fits._cli_files import bar_to_stderr, fraction_or_files, keep_inputs
 from fits._cli_jax import start_jax
 from fits._errors import DataError
+from fits._limits import parse_limits
 from fits._read_csv import read_csv, read_runs
 from fits._result import FitError
 from fits._units import parse_columns
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _REPORT, _JSON, _BASELINE, _EXTENDED = "report.html", "diagnosis.json", "baseline.json", "extended.json"
 _PROGRAM = "next_experiment.csv"
 _LONGEST_s = 1e5
+_WIDEST = 10.0
 # What the stages of the work are announced with.
 _STAGES = (
     "fitting the plain stage",
@@ -46,6 +48,8 @@ def run_diagnose(
     false_alarm: float,
     duration: float | None,
     initial: str,
+    limit: Sequence[str],
+    margin: float,
     columns: str,
     as_json: bool,
     quiet: bool,
@@ -55,6 +59,9 @@ def run_diagnose(
         raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {false_alarm:g}.")
     if duration is not None and not 0 < duration <= _LONGEST_s:
         raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {duration:g}.")
+    if not 0 <= margin <= _WIDEST:
+        raise DataError(f"--margin: expected a share of the ranges reached, 0 to {_WIDEST:g}, found {margin:g}.")
+    limits = parse_limits(limit)
     mapping = parse_columns(columns)
     fraction, files = fraction_or_files(holdout)
     for name in _FILES:
@@ -75,6 +82,8 @@ def run_diagnose(
             false_alarm=false_alarm,
             duration_s=duration,
             initial=initial,
+            limits=limits,
+            margin=margin,
             progress=progress,
         )
     except FitError as error:
@@ -131,7 +140,8 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
                 stack.enter_context(atomic_path(folder / name)).write_text(text, encoding="utf-8")
             if ahead is not None:
                 unfinished = stack.enter_context(atomic_path(folder / _PROGRAM))
-                write_csv(unfinished, {"time_s": ahead.time_s, "voltage_V": ahead.voltage_V})
+                said = [f"predicted {one}" for one in ahead.extremes]
+                write_csv(unfinished, {"time_s": ahead.time_s, "voltage_V": ahead.voltage_V}, said)
         if ahead is None:
             # One of an earlier diagnosis would pass for this one's.
             (folder / _PROGRAM).unlink(missing_ok=True)

@@ -43,7 +43,7 @@ def test_the_command_writes_everything(bench, rng):
         assert words in done.stdout
     assert "asking" in done.stderr
     folder = bench.folder / "a" / "b"
-    ahead = np.loadtxt(folder / "next_experiment.csv", delimiter=",", skiprows=1)
+    ahead = np.loadtxt(folder / "next_experiment.csv", delimiter=",", skiprows=1, comments="#")
     np.testing.assert_array_equal(ahead[:, 1], bench.answer.next_experiment.voltage_V)
     assert (folder / "report.html").read_text(encoding="utf-8") == report_html(bench.answer)
     assert json.loads((folder / "baseline.json").read_text())["model"]["type"] == "Stage"

@@ -12,7 +12,7 @@ from fits._stage_run import prepare_stage_run
 from fits.diagnosis import _baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._contest import Rival
-from fits.diagnosis._experiment import _open, refine, suggest
+from fits.diagnosis._experiment import Wish, _open, refine, suggest
 from fits.diagnosis._law import Law, law_of
 from fits.diagnosis._noise import Noise
 from fits.diagnosis._path import Limits, limits_of, paces
@@ -214,7 +214,7 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     rival = Rival("thermal_drift", drift, drift.criterion(count), 0.0, drift.cost)
     ambiguous = replace(plain, causes=(Cause("creep", 9.0, 1e-9, (rival,), 81.0),), model=creep)
     told = []
-    experiment = suggest(made, ambiguous, (found_cause("creep", "thermal_drift"),), None, told.append)
+    experiment = suggest(made, ambiguous, (found_cause("creep", "thermal_drift"),), Wish(), told.append)
     assert experiment is not None
     assert experiment.separates == ("creep", "thermal_drift")
     assert "temperature" in experiment.extra_column
@@ -242,4 +242,4 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     assert after.causes[0].name == "creep"
     assert not after.causes[0].rivals
     # Nothing is open any more.
-    assert suggest(both, after, (found_cause("creep", ""),), None, told.append) is None
+    assert suggest(both, after, (found_cause("creep", ""),), Wish(), told.append) is None

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits._columns import columns_beside
+from fits._motion import Prepared, prepare, signals
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._evaluate import Prepared, prepare, respond_again, signals, with_effects
+from fits.diagnosis._evaluate import respond_again, with_effects
 from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host
 
 # Strength at which an effect's derivative is taken, as a share of that of its probe.

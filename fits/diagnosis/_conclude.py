@@ -9,7 +9,7 @@ from scipy import stats
 from fits._record import Record
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import simulate
-from fits.diagnosis._experiment import suggest
+from fits.diagnosis._experiment import Wish, suggest
 from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_of, left_of, shared_effects
 from fits.diagnosis._faults import Faults, find_faults, name_faults
 from fits.diagnosis._floor import SPIKE
@@ -55,12 +55,12 @@ def conclude(
     records: Sequence[Record],
     false_alarm: float,
     progress: Callable[[str], None],
-    duration_s: float | None,
+    wish: Wish,
 ) -> Diagnosis:
     """Decide on the verdict, extend the stage, measure the gain, and say what else is to be said.
 
-    `records` are those whose warnings are passed on, `false_alarm` is what was asked for, and `duration_s` is the
-    length of the next experiment in s; see `diagnose`.
+    `records` are those whose warnings are passed on, `false_alarm` and `wish` are what was asked
+    for; see `diagnose`.
     """
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
@@ -106,10 +106,11 @@ def conclude(
     if (held := held_creep([run.record for run in baseline.runs])) is not None:
         causes = told_by(held, causes)
         remarks.append(held.sentence)
-    ahead = suggest(ready, found, causes, duration_s, progress)
+    ahead = suggest(ready, found, causes, wish, progress)
     if ahead is None and any(cause.also_consistent for cause in causes):
         remarks.append(
-            "no program of this length within the limits of these runs tells the class apart; allow a longer"
+            "no program of this length that stays within the limits tells the class apart; allow a longer one, or "
+            "wider limits where the rig has them"
         )
     # Faults of samples and noise explain nothing that is reproducible, but a narrow band may look as if it were.
     explained_all = any(one.name == "floor_vibration" and one.share_of_misfit > _BAND for one in causes)

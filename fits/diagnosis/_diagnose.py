@@ -1,15 +1,18 @@
 """From records to a diagnosis: what is wrong, why, and what is gained by adding it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import jax
 import numpy as np
 
 from fits._errors import DataError
+from fits._limits import MARGIN, UNITS
 from fits._record import Record, refuse_repeats
 from fits._run import UNSWEPT
 from fits.diagnosis._conclude import conclude
+from fits.diagnosis._experiment import Wish
 from fits.diagnosis._prepare import HOLDS, Prepared, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis
 from fits.diagnosis._select import Selection, select
@@ -34,6 +37,8 @@ def diagnose(
     false_alarm: float = 0.01,
     duration_s: float | None = None,
     initial: str = "unknown",
+    limits: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    margin: float = MARGIN,
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
@@ -55,6 +60,12 @@ def diagnose(
         Length of the experiment that is suggested next; that of the longest run by default.
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`.
+    limits
+        What the next experiment may reach, lowest and highest by name: voltage (V), slew (V/s), displacement (um),
+        velocity (um/s), acceleration (um/s^2), current of the driver per farad of the piezo (A/F). Of what is not
+        stated, as far as the records went.
+    margin
+        By how much of its range a predicted quantity may go beyond what the records reached.
     seed
         Of the draws that calibrate the false alarms.
     progress
@@ -84,6 +95,9 @@ def diagnose(
     fraction = float(holdout) if isinstance(holdout, int | float) else _CHECK
     if not 0 <= fraction <= 0.9:
         raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
+    unknown = set(limits) - set(UNITS)
+    if unknown or not margin >= 0:
+        raise DataError(f"expected limits of {', '.join(UNITS)} and a margin of 0 or more; correct them")
     refuse_repeats([*records, *aside])
     rng = np.random.default_rng(seed)
     ready = prepare_diagnosis(records, aside, fraction, initial, progress)
@@ -113,4 +127,4 @@ def diagnose(
         if max((cause.z for cause in beside.causes), default=0.0) > _STRONG:
             said = (*whole.baseline.remarks, _ALL)
             ready, found = replace(whole, baseline=replace(whole.baseline, remarks=said)), beside
-    return conclude(ready, found, [*records, *aside], false_alarm, progress, duration_s)
+    return conclude(ready, found, [*records, *aside], false_alarm, progress, Wish(duration_s, limits, margin))

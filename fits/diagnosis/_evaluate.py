@@ -1,8 +1,7 @@
 """Simulation of extended stages, part by part, so that only what changed is computed and compiled."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -10,43 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.backend import get_backend
 
+from fits._motion import Prepared, pass_signal, prepare, signals
 from fits._record import Record
 from fits._stage_run import StageRun
-from microid import AbstractEffect, AbstractPart, Scene, Signal, Stage, extend, host, refined
+from microid import AbstractEffect, Signal, Stage, extend, host, refined
 
 # Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
 _LONG, _MANY = 20_000, 500
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A run, and what a stage makes of it."""
-
-    run: StageRun
-    time_s: Any
-    scene: Scene
-
-
-def prepare(stage: Stage, run: StageRun) -> Prepared:
-    """Build the scene of a run."""
-    samples = run.samples
-    command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
-    return Prepared(run, samples.time_s, Scene(command, samples.beside, samples.start.memory))
-
-
-@eqx.filter_jit
-def _pass(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
-    return part.run(time_s, signal, scene)
-
-
-def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
-    """What goes into each part of a stage, and at the end what comes out."""
-    signal = prepared.scene.command
-    found = [signal]
-    for part in stage.parts:
-        signal = _pass(part, prepared.time_s, signal, prepared.scene)
-        found.append(signal)
-    return found
 
 
 def simulate(stage: Stage, run: StageRun) -> np.ndarray:
@@ -69,7 +38,7 @@ def respond_again(stage: Stage, base: Stage, known: Sequence[Signal], prepared: 
         same += 1
     signal = known[same]
     for part in stage.parts[same:]:
-        signal = _pass(part, prepared.time_s, signal, prepared.scene)
+        signal = pass_signal(part, prepared.time_s, signal, prepared.scene)
     return np.asarray(signal.values)[:: prepared.run.samples.stride][: len(prepared.run.record)]
 
 

@@ -1,15 +1,18 @@
 """The next experiment: the voltage program that would tell apart best what the records leave open."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fits._limits import MARGIN
 from fits.diagnosis._contest import best_of
+from fits.diagnosis._inside import guard_of
 from fits.diagnosis._path import limits_of, repeated
 from fits.diagnosis._predict import Hypothesis, Predictor
-from fits.diagnosis._programs import Program, menu
-from fits.diagnosis._refit import law_of
+from fits.diagnosis._programs import Program
+from fits.diagnosis._refit import Refit, law_of
 from fits.diagnosis._result import Experiment, FoundCause
 from fits.diagnosis._select import Selection
 from microid import Mechanics
@@ -64,17 +67,36 @@ _COLUMNS = (
 )
 
 
+@dataclass(frozen=True)
+class Wish:
+    """What is asked of the next experiment.
+
+    Attributes
+    ----------
+    duration_s
+        Of the program; that of the longest run if None.
+    limits, margin
+        Limits of the rig, by name, and by how much of its range a predicted quantity may otherwise go beyond what the
+        records reached; see `fits._limits.allowed`.
+    """
+
+    duration_s: float | None = None
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    margin: float = MARGIN
+
+
 def suggest(
     ready: "Prepared",
     found: Selection,
     causes: tuple[FoundCause, ...],
-    duration_s: float | None,
+    wish: Wish,
     progress: Callable[[str], None],
 ) -> Experiment | None:
     """Choose and refine the program that decides best what is open.
 
     Each program of the menu is played virtually: the regression of the new run is added to that of the old ones, and
-    what the rivals change in all of them is projected off what the stage and the other rival can follow.
+    what the rivals change in all of them is projected off what the stage and the other rival can follow. Only those
+    count that keep the rig inside its limits, whichever of the rivals is true.
 
     Parameters
     ----------
@@ -82,16 +104,16 @@ def suggest(
         All that the diagnosis of the runs at hand knows.
     causes
         What it names; the first of them that has rivals is asked about. If there is none at all, what is suspected.
-    duration_s
-        Of the program; that of the longest run if None.
+    wish
+        What was asked of the program.
     progress
         Told what is being done.
 
     Returns
     -------
     Experiment
-        None where every cause is told from all others or nothing is suspected, and where no program and no further
-        column would help.
+        None where every cause is told from all others or nothing is suspected, and where no program inside the limits
+        and no further column would help.
     """
     question = _open(ready, found, causes)
     if question is None:
@@ -100,10 +122,15 @@ def suggest(
     progress("looking for the experiment that tells " + (" from ".join(names) if len(names) > 1 else names[0]))
     baseline = ready.baseline
     resonance = next((float(p.natural_frequency_Hz) for p in baseline.stage.parts if isinstance(p, Mechanics)), None)
-    limits = limits_of([run.record for run in baseline.runs], baseline.range_V, resonance, duration_s)
+    guard = guard_of(ready, found, hypotheses, wish.limits, wish.margin)
+    limits = guard.narrowed(
+        limits_of([run.record for run in baseline.runs], baseline.range_V, resonance, wish.duration_s)
+    )
+    if limits is None:
+        return None
     predictor = Predictor(found.bench, found.projector, hypotheses, pairs)
     present = predictor.present_z
-    programs = menu(limits, _MOST)
+    programs = guard.menu(limits, _MOST)
     if not programs:
         return None
     scores = [predictor.predicted_z(*program.samples(program.start)) for program in programs]
@@ -117,13 +144,21 @@ def suggest(
     chosen = min(near, key=lambda k: (programs[k].limits.duration_s, -scores[k]))
     program, z = programs[chosen], scores[chosen]
     progress(f"refining {program.words}")
-    parameters, z = refine(program, lambda p: asked.predicted_z(*program.samples(p)), z)
+
+    def gain(parameters: np.ndarray) -> float:
+        played = program.samples(parameters)
+        return asked.predicted_z(*played) if guard.allows(played) else float("nan")
+
+    parameters, z = refine(program, gain, z)
     time_s, voltage_V = program.samples(parameters)
     times, once = 1, (time_s, voltage_V)
     most = min(_TIMES, int(limits.duration_s / (1.1 * program.limits.duration_s)))
     while times < most and z < _PLENTY:
+        longer = repeated(program.limits, once, times + 1)
+        if not guard.allows(longer):
+            break
         times += 1
-        time_s, voltage_V = repeated(program.limits, once, times)
+        time_s, voltage_V = longer
         z = asked.predicted_z(time_s, voltage_V)
     if asked is not predictor:
         z = predictor.predicted_z(time_s, voltage_V)
@@ -131,7 +166,9 @@ def suggest(
     if not column and (z < 1.0 or z < _WORTH * present):
         return None
     words = program.words if times < 2 else f"{program.words}, {_OVER[times]} over"
-    return Experiment(time_s, voltage_V, words, _purpose(names, z, present, column), names, z, present, column)
+    purpose = _purpose(names, z, present, column)
+    extremes = guard.extremes((time_s, voltage_V))
+    return Experiment(time_s, voltage_V, words, purpose, names, z, present, column, extremes)
 
 
 Question = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
@@ -140,7 +177,7 @@ Question = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int],
 def _open(ready: "Prepared", found: Selection, causes: tuple[FoundCause, ...]) -> Question | None:
     """What is to be decided: names, hypotheses, and which is compared with which."""
     named = {cause.name for cause in causes}
-    best = Hypothesis(found.model.laws, found.model.x)
+    best = Hypothesis(found.model.laws, found.model.x, _covariances(found.model))
     for at, cause in enumerate(found.causes):
         if cause.name not in named or not cause.rivals:
             continue
@@ -149,6 +186,7 @@ def _open(ready: "Prepared", found: Selection, causes: tuple[FoundCause, ...]) -
             Hypothesis(
                 (*best.laws[:at], rival.refit.laws[-1], *best.laws[at + 1 :]),
                 (*best.x[:at], rival.refit.x[-1], *best.x[at + 1 :]),
+                (*best.covariances[:at], _covariances(rival.refit)[-1], *best.covariances[at + 1 :]),
             )
             for rival in rivals
             # Another cause may have turned out to be the rival.
@@ -164,12 +202,20 @@ def _open(ready: "Prepared", found: Selection, causes: tuple[FoundCause, ...]) -
     nothing = Hypothesis((), ())
     if found.causes:
         # What explains too little to be named is a suspicion all the same.
-        return (found.causes[0].name,), (Hypothesis(best.laws[:1], best.x[:1]), nothing), ((0, 1),)
+        first = Hypothesis(best.laws[:1], best.x[:1], best.covariances[:1])
+        return (found.causes[0].name,), (first, nothing), ((0, 1),)
     leading = next(iter(best_of(found.left).values()), None)
     if leading is None or (leading.z < _SUSPECT_Z and found.family.p(leading.z) >= _SUSPECT_P):
         return None
     law = law_of(leading, len(ready.bench.prepared))
     return (leading.name,), (Hypothesis((law,), (law.start,)), nothing), ((0, 1),)
+
+
+def _covariances(model: Refit) -> tuple[np.ndarray, ...]:
+    """Covariance of the coordinates of each effect of a model."""
+    whole, stops = model.covariance(), np.cumsum([law.size for law in model.laws])
+    blocks = [slice(stop - law.size, stop) for law, stop in zip(model.laws, stops, strict=True)]
+    return tuple(whole[block, block] for block in blocks)
 
 
 def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) -> tuple[np.ndarray, float]:
@@ -180,7 +226,7 @@ def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) 
     program
         Where to begin, and the limits of its parameters.
     gain
-        Of parameters, shape `(k,)`.
+        Of parameters, shape `(k,)`; NaN where they are not allowed.
     first
         The gain at the program's start.
     """
@@ -192,13 +238,17 @@ def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) 
             ahead = best.copy()
             # Towards the middle, so that a step is never cut off.
             ahead[k] += span[k] * (_PROBE if best[k] < (program.lower + program.upper)[k] / 2 else -_PROBE)
-            slope[k] = np.log(max(gain(ahead), 1e-12) / max(top, 1e-12)) * span[k] / (ahead[k] - best[k])
+            there = gain(ahead)
+            if not np.isnan(there):
+                slope[k] = np.log(max(there, 1e-12) / max(top, 1e-12)) * span[k] / (ahead[k] - best[k])
         size = float(np.max(np.abs(slope)))
         if size == 0:
             break
         tried = [np.clip(best + length * span * slope / size, program.lower, program.upper) for length in _LENGTHS]
         gains = [gain(p) for p in tried]
-        longest = int(np.argmax(gains))
+        if np.isnan(gains).all():
+            break
+        longest = int(np.nanargmax(gains))
         if gains[longest] <= top:
             break
         best, top = tried[longest], gains[longest]

@@ -122,6 +122,14 @@ def _experiment(ahead: Experiment) -> dict[str, Any]:
         "duration_s": _number(ahead.time_s[-1] - ahead.time_s[0]) if known else None,
         "lowest_V": _number(ahead.voltage_V.min()) if known else None,
         "highest_V": _number(ahead.voltage_V.max()) if known else None,
+        "extremes": [
+            {
+                "quantity": one.name,
+                "unit": one.unit,
+                **{key: _number(getattr(one, key)) for key in ("low", "high", "lowest", "highest")},
+            }
+            for one in ahead.extremes
+        ],
     }
 
 

@@ -18,6 +18,8 @@ from fits.diagnosis._through import passed
 from microid import AbstractEffect
 
 _STEP = 1e-3
+# The farthest that a draw moves a coordinate, which are of the order of one.
+_FARTHEST = 1.0
 # Relative precision below which a direction counts as not seen.
 _RIDGE = 1e-10
 # Noise that was learnt at a sampling interval so many times longer or shorter says nothing of its colour.
@@ -26,10 +28,19 @@ _LIKE = 1.5
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Effects that the stage may have, with their coordinates in all runs; none for the plain stage."""
+    """Effects that the stage may have, none for the plain stage.
+
+    Attributes
+    ----------
+    laws, x
+        The effects, and their coordinates in all runs.
+    covariances
+        Of the coordinates of each; empty where they are not known.
+    """
 
     laws: tuple[Law, ...]
     x: tuple[np.ndarray, ...]
+    covariances: tuple[np.ndarray, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -39,7 +50,23 @@ class Hypothesis:
     def without(self, name: str) -> "Hypothesis":
         """The same without an effect."""
         kept = [k for k, other in enumerate(self.names) if other != name]
-        return Hypothesis(tuple(self.laws[k] for k in kept), tuple(self.x[k] for k in kept))
+        known = tuple(self.covariances[k] for k in kept) if self.covariances else ()
+        return Hypothesis(tuple(self.laws[k] for k in kept), tuple(self.x[k] for k in kept), known)
+
+    def effects(self, run: int) -> list[AbstractEffect]:
+        """The effects as they are in one run."""
+        return [law.effect(x, run) for law, x in zip(self.laws, self.x, strict=True)]
+
+    def drawn(self, rng: np.random.Generator) -> "Hypothesis":
+        """The same effects with other coordinates that the runs allow, none of them moved by more than one."""
+        if not self.covariances:
+            return self
+        x = []
+        for at, covariance in zip(self.x, self.covariances, strict=True):
+            value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
+            moved = vector @ (np.sqrt(np.maximum(value, 0.0)) * rng.standard_normal(len(value)))
+            x.append(at + np.clip(moved, -_FARTHEST, _FARTHEST))
+        return replace(self, x=tuple(x))
 
 
 class Predictor:

@@ -144,6 +144,12 @@ class Projector:
         columns = self.regression.baseline.chain.size
         return answer[columns : self.regression.size], answer[:columns]
 
+    def draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Steps of coordinates and columns to another baseline that the runs allow, drawn by their covariance."""
+        answer = (self._inverse @ rng.standard_normal(self._inverse.shape[1])) / self._scale
+        columns = self.regression.baseline.chain.size
+        return answer[columns : self.regression.size], answer[:columns]
+
     def _answer(self, joined: np.ndarray) -> np.ndarray:
         along = self.orthonormal.T @ joined if self._matrix is None else self._inverse.T @ (self._matrix.T @ joined)
         return (self._inverse @ along) / self._scale

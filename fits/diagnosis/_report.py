@@ -11,6 +11,7 @@ from fits.diagnosis._report_tables import (
     bounds_section,
     causes_section,
     experiment_facts,
+    experiment_limits,
     gain_section,
     section,
     tests_section,
@@ -187,6 +188,7 @@ def _next(diagnosis: Diagnosis) -> str:
         _paragraph(ahead.purpose),
         _figure(program(ahead), ahead.kind),
         experiment_facts(ahead),
+        experiment_limits(ahead),
         _paragraph(f"A further column would help: {ahead.extra_column}" if ahead.extra_column else ""),
     )
 

@@ -202,3 +202,22 @@ def experiment_facts(ahead: Experiment) -> str:
     if math.isfinite(ahead.present_z):
         pairs.append(("In the records at hand", f"{sigmas(ahead.present_z)} {SIGMA}"))
     return _facts(pairs)
+
+
+def experiment_limits(ahead: Experiment) -> str:
+    """What the next experiment is predicted to reach, beside the limits."""
+    if not ahead.extremes:
+        return ""
+
+    def span(low: float, high: float, unit: str) -> str:
+        return f"{number(low)} to {number(high)} {unit}"
+
+    rows = [
+        (one.name, span(one.low, one.high, one.unit), span(one.lowest, one.highest, one.unit))
+        for one in ahead.extremes
+    ]
+    words = (
+        "<p>Predicted for the plain stage and for each candidate, and for what else the records allow them to be. "
+        "Limits that nobody stated are what the records reached. The current is that of each farad of the piezo.</p>"
+    )
+    return words + _table(("Quantity", "Predicted", "Limits"), rows, (False, True, True), stack=True)

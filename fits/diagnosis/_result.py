@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fits._limits import Extreme
 from microid import Stage
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]
@@ -187,6 +188,9 @@ class Experiment:
         The same in the records at hand.
     extra_column
         Which further column would help, and why; empty if none would.
+    extremes
+        What the program is predicted to reach at most, whichever of the stages that the records allow is the true
+        one, beside the limits.
     """
 
     time_s: np.ndarray
@@ -197,6 +201,7 @@ class Experiment:
     predicted_z: float
     present_z: float
     extra_column: str = ""
+    extremes: tuple[Extreme, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,166 @@
+"""Programs that stay inside the limits of a rig, whichever of the stages that the records allow is the true one."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fits._limits import Extreme, Ranges, allowed, beyond, compared, joined
+from fits._motion import motion, reached_by
+from fits._record import Record
+from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._evaluate import with_effects
+from fits.diagnosis._path import Limits, Path, Samples
+from fits.diagnosis._predict import Hypothesis
+from fits.diagnosis._programs import Program, menu
+from fits.diagnosis._projector import Projector
+from microid import Stage
+
+if TYPE_CHECKING:
+    from fits.diagnosis._prepare import Prepared
+    from fits.diagnosis._select import Selection
+
+# Draws of the plain stage, and of the stage with each hypothesis.
+_DRAWS, _EACH = 4, 2
+# The farthest that a draw moves a coordinate, which are of the order of one.
+_FARTHEST = 1.0
+# Shares of the fastest slew that a program is tried with, until it is inside.
+_SLEWS = tuple(0.5**k for k in range(8))
+# Rounds in which the range of the voltage is narrowed, what each takes off beyond the excess, and the share of the
+# range below which nothing is worth playing.
+_ROUNDS, _MORE, _NARROW = 12, 1.1, 0.1
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A stage that the records allow, and what the sensor reads in um where its own displacement is zero."""
+
+    stage: Stage
+    zero_um: float
+
+
+class Guard:
+    """Predicts what a program makes the rig do, and compares it with the limits.
+
+    Parameters
+    ----------
+    models
+        Stages that the records allow, the fitted one first.
+    limits
+        Of what is commanded and of what the rig does.
+    like
+        Record whose further columns the next run is taken to have.
+    range_V
+        Of the commands that the stages were fitted with.
+    """
+
+    def __init__(self, models: Sequence[_Model], limits: Ranges, like: Record, range_V: tuple[float, float]):
+        self.models, self.limits, self._like, self._range_V = tuple(models), limits, like, range_V
+
+    def extremes(self, program: Samples) -> tuple[Extreme, ...]:
+        """What all stages reach, beside the limits."""
+        return compared(joined(self._each(program)), self.limits)
+
+    def allows(self, program: Samples) -> bool:
+        """Whether all stages stay inside."""
+        return not any(beyond(compared(ranges, self.limits)) for ranges in self._each(program))
+
+    def _each(self, program: Samples) -> Iterable[Ranges]:
+        time_s, voltage_V = program
+        share = np.linspace(0, 1, len(time_s))
+        extra = {k: np.interp(share, np.linspace(0, 1, len(v)), v) for k, v in self._like.extra.items()}
+        record = Record(time_s, voltage_V, None, extra, source="the next run")
+        # Relays that the program does not reach may have been left in any state.
+        whole = voltage_V[0] <= self._range_V[0]
+        for model in self.models:
+            for state in ("negative",) if whole else ("negative", "positive"):
+                ranges, _ = motion(model.stage, record, self._range_V, state)
+                low, high = (end + model.zero_um for end in ranges["displacement"])
+                yield {**ranges, "displacement": (low, high)}
+
+    def narrowed(self, limits: Limits) -> Limits | None:
+        """Limits of commands whose slow loops stay inside; None where hardly any voltage does."""
+        whole = limits
+        lower, upper = self.limits["voltage"]
+        limits = replace(limits, lower_V=max(limits.lower_V, lower), upper_V=min(limits.upper_V, upper))
+        limits = replace(limits, fastest_V_per_s=min(limits.fastest_V_per_s, self.limits["slew"][1]))
+        for _ in range(_ROUNDS):
+            if not limits.span_V > _NARROW * whole.span_V:
+                return None
+            slow = replace(limits, interval_s=max(limits.interval_s, limits.duration_s / 1000))
+            (moved,) = (one for one in self.extremes(Path(slow).samples()) if one.name == "displacement")
+            if moved.excess <= 0:
+                return limits
+            per_V = (moved.high - moved.low) / limits.span_V
+            limits = replace(
+                limits,
+                lower_V=limits.lower_V + _MORE * max(moved.lowest - moved.low, 0.0) / per_V,
+                upper_V=limits.upper_V - _MORE * max(moved.high - moved.highest, 0.0) / per_V,
+            )
+        return None
+
+    def menu(self, limits: Limits, most: int) -> tuple[Program, ...]:
+        """Programs that start inside, each with the fastest slew with which it does; with so many samples at most."""
+        found: dict[tuple[str, float], Program] = {}
+        for share in _SLEWS:
+            for program in menu(replace(limits, fastest_V_per_s=share * limits.fastest_V_per_s), most):
+                key = program.words, program.limits.interval_s
+                if key not in found and self.allows(program.samples(program.start)):
+                    found[key] = program
+        return tuple(found.values())
+
+
+def guard_of(
+    ready: "Prepared",
+    found: "Selection",
+    hypotheses: Sequence[Hypothesis],
+    stated: Mapping[str, tuple[float, float]],
+    margin: float,
+    seed: int = 0,
+) -> Guard:
+    """Make a guard of what a diagnosis knows.
+
+    Parameters
+    ----------
+    ready, found
+        The plain stage and the selection.
+    hypotheses
+        Effects that the stage may have.
+    stated, margin
+        See `fits._limits.allowed`.
+    seed
+        Of the draws from what the records leave open.
+    """
+    baseline = ready.baseline
+    records = [run.record for run in baseline.runs]
+    known = [run.known for run in baseline.runs]
+    states = ["unknown"] * len(records)
+    reached, offsets_um = reached_by(baseline.stage, records, baseline.range_V, states, known)
+    limits = allowed({**reached, "voltage": baseline.range_V}, stated, margin)
+    longest = int(np.argmax([record.duration_s for record in records]))
+    like = records[longest]
+    assert like.displacement_um is not None
+    # As the sensor of the first record would have read it.
+    read_um = like.displacement_um - offsets_um[longest] + offsets_um[0]
+    rng = np.random.default_rng(seed)
+
+    def model(stage: Stage) -> _Model:
+        _, own_um = motion(stage, like, baseline.range_V)
+        return _Model(stage, float(np.mean((read_um - own_um)[known[longest]])))
+
+    beside = found.bench.baseline
+    stages = [baseline.stage]
+    stages += [with_effects(beside.stage, h.effects(longest)) for h in hypotheses if h.laws]
+    stages += [_drawn(baseline, ready.projector, rng).stage for _ in range(_DRAWS)]
+    for h in hypotheses:
+        for _ in range(_EACH if h.laws else 0):
+            stages.append(with_effects(_drawn(beside, found.projector, rng).stage, h.drawn(rng).effects(longest)))
+    return Guard([model(stage) for stage in stages], limits, like, baseline.range_V)
+
+
+def _drawn(baseline: Baseline, projector: Projector, rng: np.random.Generator) -> Baseline:
+    """A plain stage out of those that the records allow."""
+    dz, dcolumns_um = projector.draw(rng)
+    kept = np.maximum(baseline.columns_um + dcolumns_um, 0.0)
+    return baseline.moved(np.clip(dz, -_FARTHEST, _FARTHEST), kept - baseline.columns_um)
