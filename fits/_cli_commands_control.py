@@ -4,7 +4,7 @@ from typing import Any
 
 import click
 
-from fits._cli_common import columns, in_sentences, json_output, limits, quiet
+from fits._cli_common import columns, in_sentences, json_output, limit, limits, margin, quiet
 
 
 @click.command()
@@ -40,6 +40,8 @@ from fits._cli_common import columns, in_sentences, json_output, limits, quiet
 @click.option("--resolution", type=float, metavar="UM", help="Steps of the sensor, in um.")
 @click.option("--resolution-voltage", type=float, metavar="V", help="Steps of the amplifier's command, in V.")
 @limits
+@limit
+@margin
 @click.option(
     "--initial",
     type=click.Choice(["negative", "positive", "demagnetised"]),

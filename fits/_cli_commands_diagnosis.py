@@ -4,7 +4,7 @@ from typing import Any
 
 import click
 
-from fits._cli_common import columns, in_sentences, json_output, quiet
+from fits._cli_common import columns, in_sentences, json_output, limit, margin, quiet
 
 
 @click.command()
@@ -24,20 +24,8 @@ from fits._cli_common import columns, in_sentences, json_output, quiet
     show_default=True,
     help="Memory before all runs.",
 )
-@click.option(
-    "--limit",
-    multiple=True,
-    metavar="NAME=LOW:HIGH",
-    help="What the next experiment may reach, such as displacement=0:40um or slew=2kV/s; give it again for voltage, "
-    "slew, displacement, velocity, acceleration and current (per farad of the piezo). By default what the runs did.",
-)
-@click.option(
-    "--margin",
-    type=float,
-    default=0.02,
-    show_default=True,
-    help="Share of its range by which what is predicted may go beyond what the runs reached.",
-)
+@limit
+@margin
 @columns
 @json_output
 @quiet

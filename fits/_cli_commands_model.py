@@ -4,7 +4,7 @@ from typing import Any
 
 import click
 
-from fits._cli_common import columns, in_sentences, json_output, limits, quiet
+from fits._cli_common import columns, in_sentences, json_output, limit, limits, margin, quiet
 
 
 def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -104,6 +104,8 @@ def simulate(**options: Any) -> None:
 @click.option("--dynamic", "way", flag_value="dynamic", help="Compensate the mechanics and the driver too.")
 @click.option("--clip", is_flag=True, help="Where the reference is out of reach take the nearest that is not.")
 @limits
+@limit
+@margin
 @click.option(
     "--initial",
     type=click.Choice(["negative", "positive", "demagnetised"]),

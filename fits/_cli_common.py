@@ -43,5 +43,19 @@ columns = click.option(
     help="Which columns to read, such as voltage_V=u1_V,displacement_um=-height[nm].",
 )
 limits = click.option("--limits", metavar="LOW,HIGH", help="Voltages allowed, in V; the model's range by default.")
+limit = click.option(
+    "--limit",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="What the rig may be asked for, such as displacement=0:40um or slew=2kV/s; again for more of voltage, slew, "
+    "displacement, velocity, acceleration and current (per farad of the piezo). By default what the runs reached.",
+)
+margin = click.option(
+    "--margin",
+    type=float,
+    default=0.02,
+    show_default=True,
+    help="Share of its range by which what is predicted may go beyond what the runs reached.",
+)
 json_output = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -15,7 +16,9 @@ from fits._compensate import compensate
 from fits._compensate_stage import static_equivalent
 from fits._errors import DataError
 from fits._export_c import export_c
+from fits._limits import Ranges, allowed, check_command, parse_limits, reached_in
 from fits._model_file import ModelFile, load_model
+from fits._motion import predicted_ranges
 from fits._plot_compensation import plot_compensation
 from fits._read_csv import read_reference
 from fits._record import Record
@@ -37,14 +40,17 @@ def run_compensate(
     way: str,
     clip: bool,
     limits: str | None,
+    limit: Sequence[str],
+    margin: float,
     initial: str,
     plots: str | None,
     columns: str,
     as_json: bool,
 ) -> None:
     """Do `microid compensate`; the options are the command's."""
-    start_jax()
     keep_inputs(out, [model, reference])
+    volts, stated = parse_rig_limits(limits, limit, margin)
+    start_jax()
     loaded = load_model(model)
     stage = _compensable(model, loaded)
     if way == "dynamic" and isinstance(stage, Preisach):
@@ -55,8 +61,11 @@ def run_compensate(
     wanted = read_reference(reference, parse_columns(columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with atomic_path(out) as unfinished, new_folder(plots) as drawings:
-        found = compensate(stage, wanted, initial, clip, _limits(limits), "dynamic" if way == "dynamic" else "static")
+        found = compensate(stage, wanted, initial, clip, volts, "dynamic" if way == "dynamic" else "static")
         program = Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
+        every = bool({"velocity", "acceleration", "current"} & set(stated))
+        predicted = predicted_ranges(stage, program, found.displacement_um, initial, every)
+        said = check_command(wanted.source, predicted, reached_in(loaded.report), stated, margin)
         sd_um = _displacement_sd_um(loaded, program, initial)
         drawn = []
         if drawings is not None:
@@ -69,7 +78,7 @@ def run_compensate(
         write_csv(unfinished, columns_out)
     off = np.abs(found.displacement_um - found.reference_um)
     places = [str(Path(plots) / path.name) for path in drawn] if plots else []
-    remarks = [*wanted.warnings, *found.remarks]
+    remarks = [*wanted.warnings, *found.remarks, *said]
     summary = {
         "out": out,
         "plots": places,
@@ -125,6 +134,20 @@ def _displacement_sd_um(loaded: ModelFile, program: Record, initial: str) -> np.
     if isinstance(loaded.model, Preisach) and isinstance(loaded.uncertainty, Uncertainty):
         return predict(loaded.model, loaded.uncertainty, program, initial).displacement_sd_um
     return None
+
+
+def parse_rig_limits(
+    volts: str | None, limit: Sequence[str], margin: float
+) -> tuple[tuple[float, float] | None, Ranges]:
+    """Read `--limits`, `--limit` and `--margin`: the range of the command in V, and what else is stated."""
+    stated = parse_limits(limit)
+    allowed({}, stated, margin)
+    both = _limits(volts)
+    if "voltage" not in stated:
+        return both, stated
+    if both is not None:
+        raise DataError("--limit voltage: --limits states that already; leave one of them out.")
+    return stated["voltage"], stated
 
 
 def _limits(text: str | None) -> tuple[float, float] | None:

@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from fits._atomic import atomic_path, write_csv
-from fits._cli_compensate import _limits
+from fits._cli_compensate import parse_rig_limits
 from fits._cli_files import keep_inputs, new_folder, progress_to_stderr
 from fits._cli_jax import start_jax
 from fits._cli_work import preisach_of
@@ -21,9 +21,10 @@ from fits._control_report import control_json, describe_control
 from fits._control_setup import Setup, setup
 from fits._draw_plants import draw_plants
 from fits._errors import DataError
+from fits._limits import check_command, joined, measured_ranges, reached_in
 from fits._model_file import load_model
 from fits._read_csv import read_reference
-from fits._record import Reference
+from fits._record import Record, Reference
 from fits._result import FitError
 from fits._tune_problem import Goal
 from fits._units import parse_columns
@@ -51,6 +52,8 @@ def run_control(
     resolution: float | None,
     resolution_voltage: float | None,
     limits: str | None,
+    limit: Sequence[str],
+    margin: float,
     initial: str,
     plants: int | None,
     overshoot: float | None,
@@ -80,6 +83,7 @@ def run_control(
             raise DataError(f"{option}: expected a number of {least:g} or more, found {bound:g}.")
     if frequency and controller != "resonant":
         raise DataError(f"--frequency: expected --controller resonant with it, found {controller}; leave it out.")
+    volts, allowed_here = parse_rig_limits(limits, limit, margin)
     start_jax()
     keep_inputs(out, [model, reference] if gains is None else [model, reference, gains])
     tell = progress_to_stderr(quiet)
@@ -91,7 +95,7 @@ def run_control(
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with atomic_path(out) as unfinished, new_folder(plots) as drawings:
         try:
-            ready = setup(plant, wanted, feedforward, initial=initial, limits_V=_limits(limits))
+            ready = setup(plant, wanted, feedforward, initial=initial, limits_V=volts)
         except DataError as error:
             # What the reference or an option is to blame for says so itself.
             if str(error).startswith(("--", f"{wanted.source}:")):
@@ -119,12 +123,20 @@ def run_control(
         tell("run")
         heard = rng.normal(0, noise, len(wanted)) if noise else None
         asked = 1 if overshoot is None else len(loop.plants)
-        runs = [loop.run(made.controller, heard, resolution_voltage, k) for k in range(asked)]
-        run = runs[0]
-        if not all(np.all(np.isfinite(one.error_um)) for one in runs):
+        played = [loop.run(made.controller, heard, resolution_voltage, k) for k in range(len(loop.plants))]
+        runs, run = played[:asked], played[0]
+        if not all(np.all(np.isfinite(one.error_um)) for one in played):
             raise DataError(f"{model}: the loop is unstable, its displacement has no bounds; lower --gains.")
         passed = passed_limits(goal, every, runs)
-        more = [*made.remarks, *_judged(passed, stated, controller, given is not None)]
+        predicted = joined(
+            measured_ranges(Record(wanted.time_s, np.asarray(one.command_V), np.asarray(one.displacement_um)))
+            for one in played
+        )
+        # Sensor noise alone makes a loop's command jump from sample to sample.
+        said = check_command(
+            wanted.source, predicted, reached_in(loaded.report), allowed_here, margin, spared=("slew",)
+        )
+        more = [*made.remarks, *said, *_judged(passed, stated, controller, given is not None)]
         names = ("time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um")
         table = {name: np.asarray(getattr(run, name)) for name in names}
         write_csv(unfinished, table | {"time_s": wanted.time_s})

@@ -15,7 +15,7 @@ from fits._atomic import atomic_path, write_csv
 from fits._cli_files import bar_to_stderr, fraction_or_files, keep_inputs
 from fits._cli_jax import start_jax
 from fits._errors import DataError
-from fits._limits import parse_limits
+from fits._limits import parse_limits, ranges_json
 from fits._read_csv import read_csv, read_runs
 from fits._result import FitError
 from fits._units import parse_columns
@@ -120,7 +120,10 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
         # What is not known is not in the file.
         uncertainty: Any = diagnosis.details.get(f"{which}_uncertainty")
         try:
-            return model_text(stage, uncertainty, {"part_of": "diagnosis", "stage": which})
+            # Their own displacement is without an offset.
+            runs = [{"offset_um": 0.0, "reached": ranges_json(one)} for one in diagnosis.details.get("reached", ())]
+            about = {"part_of": "diagnosis", "stage": which, "runs": runs}
+            return model_text(stage, uncertainty, about)
         except DataError as error:
             raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error
 

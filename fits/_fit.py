@@ -14,6 +14,7 @@ from fits._errors import DataError
 from fits._estimate import Estimate
 from fits._grid import BELIEF_LEVELS, GridSolution, cross_validate, grid_estimate, solve_grid
 from fits._history import estimate_start
+from fits._limits import measured_ranges
 from fits._metrics import Errors, errors, loop_width_pct
 from fits._moments import Data, gather
 from fits._noise import correlation_samples
@@ -318,6 +319,7 @@ def _report(model: Preisach, run: Run, noise_um: float) -> RunReport:
         start=run.starts[0] if start is None else start,
         loop_measured_pct=loop_width_pct(voltage, measured[run.known]),
         loop_model_pct=loop_width_pct(voltage, predicted[run.known]),
+        reached=measured_ranges(run.record),
     )
 
 

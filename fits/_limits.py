@@ -2,10 +2,14 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from fits._errors import DataError
+from fits._record import Record
 
 # Range of each quantity, by name: lowest and highest value.
 Ranges = dict[str, tuple[float, float]]
@@ -130,6 +134,40 @@ def _factor(name: str, unit: str) -> float:
     raise DataError(f"--limit {name}: expected the unit {expected} or a multiple of it, found {unit!r}; convert it.")
 
 
+def measured_ranges(record: Record, offset_um: float = 0.0) -> Ranges:
+    """What a record shows without a model: voltage, slew, and displacement less an offset."""
+    ranges = {"voltage": record.voltage_V, "slew": np.append(np.diff(record.voltage_V) / np.diff(record.time_s), 0.0)}
+    if record.displacement_um is not None:
+        ranges["displacement"] = record.displacement_um - offset_um
+    return {name: (float(np.min(values)), float(np.max(values))) for name, values in ranges.items()}
+
+
+def reached_in(report: Mapping[str, Any]) -> Ranges:
+    """What the runs reached that a model was fitted to.
+
+    Parameters
+    ----------
+    report
+        What a model file keeps under `fit`.
+
+    Returns
+    -------
+    dict
+        Empty where the file does not say. Displacements are as the sensor read them in the first run, whose offset is
+        the model's.
+    """
+    runs = [run for run in report.get("runs", ()) if isinstance(run, Mapping) and run.get("reached")]
+    found = []
+    for run in runs:
+        ranges = ranges_of_json(run["reached"])
+        shift_um = float(runs[0].get("offset_um", 0.0)) - float(run.get("offset_um", 0.0))
+        if "displacement" in ranges:
+            low, high = ranges["displacement"]
+            ranges["displacement"] = low + shift_um, high + shift_um
+        found.append(ranges)
+    return joined(found)
+
+
 def joined(ranges: Iterable[Mapping[str, tuple[float, float]]]) -> Ranges:
     """The smallest ranges that hold all of several."""
     found: Ranges = {}
@@ -187,6 +225,64 @@ def compared(
 def beyond(extremes: Iterable[Extreme]) -> tuple[Extreme, ...]:
     """Those that leave their limits."""
     return tuple(one for one in extremes if one.excess > 0)
+
+
+def check_command(
+    source: str,
+    predicted: Mapping[str, tuple[float, float]],
+    reached: Mapping[str, tuple[float, float]],
+    stated: Mapping[str, tuple[float, float]],
+    margin: float,
+    spared: Collection[str] = (),
+) -> list[str]:
+    """Refuse a command that leaves what the rig has shown.
+
+    Parameters
+    ----------
+    source
+        Of the reference that the command follows.
+    predicted
+        What the command is, and makes the rig do.
+    reached, stated, margin
+        See `allowed`.
+    spared
+        Quantities of which a remark is made instead, unless their limit is stated.
+
+    Returns
+    -------
+    list of str
+        Remarks.
+
+    Raises
+    ------
+    DataError
+        If something is beyond its limit.
+    """
+    unknown = [name for name in stated if name not in predicted]
+    if unknown:
+        raise DataError(f"--limit {unknown[0]}: nothing says how large it becomes here; leave it out.")
+    remarks = []
+    if not reached:
+        remarks.append(
+            "the model file does not say what its runs reached, so that only the range of the voltage was checked; "
+            "fit again, or state limits with --limit"
+        )
+    for one in beyond(compared(predicted, allowed(reached, stated, margin))):
+        worst = one.high if one.high - one.highest >= one.lowest - one.low else one.low
+        limit = one.highest if worst == one.high else one.lowest
+        words = f"{source}: to follow it takes a {one.name} of {worst:.4g} {one.unit}, "
+        if one.name in stated:
+            raise DataError(
+                f"{words}but --limit allows {limit:.4g} {one.unit}; slow it down, shrink it, or widen that."
+            )
+        words += f"where the runs that the model was fitted to reached {limit:.4g} {one.unit}"
+        if one.name in spared:
+            remarks.append(f"{words}; state what the rig stands with {stated_as(one)} to have it kept")
+            continue
+        raise DataError(
+            f"{words}; slow the reference down or shrink it, or state what the rig stands with {stated_as(one)}."
+        )
+    return remarks
 
 
 def stated_as(one: Extreme) -> str:

@@ -8,10 +8,10 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from fits._limits import Ranges, joined
+from fits._limits import Ranges, joined, measured_ranges
 from fits._record import Record
-from fits._stage_run import StageRun, place_of_hysteresis, prepare_stage_run
-from microid import AbstractPart, Driver, Mechanics, Scene, Signal, Stage, innermost
+from fits._stage_run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run
+from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
 
 # Steps in a period of the resonance: a sampled sine misses less than 2 % of its peak.
 _PER_PERIOD = 16
@@ -103,6 +103,38 @@ def motion(
         "current": np.diff(piezo) / (step_s if np.ndim(step_s) == 0 else np.diff(step_s)),
     }
     return {name: _range(values) for name, values in ranges.items()}, displacement[::stride]
+
+
+def predicted_ranges(
+    model: Preisach | Stage, program: Record, displacement_um: np.ndarray, initial: str, every: bool = False
+) -> Ranges:
+    """What a command is, and makes a model do, between its samples too where the model rings.
+
+    Parameters
+    ----------
+    model
+        From a fit or a model file.
+    program
+        The command.
+    displacement_um
+        What the model does at the samples, shape `(n,)`.
+    initial
+        Memory before the first sample.
+    every
+        Whether velocity, acceleration and current are asked for as well.
+    """
+    ranges = measured_ranges(replace(program, displacement_um=displacement_um))
+    stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
+    law = next((law for law in map(innermost, stage.parts) if isinstance(law, Preisach)), None)
+    if law is None or len(program) < 2:
+        return ranges
+    rings = fine_steps(stage, float(np.median(np.diff(program.time_s))), len(program)) > 1
+    if not (rings or every):
+        return ranges
+    gain = gain_ahead(stage) or 1.0
+    ends = float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
+    between, _ = motion(stage, program, ends, initial)
+    return joined([between, ranges]) if every else joined([ranges, {"displacement": between["displacement"]}])
 
 
 def _driven(stage: Stage) -> int:

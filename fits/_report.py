@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from fits._limits import ranges_json
 from fits._metrics import Errors
 from fits._result import FitResult, RunReport
 
@@ -62,6 +63,7 @@ def _run(run: RunReport) -> dict[str, Any]:
         "start_extremes_V": np.asarray(run.start.extremes_V)[: int(run.start.count)].tolist(),
         "e_loop_measured_pct": run.loop_measured_pct,
         "e_loop_model_pct": run.loop_model_pct,
+        "reached": ranges_json(run.reached),
     }
 
 

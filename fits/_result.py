@@ -1,12 +1,13 @@
 """What a fit gives back."""
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from fits._errors import DataError
+from fits._limits import Ranges
 from fits._metrics import Errors
 from fits._record import Record
 from fits._run import prepare_run, simulate_run
@@ -74,6 +75,8 @@ class RunReport:
         Memory before the first sample; estimated where it is unknown.
     loop_measured_pct, loop_model_pct
         Width of the widest loop (Eq. 34); None where the record holds none.
+    reached
+        Ranges of voltage, slew and displacement in the record, see `fits._limits.measured_ranges`.
     """
 
     source: str
@@ -84,6 +87,7 @@ class RunReport:
     start: Staircase
     loop_measured_pct: float | None
     loop_model_pct: float | None
+    reached: Ranges = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

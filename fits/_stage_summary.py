@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits._identifiability import unseen_directions
+from fits._limits import measured_ranges
 from fits._metrics import Errors, errors, loop_width_pct
 from fits._result import FitStatus, RunReport
 from fits._stage_checks import compare_gains, coordinates_slope
@@ -126,4 +127,5 @@ def _report(stage: Stage, run: StageRun) -> RunReport:
         start=Staircase(start.extremes_V, start.count),
         loop_measured_pct=loop_width_pct(voltage, measured[run.known]),
         loop_model_pct=loop_width_pct(voltage, predicted[run.known]),
+        reached=measured_ranges(run.record),
     )

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from fits._limits import measured_ranges
 from fits._record import Record
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import simulate
@@ -191,6 +192,10 @@ def conclude(
             "cycles": (period_um, cycle_z),
             "rest": rest_share,
             "share": share,
+            "reached": [
+                measured_ranges(run.record, float(np.mean(left[run.known])))
+                for run, left in zip(baseline.runs, ready.regression.residuals, strict=True)
+            ],
         },
     )
 
