@@ -33,7 +33,7 @@ _ROUNDS, _MORE, _NARROW = 12, 1.1, 0.1
 
 
 @dataclass(frozen=True)
-class _Model:
+class Model:
     """A stage that the records allow, and what the sensor reads in um where its own displacement is zero."""
 
     stage: Stage
@@ -55,7 +55,7 @@ class Guard:
         Of the commands that the stages were fitted with.
     """
 
-    def __init__(self, models: Sequence[_Model], limits: Ranges, like: Record, range_V: tuple[float, float]):
+    def __init__(self, models: Sequence[Model], limits: Ranges, like: Record, range_V: tuple[float, float]):
         self.models, self.limits, self._like, self._range_V = tuple(models), limits, like, range_V
 
     def extremes(self, program: Samples) -> tuple[Extreme, ...]:
@@ -145,9 +145,9 @@ def guard_of(
     read_um = like.displacement_um - offsets_um[longest] + offsets_um[0]
     rng = np.random.default_rng(seed)
 
-    def model(stage: Stage) -> _Model:
+    def model(stage: Stage) -> Model:
         _, own_um = motion(stage, like, baseline.range_V)
-        return _Model(stage, float(np.mean((read_um - own_um)[known[longest]])))
+        return Model(stage, float(np.mean((read_um - own_um)[known[longest]])))
 
     beside = found.bench.baseline
     stages = [baseline.stage]
