@@ -5,7 +5,6 @@ import math
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from fits._limits import parse_limits, ranges_json
 from fits._read_csv import read_csv, read_runs
 from fits._result import FitError
 from fits._units import parse_columns
+from fits.diagnosis._steps import Step
 
 if TYPE_CHECKING:
     from fits.diagnosis._result import Diagnosis, EffectParameter
@@ -27,16 +27,6 @@ _REPORT, _JSON, _BASELINE, _EXTENDED = "report.html", "diagnosis.json", "baselin
 _PROGRAM = "next_experiment.csv"
 _LONGEST_s = 1e5
 _WIDEST = 10.0
-# What the stages of the work are announced with.
-_STAGES = (
-    "fitting the plain stage",
-    "reading the noise",
-    "simulating every effect",
-    "learning how rough",
-    "asking for every effect",
-    "extending the stage",
-    "writing",
-)
 _FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
 
 
@@ -69,7 +59,7 @@ def run_diagnose(
     # Before the work, so that a place that cannot be written to is refused before the wait.
     _check_folder(out)
     start_jax()
-    progress = bar_to_stderr(quiet, _STAGES)
+    progress = bar_to_stderr(quiet, tuple(Step))
     records = read_runs(runs, mapping)
     aside = [read_csv(file, mapping) for file in files]
     # Not before the files are read: this takes as long as all that.
@@ -88,10 +78,7 @@ def run_diagnose(
         )
     except FitError as error:
         raise DataError(f"{error}.") from error
-    if not aside and fraction == 0 and not any("held out" in remark for remark in diagnosis.remarks):
-        words = "Nothing was held out, so what the extension is worth on new data is not known; leave out --holdout."
-        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, words))
-    progress("writing")
+    progress(Step.WRITING)
     from fits.diagnosis._json import diagnosis_json
 
     content = diagnosis_json(diagnosis)

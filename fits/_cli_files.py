@@ -6,6 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from enum import StrEnum
 from pathlib import Path
 
 import click
@@ -26,10 +27,11 @@ def progress_to_stderr(quiet: bool) -> Callable[[str], None]:
     return tell
 
 
-def bar_to_stderr(quiet: bool, stages: Sequence[str]) -> Callable[[str], None]:
-    """Make what draws on stderr how far the work has come, a step for each stage that a sentence begins with.
+def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], None]:
+    """Make what draws on stderr how far the work has come, a step for each stage that is announced.
 
-    On a terminal the bar stays in its line; elsewhere each sentence has its own.
+    A stage is announced by itself; other sentences tell of details. On a terminal the bar stays in its line;
+    elsewhere each sentence has its own.
     """
     began, at = time.monotonic(), 0
 
@@ -37,7 +39,8 @@ def bar_to_stderr(quiet: bool, stages: Sequence[str]) -> Callable[[str], None]:
         nonlocal at
         if quiet:
             return
-        at = max(at, *(k for k, stage in enumerate(stages, 1) if sentence.startswith(stage)), 0)
+        if isinstance(sentence, StrEnum):
+            at = max(at, stages.index(sentence) + 1)
         bar = "#" * at + "." * (len(stages) - at)
         line = f"[{bar}] {time.monotonic() - began:6.1f} s  {sentence}"
         if sys.stderr.isatty():

@@ -35,10 +35,29 @@ def prepare(stage: Stage, run: StageRun) -> Prepared:
     return Prepared(run, samples.time_s, Scene(command, samples.beside, samples.start.memory))
 
 
-@eqx.filter_jit
+class _Programs:
+    """Compiled functions that send a signal through one part; one for each kind of part, and length of signal."""
+
+    def __init__(self) -> None:
+        self.drop()
+
+    def drop(self) -> None:
+        """Give back the memory of all of them: they go with the function that they were compiled for."""
+
+        @eqx.filter_jit
+        def run(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
+            return part.run(time_s, signal, scene)
+
+        self.run = run
+
+
+programs = _Programs()
+
+
 def pass_signal(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
     """Send a signal through one part."""
-    return part.run(time_s, signal, scene)
+    passed: Signal = programs.run(part, time_s, signal, scene)
+    return passed
 
 
 def signals(stage: Stage, prepared: Prepared) -> list[Signal]:

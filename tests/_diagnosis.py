@@ -3,6 +3,7 @@
 import numpy as np
 
 from fits import default_stage
+from fits._limits import Extreme
 from fits.diagnosis._result import (
     Bound,
     Diagnosis,
@@ -42,9 +43,9 @@ def diagnosis(rng, kind="effect_found", n=3000, count=2):
     stage = default_stage()
     bounds = (Bound("friction", 0.4, 0.9, 0.02), Bound("thermal_gain", np.nan, np.nan, np.nan, f"no column {ODD}"))
     time_s = np.arange(0.0, 5.0, 0.01)
-    ahead = Experiment(
-        time_s, 50 + 50 * np.sign(np.sin(time_s)), "steps", "It decides.", ("creep", "aging"), 9.0, 1.0
-    )
+    program_V = 50 + 50 * np.sign(np.sin(time_s))
+    extremes = (Extreme("displacement", -0.5, 38.2, 0.0, 40.0),)
+    ahead = Experiment(time_s, program_V, "steps", "It decides.", ("creep", "aging"), 9.0, 1.0, extremes=extremes)
     return Diagnosis(
         verdict=kind,
         noise_um=0.0101,

@@ -7,8 +7,9 @@ import pytest
 from _command import files, refused, run
 from _diagnosis import diagnosis
 
-from fits import DataError, FitError, FitStatus
+from fits import DataError, FitError, FitStatus, read_csv
 from fits.diagnosis._report import report_html
+from fits.diagnosis._steps import Step
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def bench(tmp_path, monkeypatch, rng):
 
     def diagnose(records, **options):
         stand_in.asked = {"records": records, **options}
-        options["progress"]("asking")
+        options["progress"](Step.SELECTION)
         if isinstance(stand_in.answer, Exception):
             raise stand_in.answer
         return stand_in.answer
@@ -42,9 +43,17 @@ def test_the_command_writes_everything(bench, rng):
     for words in ("creep", "thermal_drift", "gain_per_decade", "0.0471", "0.0123", "It decides.", "report.html"):
         assert words in done.stdout
     assert "asking" in done.stderr
+    # Announced out of turn, a step counts those before it.
+    assert "[####..]" in done.stderr
+    assert "[######]" in done.stderr
     folder = bench.folder / "a" / "b"
-    ahead = np.loadtxt(folder / "next_experiment.csv", delimiter=",", skiprows=1, comments="#")
+    ahead = np.loadtxt(folder / "next_experiment.csv", delimiter=",", skiprows=2)
     np.testing.assert_array_equal(ahead[:, 1], bench.answer.next_experiment.voltage_V)
+    # What the program reaches, beside the limits, stands above the header, and the reader passes over it.
+    first = (folder / "next_experiment.csv").read_text().splitlines()[0]
+    assert first == "# predicted displacement -0.5 to 38.2 um (limits 0 to 40 um)"
+    again = read_csv(folder / "next_experiment.csv", required=("time_s", "voltage_V"))
+    np.testing.assert_array_equal(again.voltage_V, ahead[:, 1])
     assert (folder / "report.html").read_text(encoding="utf-8") == report_html(bench.answer)
     assert json.loads((folder / "baseline.json").read_text())["model"]["type"] == "Stage"
     as_json = json.loads(run("diagnose", "run.csv", "--out", "a/b", "--json", "--quiet").stdout)
@@ -55,16 +64,24 @@ def test_the_command_writes_everything(bench, rng):
     assert files(folder) == [name for name in names if name != "next_experiment.csv"]
 
 
-def test_the_command_says_when_nothing_was_held_out(bench):
-    assert "held out" in run("diagnose", "run.csv", "--out", "d", "--holdout", "0").stdout
+def test_what_is_held_out_and_what_the_rig_stands_are_passed_on(bench):
+    options = ["--limit", "displacement=0:0.04mm", "--limit", "slew=2kV/s", "--margin", "0.1"]
+    assert run("diagnose", "run.csv", "--out", "d", "--holdout", "0", *options).exit_code == 0
     assert bench.asked["holdout"] == 0.0
-    assert "held out" not in run("diagnose", "run.csv", "--out", "d", "--holdout", "run.csv").stdout
+    assert bench.asked["limits"] == {"displacement": (0.0, 40.0), "slew": (-2000.0, 2000.0)}
+    assert bench.asked["margin"] == 0.1
+    assert run("diagnose", "run.csv", "--out", "d", "--holdout", "run.csv").exit_code == 0
     assert [record.source for record in bench.asked["holdout"]] == ["run.csv"]
+    assert (bench.asked["limits"], bench.asked["margin"]) == ({}, 0.02)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        (["--limit", "displacement=4"], ["--limit", "displacement"]),
+        (["--limit", "length=0:4"], ["--limit", "length"]),
+        (["--margin", "-1"], ["--margin"]),
+        (["--margin", "nan"], ["--margin"]),
         (["--false-alarm", "0"], ["--false-alarm"]),
         (["--false-alarm", "0.6"], ["--false-alarm", "0.6"]),
         (["--false-alarm", "nan"], ["--false-alarm"]),

@@ -1,6 +1,7 @@
 """The parts of a diagnosis, each against something plainer: dense least squares, known noise, planted faults."""
 
 from types import SimpleNamespace
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +12,15 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from fits import Record
+from fits._motion import pass_signal
+from fits.diagnosis import _evaluate
 from fits.diagnosis._candidates import Probe
 from fits.diagnosis._evaluate import drop_programs
 from fits.diagnosis._floor import band_of, floor_of, jitter_s, quantum_um, spikes
 from fits.diagnosis._noise import Noise, learn_noise
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._score import Family, evidence, score
-from microid import EFFECTS
+from microid import EFFECTS, AbstractPart, Scene, Signal
 
 WHITE = np.zeros(0)
 
@@ -268,22 +271,40 @@ def test_evidence_beside_a_misfit_is_worth_less(rng):
         assert (found.sure > 0.6 * found.z) == trusted
 
 
-def test_programs_make_room_where_records_are_long():
-    traced = []
+def test_programs_make_room_where_records_are_long_and_those_of_the_host_stay(monkeypatch):
+    monkeypatch.setattr(_evaluate, "_MANY", 10**6)
+    hosts = []
 
     @jax.jit
-    def program(x):
-        traced.append(1)
+    def host(x):
+        hosts.append(1)
         return x + 1
+
+    class Part(AbstractPart):
+        takes: ClassVar[str] = "V"
+        gives: ClassVar[str] = "V"
+
+        def run(self, time_s, signal, scene=None):
+            traced.append(1)
+            return signal
+
+    traced: list[int] = []
+    signal = Signal(jnp.ones(7), jnp.ones(()), "first")
 
     def traces_after(n):
         drop_programs([Record(np.arange(float(n)), np.zeros(n), np.zeros(n), source="run")] * 2)
-        program(jnp.ones(3))
-        return len(traced)
+        pass_signal(Part(), jnp.ones(()), signal, Scene(signal, {}, None))
+        host(jnp.ones(3))
+        return len(traced), len(hosts)
 
-    program(jnp.ones(3))
-    assert traces_after(1000) == 1
-    assert traces_after(10_000) == 2
+    assert traces_after(1000) == (1, 1)
+    assert traces_after(1000) == (1, 1)
+    assert traces_after(10_000) == (2, 1)
+
+
+def test_a_signal_without_columns_is_whitened(rng):
+    noise = Noise(0.1, np.array([0.5]))
+    assert noise.whiten(np.zeros((20, 0))).shape == (20, 0)
 
 
 def test_what_cannot_be_negative_is_no_evidence_where_it_would_have_to_be(rng):

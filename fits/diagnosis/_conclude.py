@@ -15,13 +15,14 @@ from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_o
 from fits.diagnosis._faults import Faults, find_faults, name_faults
 from fits.diagnosis._floor import SPIKE
 from fits.diagnosis._irregular import irregular
-from fits.diagnosis._prepare import Prepared
+from fits.diagnosis._prepare import ONE_WAY, Prepared
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._regulated import held_creep, told_by
 from fits.diagnosis._result import Diagnosis, RunView, Test
 from fits.diagnosis._select import Selection
+from fits.diagnosis._steps import Step
 from fits.diagnosis._structure import cycles, further_views, look, together, views
 from fits.diagnosis._tell import bounds, causes_of
 from microid import AbstractEffect, Stage
@@ -83,7 +84,7 @@ def conclude(
     chance = stats.chi2.sf(rest, rest_freedom)
     left_over = rest_share > _REST and chance < _CHANCE
     share = explained / misfit
-    progress("extending the stage")
+    progress(Step.EXTENSION)
     extended, compared, effects = _extended(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
     weak = max((cause.z for cause in kept), default=0.0) < _WEAK
@@ -240,8 +241,7 @@ def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
                 "not used, so that an unknown initial state is not taken for an effect; state it with --initial to "
                 "have it tested"
             )
-    known = any("nothing was held out" in words for words in said)
-    if not known and not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
+    if ONE_WAY not in said and not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
         said.append("nothing was held out, so the gain is not measured: hold out a part, or a run with --holdout")
     return tuple(dict.fromkeys(said))
 

@@ -16,6 +16,7 @@ from fits.diagnosis._experiment import Wish
 from fits.diagnosis._prepare import HOLDS, Prepared, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis
 from fits.diagnosis._select import Selection, select
+from fits.diagnosis._steps import Step
 from fits.diagnosis._unswept import FirstWaysError
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
@@ -103,7 +104,7 @@ def diagnose(
     ready = prepare_diagnosis(records, aside, fraction, initial, progress)
 
     def selected(ready: Prepared, guessed: bool) -> Selection:
-        progress("asking for every effect")
+        progress(Step.SELECTION)
         return select(ready.bench, ready.projector, ready.probes, false_alarm, rng, progress, guessed)
 
     try:

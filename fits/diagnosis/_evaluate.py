@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.backend import get_backend
 
-from fits._motion import Prepared, pass_signal, prepare, signals
+from fits._motion import Prepared, pass_signal, prepare, programs, signals
 from fits._record import Record
 from fits._stage_run import StageRun
 from microid import AbstractEffect, Signal, Stage, extend, host, refined
@@ -55,10 +54,10 @@ def _rehosted(effect: AbstractEffect, stage: Stage) -> AbstractEffect:
 
 
 def drop_programs(records: Sequence[Record]) -> None:
-    """Give back the memory of all compiled programs, where records are long or programs are many.
+    """Give back the memory of the programs that simulate parts, where records are long or programs are many.
 
     A program is compiled for runs of one length, those of short runs serve the next diagnosis as well; and several
-    hundred of them take as much memory as long records do.
+    hundred of them take as much memory as long records do. What else the process has compiled stays.
     """
     if sum(len(record) for record in records) >= _LONG or len(get_backend().live_executables()) > _MANY:
-        jax.clear_caches()
+        programs.drop()

@@ -40,7 +40,8 @@ class Noise:
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Turn noise into independent numbers of variance one, along the first axis."""
-        if len(self.past):
+        # SciPy filters no array without columns.
+        if len(self.past) and values.size:
             values = lfilter(np.r_[1.0, -self.past], [1.0], values, axis=0)
         if self.spread is not None:
             values = values / self.spread.reshape(-1, *(1,) * (values.ndim - 1))

@@ -17,6 +17,7 @@ from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._regulated import held_creep
 from fits.diagnosis._score import rescore, score
+from fits.diagnosis._steps import Step
 from fits.diagnosis._unswept import first_ways, unswept
 from microid import EFFECTS, Hold, Scales, Stage
 from microid.effects.transport_delay import TransportDelay
@@ -54,7 +55,7 @@ _FIRST = (
 )
 # Part of its range through which the voltage goes up, and down, in what is fitted.
 _BOTH_WAYS = 0.5
-_ONE_WAY = (
+ONE_WAY = (
     "nothing was held out, since the voltage goes through its range both ways only in what would have been: the gain "
     "is not measured"
 )
@@ -168,7 +169,7 @@ def prepare_diagnosis(
     """
     said: tuple[str, ...] = (_FIRST,) if initial == UNSWEPT else ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
-        fraction, said = 0.0, (*said, _ONE_WAY)
+        fraction, said = 0.0, (*said, ONE_WAY)
 
     def fitted(hold: Hold) -> _Fitted:
         regression = regress(fit_baseline(records, aside, fraction, initial, progress, hold))
@@ -180,10 +181,10 @@ def prepare_diagnosis(
         found = find_faults(regression)
         return _Fitted(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
 
-    progress("fitting the plain stage")
+    progress(Step.BASELINE)
     here = fitted("first")
     drop_programs(records)
-    progress("simulating every effect")
+    progress(Step.PROBES)
     doubted = False
     for hold in holds:
         if hold != "first":
@@ -219,7 +220,7 @@ def prepare_diagnosis(
         ]
         probes = [one for one in probes if one.name == "creep"]
     baseline = replace(regression.baseline, remarks=(*regression.baseline.remarks, *said))
-    progress("learning how rough the density is")
+    progress(Step.ROUGHNESS)
     rough = learn_roughness(here.projector, [column for probe in probes for column in probe.signatures])
     # What is large and has been used makes room.
     del here
