@@ -9,9 +9,9 @@ from typing import Any
 import click
 import numpy as np
 
-from fits._atomic import atomic_path, write_csv
+from fits._atomic import write_csv
 from fits._cli_compensate import _limits
-from fits._cli_files import keep_inputs, new_folder, progress_to_stderr
+from fits._cli_files import keep_inputs, progress_to_stderr
 from fits._cli_jax import start_jax
 from fits._cli_work import preisach_of
 from fits._control_gains import read_gains
@@ -21,6 +21,7 @@ from fits._control_report import control_json, describe_control
 from fits._control_setup import Setup, setup
 from fits._draw_plants import draw_plants
 from fits._errors import DataError
+from fits._file_set import file_set
 from fits._model_file import load_model
 from fits._read_csv import read_reference
 from fits._record import Reference
@@ -89,7 +90,8 @@ def run_control(
     plant = loaded.model if isinstance(loaded.model, Stage) else preisach_of(model, loaded)
     wanted = read_reference(reference, parse_columns(columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
-    with atomic_path(out) as unfinished, new_folder(plots) as drawings:
+    with file_set() as files:
+        unfinished, drawings = files.file(out), files.folder(plots)
         try:
             ready = setup(plant, wanted, feedforward, initial=initial, limits_V=_limits(limits))
         except DataError as error:
@@ -132,7 +134,7 @@ def run_control(
         if drawings is not None:
             from fits._plot_control import plot_control
 
-            drawn = plot_control(run, made.controller, loop.plants, drawings(), delay=delay)
+            drawn = plot_control(run, made.controller, loop.plants, drawings, delay=delay)
         places = [str(Path(plots) / path.name) for path in drawn] if plots else []
         about = {"controller": controller, "out": out, "plots": places}
         # Before the file is in its place: what cannot be told is not left behind either.
