@@ -16,6 +16,7 @@ from typing import Any, NoReturn, TypeVar
 import click
 
 from fits._errors import DataError
+from fits._printable import printable
 
 # Signals that ask the command to end.
 _SIGNALS = ("SIGTERM", "SIGHUP")
@@ -83,7 +84,7 @@ def in_sentences(command: _Command) -> _Command:
         except KeyboardInterrupt as stop:
             stopped(stop, "no unfinished file was left")
         except DataError as error:
-            sentence = " ".join(str(error).split())
+            sentence = printable(" ".join(str(error).split()))
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
             sys.exit(2)
         except OSError as error:
@@ -91,7 +92,7 @@ def in_sentences(command: _Command) -> _Command:
                 raise  # click ends without a word: who reads has read enough
             # What the system refuses is no mistake of the program's, and says itself what it is.
             place = error.filename if isinstance(error.filename, str) else "output"
-            click.echo(f"{place}: refused by the system ({error.strerror or error}).", err=True)
+            click.echo(f"{printable(place)}: refused by the system ({error.strerror or error}).", err=True)
             sys.exit(2)
 
     return run  # type: ignore[return-value]

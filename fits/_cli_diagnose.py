@@ -14,7 +14,7 @@ from fits._atomic import write_csv
 from fits._cli_files import bar_to_stderr, fraction_or_files, keep_inputs
 from fits._cli_jax import start_jax
 from fits._errors import DataError
-from fits._file_set import check_folder, file_set
+from fits._file_set import file_set, usable_folder
 from fits._read_csv import read_csv, read_runs
 from fits._result import FitError
 from fits._units import parse_columns
@@ -60,7 +60,7 @@ def run_diagnose(
     for name in _FILES:
         keep_inputs(os.path.join(out, name), [*runs, *files])
     # Before the work, so that a place that cannot be written to is refused before the wait.
-    check_folder(out, "--out")
+    usable_folder(out, "--out")
     start_jax()
     progress = bar_to_stderr(quiet, _STAGES)
     records = read_runs(runs, mapping)

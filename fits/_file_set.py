@@ -93,7 +93,7 @@ class FileSet:
         """
         if path is None:
             return None
-        target, anchor = check_folder(path, option)
+        target, anchor = usable_folder(path, option)
         missing = target.relative_to(anchor).parts
         made = anchor / temporary_name()
         files = made.joinpath(*missing[1:])
@@ -123,7 +123,8 @@ class FileSet:
             if move.staged is None or not move.staged.is_dir():
                 _check_file(move.target, move.shown)
         for move in moves:
-            _flush(move.staged)
+            if move.staged is not None and not move.staged.is_dir():
+                flush(move.staged)
         with ExitStack() as undo:
             for k, move in enumerate(moves):
                 # After the last one there is nothing to undo.
@@ -141,7 +142,7 @@ class FileSet:
             try:
                 if not os.path.lexists(folder.first):
                     for file in folder.files.iterdir():
-                        _flush(file)
+                        flush(file)
                     # All of it in one step.
                     moves.append(_Move(folder.made, folder.first, folder.shown))
                     continue
@@ -217,7 +218,7 @@ def file_set() -> Iterator[FileSet]:
         files.discard()
 
 
-def check_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path]:
+def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path]:
     """Refuse a folder that cannot be written to, or made; itself and the nearest one that exists come back."""
     shown = os.fspath(path)
     if not shown:
@@ -288,10 +289,8 @@ def _restore(kept: Path, target: Path) -> None:
         os.replace(kept, target)
 
 
-def _flush(path: Path | None) -> None:
+def flush(path: Path) -> None:
     """Have a file on the disk before it gets its name; an OSError says that the disk is full after all."""
-    if path is None or path.is_dir():
-        return
     with open(path, "r+b") as file:
         try:
             os.fsync(file.fileno())
