@@ -20,7 +20,7 @@ from fits._control_make import Loop, Maker
 from fits._control_report import control_json, describe_control
 from fits._control_setup import Setup, setup
 from fits._draw_plants import draw_plants
-from fits._errors import DataError
+from fits._errors import DataError, ModelError
 from fits._file_set import file_set
 from fits._model_file import load_model
 from fits._read_csv import read_reference
@@ -94,10 +94,7 @@ def run_control(
         unfinished, drawings = files.file(out), files.folder(plots)
         try:
             ready = setup(plant, wanted, feedforward, initial=initial, limits_V=_limits(limits))
-        except DataError as error:
-            # What the reference or an option is to blame for says so itself.
-            if str(error).startswith(("--", f"{wanted.source}:")):
-                raise
+        except ModelError as error:
             raise DataError(f"{model}: {error}") from error
         skipped = _skipped(wanted, ready, skip)
         count = plants or (_PLANTS if known else 1)
