@@ -60,6 +60,7 @@ from data_synth._truth_density import Bump as Bump
 from data_synth._truth_density import Density as Density
 from data_synth._truth_density import Reversible as Reversible
 from data_synth._truth_density import Ridge as Ridge
+from data_synth._write import files as files
 from data_synth._write import write as write
 from data_synth.effects import EFFECTS as EFFECTS
 from data_synth.effects import OUTSIDE as OUTSIDE
@@ -99,6 +100,7 @@ __all__ = [
     "Sensor",
     "TemperatureSettings",
     "chirp",
+    "files",
     "forc",
     "hidden",
     "hold",

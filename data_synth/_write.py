@@ -2,6 +2,7 @@
 
 import json
 import os
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,12 +13,17 @@ SCHEMA = "data_synth.truth/1"
 """What `truth.json` calls itself."""
 
 
-def write(bench: Bench, folder: str | Path) -> list[Path]:
-    """Write `<run>.csv` for each run, and `truth.json`, into a folder that is made if need be.
+def files(bench: Bench) -> dict[str, str]:
+    """Make the text of each file by its name: `<run>.csv` for each run, and `truth.json` last.
 
     A CSV has the columns `time_s,voltage_V,displacement_um`, and `temperature_C` and `other_um` where these are
-    measured, and nothing else: what is true stands in `truth.json` only. Each file is written under a temporary name
-    and renamed. The same seed gives the same bytes.
+    measured, and nothing else: what is true stands in `truth.json` only. The same seed gives the same bytes.
+    """
+    return {f"{record.name}.csv": _csv(record) for record in bench.records} | {"truth.json": _truth(bench)}
+
+
+def write(bench: Bench, folder: str | Path) -> list[Path]:
+    """Write `files` into a folder that is made if need be: all under temporary names first, then each is renamed.
 
     Returns
     -------
@@ -30,23 +36,17 @@ def write(bench: Bench, folder: str | Path) -> list[Path]:
         If the folder cannot be written to.
     """
     folder = Path(folder)
-    contents = {f"{record.name}.csv": _csv(record) for record in bench.records} | {"truth.json": _truth(bench)}
+    contents = files(bench)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, text in contents.items():
-            _replace(folder / name, text)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".data_synth-") as unfinished:
+            for name, text in contents.items():
+                Path(unfinished, name).write_bytes(text.encode())
+            for name in contents:
+                os.replace(Path(unfinished, name), folder / name)
     except OSError as error:
         raise ScenarioError(f"{folder}: cannot be written to: {error.strerror}") from error
     return [folder / name for name in contents]
-
-
-def _replace(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(text.encode())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _csv(record: Record) -> str:

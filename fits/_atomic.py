@@ -1,10 +1,8 @@
 """Whole files or none: written under a temporary name in the same folder, then renamed."""
 
 import csv
-import errno
 import gzip
 import os
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._errors import DataError
-
-_DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+from fits._file_set import file_set
 
 
 @contextmanager
@@ -23,7 +19,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path; on success it becomes `path`, on any exception it is deleted.
 
     The temporary path does not exist yet, lies in the same folder and ends as `path` does, so that Matplotlib
-    infers the format. A file that was at `path` before is replaced in one step or left as it was.
+    infers the format. A file that was at `path` before is replaced in one step or left as it was. What is written is
+    on the disk before it is at `path`. For several files that belong together, see `file_set`.
 
     Parameters
     ----------
@@ -33,36 +30,11 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     DataError
-        The folder is missing or cannot be written to, `path` is a folder or write-protected, or the disk is full.
+        The folder is missing or cannot be written to, `path` is write-protected or anything but a regular file, or
+        the disk is full.
     """
-    target = Path(os.path.realpath(path))
-    _check_writable(path, target)
-    temporary = target.with_name(f".{secrets.token_hex(8)}-{target.name[-50:]}")
-    try:
-        yield temporary
-        os.replace(temporary, target)
-    except OSError as error:
-        # Errors of other files that the caller reads meanwhile are not ours to explain.
-        if error.filename != str(temporary) and error.errno not in _DISK_TROUBLE:
-            raise
-        raise DataError(
-            f"{os.fspath(path)}: cannot be written ({error.strerror or error}); "
-            "free the disk, close the file in other programs or choose another place."
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _check_writable(path: str | os.PathLike[str], target: Path) -> None:
-    shown = os.fspath(path)
-    if target.is_dir():
-        raise DataError(f"{shown}: expected the name of a file to write, found a folder; add a file name.")
-    if not target.parent.is_dir():
-        raise DataError(f"{shown}: the folder {target.parent} does not exist; create it or choose another.")
-    if not os.access(target.parent, os.W_OK | os.X_OK):
-        raise DataError(f"{shown}: the folder {target.parent} cannot be written to; choose another.")
-    if target.exists() and not os.access(target, os.W_OK):
-        raise DataError(f"{shown}: the file is write-protected; choose another name or allow writing.")
+    with file_set() as files:
+        yield files.file(path)
 
 
 def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:

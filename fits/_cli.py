@@ -3,6 +3,8 @@
 Only the standard library and click are imported before a command runs.
 """
 
+import contextlib
+import io
 import os
 import sys
 
@@ -14,7 +16,7 @@ from fits._cli_commands_model import compensate, export, fit, info, simulate, sy
 from fits._cli_commands_paper import paper
 from fits._cli_commands_stage import budget, sensitivity
 from fits._cli_commands_sweep import sweep
-from fits._cli_common import INTERRUPTED
+from fits._cli_common import Stopped, heed_signals, stopped
 
 
 def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -61,12 +63,23 @@ for _command in (
 
 def main() -> None:
     """Run the command."""
+    heed_signals()
+    _bear_any_text()
     try:
-        cli(prog_name="microid")
-    except SystemExit as stop:
-        if stop.code == INTERRUPTED:
-            # All that is kept is written. Threads that still compile crash an interpreter that is taken down.
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(INTERRUPTED)
-        raise
+        try:
+            cli(prog_name="microid")
+        except KeyboardInterrupt as stop:
+            stopped(stop, "no unfinished file was left")
+    except Stopped as stop:
+        # All that is kept is written. Threads that still compile crash an interpreter that is taken down.
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, AttributeError):
+                stream.flush()
+        os._exit(int(str(stop.code)))
+
+
+def _bear_any_text() -> None:
+    """Write what a terminal or a file cannot show, such as half a character in a file's name, as its code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")

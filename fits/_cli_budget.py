@@ -3,21 +3,19 @@
 import json
 import math
 import re
-from contextlib import ExitStack
 from pathlib import Path
 
 import click
 
 import microid as m
-from fits._atomic import atomic_path
 from fits._budget import Measures, budget
 from fits._budget_report import budget_json, describe_budget
-from fits._cli_files import new_folder
 from fits._cli_jax import start_jax
 from fits._cli_sensitivity import _keep_apart
 from fits._cli_work import preisach_of
 from fits._compensate_stage import static_equivalent
-from fits._errors import DataError
+from fits._errors import DataError, ModelError
+from fits._file_set import file_set
 from fits._idle import idle_noise, read_idle
 from fits._model_file import load_model
 from fits._stage_design import paper_design
@@ -54,10 +52,10 @@ def run_budget(
             f"--model-measures {model_measures}: expected the arm at which a displacement is a rotation, found none; "
             "add --arm, such as --arm 50mm."
         )
-    with ExitStack() as stack:
+    with file_set() as files:
         # Entered before the work, so that a place that cannot be written to is refused before the wait.
-        unfinished = None if out is None else stack.enter_context(atomic_path(out))
-        drawings = stack.enter_context(new_folder(plots))
+        unfinished = None if out is None else files.file(out)
+        drawings = files.folder(plots)
         design = paper_design() if stage == _PAPER else read_design(stage)
         noise = idle_noise(read_idle(idle, parse_columns(columns)))
         law = _law(model)
@@ -68,7 +66,7 @@ def run_budget(
         if drawings is not None:
             from fits._plot_budget import plot_budget
 
-            drawn = plot_budget(found, drawings())
+            drawn = plot_budget(found, drawings)
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
     if printed:
@@ -86,7 +84,7 @@ def _law(path: str) -> m.Preisach:
         return preisach_of(path, loaded)
     try:
         return static_equivalent(loaded.model)
-    except DataError as error:
+    except ModelError as error:
         raise DataError(f"{path}: {error}") from error
 
 

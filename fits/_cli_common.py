@@ -4,18 +4,74 @@ Of other packages only click is imported here and in the `_cli_commands_...` mod
 is in the modules those call.
 """
 
+import errno
 import functools
+import os
+import signal
 import sys
+import threading
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import click
 
 from fits._errors import DataError
+from fits._printable import printable
 
-# Exit status after Ctrl-C, as shells have it.
-INTERRUPTED = 130
+# Signals that ask the command to end.
+_SIGNALS = ("SIGTERM", "SIGHUP")
+_AGAIN_s = 0.05
 _Command = TypeVar("_Command", bound=Callable[..., None])
+
+
+class Terminated(KeyboardInterrupt):
+    """A signal that asks the command to end; what cleans up after Ctrl-C does so after this.
+
+    Attributes
+    ----------
+    number
+        Of the signal.
+    """
+
+    def __init__(self, number: int):
+        super().__init__()
+        self.number = number
+
+
+def heed_signals() -> None:
+    """Let a request to end clean up as Ctrl-C does; one that is ignored, as under `nohup`, stays ignored."""
+
+    def stop(number: int, _: object) -> None:
+        raise Terminated(number)
+
+    for name in _SIGNALS:
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, stop)
+    sys.unraisablehook = _again
+
+
+def _again(lost: Any) -> None:
+    """Send a signal again whose exception came while Python ran a finaliser or a callback, where it goes nowhere."""
+    stop = lost.exc_value
+    if not isinstance(stop, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    number = stop.number if isinstance(stop, Terminated) else signal.SIGINT
+    timer = threading.Timer(_AGAIN_s, os.kill, (os.getpid(), number))
+    timer.daemon = True
+    timer.start()
+
+
+def stopped(stop: KeyboardInterrupt, what: str) -> NoReturn:
+    """Say that the command was stopped, and what is left, and end with the status that shells have for it."""
+    by_signal = isinstance(stop, Terminated)
+    click.echo(f"{'Terminated' if by_signal else 'Interrupted'}: {what}.", err=True)
+    raise Stopped(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))
+
+
+class Stopped(SystemExit):
+    """The end of a command that was stopped."""
 
 
 def in_sentences(command: _Command) -> _Command:
@@ -25,12 +81,18 @@ def in_sentences(command: _Command) -> _Command:
     def run(*args: Any, **kwargs: Any) -> None:
         try:
             command(*args, **kwargs)
-        except KeyboardInterrupt:
-            click.echo("Interrupted: no unfinished file was left.", err=True)
-            sys.exit(INTERRUPTED)
+        except KeyboardInterrupt as stop:
+            stopped(stop, "no unfinished file was left")
         except DataError as error:
-            sentence = " ".join(str(error).split())
+            sentence = printable(" ".join(str(error).split()))
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
+            sys.exit(2)
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                raise  # click ends without a word: who reads has read enough
+            # What the system refuses is no mistake of the program's, and says itself what it is.
+            place = error.filename if isinstance(error.filename, str) else "output"
+            click.echo(f"{printable(place)}: refused by the system ({error.strerror or error}).", err=True)
             sys.exit(2)
 
     return run  # type: ignore[return-value]

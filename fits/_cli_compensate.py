@@ -8,14 +8,15 @@ from pathlib import Path
 import click
 import numpy as np
 
-from fits._atomic import atomic_path, write_csv
-from fits._cli_files import keep_inputs, new_folder
+from fits._atomic import write_csv
+from fits._cli_files import keep_inputs
 from fits._cli_jax import start_jax
 from fits._cli_work import preisach_of
 from fits._compensate import compensate
 from fits._compensate_stage import static_equivalent
 from fits._errors import DataError
 from fits._export_c import export_c
+from fits._file_set import file_set
 from fits._limits import Ranges, allowed, check_command, parse_limits, reached_in
 from fits._model_file import ModelFile, load_model
 from fits._motion import predicted_ranges
@@ -60,7 +61,8 @@ def run_compensate(
         )
     wanted = read_reference(reference, parse_columns(columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
-    with atomic_path(out) as unfinished, new_folder(plots) as drawings:
+    with file_set() as made:
+        unfinished, drawings = made.file(out), made.folder(plots)
         found = compensate(stage, wanted, initial, clip, volts, "dynamic" if way == "dynamic" else "static")
         program = Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
         every = bool({"velocity", "acceleration", "current"} & set(stated))
@@ -69,7 +71,7 @@ def run_compensate(
         sd_um = _displacement_sd_um(loaded, program, initial)
         drawn = []
         if drawings is not None:
-            drawn = plot_compensation(stage, wanted, found, sd_um, drawings(), initial=initial)
+            drawn = plot_compensation(stage, wanted, found, sd_um, drawings, initial=initial)
         columns_out = {
             "time_s": wanted.time_s,
             "voltage_V": found.voltage_V,

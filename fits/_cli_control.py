@@ -9,9 +9,9 @@ from typing import Any
 import click
 import numpy as np
 
-from fits._atomic import atomic_path, write_csv
+from fits._atomic import write_csv
 from fits._cli_compensate import parse_rig_limits
-from fits._cli_files import keep_inputs, new_folder, progress_to_stderr
+from fits._cli_files import keep_inputs, progress_to_stderr
 from fits._cli_jax import start_jax
 from fits._cli_work import preisach_of
 from fits._control_gains import read_gains
@@ -20,7 +20,8 @@ from fits._control_make import Loop, Maker
 from fits._control_report import control_json, describe_control
 from fits._control_setup import Setup, setup
 from fits._draw_plants import draw_plants
-from fits._errors import DataError
+from fits._errors import DataError, ModelError
+from fits._file_set import file_set
 from fits._limits import check_command, joined, measured_ranges, reached_in
 from fits._model_file import load_model
 from fits._read_csv import read_reference
@@ -93,13 +94,11 @@ def run_control(
     plant = loaded.model if isinstance(loaded.model, Stage) else preisach_of(model, loaded)
     wanted = read_reference(reference, parse_columns(columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
-    with atomic_path(out) as unfinished, new_folder(plots) as drawings:
+    with file_set() as files:
+        unfinished, drawings = files.file(out), files.folder(plots)
         try:
             ready = setup(plant, wanted, feedforward, initial=initial, limits_V=volts)
-        except DataError as error:
-            # What the reference or an option is to blame for says so itself.
-            if str(error).startswith(("--", f"{wanted.source}:")):
-                raise
+        except ModelError as error:
             raise DataError(f"{model}: {error}") from error
         skipped = _skipped(wanted, ready, skip)
         count = plants or (_PLANTS if known else 1)
@@ -144,7 +143,7 @@ def run_control(
         if drawings is not None:
             from fits._plot_control import plot_control
 
-            drawn = plot_control(run, made.controller, loop.plants, drawings(), delay=delay)
+            drawn = plot_control(run, made.controller, loop.plants, drawings, delay=delay)
         places = [str(Path(plots) / path.name) for path in drawn] if plots else []
         about = {"controller": controller, "out": out, "plots": places}
         # Before the file is in its place: what cannot be told is not left behind either.

@@ -4,16 +4,16 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fits._atomic import atomic_path, write_csv
+from fits._atomic import write_csv
 from fits._cli_files import bar_to_stderr, fraction_or_files, keep_inputs
 from fits._cli_jax import start_jax
 from fits._errors import DataError
+from fits._file_set import file_set, usable_folder
 from fits._limits import parse_limits, ranges_json
 from fits._read_csv import read_csv, read_runs
 from fits._result import FitError
@@ -57,7 +57,7 @@ def run_diagnose(
     for name in _FILES:
         keep_inputs(os.path.join(out, name), [*runs, *files])
     # Before the work, so that a place that cannot be written to is refused before the wait.
-    _check_folder(out)
+    usable_folder(out, "--out")
     start_jax()
     progress = bar_to_stderr(quiet, tuple(Step))
     records = read_runs(runs, mapping)
@@ -89,16 +89,8 @@ def run_diagnose(
         click.echo("\n".join([*_lines(diagnosis), "", *places]))
 
 
-def _check_folder(out: str) -> None:
-    """Refuse a folder that cannot be written to, or made."""
-    target = Path(os.path.realpath(out))
-    anchor = next(place for place in (target, *target.parents) if place.exists())
-    if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
-        raise DataError(f"{out}: expected a folder that can be written to; choose another for --out.")
-
-
 def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[str]:
-    """Write all files: first under temporary names, then each is renamed; their names come back."""
+    """Write all files, or none; their names come back."""
     from fits._model_file import model_text
     from fits.diagnosis._report import report_html
 
@@ -122,22 +114,17 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
         _EXTENDED: model("extended"),
     }
     ahead = diagnosis.next_experiment
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as stack:
-            for name, text in texts.items():
-                stack.enter_context(atomic_path(folder / name)).write_text(text, encoding="utf-8")
-            if ahead is not None:
-                unfinished = stack.enter_context(atomic_path(folder / _PROGRAM))
-                said = [f"predicted {one}" for one in ahead.extremes]
-                write_csv(unfinished, {"time_s": ahead.time_s, "voltage_V": ahead.voltage_V}, said)
-        if ahead is None:
+    with file_set() as files:
+        place = files.folder(out, "--out")
+        for name, text in texts.items():
+            (place / name).write_text(text, encoding="utf-8")
+        if ahead is not None:
+            said = [f"predicted {one}" for one in ahead.extremes]
+            write_csv(place / _PROGRAM, {"time_s": ahead.time_s, "voltage_V": ahead.voltage_V}, said)
+        else:
             # One of an earlier diagnosis would pass for this one's.
-            (folder / _PROGRAM).unlink(missing_ok=True)
-    except OSError as error:
-        raise DataError(f"{out}: cannot be written ({error.strerror or error}); choose another for --out.") from error
-    return [str(folder / name) for name in (*texts, *([_PROGRAM] if ahead is not None else []))]
+            files.absent(Path(out) / _PROGRAM)
+    return [str(Path(out) / name) for name in (*texts, *([_PROGRAM] if ahead is not None else []))]
 
 
 def _lines(diagnosis: "Diagnosis") -> list[str]:

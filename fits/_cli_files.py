@@ -2,12 +2,9 @@
 
 import os
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
-from pathlib import Path
 
 import click
 
@@ -43,7 +40,7 @@ def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], Non
             at = max(at, stages.index(sentence) + 1)
         bar = "#" * at + "." * (len(stages) - at)
         line = f"[{bar}] {time.monotonic() - began:6.1f} s  {sentence}"
-        if sys.stderr.isatty():
+        if sys.stderr is not None and sys.stderr.isatty():
             click.echo(f"\r\033[K{line}", nl=at == len(stages), err=True)
         else:
             click.echo(line, err=True)
@@ -75,38 +72,3 @@ def keep_inputs(out: str, inputs: Iterable[str]) -> None:
     for path in inputs:
         if os.path.realpath(path) == os.path.realpath(out):
             raise DataError(f"--out: {out} would overwrite what is read; choose another name.")
-
-
-@contextmanager
-def new_folder(path: str | None, option: str = "--plots", what: str = "plots") -> Iterator[Callable[[], Path] | None]:
-    """Yield a function that makes a temporary folder; what is in it moves to `path` at the end, or nowhere."""
-    if path is None:
-        yield None
-        return
-    target = Path(os.path.realpath(path))
-    anchor = next(place for place in (target, *target.parents) if place.exists())
-    if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
-        raise DataError(f"{path}: expected a folder that can be written to; choose another for {option}.")
-    made: list[Path] = []
-
-    def refused(error: OSError) -> DataError:
-        reason = error.strerror or error
-        return DataError(f"{path}: the {what} cannot be put there ({reason}); choose another for {option}.")
-
-    with ExitStack() as stack:
-
-        def make() -> Path:
-            try:
-                place = stack.enter_context(tempfile.TemporaryDirectory(dir=anchor, prefix=".microid-"))
-            except OSError as error:
-                raise refused(error) from error
-            made.append(Path(place))
-            return made[-1]
-
-        yield make
-        try:
-            target.mkdir(parents=True, exist_ok=True)
-            for file in sorted(file for folder in made for file in folder.iterdir()):
-                os.replace(file, target / file.name)
-        except OSError as error:
-            raise refused(error) from error

@@ -8,10 +8,10 @@ from typing import Any
 
 import click
 
-from fits._atomic import atomic_path
-from fits._cli_files import fraction_or_files, keep_inputs, new_folder, progress_to_stderr
+from fits._cli_files import fraction_or_files, keep_inputs, progress_to_stderr
 from fits._cli_jax import start_jax
 from fits._errors import DataError
+from fits._file_set import file_set
 from fits._fit import fit
 from fits._fit_stage import default_stage, fit_stage
 from fits._model_file import model_text
@@ -70,7 +70,8 @@ def run_fit(
     fraction, files = fraction_or_files(holdout)
     keep_inputs(out, [*runs, *files])
     # Entered before the fit, so that a place that cannot be written to is refused before the wait.
-    with atomic_path(out) as unfinished, new_folder(plots) as drawings:
+    with file_set() as made:
+        unfinished, drawings = made.file(out), made.folder(plots)
         records = read_runs(runs, mapping)
         aside = [read_csv(file, mapping) for file in files]
         left_out = aside or fraction
@@ -82,7 +83,7 @@ def run_fit(
         drawn: Sequence[Path] = ()
         if drawings is not None:
             progress("drawing")
-            drawn = kind.plot(result, records, drawings(), holdout=left_out, initial=states)
+            drawn = kind.plot(result, records, drawings, holdout=left_out, initial=states)
         unfinished.write_text(model_text(result.model, result.uncertainty, report), encoding="utf-8")
     places = [str(Path(plots) / path.name) for path in drawn] if plots else []
     if as_json:

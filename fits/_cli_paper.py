@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import data_synth
-from fits._cli_files import new_folder, progress_to_stderr
+from fits._cli_files import progress_to_stderr
 from fits._cli_jax import start_jax
 from fits._cli_paper_gains import INTERVAL_s
 from fits._cli_paper_loop import PaperRun
@@ -25,6 +25,7 @@ from fits._cli_paper_runs import (
     identify,
     identify_modes,
 )
+from fits._file_set import file_set
 from fits._idle import idle_noise
 from fits._metrics import errors, loop_width_pct
 from fits._paper_tables import AXIS_TITLES, PAPER, Measured, PaperResult, paper_json, paper_page
@@ -44,10 +45,8 @@ def run_paper(*, out: str, seeds: int, seed: int, quiet: bool) -> None:
     """Do `microid paper`; the options are the command's."""
     start_jax()
     tell = progress_to_stderr(quiet)
-    with new_folder(out, "--out", "page") as drawings:
-        assert drawings is not None
-        folder = drawings()
-        result = paper_result(seeds, seed, folder, tell)
+    with file_set() as files:
+        result = paper_result(seeds, seed, files.folder(out, "--out"), tell)
     click.echo(f"page   {Path(out) / 'paper.md'}\njson   {Path(out) / 'paper.json'}")
     worse = result.worse()
     click.echo("worse than the paper: " + ("; ".join(worse) if worse else "no row"))

@@ -5,16 +5,14 @@ import json
 import math
 import os
 import re
-from contextlib import ExitStack
 from pathlib import Path
 
 import click
 
 import microid as m
-from fits._atomic import atomic_path
-from fits._cli_files import new_folder
 from fits._cli_jax import start_jax
 from fits._errors import DataError
+from fits._file_set import file_set
 from fits._paper_claims import describe_claims, paper_claims
 from fits._sensitivity import sensitivities
 from fits._sensitivity_report import describe_sensitivity, sensitivity_json
@@ -42,11 +40,11 @@ def run_sensitivity(
     _keep_apart({"STAGE.toml": stage, "--json": out, "--write-stage": write_stage})
     design = _design(stage, tolerance, level)
     axes = tuple(name for name in m.AXES if axis in (name, "all"))
-    with ExitStack() as stack:
+    with file_set() as files:
         # Entered before the work, so that a place that cannot be written to is refused before the wait.
-        unfinished = None if out is None else stack.enter_context(atomic_path(out))
-        unfinished_stage = None if write_stage is None else stack.enter_context(atomic_path(write_stage))
-        drawings = stack.enter_context(new_folder(plots))
+        unfinished = None if out is None else files.file(out)
+        unfinished_stage = None if write_stage is None else files.file(write_stage)
+        drawings = files.folder(plots)
         report = sensitivities(design, axes)
         text = json.dumps(sensitivity_json(report), indent=1, allow_nan=False)
         claims = [] if stage or printed else [claim for claim in paper_claims(design) if {*claim.axes} & {*axes}]
@@ -54,7 +52,7 @@ def run_sensitivity(
         if drawings is not None:
             from fits._plot_sensitivity import plot_sensitivity
 
-            drawn = plot_sensitivity(design, report, drawings())
+            drawn = plot_sensitivity(design, report, drawings)
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
         if unfinished_stage is not None:

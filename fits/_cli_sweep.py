@@ -1,14 +1,14 @@
 """The command `microid sweep`: the work."""
 
 import json
-import sys
 from pathlib import Path
 
 import click
 
-from fits._cli_common import INTERRUPTED
-from fits._cli_files import new_folder, progress_to_stderr
+from fits._cli_common import stopped
+from fits._cli_files import progress_to_stderr
 from fits._cli_jax import start_jax
+from fits._file_set import file_set
 
 
 def run_sweep(*, file: str, out: str, resume: bool, cluster: str | None, as_json: bool, quiet: bool) -> None:
@@ -22,9 +22,8 @@ def run_sweep(*, file: str, out: str, resume: bool, cluster: str | None, as_json
     sweep = read_sweep(file)
     try:
         outcome = run_all(sweep, out, resume=resume, cluster=cluster, progress=progress)
-    except KeyboardInterrupt:
-        click.echo("Interrupted: what was computed is kept; go on with --resume.", err=True)
-        sys.exit(INTERRUPTED)
+    except KeyboardInterrupt as stop:
+        stopped(stop, "what was computed is kept; go on with --resume")
     files = [str(Path(out) / name) for name in (RESULTS, TABLE)]
     if as_json:
         content = {
@@ -49,11 +48,12 @@ def show_sweep(*, folder: str, best: str | None, largest: bool, plots: str | Non
 
     summary = summarise(folder, best, largest)
     drawn: list[Path] = []
-    with new_folder(plots) as drawings:
+    with file_set() as files:
+        drawings = files.folder(plots)
         if drawings is not None:
             from fits.sweeps._show import plot_sweep
 
-            drawn = plot_sweep(folder, drawings(), best)
+            drawn = plot_sweep(folder, drawings, best)
     if as_json:
         click.echo(json.dumps(summary, indent=1, allow_nan=False))
         return

@@ -1,20 +1,28 @@
 """The `microid synth` command: the work. It has no use for JAX, so it does not wait for it."""
 
 import json
+from pathlib import Path
 
 import click
 
 import data_synth
 from fits._errors import DataError
+from fits._file_set import file_set
 
 
 def run_synth(*, scenario: str, out: str, seed: int | None, as_json: bool) -> None:
     """Do `microid synth`; the options are the command's."""
-    try:
-        bench = data_synth.simulate(data_synth.load_scenario(scenario), seed)
-        files = [str(file) for file in data_synth.write(bench, out)]
-    except data_synth.ScenarioError as error:
-        raise DataError(str(error)) from error
+    with file_set() as made:
+        # Before the work, so that a place that cannot be written to is refused before the wait.
+        folder = made.folder(out, "--out")
+        try:
+            bench = data_synth.simulate(data_synth.load_scenario(scenario), seed)
+        except data_synth.ScenarioError as error:
+            raise DataError(str(error)) from error
+        contents = data_synth.files(bench)
+        for name, text in contents.items():
+            (folder / name).write_bytes(text.encode())
+    files = [str(Path(out) / name) for name in contents]
     if as_json:
         click.echo(json.dumps({"seed": bench.seed, "files": files}, indent=1))
     else:

@@ -6,3 +6,7 @@ class DataError(ValueError):
 
     The `microid` command prints the sentence on stderr and exits with status 2.
     """
+
+
+class ModelError(DataError):
+    """A model that cannot do what is asked; the command names its file before the sentence."""

@@ -10,9 +10,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._atomic import atomic_write_text
 from fits._compensate import within_range
 from fits._errors import DataError
+from fits._file_set import file_set
 from fits._version import written_by
 from microid import Everett, Preisach
 
@@ -67,19 +67,14 @@ def export_c(
     if size < _SMALLEST:
         raise DataError(f"--memory: expected {_SMALLEST} extremes or more, found {size}; 128 suit most references.")
     fields = _fields(model, name, size, within_range(model, limits_V))
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = error.strerror or error
-        raise DataError(f"{target}: the folder cannot be made ({reason}); choose another for --out.") from error
-    written = []
-    for ending in ("h", "c"):
-        template = Path(__file__).with_name("templates") / f"controller.{ending}"
-        text = Template(template.read_text(encoding="utf-8")).substitute(fields)
-        written.append(target / f"{name}.{ending}")
-        atomic_write_text(written[-1], text)
-    return written
+    written = [f"{name}.{ending}" for ending in ("h", "c")]
+    with file_set() as files:
+        place = files.folder(folder, "--out")
+        for file in written:
+            template = Path(__file__).with_name("templates") / f"controller{Path(file).suffix}"
+            text = Template(template.read_text(encoding="utf-8")).substitute(fields)
+            (place / file).write_bytes(text.encode())
+    return [Path(folder) / file for file in written]
 
 
 @eqx.filter_jit

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from fits._idle import IdleNoise
-from fits._plot_style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned
+from fits._plot_style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned, verbatim
 from fits._record import Reference
 
 _MOST_LINES = 5
@@ -43,7 +43,7 @@ def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[
     _draw_readings(readings, histogram, reference, noise)
     _draw_spectrum(spectrum, noise)
     _draw_allan(allan, noise)
-    titles = {readings: reference.source or "readings", spectrum: "spectrum", allan: "Allan deviation"}
+    titles = {readings: verbatim(reference.source) or "readings", spectrum: "spectrum", allan: "Allan deviation"}
     for axes, title in titles.items():
         axes.set_title(title, loc="left", fontsize=7)
     legend(picture, (readings,))

@@ -228,28 +228,37 @@ def _apart(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
     return np.asarray(isotonic_regression(wanted - steps).x) + steps
 
 
-def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[tuple[str, str]]:
-    """What the paper says of a motion, each with our verdict and the figures for it: lines with their colours."""
-    lines: list[tuple[str, str]] = []
+@dataclass(frozen=True)
+class _Line:
+    """A line of words in a colour, with a verdict in bold before them where there is one."""
+
+    words: str
+    color: str = DARK
+    verdict: str = ""
+
+
+def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[_Line]:
+    """What the paper says of a motion, each with our verdict and the figures for it."""
+    lines: list[_Line] = []
     for claim in claims:
         # One on several motions stands below the last of them.
         if panel.axis.axis in claim.axes and (panel.axis.axis == claim.axes[0]) == (len(claim.axes) < 3):
             reason = claim.reason.partition(". ")[0].rstrip(".")
-            said = f"{claim.verdict}: {claim.statement}"
-            lines += [(line, DARK) for line in textwrap.wrap(said, _CHARACTERS, subsequent_indent="   ")]
-            lines += [(f"   {line}", "0.4") for line in textwrap.wrap(reason, _CHARACTERS - 3)]
-    return [("The paper's reading of its Fig. 7, and this stage:", DARK), *lines] if lines else []
+            room = " " * len(f"{claim.verdict}: ")
+            first, *more = textwrap.wrap(claim.statement, _CHARACTERS, initial_indent=room, subsequent_indent="   ")
+            lines.append(_Line(first[len(room) :], verdict=claim.verdict))
+            lines += [_Line(line) for line in more]
+            lines += [_Line(f"   {line}", "0.4") for line in textwrap.wrap(reason, _CHARACTERS - 3)]
+    return [_Line("The paper's reading of its Fig. 7, and this stage:"), *lines] if lines else []
 
 
-def _write(axes: Axes, lines: Sequence[tuple[str, str]]) -> None:
-    for k, (words, color) in enumerate(lines):
-        verdict, colon, rest = words.partition(": ")
-        if color == DARK and colon:
-            words = rf"$\bf{{{verdict}}}${colon}{_with_symbols(rest)}"
-        else:
-            words = _with_symbols(words)
+def _write(axes: Axes, lines: Sequence[_Line]) -> None:
+    for k, line in enumerate(lines):
+        words = _with_symbols(line.words)
+        if line.verdict:
+            words = rf"$\bf{{{line.verdict}}}$: {words}"
         place: dict[str, Any] = {"xy": (0, 1), "xytext": (0, -72 * _LINE_in * k), "textcoords": "offset points"}
-        axes.annotate(words, **place, xycoords="axes fraction", va="top", fontsize=_SMALL_pt, color=color)
+        axes.annotate(words, **place, xycoords="axes fraction", va="top", fontsize=_SMALL_pt, color=line.color)
 
 
 def _with_symbols(words: str) -> str:

@@ -13,7 +13,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from fits._compensate_stage import static_equivalent
-from fits._plot_style import DARK, LIGHT, MEASURED, MODEL, NARROW_in, WIDE_in, figure, label, legend, save, thinned
+from fits._plot_style import (
+    DARK,
+    LIGHT,
+    MEASURED,
+    MODEL,
+    NARROW_in,
+    WIDE_in,
+    figure,
+    label,
+    legend,
+    save,
+    thinned,
+    verbatim,
+)
 from fits._plots import _MOST_RUNS, _TWO_SIDED_95, _caption
 from fits._record import Record
 from fits._result import RunReport
@@ -203,7 +216,9 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
     turn.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
     label(size, "", "magnitude")
     label(turn, "frequency (Hz)", "phase (°)")
-    size.set_title(f"{source}\nover the displacement that the hysteresis alone would give", loc="left", fontsize=7)
+    size.set_title(
+        f"{verbatim(source)}\nover the displacement that the hysteresis alone would give", loc="left", fontsize=7
+    )
     legend(picture, (size,))
     return picture
 

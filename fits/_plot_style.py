@@ -12,6 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 
 from fits._atomic import atomic_path
+from fits._printable import printable
 
 # One and two columns of a journal, 90 mm and 180 mm.
 NARROW_in, WIDE_in = 3.54, 7.09
@@ -36,6 +37,12 @@ def label(axes: Axes, x: str = "", y: str = "") -> None:
     axes.set_xlabel(x or axes.get_xlabel())
     axes.set_ylabel(y or axes.get_ylabel())
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def verbatim(text: str, most: int = 60) -> str:
+    """Let a text from outside, such as a file's name, be drawn as it is: `$` starts no formula, and it fits."""
+    cut = text if len(text) <= most else f"…{text[1 - most :]}"
+    return printable(cut).replace("$", r"\$")
 
 
 def legend(picture: Figure, axes: Iterable[Axes]) -> None:

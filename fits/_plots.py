@@ -13,7 +13,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fits._metrics import Errors
-from fits._plot_style import DARK, LIGHT, MEASURED, MODEL, NARROW_in, WIDE_in, figure, label, legend, save, thinned
+from fits._plot_style import (
+    DARK,
+    LIGHT,
+    MEASURED,
+    MODEL,
+    NARROW_in,
+    WIDE_in,
+    figure,
+    label,
+    legend,
+    save,
+    thinned,
+    verbatim,
+)
 from fits._record import Record
 from fits._result import FitResult, RunReport
 from fits._run import Run, prepare_run, simulate_run, split
@@ -128,7 +141,7 @@ def _columns(runs: Sequence[_Drawn], width_in: float) -> tuple[Figure, np.ndarra
 
 def _caption(axes: Axes, report: RunReport, errors: Errors | None) -> None:
     figures = "" if errors is None else f"\ne_rms {errors.e_rms_pct:.3g} %, e_max {errors.e_max_pct:.3g} %"
-    axes.set_title(report.source + figures, loc="left", fontsize=7)
+    axes.set_title(verbatim(report.source) + figures, loc="left", fontsize=7)
 
 
 def _loops(runs: Sequence[_Drawn]) -> Figure:

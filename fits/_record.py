@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fits._errors import DataError
+from fits._printable import printable
 
 FloatArray = NDArray[np.float64]
 
@@ -36,7 +37,7 @@ class Record:
     extra
         All other numeric columns by name, each of shape (n,), such as ``temperature_degC``.
     source
-        Name of the file, without its folder.
+        Name of the file, without its folder; what cannot be printed of it is kept as codes.
     warnings
         What looked odd when the file was read, one sentence each.
 
@@ -64,7 +65,7 @@ class Record:
         for name, array in arrays.items():
             object.__setattr__(self, name, array)
         object.__setattr__(self, "extra", MappingProxyType(extra))
-        object.__setattr__(self, "warnings", tuple(self.warnings))
+        _make_printable(self)
 
     def __len__(self) -> int:
         return self.time_s.size
@@ -105,7 +106,7 @@ class Reference:
     displacement_um
         Displacement in um as the sensor would read it, shape (n,).
     source
-        Name of the file, without its folder.
+        Name of the file, without its folder; what cannot be printed of it is kept as codes.
     warnings
         What looked odd when the file was read, one sentence each.
 
@@ -127,9 +128,16 @@ class Reference:
             raise ValueError(
                 f"displacement_um has shape {self.displacement_um.shape}, expected ({self.time_s.size},)."
             )
+        _make_printable(self)
 
     def __len__(self) -> int:
         return self.time_s.size
+
+
+def _make_printable(record: Record | Reference) -> None:
+    """Names of files may hold what no report, page or picture can."""
+    object.__setattr__(record, "source", printable(record.source))
+    object.__setattr__(record, "warnings", tuple(map(printable, record.warnings)))
 
 
 def refuse_repeats(records: Sequence[Record]) -> None:

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from fits._plot_style import figure, label
+from fits._plot_style import figure, label, verbatim
 from fits.diagnosis._report_views import VIEWS
 from fits.diagnosis._report_words import Lengths
 from fits.diagnosis._result import Diagnosis, Experiment, RunView
@@ -121,17 +121,12 @@ def residuals(diagnosis: Diagnosis, length: Lengths) -> Picture | None:
                 for edge in (-band, band):
                     axes.axhline(edge, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=3)
             axes.set_xlim(run.time_s[0], run.time_s[-1])
-            axes.set_title(_short(run.source, width_in), loc="left")
+            axes.set_title(verbatim(run.source, int(12 * width_in)), loc="left")
             label(axes, y=f"residual ({length.unit})" if len(runs) < 3 or width_in == _WIDE_in else length.unit)
         label(panels[-1], "time (s)")
         return picture
 
     return _drawn("residuals", "Residual over time before and after the extension, with the band of the noise", draw)
-
-
-def _short(name: str, width_in: float) -> str:
-    most = int(12 * width_in)
-    return name if len(name) <= most else f"…{name[1 - most :]}"
 
 
 def _set_aside(axes: Axes, run: RunView) -> None:

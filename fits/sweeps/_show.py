@@ -11,7 +11,7 @@ import numpy as np
 
 from fits._atomic import atomic_path
 from fits._errors import DataError
-from fits._plot_style import figure, label
+from fits._plot_style import figure, label, verbatim
 from fits.sweeps._about import about_of
 from fits.sweeps._extra import need
 from fits.sweeps._store import LEDGER, RESULTS
@@ -214,8 +214,8 @@ def _parallel(
     for line, colour in zip(scaled, colours, strict=True):
         axes.plot(line, color=(colour, 0.25, 1 - colour), linewidth=0.4, alpha=0.6)
     ranges = {name: f"{a:.3g} to {b:.3g}" for name, a, b in zip([*swept, by], low, high, strict=True)}
-    ranges |= {name: ", ".join(each) for name, each in words.items()}
-    axes.set_xticks(range(len(ranges)), [f"{name}\n{each}" for name, each in ranges.items()], fontsize=6)
+    ranges |= {name: verbatim(", ".join(each)) for name, each in words.items()}
+    axes.set_xticks(range(len(ranges)), [f"{verbatim(name)}\n{each}" for name, each in ranges.items()], fontsize=6)
     axes.set_yticks([])
     label(axes)
     return _saved(picture, path)
@@ -242,11 +242,11 @@ def _heat(
     corners = [10**ends if log else ends for ends, log in zip(edges, logs, strict=True)]
     drawn = axes.pcolormesh(*corners, mean.T, cmap="viridis")
     axes.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
-    picture.colorbar(drawn, label=f"mean {by}")
-    label(axes, *pair)
+    picture.colorbar(drawn, label=f"mean {verbatim(by)}")
+    label(axes, *map(verbatim, pair))
     for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
         if name in words:
-            axis.set_ticks(range(len(words[name])), words[name].tolist())
+            axis.set_ticks(range(len(words[name])), [verbatim(word, 24) for word in words[name]])
     return _saved(picture, path)
 
 

@@ -9,7 +9,6 @@ import errno
 import hashlib
 import json
 import os
-import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +19,8 @@ import numpy as np
 
 from fits._atomic import atomic_write_text
 from fits._errors import DataError
+from fits._file_set import flush, usable_folder
+from fits._temporary import is_temporary
 from fits.sweeps._about import ABOUT, SCHEMA, about_of
 from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of
 from fits.sweeps._extra import need
@@ -32,8 +33,8 @@ _STATUS = Output("status", "1", "of the row: 0 pending, 1 done, 2 failed", dtype
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 # A disk that is nearly full is full for others.
 _SHARE = 0.9
-# What a process that was killed leaves of a file it wrote, see `atomic_path`.
-_LEFT = re.compile(r"\.[0-9a-f]{16}-.*")
+# What zarr calls a file before it is whole.
+_PARTIAL = "**/*.partial"
 
 
 class Store:
@@ -127,11 +128,11 @@ class Store:
             return False
 
     def clear(self) -> None:
-        """Delete what processes that were killed have left of files."""
-        for folder in (self.folder, self.folder / LEDGER):
-            for path in folder.iterdir() if folder.is_dir() else ():
-                if _LEFT.fullmatch(path.name):
-                    path.unlink(missing_ok=True)
+        """Delete what processes that were killed have left of files; the lock says that no other is at work."""
+        left = [path for folder in (self.folder, self.folder / LEDGER) for path in folder.glob(".*")]
+        left = [path for path in left if is_temporary(path.name)] + [*(self.folder / RESULTS).glob(_PARTIAL)]
+        for path in left:
+            path.unlink(missing_ok=True)
 
     def write(self, chunk: int, rows: Rows) -> None:
         """Keep a chunk, then say so in the ledger.
@@ -148,8 +149,18 @@ class Store:
             for variable in self.variables:
                 array = np.ascontiguousarray(arrays[variable.name], dtype=variable.dtype)
                 group[variable.name][start : start + len(array)] = array
+            self._flush(chunk)
             entry = {"sha256": self._sum(arrays), "failed": sum(map(bool, rows.reasons)), "rows": len(rows.reasons)}
             atomic_write_text(self.folder / LEDGER / f"{chunk:08d}.json", json.dumps(entry) + "\n")
+
+    def _flush(self, chunk: int) -> None:
+        """Have a chunk on the disk before the ledger says that it is there."""
+        for variable in self.variables:
+            file = ".".join(map(str, (chunk, *(0 for _ in variable.shape))))
+            path = self.folder / RESULTS / variable.name / file
+            # A chunk of nothing but fill values has no file.
+            if path.exists():
+                flush(path)
 
     def read(self, chunk: int) -> dict[str, np.ndarray]:
         """Read all variables of a chunk."""
@@ -182,10 +193,7 @@ class Store:
 def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
     """Refuse a folder that cannot be written to, or holds something else, before anything starts; see `opened`."""
     need("zarr")
-    folder = Path(os.path.realpath(out))
-    anchor = next(place for place in (folder, *folder.parents) if place.exists())
-    if not anchor.is_dir() or not os.access(anchor, os.W_OK | os.X_OK):
-        raise DataError(f"{out}: expected a folder that can be written to; choose another for --out.")
+    folder, anchor = usable_folder(out, "--out")
     if (folder / ABOUT).exists():
         if not resume:
             raise DataError(
@@ -194,7 +202,7 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
         _check_same(sweep, out)
         return
     own = (RESULTS, LEDGER, TEXT, ".lock")
-    if folder.exists() and any(path.name not in own and not _LEFT.fullmatch(path.name) for path in folder.iterdir()):
+    if folder.exists() and any(path.name not in own and not is_temporary(path.name) for path in folder.iterdir()):
         raise DataError(f"{out}: the folder holds other files; choose another for --out.")
     _check_size(sweep, out, anchor)
 
