@@ -1,24 +1,22 @@
 """Low-level reading: from bytes to named columns of numbers, with line numbers as an editor shows them."""
 
 import csv
-import gzip
 import io
 import itertools
 import math
 import os
 import re
-import zlib
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fits._errors import DataError
+from fits._read_file import MOST_CSV_BYTES, read_bytes, unpack
 
 FloatArray = NDArray[np.float64]
 
@@ -272,23 +270,9 @@ def open_table(path: str | os.PathLike[str]) -> Table:
 
 
 def _load(path: str) -> bytes:
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise data_error(path, "no such file; check the name and the folder") from None
-    except IsADirectoryError:
-        raise data_error(path, "expected a CSV file, found a folder; name a file in it") from None
-    except (OSError, ValueError) as error:
-        what = error.strerror if isinstance(error, OSError) else error
-        raise data_error(path, f"cannot be read ({what}); check the name and the permissions") from None
+    data = read_bytes(path, "a CSV file", MOST_CSV_BYTES)
     if data.startswith(b"\x1f\x8b") or path.lower().endswith(".gz"):
-        try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError, zlib.error) as error:
-            what = str(error).rstrip(".")
-            raise data_error(
-                path, f"expected whole gzip data, found damage ({what}); copy or pack it again"
-            ) from None
+        return unpack(data, path, MOST_CSV_BYTES)
     return data
 
 

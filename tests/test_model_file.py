@@ -222,7 +222,7 @@ def test_other_files_are_refused(written, tmp_path):
     assert "UTF-8" in refusal(tmp_path / "binary.json")
     (tmp_path / "folder.json").mkdir()
     assert "folder" in refusal(tmp_path / "folder.json")
-    assert "No such file" in refusal(tmp_path / "none.json")
+    assert "no such file" in refusal(tmp_path / "none.json")
 
 
 def replaced(content, path, value):
