@@ -284,6 +284,11 @@ class _Stage:
         temperature_C = other_um = None
         if self._room is not None and self._room.settings.column:
             temperature_C = self._room.read_C(played.clock.time_s + time_s, columns_rng)
+        if not (np.isfinite(displacement_um).all() and np.isfinite(true_displacement_um).all()):
+            raise ScenarioError(
+                f"{self.scenario.file}: run {played.name}: the displacement is not finite; some number of the "
+                "scenario is too large"
+            )
         axis, true_other_um = self.scenario.other_axis, self._other_um(played, time_s)
         if axis is not None and axis.column and true_other_um is not None:
             other_um = axis.read_um(true_other_um, columns_rng)

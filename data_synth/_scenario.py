@@ -5,7 +5,6 @@ import importlib.resources
 import inspect
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from data_synth._environment import OtherAxisSettings, TemperatureSettings
 from data_synth._errors import ScenarioError
 from data_synth._plant import Hold, Plant, random_plant
 from data_synth._programs import PROGRAMS
+from data_synth._read_toml import parse_toml, read_text
 from data_synth._rig import Kind, Rig, random_rig
 from data_synth._sensor import Sensor
 from data_synth._strength import EffectSettings
@@ -307,11 +307,7 @@ def parse_scenario(text: str, file: str = "scenario") -> Scenario:
     ScenarioError
         For the first thing in it that is not as it should be.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{file}: not valid TOML: {error}") from error
-    scenario: Scenario = build(Scenario, table, file, file=file, text=text)
+    scenario: Scenario = build(Scenario, parse_toml(text, file), file, file=file, text=text)
     return scenario
 
 
@@ -334,9 +330,4 @@ def load_scenario(scenario: str) -> Scenario:
             raise ScenarioError(f"no scenario is called '{scenario}': {nearest(scenario, scenario_names())}")
         shipped = importlib.resources.files("data_synth") / "scenarios" / f"{scenario}.toml"
         return parse_scenario(shipped.read_text(encoding="utf-8"), f"{scenario}.toml")
-    try:
-        text = Path(scenario).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ScenarioError(f"{scenario}: cannot be read: {reason}") from error
-    return parse_scenario(text, scenario)
+    return parse_scenario(read_text(scenario), scenario)

@@ -24,6 +24,7 @@ _COMMENT = re.compile(r"^ *[#%].*\n?", re.MULTILINE)
 _EXCEL_SEPARATOR = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+MOST_COLUMNS = 1000
 _EXPORT = "export it as CSV text (UTF-8)"
 
 
@@ -139,6 +140,8 @@ class Table:
         if "#" in text or "%" in text:
             text = _COMMENT.sub("", text)
         width = next(self._lines())[1].count(self.separator) + 1
+        if width > MOST_COLUMNS:
+            return None
         options: dict[str, Any] = {}
         if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
             options["float_precision"] = "round_trip"  # the only mode from 3.1 on, where naming it warns
@@ -256,6 +259,9 @@ def open_table(path: str | os.PathLike[str]) -> Table:
             header_line,
             names[0] if names else None,
         )
+    if len(names) > MOST_COLUMNS:
+        what = f"expected up to {MOST_COLUMNS:,} columns, found {len(names):,}; write a row per sample"
+        raise data_error(shown, what, header_line)
     names = [name or f"column_{i}" for i, name in enumerate(names, 1)]
     for i, name in enumerate(names):
         if name in names[:i]:

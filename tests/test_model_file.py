@@ -27,7 +27,7 @@ def draw(family, rng, levels=7):
     slope = jnp.asarray(rng.uniform(0, 1, levels) / 3)
     model = microid.Preisach(density, microid.Reversible(slope, lower, upper), jnp.asarray(rng.normal()))
     grid = Grid(lower, upper, levels)
-    columns = jnp.asarray(rng.normal(size=(4, grid.columns)) * 10.0 ** rng.integers(-300, 300, (4, grid.columns)))
+    columns = jnp.asarray(rng.normal(size=(4, grid.columns)) * 10.0 ** rng.integers(-300, 29, (4, grid.columns)))
     return model, Uncertainty(columns, jnp.asarray(rng.normal(size=4)), jnp.asarray(rng.uniform()), grid)
 
 
