@@ -82,8 +82,8 @@ def refuse_nonfinite(name: str, values: NDArray[Any]) -> None:
     if not finite.all():
         row = int(np.argmin(finite))
         raise DataError(
-            f"{name}: the result is {values[row]} from sample {row + 1} on, so nothing was written; check the numbers "
-            "of the model and of the file it was given."
+            f"{name}: the result is {values[row]} from sample {row + 1} on, so nothing was written; check the "
+            "numbers of the model and of the file it was given."
         )
 
 

@@ -27,7 +27,7 @@ from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter
 from microid import Staircase, node_areas
 
 _KEYS = ("method", "levels", "holdout", "initial", "samples", "weights", "smoothness")
-_BLOCK, _PLACES, _FEWEST = 32, 64, 50
+_BLOCK, _PLACES, _FEWEST, _MOST = 32, 64, 50, 100_000
 _FEWEST_LEVELS, _MOST_LEVELS, _DEFAULT_LEVELS = 4, 32, 8
 _OUTPUTS = (
     Output("offset_um", "um", "reading at negative saturation"),
@@ -258,8 +258,8 @@ def make(request: Request) -> FitJob:
     if method == "one_by_one" and "smoothness" in table:
         raise DataError("fit.smoothness: one_by_one finds it from the data; leave it out.")
     samples = records.program.samples if isinstance(records, Simulated) else table.get("samples", 2048)
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < _FEWEST:
-        raise DataError(f"fit.samples: expected a number of {_FEWEST} or more, found {shown(samples)}; correct it.")
+    if isinstance(samples, bool) or not isinstance(samples, int) or not _FEWEST <= samples <= _MOST:
+        raise DataError(f"fit.samples: expected a number from {_FEWEST} to {_MOST:,}, found {shown(samples)}.")
     holdout = number(table.get("holdout", 0.2), "fit.holdout")
     if not 0 <= holdout <= 0.9:
         raise DataError(f"fit.holdout: expected a share between 0 and 0.9, found {holdout:g}; correct it.")

@@ -141,6 +141,11 @@ def _sweep(
     factors = tuple(axis.parameter for axis in plan.axes if axis.relative)
     if set(factors) != set(relative):
         job = KINDS[kind].make(Request(table, names, factors, load, folder))
+    if chunk_rows is not None and chunk_rows % job.facts.block:
+        raise DataError(
+            f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, found "
+            f"{chunk_rows}; correct it, or leave it out."
+        )
     return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows, folder)
 
 
