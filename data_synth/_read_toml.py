@@ -46,8 +46,10 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
     """
     try:
         table = tomllib.loads(text)
-    except ValueError as error:
+    except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{file}: not valid TOML: {error}") from error
+    except ValueError:  # from Python's `int`
+        raise ScenarioError(f"{file}: not valid TOML: an integer of thousands of digits") from None
     except RecursionError:
         raise ScenarioError(f"{file}: not valid TOML: more than {_MOST_DEPTH} nested levels") from None
     left: list[tuple[Any, int]] = [(table, 0)]

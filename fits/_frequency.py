@@ -143,6 +143,8 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
             table.header_line,
             "period",
         )
+    if periods * lengths[0] < 2:
+        raise data_error(table.path, "expected two samples or more per realization, found one", table.header_line)
     steps = np.diff(values["time_s"].reshape(-1, periods * lengths[0]), axis=1)
     interval_s = float(np.mean(steps))
     if not interval_s > 0 or np.max(np.abs(steps - interval_s)) > 0.01 * interval_s:

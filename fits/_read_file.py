@@ -101,11 +101,11 @@ def parse_json(text: str, place: str, what: str) -> Any:
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(dict(pairs)) < len(pairs):
-            raise ValueError("a key stands twice")
+            raise json.JSONDecodeError("a key stands twice", "", 0)
         return dict(pairs)
 
     def refuse(name: str) -> None:
-        raise ValueError(f"{name} is not JSON")
+        raise json.JSONDecodeError(f"{name} is not JSON", "", 0)
 
     try:
         found = json.loads(text, object_pairs_hook=once, parse_constant=refuse)
@@ -142,7 +142,14 @@ def parse_toml(text: str, place: str) -> dict[str, Any]:
 
 
 def _why(error: ValueError | RecursionError) -> str:
-    return f"more than {MOST_DEPTH} nested levels" if isinstance(error, RecursionError) else str(error).rstrip(".")
+    if isinstance(error, RecursionError):
+        return f"more than {MOST_DEPTH} nested levels"
+    if isinstance(error, json.JSONDecodeError):
+        return f"{error.msg}, line {error.lineno}" if error.pos else error.msg
+    # All else comes from Python's `int`, and is for programmers.
+    return (
+        str(error).rstrip(".") if isinstance(error, tomllib.TOMLDecodeError) else "an integer of thousands of digits"
+    )
 
 
 def _check(found: Any, place: str, finite: bool) -> None:

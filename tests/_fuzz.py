@@ -56,6 +56,8 @@ def spoilt(rng: np.random.Generator, name: str, data: bytes) -> bytes:
 
 
 def weird(rng):
+    if rng.uniform() < 0.4:  # what a file may well hold
+        return f"{rng.choice([0, 1, 7.5, 50, 99.5, 1e3, 1e6, 1e-3, 1e-6]) * rng.choice([1, 1, -1]):g}"
     return str(rng.choice(np.array(WEIRD, dtype=object)))
 
 
@@ -106,8 +108,8 @@ def column(rng, data):
     """Every cell of a column scaled, shifted, made one value, or left out."""
     head, *rows = [line.split(",") for line in lines_of(data)]
     at, way = int(rng.integers(len(head))), int(rng.integers(5))
-    factor = float(10.0 ** rng.choice([-318, -306, -100, -20, -9, -6, -3, 3, 6, 9, 20, 100, 306]))
-    shift = float(rng.choice([1e3, 1e9, 1e15, 1e300, -1e6]))
+    factor = float(10.0 ** rng.choice([-318, -306, -100, -20, -9, -6, -3, -1, -0.1, 0.1, 1, 3, 6, 9, 20, 100, 306]))
+    factor, shift = float(rng.choice([-1, 1, 1, 1])) * factor, float(rng.choice([1, -5, 1e3, 1e9, 1e15, 1e300, -1e6]))
     for row in rows:
         try:
             value = float(row[at])
@@ -195,8 +197,8 @@ def structure(rng, data):
         del owner[key]
     elif way == 2 and isinstance(value, list) and value:
         value[int(rng.integers(len(value)))] = choices[rng.integers(len(choices))]
-    elif way == 3 and isinstance(value, int | float) and not isinstance(value, bool):
-        owner[key] = value * float(rng.choice([1e3, 1e-3, -1, 1e300, 1e-300, 0]))
+    elif way == 3 and isinstance(value, float):
+        owner[key] = value * float(rng.choice([1.5, 0.5, 10, 1e3, 1e-3, -1, 1e6, 1e-6, 1e300, 1e-300, 0]))
     else:
         owner[key] = choices[rng.integers(len(choices))]
     return json.dumps(content).encode()
@@ -231,7 +233,8 @@ def toml_value(rng, data):
         return flipped(rng, data)
     k = places[rng.integers(len(places))]
     key, _, old = lines[k].partition("=")
-    values = ["nan", "-inf", "1e308", "5e-324", "0", "-1", "1e12", "1000000000", "[]", "{}", "[1, 2]", "true", '"x"']
+    values = ["0.5", "2", "3.0", "40", "0.01", "1000", "1e6", "1e-6", "100000", "1e5", "0.1", "10.0", "-5"]
+    values += ["nan", "-inf", "1e308", "5e-324", "0", "-1", "1e12", "1000000000", "[]", "{}", "[1, 2]", "true", '"x"']
     values += ["9" * 5000, "9" * 100, "[" * 2000 + "]" * 2000, "[" * 100 + "]" * 100, "1979-05-27", "0x1F", "1e-300"]
     values += ['"' + "y" * 7000 + '"', "[" + "1," * 3000 + "]", '"\\uD800"', "'''a'''", "a.b.c", weird(rng)]
     if "value" in old and rng.uniform() < 0.7:  # a quantity with its unit

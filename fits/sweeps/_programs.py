@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits._errors import DataError, shown
+from fits._plausible import SHORTEST_STEP_s
 from fits._read_csv import read_csv, read_reference
 from fits._stage_design import nearest
 from fits._table import open_table
@@ -29,9 +30,11 @@ SHAPES: dict[str, tuple[str, ...]] = {
 }
 _DEFAULTS = {"frequency_Hz": 10.0, "frequency_end_Hz": 100.0, "phase_rad": 0.0, "step_s": 0.0}
 _UNITS = {"frequency_Hz": "Hz", "frequency_end_Hz": "Hz", "phase_rad": "rad", "step_s": "s"}
-_SAMPLES = 10_000_000
+_SAMPLES, _LONGEST_s = 10_000_000, 1e4
 # Samples that differ by less from even intervals, as a fraction of one, count as even.
 _EVEN = 1e-3
+# Squares and products of what is larger overflow.
+_LARGEST = 1e30
 
 
 @dataclass(frozen=True)
@@ -135,8 +138,10 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
     if isinstance(samples, bool) or not isinstance(samples, int) or not 3 <= samples <= _SAMPLES:
         raise DataError(f"{name}.samples: expected a number from 3 to {_SAMPLES:,}, found {shown(samples)}.")
     interval = number(table.get("interval_s", 1e-4), f"{name}.interval_s")
-    if not interval > 0:
-        raise DataError(f"{name}.interval_s: expected a time above 0, found {interval:g}; correct it.")
+    if not SHORTEST_STEP_s <= interval <= _LONGEST_s:
+        raise DataError(
+            f"{name}.interval_s: expected a time from {SHORTEST_STEP_s:g} to {_LONGEST_s:g} s, found {interval:g}."
+        )
     program = Program(name, unit, shape, samples, interval, tuple(nominal.items()))
     for parameter in program.parameters:
         value = dict(nominal)[parameter.name.removeprefix(f"{name}.")]
@@ -189,4 +194,6 @@ def number(found: Any, place: str) -> float:
         value = math.inf
     if not math.isfinite(value):
         raise DataError(f"{place}: expected a finite number, found {shown(found)}; give one without quotes.")
+    if abs(value) > _LARGEST or 0 < abs(value) < 1 / _LARGEST:
+        raise DataError(f"{place}: expected 0, or {1 / _LARGEST:g} to {_LARGEST:g} in size, found {value:g}.")
     return value
