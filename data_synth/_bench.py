@@ -19,6 +19,9 @@ from data_synth._types import FloatArray, Hysteresis
 _PAUSE_S = 30.0
 """Between the end of a run and the start of the next."""
 
+# Samples of a run whose stage hides something: each is simulated in 16 steps or more.
+_MOST_FINE = 500_000
+
 # Streams of chance that runs without effects know nothing of, each after the seed.
 _ROOM, _OTHER, _EFFECTS, _COLUMNS = 101, 102, 103, 104
 
@@ -252,6 +255,11 @@ class _Stage:
         """The run on a fine grid."""
         plant = self.plant or Plant()
         samples = len(played.voltage_V)
+        if samples > _MOST_FINE:
+            raise ScenarioError(
+                f"{self.scenario.file}: run {played.name} takes {samples:,} samples, and in fine steps at most "
+                f"{_MOST_FINE:,} are simulated: shorten it, or sample slower"
+            )
         steps = refinement(plant, played.sample_rate_Hz, samples)
         time_s = np.arange((samples + AFTER - 1) * steps + 1) / (played.sample_rate_Hz * steps)
         situation = Situation(
@@ -284,6 +292,11 @@ class _Stage:
         temperature_C = other_um = None
         if self._room is not None and self._room.settings.column:
             temperature_C = self._room.read_C(played.clock.time_s + time_s, columns_rng)
+        if not (np.isfinite(displacement_um).all() and np.isfinite(true_displacement_um).all()):
+            raise ScenarioError(
+                f"{self.scenario.file}: run {played.name}: the displacement is not finite; some number of the "
+                "scenario is too large"
+            )
         axis, true_other_um = self.scenario.other_axis, self._other_um(played, time_s)
         if axis is not None and axis.column and true_other_um is not None:
             other_um = axis.read_um(true_other_um, columns_rng)

@@ -5,7 +5,6 @@ import importlib.resources
 import inspect
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,11 +16,15 @@ from data_synth._environment import OtherAxisSettings, TemperatureSettings
 from data_synth._errors import ScenarioError
 from data_synth._plant import Hold, Plant, random_plant
 from data_synth._programs import PROGRAMS
+from data_synth._read_toml import parse_toml, read_text
 from data_synth._rig import Kind, Rig, random_rig
 from data_synth._sensor import Sensor
 from data_synth._strength import EffectSettings
 from data_synth._table import build, nearest, read_arguments
 from data_synth._types import FloatArray, Initial
+
+# Of a run, and of all runs together: a CSV of 1 GB.
+_MOST_SAMPLES = 10_000_000
 
 
 def _require(holds: bool, sentence: str) -> None:
@@ -222,6 +225,10 @@ class Run:
                 raise ValueError(f"program[{k}] ({segment.kind}): {error}") from error
             if len(pieces[-1]) == 0:
                 pieces.pop()
+            _require(
+                sum(map(len, pieces)) <= _MOST_SAMPLES,
+                f"program[{k}]: the run takes more than {_MOST_SAMPLES:,} samples: shorten it, or sample slower",
+            )
         return np.concatenate(pieces)
 
 
@@ -277,6 +284,7 @@ class Scenario:
         hidden = [effect.name for effect in self.effects]
         for k, name in enumerate(hidden):
             _require(hidden.count(name) == 1, f"effects[{k}]: {name} stands twice")
+        samples = 0
         names = [run.name.casefold() for run in self.runs]  # not every file system tells Train from train
         for k, run in enumerate(self.runs):
             _require(names.count(names[k]) == 1, f"runs[{k}]: name {run.name!r} is taken by another run")
@@ -287,9 +295,11 @@ class Scenario:
                 f"runs[{k}]: start_V must lie in {self.rig.lower_V:g} to {self.rig.upper_V:g} V, got {start_V:g}",
             )
             try:
-                run.voltage_V(start_V, self.rig.lower_V, self.rig.upper_V, np.random.default_rng(0))
+                played_V = run.voltage_V(start_V, self.rig.lower_V, self.rig.upper_V, np.random.default_rng(0))
             except ValueError as error:
                 raise ValueError(f"runs[{k}]: {error}") from error
+            samples += len(played_V)
+            _require(samples <= _MOST_SAMPLES, f"runs[{k}]: all runs take more than {_MOST_SAMPLES:,} samples")
 
 
 def parse_scenario(text: str, file: str = "scenario") -> Scenario:
@@ -307,11 +317,7 @@ def parse_scenario(text: str, file: str = "scenario") -> Scenario:
     ScenarioError
         For the first thing in it that is not as it should be.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{file}: not valid TOML: {error}") from error
-    scenario: Scenario = build(Scenario, table, file, file=file, text=text)
+    scenario: Scenario = build(Scenario, parse_toml(text, file), file, file=file, text=text)
     return scenario
 
 
@@ -334,9 +340,4 @@ def load_scenario(scenario: str) -> Scenario:
             raise ScenarioError(f"no scenario is called '{scenario}': {nearest(scenario, scenario_names())}")
         shipped = importlib.resources.files("data_synth") / "scenarios" / f"{scenario}.toml"
         return parse_scenario(shipped.read_text(encoding="utf-8"), f"{scenario}.toml")
-    try:
-        text = Path(scenario).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ScenarioError(f"{scenario}: cannot be read: {reason}") from error
-    return parse_scenario(text, scenario)
+    return parse_scenario(read_text(scenario), scenario)

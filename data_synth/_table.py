@@ -11,11 +11,14 @@ from typing import Any
 
 from data_synth._errors import ScenarioError
 
+# No quantity of a stage lies beyond, in any unit; powers of numbers that do overflow.
+_SMALLEST, _LARGEST = 1e-15, 1e15
+
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """Say which known word is meant, in words to end a sentence with, or which ones there are."""
     known = list(known)
-    close = difflib.get_close_matches(word, known, n=1)
+    close = difflib.get_close_matches(word[:100], known, n=1)
     return f"did you mean '{close[0]}'?" if close else f"known are {', '.join(known)}"
 
 
@@ -91,6 +94,10 @@ def _read_value(hint: Any, value: object, where: str) -> Any:
     if type(value) is not hint:  # not isinstance: true is an int to Python, but not to us
         words = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
         raise ScenarioError(f"{where} must be {words[hint]}, got {value!r}")
-    if hint is float and not math.isfinite(typing.cast(float, value)):
-        raise ScenarioError(f"{where} must be finite, got {value}")
+    if hint is float:
+        size = abs(typing.cast(float, value))
+        if not math.isfinite(size):
+            raise ScenarioError(f"{where} must be finite, got {value}")
+        if size > _LARGEST or 0 < size < _SMALLEST:
+            raise ScenarioError(f"{where} must be 0, or {_SMALLEST:g} to {_LARGEST:g} in size, got {value}")
     return value

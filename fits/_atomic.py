@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fits._errors import DataError
 from fits._file_set import file_set
 
 
@@ -48,6 +49,17 @@ def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
     atomic_write_bytes(path, text.encode())
 
 
+def refuse_nonfinite(name: str, values: NDArray[Any]) -> None:
+    """Refuse, in a `DataError`, to pass on results that are not finite, shape `(n,)`: no file holds any."""
+    finite = np.isfinite(values) if values.dtype.kind in "fc" else np.ones(values.shape, dtype=bool)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise DataError(
+            f"{name}: the result is {values[row]} from sample {row + 1} on, so nothing was written; check the "
+            "numbers of the model and of the file it was given."
+        )
+
+
 def write_csv(
     path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]], comments: Sequence[str] = ()
 ) -> None:
@@ -67,8 +79,10 @@ def write_csv(
     ValueError
         The columns differ in length.
     DataError
-        As `atomic_path`.
+        As `atomic_path`, or a value is not finite.
     """
+    for name, values in columns.items():
+        refuse_nonfinite(name, np.asarray(values))
     lists = [np.asarray(values).tolist() for values in columns.values()]
     with atomic_path(path) as temporary:
         opener: Any = gzip.open if temporary.suffix == ".gz" else open

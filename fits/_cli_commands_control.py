@@ -51,7 +51,7 @@ from fits._cli_common import columns, in_sentences, json_output, limit, limits, 
 )
 @click.option(
     "--plants",
-    type=click.IntRange(min=1),
+    type=click.IntRange(1, 100),
     help="Models drawn from the uncertainty of the fit, all to be controlled (default 4, or 1 without one).",
 )
 @click.option("--overshoot", type=float, metavar="PCT", help="Largest overshoot, in percent of the range.")
@@ -61,7 +61,7 @@ from fits._cli_common import columns, in_sentences, json_output, limit, limits, 
 @click.option("--effort", type=float, default=0.0, metavar="UM/V", help="Weight of the feedback in the cost.")
 @click.option("--rate", type=float, default=0.0, metavar="UM/V", help="Weight of the command's steps in the cost.")
 @click.option("--skip", type=float, default=0.0, metavar="S", help="Time at the beginning that does not count, in s.")
-@click.option("--starts", type=click.IntRange(min=1), default=2, show_default=True, help="Places to tune from.")
+@click.option("--starts", type=click.IntRange(1, 100), default=2, show_default=True, help="Places to tune from.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Of noise, plants and starts (default 0).")
 @columns
 @json_output

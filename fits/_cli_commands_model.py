@@ -53,8 +53,10 @@ def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) ->
     help="How the command of a stage runs between samples (default lines); a converter that holds it makes steps, a "
     "smooth one curves.",
 )
-@click.option("--starts", type=click.IntRange(min=1), help="Starts for families whose fit is not convex (default 8).")
-@click.option("--seed", type=click.IntRange(min=0), help="Seed of the starts (default 0).")
+@click.option(
+    "--starts", type=click.IntRange(1, 100), help="Starts for families whose fit is not convex (default 8)."
+)
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the starts (default 0).")
 @json_output
 @quiet
 @in_sentences
@@ -149,7 +151,7 @@ def export(**options: Any) -> None:
 @click.command()
 @click.argument("scenario")
 @click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
-@click.option("--seed", type=click.IntRange(min=0), help="Seed; the scenario's own by default.")
+@click.option("--seed", type=click.IntRange(0, 2**64 - 1), help="Seed; the scenario's own by default.")
 @click.option(
     "--list",
     is_flag=True,

@@ -1,7 +1,6 @@
 """The command `microid control`: the work."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ from microid import Stage
 
 _PLANTS = 4
 # Finer steps, of um or V, are none.
-_FINEST = 1e-9
+_FINEST, _LARGEST = 1e-9, 1e9
 # In the order of the options that are looked at.
 _LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "overshoot_max_pct")
 
@@ -72,16 +71,16 @@ def run_control(
 ) -> None:
     """Do `microid control`; the options are the command's."""
     for option, value in {"--noise": noise, "--effort": effort, "--rate": rate, "--skip": skip}.items():
-        if not (math.isfinite(value) and value >= 0):
-            raise DataError(f"{option}: expected a number that is not negative, found {value:g}.")
+        if not 0 <= value <= _LARGEST:
+            raise DataError(f"{option}: expected a number from 0 to {_LARGEST:g}, found {value:g}.")
     for option, step in {"--resolution": resolution, "--resolution-voltage": resolution_voltage}.items():
-        if step is not None and not (math.isfinite(step) and step >= _FINEST):
-            raise DataError(f"{option}: expected {_FINEST:g} or more, found {step:g}; leave it out for none.")
+        if step is not None and not _FINEST <= step <= _LARGEST:
+            raise DataError(f"{option}: expected {_FINEST:g} to {_LARGEST:g}, found {step:g}; leave it out for none.")
     stated = {"--gain-margin": gain_margin, "--phase-margin": phase_margin, "--peak": peak, "--overshoot": overshoot}
     for option, bound in stated.items():
         least = 0.0 if option == "--overshoot" else 1.0
-        if bound is not None and not (math.isfinite(bound) and bound >= least):
-            raise DataError(f"{option}: expected a number of {least:g} or more, found {bound:g}.")
+        if bound is not None and not least <= bound <= _LARGEST:
+            raise DataError(f"{option}: expected a number from {least:g} to {_LARGEST:g}, found {bound:g}.")
     if frequency and controller != "resonant":
         raise DataError(f"--frequency: expected --controller resonant with it, found {controller}; leave it out.")
     volts, allowed_here = parse_rig_limits(limits, limit, margin)

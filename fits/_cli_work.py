@@ -34,7 +34,7 @@ def run_simulate(*, model: str, program: str, out: str, initial: str, columns: s
         "voltage_V": record.voltage_V,
         "displacement_um": prediction.displacement_um,
     }
-    known = bool(np.all(np.isfinite(prediction.displacement_sd_um)))
+    known = loaded.uncertainty is not None
     if known:
         table["displacement_sd_um"] = prediction.displacement_sd_um
     write_csv(out, table)
@@ -75,14 +75,21 @@ def run_info(*, model: str, as_json: bool) -> None:
         content = {"written_by": loaded.written_by, "model": kind, "parameters": parameters, "fit": loaded.report}
         click.echo(json.dumps(content, indent=1, allow_nan=False))
         return
-    click.echo(f"{kind}, written by {loaded.written_by}")
+    lines = [f"{kind}, written by {loaded.written_by}"]
     for row in parameters:
-        click.echo(f"  {row['path']:28} {'x'.join(map(str, row['shape'])) or '1':>8} {row['unit']}")
+        lines.append(f"  {row['path']:28} {'x'.join(map(str, row['shape'])) or '1':>8} {row['unit']}")
+    click.echo("\n".join([*lines, "", _known_of_fit(model, loaded)]))
+
+
+def _known_of_fit(path: str, loaded: ModelFile) -> str:
     if loaded.uncertainty is None:
-        click.echo("\nwritten by 'microid diagnose', whose report says how well it predicts")
-        return
+        return "written by 'microid diagnose', whose report says how well it predicts"
     words = describe_stage if isinstance(loaded.uncertainty, StageUncertainty) else describe
-    click.echo(f"\n{words(loaded.report)}")
+    try:
+        return words(loaded.report)
+    except (LookupError, TypeError, ValueError, AttributeError):
+        # The format does not say what a report holds, and the words are made for that of a fit.
+        raise DataError(f"{path}: its report is not that of a fit; fit again, or add --json to see it.") from None
 
 
 def _predict(path: str, loaded: ModelFile, record: Record, initial: str) -> Prediction:

@@ -1,17 +1,16 @@
 """Gains of controllers as `microid control` prints them, and as it reads them again."""
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
+from fits._read_file import MOST_JSON_BYTES, parse_json, read_text
 from fits._tune import parameter_values
 from microid import PID, AbstractController, ResonantPID, parameter_table
 
@@ -140,12 +139,11 @@ def read_gains(text: str) -> Given:
 
 
 def _read_file(path: str) -> Given:
+    what = "KP,KI,KD or a file of gains"
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(
-            f"--gains: expected KP,KI,KD or a JSON file of gains, found '{path}' ({error}); write three numbers."
-        ) from error
+        content = parse_json(read_text(path, what, MOST_JSON_BYTES), shown(path), what)
+    except DataError as error:
+        raise DataError(f"--gains: {error}") from None
     content = content.get("gains", content) if isinstance(content, dict) else {}
     if not isinstance(content, dict):
         content = {}
@@ -171,5 +169,5 @@ def _numbers(path: str, name: str, value: Any, known: set[str]) -> np.ndarray:
     except ValueError:
         numbers = np.asarray(None)
     if numbers.dtype.kind not in "iuf" or numbers.size == 0 or not np.all(np.isfinite(numbers)):
-        raise DataError(f"{path}: expected the key {name} with numbers, found {value!r}.")
+        raise DataError(f"{path}: expected the key {name} with numbers, found {shown(value)}.")
     return numbers.astype(float)

@@ -17,12 +17,14 @@ import numpy as np
 
 import microid
 from fits._design import Grid
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits._stage_uncertainty import StageUncertainty
 from fits._uncertainty import Uncertainty
 from microid import ParameterSpec
 
 _ACTIVATIONS = {"tanh": jnp.tanh}
+# Squares and products of what is larger overflow.
+_LARGEST, _LARGEST_PLAIN = 1e30, 1000
 _DTYPES = ("float32", "float64", "int32", "int64", "bool")
 
 
@@ -77,6 +79,9 @@ def decode(item: Any, where: str, spec: ParameterSpec | None = None) -> Any:
     """
     if isinstance(item, list):
         return tuple(decode(entry, f"{where}[{index}]", spec) for index, entry in enumerate(item))
+    if isinstance(item, int | float) and abs(item) > _LARGEST_PLAIN:
+        # Levels and steps, whose squares are sizes of arrays.
+        raise DataError(f"{where}: expected a number up to {_LARGEST_PLAIN} in size, found {shown(item)}")
     if not isinstance(item, dict):
         return item
     if "type" not in item:
@@ -137,7 +142,7 @@ def _encode_module(module: eqx.Module, packed: Collection[str]) -> dict[str, Any
 def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
     cls = _classes().get(item["type"]) if isinstance(item["type"], str) else None
     if cls is None:
-        raise DataError(f"{where}: {item['type']!r} is not the name of a model that this version knows")
+        raise DataError(f"{where}: {shown(item['type'])} is not the name of a model that this version knows")
     fields = _fields(cls)
     if set(item) - {"type"} != set(fields):
         raise DataError(f"{where}: a {item['type']} has the fields {', '.join(fields)}, and no others")
@@ -146,11 +151,20 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
     with jaxtyping.jaxtyped("context"):
         for key, field in fields.items():
             if isinstance(field.type, type) and not isinstance(values[key], field.type):
-                raise DataError(f"{where}.{key}: expected {field.type.__name__}, found something else")
+                raise DataError(f"{where}.{key}: expected {_words(field.type)}, found something else")
     try:
         return cls(**values)
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{where}: {error}") from error
+    except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError) as error:
+        # A constructor is written for what code gives it; a file may give it anything.
+        raise DataError(f"{where}: {' '.join(str(error).split())}") from error
+
+
+def _words(kind: Any) -> str:
+    """What a field holds, for somebody who has never seen its annotation."""
+    if not issubclass(kind, jaxtyping.AbstractArray):
+        return "an object" if issubclass(kind, eqx.Module) else f"a value of type {kind.__name__}"
+    axes = str(kind.dim_str).split()
+    return f"an array of {len(axes)} axes ({', '.join(axes)})" if axes else "a single number with its unit"
 
 
 def _encode_array(array: np.ndarray, unit: str) -> dict[str, Any]:
@@ -171,10 +185,10 @@ def _encode_packed(array: np.ndarray, unit: str) -> dict[str, Any]:
 
 def _decode_array(item: dict[str, Any], where: str, spec: ParameterSpec | None) -> jax.Array:
     if spec is not None and item.get("unit") != spec.unit:
-        raise DataError(f"{where}: expected the unit {spec.unit!r}, found {item.get('unit')!r}")
+        raise DataError(f"{where}: expected the unit {spec.unit!r}, found {shown(item.get('unit'))}")
     array = _unpack(item, where) if "float64_base64" in item else _plain(item, where)
-    if not np.all(np.isfinite(array)):
-        raise DataError(f"{where}: expected finite numbers")
+    if not np.all(np.abs(array) <= _LARGEST):
+        raise DataError(f"{where}: expected numbers up to {_LARGEST:g} in size")
     if spec is not None and not np.all((array >= spec.lower) & (array <= spec.upper)):
         raise DataError(f"{where}: expected numbers between {spec.lower:g} and {spec.upper:g} {spec.unit}")
     return jnp.asarray(array)

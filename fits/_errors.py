@@ -1,12 +1,39 @@
-"""The one exception for bad input."""
+"""The one exception for bad input, and how its sentences quote what was found."""
+
+import json
+from typing import Any
+
+# What is quoted, and a whole sentence, are cut to so many characters; so many are kept at its end.
+_SHOWN, _SENTENCE, _END = 60, 1000, 400
+# Integers of more digits take long to write.
+_ENORMOUS = 10**_SHOWN
 
 
 class DataError(ValueError):
     """Bad input, in one sentence: the file, the place in it, what was expected and what to do.
 
-    The `microid` command prints the sentence on stderr and exits with status 2.
+    The `microid` command prints the sentence on stderr and exits with status 2. Of more than 1,000 characters the
+    middle is left out: what was expected stands at the beginning, and what to do at the end.
     """
+
+    def __init__(self, sentence: object = "") -> None:
+        text = str(sentence)
+        if len(text) > _SENTENCE:
+            text = f"{text[: _SENTENCE - _END - 5]} ... {text[-_END:]}"
+        super().__init__(text)
 
 
 class ModelError(DataError):
     """A model that cannot do what is asked; the command names its file before the sentence."""
+
+
+def shown(found: Any) -> str:
+    """Write what was found in a file as TOML and JSON have it, short enough for a sentence."""
+    if isinstance(found, dict | list):
+        return "a table" if isinstance(found, dict) else "a list"
+    if isinstance(found, int) and abs(found) >= _ENORMOUS:
+        return "an enormous number"
+    if isinstance(found, str):
+        found = " ".join(found[: 2 * _SHOWN].split())
+    text = json.dumps(found, ensure_ascii=False) if isinstance(found, str | bool) else str(found)
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."

@@ -18,7 +18,7 @@ from microid import Everett, Preisach
 
 # That of a demagnetised staircase in `microid`.
 _SWINGS = 31
-_SMALLEST = 8
+_SMALLEST, _LARGEST = 8, 65_536
 _LINE = 118
 
 
@@ -64,8 +64,10 @@ def export_c(
         raise DataError(
             f"--name: expected a letter and then up to 30 letters, digits or underscores, found '{name}'; rename it."
         )
-    if size < _SMALLEST:
-        raise DataError(f"--memory: expected {_SMALLEST} extremes or more, found {size}; 128 suit most references.")
+    if not _SMALLEST <= size <= _LARGEST:
+        raise DataError(
+            f"--memory: expected {_SMALLEST} to {_LARGEST} extremes, found {size}; 128 suit most references."
+        )
     fields = _fields(model, name, size, within_range(model, limits_V))
     written = [f"{name}.{ending}" for ending in ("h", "c")]
     with file_set() as files:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits._errors import DataError
+from fits._plausible import check_size
 from fits._table import data_error, open_table
 
 # A line is excited if the input reaches this share of its largest.
@@ -125,6 +126,8 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
                 table.path, f"expected a column '{name}', found none; rename or add it", table.header_line
             )
     values, _ = table.read(needed)
+    for name in needed:
+        check_size(table, name, values[name], {"V": "V", "um": "um", "s": "s"}.get(name.rpartition("_")[2], "1"))
     group = np.stack([values["realization"], values["period"]])
     starts = np.flatnonzero(np.append(True, np.any(np.diff(group) != 0, axis=0)))
     lengths, periods = np.diff(np.append(starts, group.shape[1])), len(np.unique(group[1]))
@@ -140,6 +143,8 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
             table.header_line,
             "period",
         )
+    if periods * lengths[0] < 2:
+        raise data_error(table.path, "expected two samples or more per realization, found one", table.header_line)
     steps = np.diff(values["time_s"].reshape(-1, periods * lengths[0]), axis=1)
     interval_s = float(np.mean(steps))
     if not interval_s > 0 or np.max(np.abs(steps - interval_s)) > 0.01 * interval_s:

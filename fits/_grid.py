@@ -238,7 +238,8 @@ def cross_validate(
         belief = posterior(rest.scaled(1 / correlation, stroke_um), rough, hyper)
         columns = np.asarray(belief.mean if basis is None else basis @ belief.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
-        off = [(run.displacement_um - simulate_run(model, run))[label == number] for run, label in pairs]
+        errors = [(run.displacement_um - simulate_run(model, run))[label == number] for run, label in pairs]
+        off = [error for error in errors if len(error)]
         squares += sum(float(np.sum((o - o.mean()) ** 2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)
         expected += float(_expected_square(belief, block)) * stroke_um**2

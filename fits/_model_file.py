@@ -50,7 +50,8 @@ import jax
 from fits._atomic import atomic_write_text
 from fits._design import Grid
 from fits._encode import decode, encode
-from fits._errors import DataError
+from fits._errors import DataError, shown
+from fits._read_file import MOST_JSON_BYTES, parse_json, read_text
 from fits._stage_uncertainty import StageUncertainty, offsets_out
 from fits._uncertainty import Uncertainty
 from fits._version import written_by
@@ -164,21 +165,21 @@ def load_model(path: str | os.PathLike[str]) -> ModelFile:
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('model files hold float64: jax.config.update("jax_enable_x64", True)')
-    shown = os.fspath(path)
-    content = _read(shown)
+    name = os.fspath(path)
+    content = _read(name)
     try:
         model = decode(content["model"], "model")
         uncertainty = decode(content["uncertainty"], "uncertainty")
     except DataError as error:
-        raise DataError(f"{shown}: {error}; write the file again with 'microid fit'.") from error
+        raise DataError(f"{name}: {error}; write the file again with 'microid fit'.") from error
     if not isinstance(model, eqx.Module) or not isinstance(uncertainty, Uncertainty | StageUncertainty | None):
-        raise DataError(f"{shown}: expected a model and its uncertainty; write the file again with 'microid fit'.")
+        raise DataError(f"{name}: expected a model and its uncertainty; write the file again with 'microid fit'.")
     if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
-        raise DataError(f"{shown}: the uncertainty does not fit the stage; write the file again with 'microid fit'.")
+        raise DataError(f"{name}: the uncertainty does not fit the stage; write the file again with 'microid fit'.")
     if uncertainty is not None and uncertainty.columns_um.shape[1] != (
         0 if uncertainty.grid is None else uncertainty.grid.columns
     ):
-        raise DataError(f"{shown}: the uncertainty does not fit its grid; write the file again with 'microid fit'.")
+        raise DataError(f"{name}: the uncertainty does not fit its grid; write the file again with 'microid fit'.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
 
 
@@ -195,51 +196,26 @@ def _moves(model: eqx.Module, uncertainty: StageUncertainty) -> bool:
         return False
 
 
-def _read(shown: str) -> dict[str, Any]:
-    content = _parse(shown)
+def _read(name: str) -> dict[str, Any]:
+    what = "a model file"
+    content = parse_json(read_text(name, what, MOST_JSON_BYTES), name, what)
     schema = content.get("schema") if isinstance(content, dict) else None
     if not isinstance(schema, str) or not schema.startswith(_FAMILY):
-        raise DataError(f"{shown}: expected a model written by 'microid fit', found other JSON; name such a file.")
+        raise DataError(f"{name}: expected a model written by 'microid fit', found other JSON; name such a file.")
     if schema != SCHEMA:
         raise DataError(
-            f"{shown}: expected the format {SCHEMA}, found {schema!r}; "
+            f"{name}: expected the format {SCHEMA}, found {shown(schema)}; "
             "read it with the version of microid that wrote it, or fit again."
         )
     typed = isinstance(content.get("written_by"), str) and isinstance(content.get("fit"), dict)
     if set(content) != set(_PARTS) or not typed:
-        raise DataError(f"{shown}: expected the keys {', '.join(_PARTS)}; write the file again with 'microid fit'.")
+        raise DataError(f"{name}: expected the keys {', '.join(_PARTS)}; write the file again with 'microid fit'.")
     if content["sha256"] != _hash(content):
         raise DataError(
-            f"{shown}: the content does not match its sha256, so it was changed after it was written; "
+            f"{name}: the content does not match its sha256, so it was changed after it was written; "
             "restore the file, or write it again with 'microid fit'."
         )
     return content
-
-
-def _parse(shown: str) -> Any:
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(dict(pairs)) < len(pairs):
-            raise ValueError("a key stands twice")
-        return dict(pairs)
-
-    def refuse(name: str) -> None:
-        raise ValueError(f"{name} is not JSON")
-
-    try:
-        with open(shown, encoding="utf-8") as file:
-            return json.load(file, object_pairs_hook=once, parse_constant=refuse)
-    except IsADirectoryError:
-        raise DataError(f"{shown}: expected a model file, found a folder; name a file in it.") from None
-    except OSError as error:
-        reason = error.strerror or error
-        raise DataError(f"{shown}: cannot be read ({reason}); check the name and the permissions.") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{shown}: expected a model file in JSON, found no UTF-8 text; name another file.") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(
-            f"{shown}: expected a model file in JSON, found a broken or cut one ({error}); "
-            "restore the file, or write it again with 'microid fit'."
-        ) from error
 
 
 def _hash(content: Mapping[str, Any]) -> str:

@@ -16,12 +16,13 @@ _NEIGHBOURS = 10
 def shared_square(residual: np.ndarray) -> float:
     """Mean square of the part of a residual that neighbouring samples share, in its unit squared.
 
-    That is the mean of the autocovariances at lags 1 to 10: white noise has none, errors of a model do. As an
-    estimate it can come out negative.
+    That is the mean of the autocovariances at lags 1 to 10, as far as there are so many: white noise has
+    none, errors of a model do. As an estimate it can come out negative.
     """
     centred = residual - residual.mean()
-    products = [float(np.mean(centred[lag:] * centred[:-lag])) for lag in range(1, _NEIGHBOURS + 1)]
-    return float(np.mean(products))
+    furthest = min(_NEIGHBOURS, len(residual) - 1)
+    products = [float(np.mean(centred[lag:] * centred[:-lag])) for lag in range(1, furthest + 1)]
+    return float(np.mean(products)) if products else 0.0
 
 
 def correlation_samples(residuals: Sequence[np.ndarray]) -> float:

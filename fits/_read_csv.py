@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits._errors import DataError
+from fits._plausible import LARGEST_EXTRA, check_size, check_steps
 from fits._record import Record, Reference
 from fits._table import Table, data_error, open_table
 from fits._units import Source, find_sources, known_quantity
@@ -82,6 +83,12 @@ def read_csv(
         "correct the cell if the column matters."
         for name, problem in problems.items()
     ]
+    for name in [name for name, array in extra.items() if np.abs(array).max() > LARGEST_EXTRA]:
+        del extra[name]
+        warnings.append(
+            f"{table.path}, column '{name}': dropped, because it holds numbers beyond {LARGEST_EXTRA:g}; correct "
+            "them if the column matters."
+        )
     with np.errstate(all="ignore"):  # absurd magnitudes overflow here, and then warn of nothing
         warnings += _odd_gaps(table, sources["time_s"].column, time_s)
         warnings += _odd_voltage(table, sources, voltage_V, displacement_um)
@@ -122,16 +129,14 @@ def _converted(table: Table, column: str, source: Source, values: Mapping[str, F
     quantity = known_quantity(column)
     with np.errstate(over="ignore"):
         array = quantity.convert(source.sign * values[source.column], source.unit)
-    if not np.isfinite(array).all():
-        row = int(np.argmin(np.isfinite(array)))
-        what = f"expected a number that fits in {quantity.unit}, found an overflow; check the unit {source.unit}"
-        raise data_error(table.path, what, table.line(row), source.column)
+    check_size(table, source.column, array, quantity.unit, source.unit)
     return array
 
 
 def _check_time(table: Table, column: str, time_s: FloatArray) -> None:
     wrong = np.flatnonzero(time_s[1:] <= time_s[:-1])
     if wrong.size == 0:
+        check_steps(table, column, time_s)
         return
     row = int(wrong[0]) + 1
     before, now = float(time_s[row - 1]), float(time_s[row])

@@ -5,10 +5,22 @@ import os
 import numpy as np
 
 from fits._frequency import ResponseData
+from fits._plausible import check_size
 from fits._table import Table, data_error, open_table
 
 _REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
 _MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"
+# What a unit is checked by, of each column.
+_UNITS = {
+    "frequency_Hz": "Hz",
+    _REAL: "um/V",
+    _IMAGINARY: "um/V",
+    _VARIANCE: "um^2/V^2",
+    _MAGNITUDE: "um/V",
+    _DECIBEL: "dB",
+    _DEGREES: "deg",
+    _RADIANS: "rad",
+}
 
 
 def read_response(path: str | os.PathLike[str]) -> ResponseData:
@@ -42,6 +54,9 @@ def read_response(path: str | os.PathLike[str]) -> ResponseData:
     shown = (_REAL, _IMAGINARY) if cartesian else (magnitude, phase)
     known = (_VARIANCE,) if _VARIANCE in table.names else ()
     values, _ = table.read(("frequency_Hz", *shown, *known))
+    for name, unit in _UNITS.items():
+        if name in ("frequency_Hz", *shown, *known):
+            check_size(table, name, values[name], unit)
     first, second = (values[name] for name in shown)
     for name, wrong, expected in (
         ("frequency_Hz", np.diff(values["frequency_Hz"], prepend=-np.inf) <= 0, "frequencies that increase"),

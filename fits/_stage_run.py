@@ -35,6 +35,8 @@ _SHORTEST = 1024
 _EVEN = 1e-6
 # Extremes that a memory may hold: filtered multisines nest deeply.
 _EXTREMES = 512
+# A hundred arrays of so many values are 8 GB.
+_MOST_STEPS = 10_000_000
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
 
@@ -152,6 +154,11 @@ def prepare_stage_run(
     """
     if record.displacement_um is None:
         raise DataError(f"{record.source}: a displacement column is needed here")
+    if stride * len(record) > _MOST_STEPS:
+        raise DataError(
+            f"{record.source}: expected at most {_MOST_STEPS:,} steps, found {len(record):,} samples of {stride} "
+            "substeps each; split the record, or use a model of fewer substeps"
+        )
     lower, upper = range_V
     n, unknown = len(record), initial in ("unknown", UNSWEPT)
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)

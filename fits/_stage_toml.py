@@ -1,19 +1,17 @@
 """Designs of stages as TOML files."""
 
-import json
 import math
 import os
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 
 import microid as m
 from fits._atomic import atomic_write_text
-from fits._errors import DataError
+from fits._errors import DataError, shown
+from fits._read_file import MOST_TOML_BYTES, parse_toml, read_text
 from fits._stage_design import TOLERANCE_MM, Design, Together, default_tolerance, nearest
 
 SCHEMA = "microid.stage/1"
@@ -39,8 +37,6 @@ _ACTUATION: tuple[tuple[str, _Units, str, str], ...] = (
     ("inertia_rotor", _INERTIA, "inertia_rotor_kg_mm2", "turned about z"),
     ("damping_ratio", _NUMBER, "damping_ratio", "of all axes"),
 )
-# Longer values are cut in messages.
-_SHOWN, _ENORMOUS = 60, 10**60
 _TABLES = ("schema", "level", "geometry", "material", "actuation", "together")
 
 
@@ -64,20 +60,8 @@ def read_design(path: str | os.PathLike[str]) -> Design:
         If the file cannot be read, or for the first thing in it that is not as it should be.
     """
     name = os.fspath(path)
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(
-            f"{name}: cannot be read ({error.strerror or error}); give the TOML file of a stage."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{name}: expected TOML, found no UTF-8 text; give the TOML file of a stage.") from error
-    try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(
-            f"{name}: expected TOML, found a mistake: {error or 'nested too deeply'}; correct it."
-        ) from None
+    text = read_text(path, "the TOML file of a stage", MOST_TOML_BYTES)
+    table = parse_toml(text, name)
     try:
         return _design(table)
     except DataError as error:
@@ -133,14 +117,14 @@ def _quoted(text: str) -> str:
 
 def _design(table: Mapping[str, Any]) -> Design:
     """Build a design; a `DataError` begins with the place of its cause, such as `geometry.t2`."""
+    # First of all: keys of another file are not ours to show.
+    if table.get("schema") != SCHEMA:
+        found = shown(table["schema"]) if "schema" in table else "none"
+        raise DataError(f"schema: expected {_quoted(SCHEMA)}, found {found}; give that, or another file.")
     _keys(table, _TABLES, "", optional=("together",))
-    if table["schema"] != SCHEMA:
-        raise DataError(
-            f"schema: expected {_quoted(SCHEMA)}, found {_shown(table['schema'])}; give that, or another file."
-        )
     level = table["level"]
     if isinstance(level, bool) or not isinstance(level, int) or level not in (0, 1):
-        raise DataError(f"level: expected 0 or 1, found {_shown(level)}; give one of them.")
+        raise DataError(f"level: expected 0 or 1, found {shown(level)}; give one of them.")
     geometry = _table(table["geometry"], "geometry")
     _keys(geometry, [*m.DIMENSIONS], "geometry.")
     sizes, tolerance = {}, {}
@@ -176,7 +160,7 @@ def _design(table: Mapping[str, Any]) -> Design:
 
 def _groups(found: Any) -> tuple[Together, ...]:
     if not isinstance(found, list):
-        raise DataError(f"together: expected tables [[together]], found {_shown(found)}; double the brackets.")
+        raise DataError(f"together: expected tables [[together]], found {shown(found)}; double the brackets.")
     groups = []
     for k, item in enumerate(found):
         place = f"together[{k}]"
@@ -185,7 +169,7 @@ def _groups(found: Any) -> tuple[Together, ...]:
         names = group["dimensions"]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise DataError(
-                f'{place}.dimensions: expected a list of names, found {_shown(names)}; write ["t1", "t2"].'
+                f'{place}.dimensions: expected a list of names, found {shown(names)}; write ["t1", "t2"].'
             )
         groups.append(Together(tuple(names), _number(group["correlation"], f"{place}.correlation")))
     return tuple(groups)
@@ -195,9 +179,7 @@ def _keys(table: Mapping[str, Any], known: Sequence[str], above: str, optional: 
     """Refuse unknown and missing keys; of both, a misspelt one explains the missing one."""
     for key in table:
         if key not in known:
-            raise DataError(
-                f"{above}{_plain(key)}: expected a known key, found '{_plain(key)}'; {nearest(key, known)}"
-            )
+            raise DataError(f"{above}{_plain(key)}: expected a known key, found {shown(key)}; {nearest(key, known)}")
     for key in known:
         if key not in table and key not in optional:
             raise DataError(f"{above}{key}: expected this key, found none; add it.")
@@ -205,7 +187,7 @@ def _keys(table: Mapping[str, Any], known: Sequence[str], above: str, optional: 
 
 def _table(found: Any, place: str) -> Mapping[str, Any]:
     if not isinstance(found, dict):
-        raise DataError(f"{place}: expected a table, found {_shown(found)}; write [{place}] and its keys below.")
+        raise DataError(f"{place}: expected a table, found {shown(found)}; write [{place}] and its keys below.")
     return found
 
 
@@ -214,14 +196,14 @@ def _quantity(found: Any, place: str, units: _Units, tolerated: bool = False) ->
     first = next(iter(units))
     if not isinstance(found, dict):
         raise DataError(
-            f"{place}: expected a value with its unit, found {_shown(found)}; write {{ value = 1.0, unit = "
+            f"{place}: expected a value with its unit, found {shown(found)}; write {{ value = 1.0, unit = "
             f"{_quoted(first)} }}."
         )
     optional = ("tolerance",)
     _keys(found, ("value", "unit", *(optional if tolerated else ())), f"{place}.", optional)
     unit = found["unit"]
     if not isinstance(unit, str) or unit.replace("µ", "u").replace("μ", "u") not in units:
-        raise DataError(f"{place}.unit: expected one of {', '.join(units)}, found {_shown(unit)}; convert the value.")
+        raise DataError(f"{place}.unit: expected one of {', '.join(units)}, found {shown(unit)}; convert the value.")
     times, over = units[unit.replace("µ", "u").replace("μ", "u")]
     value = _number(found["value"], f"{place}.value") * times / over
     if "tolerance" not in found:
@@ -235,22 +217,12 @@ def _number(found: Any, place: str) -> float:
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise DataError(f"{place}: expected a finite number, found {_shown(found)}; give one without quotes.")
+        raise DataError(f"{place}: expected a finite number, found {shown(found)}; give one without quotes.")
     return number
 
 
-def _shown(found: Any) -> str:
-    """What was found, short enough for a sentence."""
-    if isinstance(found, dict | list):
-        return "a table" if isinstance(found, dict) else "a list"
-    if isinstance(found, int) and abs(found) >= _ENORMOUS:
-        return "an enormous number"
-    text = " ".join(json.dumps(found, ensure_ascii=False).split()) if isinstance(found, str | bool) else str(found)
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
-
-
 def _plain(key: str) -> str:
-    return _shown(key).strip('"')
+    return shown(key)[1:-1]
 
 
 def _line_of(text: str, place: str) -> int | None:

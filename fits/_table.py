@@ -1,24 +1,22 @@
 """Low-level reading: from bytes to named columns of numbers, with line numbers as an editor shows them."""
 
 import csv
-import gzip
 import io
 import itertools
 import math
 import os
 import re
-import zlib
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fits._errors import DataError
+from fits._read_file import MOST_CSV_BYTES, read_bytes, unpack
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +24,7 @@ _COMMENT = re.compile(r"^ *[#%].*\n?", re.MULTILINE)
 _EXCEL_SEPARATOR = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+MOST_COLUMNS = 1000
 _EXPORT = "export it as CSV text (UTF-8)"
 
 
@@ -141,6 +140,8 @@ class Table:
         if "#" in text or "%" in text:
             text = _COMMENT.sub("", text)
         width = next(self._lines())[1].count(self.separator) + 1
+        if width > MOST_COLUMNS:
+            return None
         options: dict[str, Any] = {}
         if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
             options["float_precision"] = "round_trip"  # the only mode from 3.1 on, where naming it warns
@@ -258,6 +259,9 @@ def open_table(path: str | os.PathLike[str]) -> Table:
             header_line,
             names[0] if names else None,
         )
+    if len(names) > MOST_COLUMNS:
+        what = f"expected up to {MOST_COLUMNS:,} columns, found {len(names):,}; write a row per sample"
+        raise data_error(shown, what, header_line)
     names = [name or f"column_{i}" for i, name in enumerate(names, 1)]
     for i, name in enumerate(names):
         if name in names[:i]:
@@ -272,23 +276,9 @@ def open_table(path: str | os.PathLike[str]) -> Table:
 
 
 def _load(path: str) -> bytes:
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise data_error(path, "no such file; check the name and the folder") from None
-    except IsADirectoryError:
-        raise data_error(path, "expected a CSV file, found a folder; name a file in it") from None
-    except (OSError, ValueError) as error:
-        what = error.strerror if isinstance(error, OSError) else error
-        raise data_error(path, f"cannot be read ({what}); check the name and the permissions") from None
+    data = read_bytes(path, "a CSV file", MOST_CSV_BYTES)
     if data.startswith(b"\x1f\x8b") or path.lower().endswith(".gz"):
-        try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError, zlib.error) as error:
-            what = str(error).rstrip(".")
-            raise data_error(
-                path, f"expected whole gzip data, found damage ({what}); copy or pack it again"
-            ) from None
+        return unpack(data, path, MOST_CSV_BYTES)
     return data
 
 

@@ -13,6 +13,9 @@ from microid._param import ParameterInfo, _as_inexact, parameter_table, static
 from microid._part import AbstractHysteresis, AbstractLinear, AbstractPart, Scene, Signal, _imaginary, _run_linear
 from microid._refine import _lines, refined
 
+# So many are exact to the last digit for any part; more take time and memory only.
+_MOST_SUBSTEPS = 1000
+
 
 def _maybe_inexact(value: Any) -> Any:
     return None if value is None else _as_inexact(value)
@@ -79,11 +82,14 @@ class Stage(eqx.Module):
         """Refuse chains that do not fit together."""
         if len(self.names) != len(self.parts) or len(set(self.names)) != len(self.names) or not self.parts:
             raise ValueError(f"a stage needs one part or more and one name for each, no two alike, got {self.names}")
-        if self.hold not in ("first", "zero", "smooth") or self.substeps < 1:
+        if self.hold not in ("first", "zero", "smooth") or not 1 <= self.substeps <= _MOST_SUBSTEPS:
             raise ValueError(
-                "hold must be 'first', 'zero' or 'smooth' and substeps positive, got "
+                f"hold must be 'first', 'zero' or 'smooth' and substeps 1 to {_MOST_SUBSTEPS}, got "
                 f"{self.hold!r} and {self.substeps}"
             )
+        for name, part in zip(self.names, self.parts, strict=True):
+            if not isinstance(part, AbstractPart):
+                raise ValueError(f"{name!r} must be a part of a stage, got a {type(part).__name__}")
         unit, giver = "V", "the command"
         for name, part in zip(self.names, self.parts, strict=True):
             if part.takes != unit:

@@ -27,7 +27,7 @@ def draw(rng, grid=True):
     mesh = Grid(jnp.asarray(0.0), jnp.asarray(rng.uniform(10, 100)), LEVELS) if grid else None
 
     def numbers(*shape):
-        return jnp.asarray(rng.normal(size=shape) * 10.0 ** rng.integers(-300, 300, shape))
+        return jnp.asarray(rng.normal(size=shape) * 10.0 ** rng.integers(-300, 29, shape))
 
     return stage, StageUncertainty(
         numbers(PERTURBATIONS, PARAMETERS if grid else PARAMETERS + 1),

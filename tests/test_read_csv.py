@@ -132,7 +132,7 @@ UNITS = [
 def test_units_are_converted_by_suffix(tmp_path, header, cell, column, value):
     stem = header.rsplit("_", 1)[0]
     names = [name for name in HEAD.split(",") if not name.startswith(stem + "_")] + [header]
-    rows = [["-1"] * (len(names) - 1) + [cell]] + [[str(1e9 + i)] * len(names) for i in range(N)]
+    rows = [["-1"] * (len(names) - 1) + [cell]] + [[str(100.0 + i)] * len(names) for i in range(N)]
     record = read_csv(saved(tmp_path, "\n".join(",".join(row) for row in [names, *rows])))
     found = record.extra[column] if column in record.extra else getattr(record, column)
     assert found[0] == value
@@ -239,7 +239,7 @@ REFUSED = {
     "NaN": (with_row(9, "3.5,1,NaN"), 9, "displacement_um", "finite number, found 'NaN'"),
     "infinity": (with_row(9, "3.5,-inf,1"), 9, "voltage_V", "finite number, found '-inf'"),
     "overflow": (with_row(9, "3.5,1e400,1"), 9, "voltage_V", "finite number, found '1e400'"),
-    "unit overflow": (with_row(9, "3.5,1,1e307", "time_s,voltage_V,displacement_m"), 9, "displacement_m", "overflow"),
+    "unit overflow": (with_row(9, "3.5,1,1e307", "time_s,voltage_V,displacement_m"), 9, "displacement_m", "inf"),
     "too few cells": (with_row(9, "3.5,1"), 9, "displacement_um", "expected 3 cells .* line 1, found 2"),
     "too many cells": (with_row(9, "3.5,1,2,3"), 9, "displacement_um", "expected 3 cells .* line 1, found 4"),
     "too many in the first row": (with_row(2, "3.5,1,2,3"), 2, "displacement_um", "found 4"),
@@ -313,18 +313,20 @@ def test_lines_are_counted_as_an_editor_does(tmp_path, above, within):
         assert f", line {lines.index('20,bad,0') + 1}, column 'voltage_V'" in message
 
 
-FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+FLOATS = st.floats(-1e9, 1e9)
+# Steps of a millisecond or more: shorter ones are refused where double precision does not resolve them.
+TIMES = st.integers(-(10**12), 10**12).map(lambda count: count * 1e-3)
 
 
 @settings(max_examples=100, deadline=None, database=None)
 @given(
-    st.lists(st.tuples(FLOATS, FLOATS, FLOATS), min_size=50, max_size=60, unique_by=lambda row: row[0]),
+    st.lists(st.tuples(TIMES, FLOATS, FLOATS), min_size=50, max_size=60, unique_by=lambda row: row[0]),
     st.sampled_from(DIALECTS),
 )
 def test_every_float_is_read_exactly(table, dialect):
     separator, decimal = dialect
     columns = tuple(zip(*sorted(table), strict=True))
-    assume(all(min(column) < max(column) for column in columns))
+    assume(all(max(column) - min(column) > 1e-9 for column in columns))
     rows = [separator.join(map(repr, row)).replace(".", decimal) for row in zip(*columns, strict=True)]
     with tempfile.TemporaryDirectory() as folder:
         record = read_csv(saved(Path(folder), csv_text(HEAD.replace(",", separator), rows)))

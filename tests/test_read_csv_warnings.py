@@ -34,7 +34,6 @@ STROKES = [  # um per V as written in the file, words of the warning
     (2e-4, r"0\.0002 um/V.*in mm instead of um.*voltage_V=voltage_V\[mV\]"),
     (2e5, "in pm instead of um"),
     (2e-7, "in m instead of um"),
-    (1e20, "check the units"),
 ]
 
 
@@ -71,7 +70,7 @@ def test_gaps_are_warned_of_but_uneven_sampling_is_not(tmp_path, rng):
     (sentence,) = warned(tmp_path, time_s + (time_s > 2.005), voltage_V, 0.2 * voltage_V)
     # Samples 200 (2.00 s, line 202) and 201 (line 203) are 0.01 s + 1 s apart.
     assert "a.csv, line 203, column 'time_s': a gap of 1.01 s after 2 s" in sentence
-    for uneven_s in (np.cumsum(rng.exponential(size=400)), 1.1 ** np.arange(400.0), np.cumsum([0.1, 1.0] * 200)):
+    for uneven_s in (np.cumsum(rng.exponential(size=400)), 1.05 ** np.arange(400.0), np.cumsum([0.1, 1.0] * 200)):
         assert warned(tmp_path, uneven_s, voltage_V, 0.2 * voltage_V) == ()
 
 

@@ -159,7 +159,7 @@ def test_a_list_may_hold_words(seed):
     assert sweep.plan.values(np.arange(2))["fit.initial"].tolist() == [2, 0]
     with pytest.raises(DataError, match=r"rows.csv, line 3: expected one of .* did you mean negative"):
         parsed(listed, rows=b"fit.initial,fit.levels\npositive,5\nnegativ,8\n")
-    with pytest.raises(DataError, match=r"rows.csv, line 2: expected 2 values, found 'positive'"):
+    with pytest.raises(DataError, match=r"rows.csv, line 2: expected 2 values, found \"positive\""):
         parsed(listed, rows=b"fit.initial,fit.levels\npositive\n")
     with pytest.raises(DataError, match=r"rows.csv: fit.levels is a whole number, found 5.5"):
         parsed(listed, rows=b"fit.initial,fit.levels\npositive,5.5\n")
@@ -187,11 +187,11 @@ def test_numbers_of_levels_out_of_bounds_fail_as_rows(seed):
         ('parameter = "fit.initial"\nmean = 0\nsd = 3', "is a choice of words, which are listed; give values"),
         ('parameter = "fit.initial"\nrelative = true\nvalues = ["unknown"]', "which no factor changes"),
         ('parameter = "fit.levels"\nvalues = [5, 6.5]', "fit.levels is a whole number, found 6.5; give whole values"),
-        ('parameter = "fit.levels"\nvalues = ["many"]', "expected a finite number, found 'many'"),
+        ('parameter = "fit.levels"\nvalues = ["many"]', 'expected a finite number, found "many"'),
         ('parameter = "fit.levels"\nlow = 4\nhigh = 9\ncount = 3', "is a whole number, found 6.5"),
         ('parameter = "fit.levels"\nlow = 4\nhigh = 9', "is a whole number, which is not drawn; give values"),
         ('parameter = "fit.levels"\nrelative = true\nvalues = [0.5]', "which no factor changes"),
-        ('parameter = "fit.method"\nvalues = ["batch"]', "there is no parameter 'fit.method'"),
+        ('parameter = "fit.method"\nvalues = ["batch"]', 'there is no parameter "fit.method"'),
         ('parameter = "fit.levels"\nvalues = [5]\n[fit]\nweights = true', "leave out one of the two"),
         ('parameter = "fit.levels"\nvalues = [5]\n[fit]\nsamples = 300', "the samples of their program"),
         ('parameter = "fit.levels"\nvalues = [5]\n[fit]\nmethod = "one_by_one"\nsmoothness = 0.1', "leave it out"),

@@ -103,7 +103,7 @@ def test_rows_come_from_a_csv():
         ),
         (axis('parameter = "program.amplitude_V"\nvalues=[]'), "the axis is empty"),
         (axis('parameter = "program.amplitude_V"\nlow=1\nhigh=2\ncount=0'), "the axis is empty"),
-        (axis('parameter = "program.amplitude_V"\nunit="um"\nvalues=[1.0]'), "is in V, found 'um'"),
+        (axis('parameter = "program.amplitude_V"\nunit="um"\nvalues=[1.0]'), 'is in V, found "um"'),
         (axis('parameter = "program.amplitude_V"\nvalue=[1.0]'), "did you mean values"),
         (axis('parameter = "program.amplitude_V"\nlow=2\nhigh=1\ncount=3'), "no higher than high"),
         (axis('parameter = "program.amplitude_V"\nlow=1\nhigh=2'), "add [design]"),

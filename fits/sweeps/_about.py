@@ -1,11 +1,11 @@
 """What a sweep's folder says of itself."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any
 
 from fits._errors import DataError
+from fits._read_file import MOST_JSON_BYTES, parse_json, read_text
 
 SCHEMA = "microid.sweep.results/1"
 ABOUT = "about.json"
@@ -24,11 +24,12 @@ _KEYS: dict[str, type] = {
 def about_of(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Read what is known of a sweep; a `DataError` says why it cannot be read."""
     shown = os.fspath(folder)
+    if not (Path(folder) / ABOUT).exists():
+        raise DataError(f"{shown}: there is no sweep in this folder; give what --out named.")
     try:
-        about = json.loads((Path(folder) / ABOUT).read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise DataError(f"{shown}: there is no sweep in this folder; give what --out named.") from None
-    except (OSError, ValueError, RecursionError) as error:
+        what = "what is known of a sweep"
+        about = parse_json(read_text(Path(folder) / ABOUT, what, MOST_JSON_BYTES), ABOUT, what)
+    except DataError as error:
         raise DataError(f"{shown}: {ABOUT} is broken ({error}); run the sweep again in another folder.") from None
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise DataError(f"{shown}: expected results of the format {SCHEMA}; run the sweep again in another folder.")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits._stage_design import nearest
 from fits.sweeps._types import FloatArray, Output, Parameter
 
@@ -20,7 +20,7 @@ def code_of(found: Any, parameter: Parameter, place: str) -> float:
     """Place of a word among those of its parameter, or a `DataError` that begins with its place in the sweep."""
     if not isinstance(found, str) or found not in parameter.words:
         raise DataError(
-            f"{place}: expected one of {', '.join(parameter.words)}, found {found!r}; "
+            f"{place}: expected one of {', '.join(parameter.words)}, found {shown(found)}; "
             f"{nearest(str(found), parameter.words)}"
         )
     return float(parameter.words.index(found))

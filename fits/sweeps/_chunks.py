@@ -25,7 +25,7 @@ def chunk_rows(sweep: Sweep) -> int:
     widest = max(output.bytes_per_row for output in (*sweep.facts.outputs, REASON))
     most = max(1, min(-(-rows // block), _LARGEST_BYTES // (widest * block)))
     if sweep.chunk_rows is not None:
-        return block * min(-(-sweep.chunk_rows // block), most)
+        return min(sweep.chunk_rows, block * most)
     fit = int(sweep.memory_MB * 1e6 / (bytes_per_row(sweep) + REASON.bytes_per_row))
     wanted = min(fit, most * block, _LARGEST if block > 1 else _LARGEST_SLOW, max(1, rows // _PARTS))
     return block * max(1, min(wanted, rows) // block if wanted >= block else 1)

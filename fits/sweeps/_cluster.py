@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits.sweeps._chunks import compute_chunk
 from fits.sweeps._extra import need
 from fits.sweeps._spec import Sweep, parse_sweep
@@ -67,7 +67,7 @@ def connected(address: str) -> Iterator[Any]:
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     count = address.removeprefix("local:")
     if count != address and (not count.isdecimal() or not 1 <= int(count) <= _MOST_LOCAL):
-        raise DataError(f"--cluster: expected local:N with a number of processes, found {address!r}; write local:2.")
+        raise DataError(f"--cluster: expected local:N with a number of processes, found {shown(address)}; give one.")
     with ExitStack() as stack:
         try:
             where = address

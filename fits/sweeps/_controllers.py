@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fits._control_defaults import PERIODS, bp_defaults, cmac_defaults, strongest_Hz
 from fits._control_gains import GAINS
 from fits._control_setup import setup
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits._record import Reference
 from fits._stage_design import nearest
 from fits._tune_start import slope_array
@@ -171,7 +171,8 @@ def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, refer
     kind = given.get("kind", "pid")
     if not isinstance(kind, str) or kind not in _KINDS:
         raise DataError(
-            f"controller.kind: expected one of {', '.join(_KINDS)}, found {kind!r}; {nearest(str(kind), [*_KINDS])}"
+            f"controller.kind: expected one of {', '.join(_KINDS)}, found {shown(kind)}; "
+            f"{nearest(str(kind), [*_KINDS])}"
         )
     own = (*_KINDS[kind].varied, *_KINDS[kind].stated, *_LIMITS)
     for key in given:
@@ -179,7 +180,7 @@ def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, refer
             raise DataError(_unknown(key, kind, (*own, "kind", "delay_samples")))
     delay = given.get("delay_samples", 0)
     if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= 100:
-        raise DataError(f"controller.delay_samples: expected a number from 0 to 100, found {delay!r}; correct it.")
+        raise DataError(f"controller.delay_samples: expected a number from 0 to 100, found {shown(delay)}.")
     stated = {name: number(given[name], f"controller.{name}") for name in own if name in given}
     span = stated.pop("span", _SPAN)
     if not span > 1:
@@ -215,7 +216,7 @@ def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, refer
 def _unknown(key: str, kind: str, known: tuple[str, ...]) -> str:
     owners = [name for name, each in _KINDS.items() if key in (*each.varied, *each.stated)]
     of = f", which is of {' and '.join(owners)}" if owners else ""
-    return f"controller.{key}: expected a known key of {kind}, found '{key}'{of}; {nearest(key, known)}"
+    return f"controller.{key}: expected a known key of {kind}, found {shown(key)}{of}; {nearest(key, known)}"
 
 
 def _check(parameters: tuple[Parameter, ...], numbers: Mapping[str, float]) -> None:

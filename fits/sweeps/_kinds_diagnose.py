@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits._record import Record
 from fits._result import FitError
 from fits._run import INITIAL_STATES
@@ -95,12 +95,12 @@ def make(request: Request) -> DiagnoseJob:
     records, table = requested_records(request), request.table.get("diagnose", {})
     for key in table:
         if key not in _KEYS:
-            raise DataError(f"diagnose.{key}: expected a known key, found '{key}'; {nearest(key, _KEYS)}")
+            raise DataError(f"diagnose.{key}: expected a known key, found {shown(key)}; {nearest(key, _KEYS)}")
     known = request.table.get("initial", "negative") if isinstance(records, Simulated) else "unknown"
     initial = table.get("initial", known)
     if initial not in INITIAL_STATES:
         raise DataError(
-            f"diagnose.initial: expected one of {', '.join(INITIAL_STATES)}, found {initial!r}; choose one."
+            f"diagnose.initial: expected one of {', '.join(INITIAL_STATES)}, found {shown(initial)}; choose one."
         )
     alarm = number(table.get("false_alarm", 0.01), "diagnose.false_alarm")
     if not 0 < alarm <= 0.5:

@@ -9,7 +9,7 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from fits._design import branch_table
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits._fit import fit
 from fits._metrics import errors
 from fits._prior import roughness
@@ -27,7 +27,7 @@ from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter
 from microid import Staircase, node_areas
 
 _KEYS = ("method", "levels", "holdout", "initial", "samples", "weights", "smoothness")
-_BLOCK, _PLACES, _FEWEST = 32, 64, 50
+_BLOCK, _PLACES, _FEWEST, _MOST = 32, 64, 50, 100_000
 _FEWEST_LEVELS, _MOST_LEVELS, _DEFAULT_LEVELS = 4, 32, 8
 _OUTPUTS = (
     Output("offset_um", "um", "reading at negative saturation"),
@@ -234,23 +234,23 @@ def make(request: Request) -> FitJob:
     records, table = requested_records(request), request.table.get("fit", {})
     for key in table:
         if key not in _KEYS:
-            raise DataError(f"fit.{key}: expected a known key, found '{key}'; {nearest(key, _KEYS)}")
+            raise DataError(f"fit.{key}: expected a known key, found {shown(key)}; {nearest(key, _KEYS)}")
     method, initial = table.get("method", "batch"), table.get("initial")
     if method not in ("batch", "one_by_one"):
-        raise DataError(f"fit.method: expected batch or one_by_one, found {method!r}; choose one.")
+        raise DataError(f"fit.method: expected batch or one_by_one, found {shown(method)}; choose one.")
     known = request.table.get("initial", "negative") if isinstance(records, Simulated) else "unknown"
     initial = known if initial is None else initial
     if initial not in INITIAL_STATES:
-        raise DataError(f"fit.initial: expected one of {', '.join(INITIAL_STATES)}, found {initial!r}; choose one.")
+        raise DataError(f"fit.initial: expected one of {', '.join(INITIAL_STATES)}, found {shown(initial)}.")
     levels = table.get("levels", _DEFAULT_LEVELS if method == "batch" else None)
     whole = isinstance(levels, int) and not isinstance(levels, bool)
     if levels is not None and not (whole and _FEWEST_LEVELS <= levels <= _MOST_LEVELS):
         raise DataError(
-            f"fit.levels: expected a number from {_FEWEST_LEVELS} to {_MOST_LEVELS}, found {levels!r}; correct it."
+            f"fit.levels: expected a number from {_FEWEST_LEVELS} to {_MOST_LEVELS}, found {shown(levels)}."
         )
     weights = table.get("weights", False)
     if not isinstance(weights, bool) or (weights and levels is None):
-        raise DataError(f"fit.weights: expected true, with fit.levels, or false, found {weights!r}; correct it.")
+        raise DataError(f"fit.weights: expected true, with fit.levels, or false, found {shown(weights)}; correct it.")
     if weights and "fit.levels" in request.names:
         raise DataError("fit.weights: rows of other fit.levels have other weights; leave out one of the two.")
     if isinstance(records, Simulated) and "samples" in table:
@@ -258,8 +258,8 @@ def make(request: Request) -> FitJob:
     if method == "one_by_one" and "smoothness" in table:
         raise DataError("fit.smoothness: one_by_one finds it from the data; leave it out.")
     samples = records.program.samples if isinstance(records, Simulated) else table.get("samples", 2048)
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < _FEWEST:
-        raise DataError(f"fit.samples: expected a number of {_FEWEST} or more, found {samples!r}; correct it.")
+    if isinstance(samples, bool) or not isinstance(samples, int) or not _FEWEST <= samples <= _MOST:
+        raise DataError(f"fit.samples: expected a number from {_FEWEST} to {_MOST:,}, found {shown(samples)}.")
     holdout = number(table.get("holdout", 0.2), "fit.holdout")
     if not 0 <= holdout <= 0.9:
         raise DataError(f"fit.holdout: expected a share between 0 and 0.9, found {holdout:g}; correct it.")

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 import microid as m
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits._stage_design import Design, paper_design
 from fits._stage_toml import read_design
 from fits.sweeps._devices import by_rows, place
@@ -84,15 +84,15 @@ def make(request: Request) -> SensitivityJob:
     """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
     name = request.table.get("stage", "paper")
     if not isinstance(name, str):
-        raise DataError(f'stage: expected "paper" or the name of the TOML of a stage, found {name!r}; give one.')
+        raise DataError(f'stage: expected "paper" or the name of the TOML of a stage, found {shown(name)}; give one.')
     design = paper_design() if name == "paper" else in_a_file(request.load(name), name, read_design)
     options = request.table.get("sensitivity", {})
     for key in options:
         if key != "axes":
-            raise DataError(f"sensitivity.{key}: expected a known key, found '{key}'; use axes.")
+            raise DataError(f"sensitivity.{key}: expected a known key, found {shown(key)}; use axes.")
     axes = options.get("axes", ["x", "z"])
     if not isinstance(axes, list) or not axes or any(axis not in m.AXES for axis in axes):
-        raise DataError(f"sensitivity.axes: expected some of {', '.join(m.AXES)} in a list, found {axes!r}.")
+        raise DataError(f"sensitivity.axes: expected some of {', '.join(m.AXES)} in a list, found {shown(axes)}.")
     return SensitivityJob(design, tuple(dict.fromkeys(axes)), request.names, request.relative)
 
 

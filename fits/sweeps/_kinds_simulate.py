@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits.sweeps._devices import by_rows, on_cpu, place
 from fits.sweeps._jobs import Request
 from fits.sweeps._kernel import respond
@@ -120,12 +120,12 @@ def make(request: Request) -> SimulateJob:
     asked = request.table.get("outputs", {})
     for key in asked:
         if key not in ("traces", "every", "from_s"):
-            raise DataError(f"outputs.{key}: expected a known key, found '{key}'; use traces, every and from_s.")
+            raise DataError(f"outputs.{key}: expected a known key, found {shown(key)}; use traces, every and from_s.")
     traces, every = asked.get("traces", False), asked.get("every", 1)
     if not isinstance(traces, bool):
-        raise DataError(f"outputs.traces: expected true or false, found {traces!r}; correct it.")
+        raise DataError(f"outputs.traces: expected true or false, found {shown(traces)}; correct it.")
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-        raise DataError(f"outputs.every: expected a number of samples, 1 or more, found {every!r}; correct it.")
+        raise DataError(f"outputs.every: expected a number of samples, 1 or more, found {shown(every)}; correct it.")
     from_s = number(asked.get("from_s", 0.0), "outputs.from_s")
     if not 0 <= from_s < (program.samples - 1) * program.interval_s:
         raise DataError(f"outputs.from_s: expected a time within the program, found {from_s:g}; correct it.")

@@ -10,9 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
+from fits._plausible import SHORTEST_STEP_s
 from fits._read_csv import read_csv, read_reference
 from fits._stage_design import nearest
+from fits._table import open_table
+from fits._units import recognise
 from fits.sweeps._files import in_a_file
 from fits.sweeps._types import FloatArray, Parameter
 
@@ -27,9 +30,11 @@ SHAPES: dict[str, tuple[str, ...]] = {
 }
 _DEFAULTS = {"frequency_Hz": 10.0, "frequency_end_Hz": 100.0, "phase_rad": 0.0, "step_s": 0.0}
 _UNITS = {"frequency_Hz": "Hz", "frequency_end_Hz": "Hz", "phase_rad": "rad", "step_s": "s"}
-_SAMPLES = 10_000_000
+_SAMPLES, _LONGEST_s = 10_000_000, 1e4
 # Samples that differ by less from even intervals, as a fraction of one, count as even.
 _EVEN = 1e-3
+# Squares and products of what is larger overflow.
+_LARGEST = 1e30
 
 
 @dataclass(frozen=True)
@@ -114,27 +119,29 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
         For the first thing that is not as it should be.
     """
     if not isinstance(table, dict):
-        raise DataError(f"{name}: expected a table, found {table!r}; write [{name}] and its keys below.")
+        raise DataError(f"{name}: expected a table, found {shown(table)}; write [{name}] and its keys below.")
     shape = table.get("shape", "file" if "file" in table else None)
     if not isinstance(shape, str) or shape not in SHAPES:
-        raise DataError(f"{name}.shape: expected one of {', '.join(SHAPES)}, found {shape!r}; choose one.")
+        raise DataError(f"{name}.shape: expected one of {', '.join(SHAPES)}, found {shown(shape)}; choose one.")
     own = [f"offset_{unit}", f"amplitude_{unit}", *SHAPES[shape]]
     known = ["shape", "samples", "interval_s", *own]
     if shape == "file":
         known = ["shape", "file", f"offset_{unit}", "gain"]
     for key in table:
         if key not in known:
-            raise DataError(f"{name}.{key}: expected a known key, found '{key}'; {nearest(key, known)}")
+            raise DataError(f"{name}.{key}: expected a known key, found {shown(key)}; {nearest(key, known)}")
     if shape == "file":
         return _from_file(table, name, unit, load)
     nominal = {f"offset_{unit}": 0.0, f"amplitude_{unit}": 1.0} | {key: _DEFAULTS[key] for key in SHAPES[shape]}
     nominal |= {key: number(table[key], f"{name}.{key}") for key in nominal if key in table}
     samples = table.get("samples", 1000)
     if isinstance(samples, bool) or not isinstance(samples, int) or not 3 <= samples <= _SAMPLES:
-        raise DataError(f"{name}.samples: expected a number from 3 to {_SAMPLES:,}, found {samples!r}; correct it.")
+        raise DataError(f"{name}.samples: expected a number from 3 to {_SAMPLES:,}, found {shown(samples)}.")
     interval = number(table.get("interval_s", 1e-4), f"{name}.interval_s")
-    if not interval > 0:
-        raise DataError(f"{name}.interval_s: expected a time above 0, found {interval:g}; correct it.")
+    if not SHORTEST_STEP_s <= interval <= _LONGEST_s:
+        raise DataError(
+            f"{name}.interval_s: expected a time from {SHORTEST_STEP_s:g} to {_LONGEST_s:g} s, found {interval:g}."
+        )
     program = Program(name, unit, shape, samples, interval, tuple(nominal.items()))
     for parameter in program.parameters:
         value = dict(nominal)[parameter.name.removeprefix(f"{name}.")]
@@ -149,7 +156,7 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
 def _from_file(table: Mapping[str, Any], name: str, unit: str, load: Callable[[str], bytes]) -> Program:
     path = table.get("file")
     if not isinstance(path, str):
-        raise DataError(f"{name}.file: expected the name of a CSV file, found {path!r}; give one.")
+        raise DataError(f"{name}.file: expected the name of a CSV file, found {shown(path)}; give one.")
     time_s, given = in_a_file(load(path), path, _read_voltage if unit == "V" else _read_displacement)
     interval = np.diff(time_s)
     if np.ptp(interval) > _EVEN * np.mean(interval):
@@ -159,12 +166,22 @@ def _from_file(table: Mapping[str, Any], name: str, unit: str, load: Callable[[s
     return Program(name, unit, "file", len(given), float(np.mean(interval)), tuple(nominal.items()), given)
 
 
+def _needs(path: Path, *columns: str) -> None:
+    """Refuse a file that is no record before anything of it is shown."""
+    if not any(map(recognise, open_table(path).names)):
+        raise DataError(
+            f"{path}: expected the columns {' and '.join(columns)}, found none that is known; name another."
+        )
+
+
 def _read_voltage(path: Path) -> tuple[FloatArray, FloatArray]:
+    _needs(path, "time_s", "voltage_V")
     record = read_csv(path, required=("time_s", "voltage_V"))
     return record.time_s, record.voltage_V
 
 
 def _read_displacement(path: Path) -> tuple[FloatArray, FloatArray]:
+    _needs(path, "time_s", "displacement_um")
     reference = read_reference(path)
     return reference.time_s, reference.displacement_um
 
@@ -176,5 +193,7 @@ def number(found: Any, place: str) -> float:
     except OverflowError:
         value = math.inf
     if not math.isfinite(value):
-        raise DataError(f"{place}: expected a finite number, found {found!r}; give one without quotes.")
+        raise DataError(f"{place}: expected a finite number, found {shown(found)}; give one without quotes.")
+    if abs(value) > _LARGEST or 0 < abs(value) < 1 / _LARGEST:
+        raise DataError(f"{place}: expected 0, or {1 / _LARGEST:g} to {_LARGEST:g} in size, found {value:g}.")
     return value

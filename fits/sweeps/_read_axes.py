@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
 from fits.sweeps._choices import check_plain, code_of
 from fits.sweeps._programs import number
@@ -62,7 +62,7 @@ def read_plan(
         else:
             label = entry.get("zip")
             if label is not None and not isinstance(label, str):
-                raise DataError(f"axis[{k}].zip: expected a name that zipped axes share, found {label!r}.")
+                raise DataError(f"axis[{k}].zip: expected a name that zipped axes share, found {shown(label)}.")
             listed.setdefault(f"{k}" if label is None else f"zip {label}", []).append((axis, values))
     groups: list[AbstractGroup] = []
     for label, members in listed.items():
@@ -103,7 +103,7 @@ def _parameter(name: Any, place: str, known: Mapping[str, Parameter]) -> Paramet
     if not isinstance(name, str) or name not in known:
         close = get_close_matches(str(name), [*known], n=3, cutoff=0.4)
         meant = f"did you mean {' or '.join(close)}?" if close else f"use one of {', '.join(known)}."
-        raise DataError(f"{place}.parameter: there is no parameter {name!r}; {meant}")
+        raise DataError(f"{place}.parameter: there is no parameter {shown(name)}; {meant}")
     return known[name]
 
 
@@ -112,13 +112,13 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
         if key not in _KEYS:
             close = get_close_matches(key, _KEYS, n=1, cutoff=0.5)
             meant = f"did you mean {close[0]}?" if close else f"use some of {', '.join(_KEYS)}."
-            raise DataError(f"{place}.{key}: expected a known key, found '{key}'; {meant}")
+            raise DataError(f"{place}.{key}: expected a known key, found {shown(key)}; {meant}")
     if "parameter" not in entry:
         raise DataError(f"{place}.parameter: expected the name of what varies, found none; add it.")
     parameter = _parameter(entry["parameter"], place, known)
     relative = entry.get("relative", False)
     if not isinstance(relative, bool):
-        raise DataError(f"{place}.relative: expected true or false, found {relative!r}; correct it.")
+        raise DataError(f"{place}.relative: expected true or false, found {shown(relative)}; correct it.")
     if not relative and math.isnan(parameter.nominal):
         raise DataError(
             f"{place}.parameter: {parameter.name} is an array, varied relative to itself; add relative = true."
@@ -171,7 +171,7 @@ def _values(
         values = entry["values"]
         if not isinstance(values, list):
             kind = "words" if parameter.words else "numbers"
-            raise DataError(f"{place}.values: expected a list of {kind}, found {values!r}.")
+            raise DataError(f"{place}.values: expected a list of {kind}, found {shown(values)}.")
         if not values:
             raise DataError(f"{place}.values: the axis is empty; give at least one value.")
         if parameter.words:
@@ -185,7 +185,7 @@ def _values(
     low, high = (number(entry.get(key), f"{place}.{key}") * factor for key in ("low", "high"))
     spacing = entry.get("spacing", "linear")
     if spacing not in ("linear", "log"):
-        raise DataError(f"{place}.spacing: expected linear or log, found {spacing!r}; choose one.")
+        raise DataError(f"{place}.spacing: expected linear or log, found {shown(spacing)}; choose one.")
     if not low <= high or (spacing == "log" and not low > 0):
         above = " above 0" if spacing == "log" else ""
         raise DataError(f"{place}: expected low{above} and no higher than high, found {low:g} and {high:g}.")
@@ -193,7 +193,7 @@ def _values(
         return ("log" if spacing == "log" else "uniform"), low, high
     count = entry["count"]
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {count!r}.")
+        raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {shown(count)}.")
     if count > _LONGEST:
         raise DataError(
             f"{place}.count: expected up to {_LONGEST:,} values, found more; leave out count and add [design]."
@@ -215,7 +215,7 @@ def _factor(unit: Any, wanted: str, place: str, name: str) -> float:
     if unit is None or unit == wanted:
         return 1.0
     if not isinstance(unit, str):
-        raise DataError(f"{place}: expected a unit in quotes, found {unit!r}.")
+        raise DataError(f"{place}: expected a unit in quotes, found {shown(unit)}.")
     plain = unit.replace("µ", "u").replace("μ", "u")
     for mine, power in _PREFIXES.items():
         for other, wanted_power in _PREFIXES.items():
@@ -223,7 +223,7 @@ def _factor(unit: Any, wanted: str, place: str, name: str) -> float:
             prefixed = plain.startswith(mine) and wanted == other + base
             if prefixed and base in _BASES:
                 return float(10.0 ** (power - wanted_power))
-    raise DataError(f"{place}: {name} is in {wanted}, found {unit!r}; convert the values.")
+    raise DataError(f"{place}: {name} is in {wanted}, found {shown(unit)}; convert the values.")
 
 
 def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:
@@ -232,12 +232,12 @@ def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:
         raise DataError("design: expected how axes without a count are drawn; add [design] with method and rows.")
     for key in design:
         if key not in known:
-            raise DataError(f"design.{key}: expected a known key, found '{key}'; use {' and '.join(known)}.")
+            raise DataError(f"design.{key}: expected a known key, found {shown(key)}; use {' and '.join(known)}.")
     method, rows = design.get("method"), design.get("rows")
     if method not in SAMPLERS:
-        raise DataError(f"design.method: expected one of {', '.join(SAMPLERS)}, found {method!r}; choose one.")
+        raise DataError(f"design.method: expected one of {', '.join(SAMPLERS)}, found {shown(method)}; choose one.")
     if isinstance(rows, bool) or not isinstance(rows, int) or not 1 <= rows <= _MOST:
-        raise DataError(f"design.rows: expected a number from 1 to 2^62, found {rows!r}; correct it.")
+        raise DataError(f"design.rows: expected a number from 1 to 2^62, found {shown(rows)}; correct it.")
     return Drawn(axes, method, rows, seed)
 
 
@@ -264,7 +264,11 @@ def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], byte
     header, lines = read_list(load(name), name)
     if not lines:
         raise DataError(f"{name}: the list is empty: expected a header and at least one row.")
-    axes = [Axis(_parameter(column, f"{name}: list", known).name) for column in header]
+    for k, column in enumerate(header, 1):
+        if column not in known:
+            # What stands in a file that is no list is not ours to show.
+            raise DataError(f"{name}: cell {k} of its header is no parameter; use some of {', '.join(known)}.")
+    axes = [Axis(column) for column in header]
     for axis in axes:
         if math.isnan(known[axis.parameter].nominal):
             raise DataError(f"{name}: {axis.parameter} is an array; vary it by [[axis]] with relative = true.")
@@ -277,7 +281,7 @@ def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], byte
         if len(cells) == len(axes):
             numbers = [_cell(cell, parameter, place) for cell, parameter in zip(cells, columns, strict=True)]
         if not numbers or any(map(math.isnan, numbers)):
-            raise DataError(f"{place}: expected {len(axes)} {kind}, found {', '.join(cells)!r}; correct it.")
+            raise DataError(f"{place}: expected {len(axes)} {kind}, found {shown(', '.join(cells))}; correct it.")
         table[:, k] = numbers
     if not np.all(np.isfinite(table)):
         raise DataError(f"{name}: expected finite numbers, found others; correct them.")

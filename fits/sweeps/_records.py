@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits._read_csv import read_csv
 from fits._record import Record
 from fits._stage_design import nearest
@@ -127,7 +127,7 @@ def requested_records(request: Request) -> Files | Simulated:
     table = request.table.get("records", {})
     for key in table:
         if key not in _KEYS:
-            raise DataError(f"records.{key}: expected a known key, found '{key}'; {nearest(key, _KEYS)}")
+            raise DataError(f"records.{key}: expected a known key, found {shown(key)}; {nearest(key, _KEYS)}")
     if "files" not in table:
         stage, initial = requested_stage(request)
         program = read_program(request.table.get("program", {"shape": "sine"}), "program", "V", request.load)
@@ -140,12 +140,12 @@ def requested_records(request: Request) -> Files | Simulated:
             raise DataError(f"{key}: records come from files here; leave out {key}, or records.files.")
     pattern = table["files"]
     if not isinstance(pattern, str) or os.path.isabs(pattern) or request.folder is None:
-        raise DataError(f"records.files: expected a pattern such as data/*.csv, found {pattern!r}; correct it.")
+        raise DataError(f"records.files: expected a pattern such as data/*.csv, found {shown(pattern)}; correct it.")
     try:
         names = tuple(sorted(str(path.relative_to(request.folder)) for path in request.folder.glob(pattern)))
     except (ValueError, NotImplementedError, OSError) as error:
         raise DataError(
-            f"records.files: expected a pattern such as data/*.csv, found {pattern!r} ({error}); correct it."
+            f"records.files: expected a pattern such as data/*.csv, found {shown(pattern)} ({error}); correct it."
         ) from None
     if not names:
         raise DataError(f"records.files: the axis is empty: no file matches {pattern}; correct the pattern.")

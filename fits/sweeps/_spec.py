@@ -3,7 +3,6 @@
 import hashlib
 import math
 import os
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -12,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
+from fits._read_file import MOST_CSV_BYTES, MOST_TOML_BYTES, parse_toml, read_bytes, read_text
 from fits.sweeps._axes import Plan
 from fits.sweeps._jobs import KINDS, Request
 from fits.sweeps._read_axes import read_list, read_plan
@@ -80,34 +80,21 @@ def read_sweep(path: str | os.PathLike[str]) -> Sweep:
         For the first thing that is not as it should be.
     """
     name = os.fspath(path)
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(
-            f"{name}: cannot be read ({error.strerror or error}); give the TOML of a sweep, such as "
-            "'microid sweep --example simulate' prints."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{name}: expected TOML, found no UTF-8 text; give the TOML of a sweep.") from error
+    text = read_text(path, "the TOML of a sweep, such as 'microid sweep --example simulate' prints", MOST_TOML_BYTES)
     folder = Path(path).resolve().parent
 
     def load(file: str) -> bytes:
         try:
-            return (folder / file).read_bytes()
-        except OSError as error:
-            raise DataError(f"{file}: cannot be read ({error.strerror or error}); correct its name.") from error
-        except ValueError as error:
-            raise DataError(f"{file!r}: expected the name of a file ({error}); correct it.") from error
+            return read_bytes(folder / file, "a file of the sweep", MOST_CSV_BYTES)
+        except DataError as error:
+            raise DataError(str(error).replace(str(folder / file), file)) from None
 
     return parse_sweep(text, name, load, folder)
 
 
 def parse_sweep(text: str, name: str, load: Callable[[str], bytes], folder: Path | None = None) -> Sweep:
     """Make a sweep of its text; files come through `load`, and patterns of names stand for files in `folder`."""
-    try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{name}: expected TOML, found a mistake: {error}; correct it.") from None
+    table = parse_toml(text, name)
     inputs: dict[str, bytes] = {}
 
     def kept(file: str) -> bytes:
@@ -130,22 +117,22 @@ def _sweep(
     folder: Path | None,
 ) -> Sweep:
     if table.get("schema") != SCHEMA:
-        raise DataError(f'schema: expected "{SCHEMA}", found {table.get("schema")!r}; give that, or another file.')
+        raise DataError(f'schema: expected "{SCHEMA}", found {shown(table.get("schema"))}; give that.')
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
-        raise DataError(f"kind: expected one of {', '.join(KINDS)}, found {kind!r}; choose one.")
+        raise DataError(f"kind: expected one of {', '.join(KINDS)}, found {shown(kind)}; choose one.")
     tables = KINDS[kind].tables
     for key in table:
         known = [*_COMMON, *tables]
         if key not in known:
             close = get_close_matches(key, known, n=1, cutoff=0.5)
             meant = f"did you mean {close[0]}?" if close else f"use some of {', '.join(known)}."
-            raise DataError(f"{key}: expected a known key, found '{key}'; {meant}")
+            raise DataError(f"{key}: expected a known key, found {shown(key)}; {meant}")
         if key in tables and key not in _NO_TABLES and not isinstance(table[key], dict):
-            raise DataError(f"{key}: expected a table, found {table[key]!r}; write [{key}] and its keys below.")
+            raise DataError(f"{key}: expected a table, found {shown(table[key])}; write [{key}] and its keys below.")
     seed = table.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise DataError(f"seed: expected a whole number of 0 or more, found {seed!r}; correct it.")
+        raise DataError(f"seed: expected a whole number of 0 or more, found {shown(seed)}; correct it.")
     memory, chunk_rows = _run_options(table.get("run", {}))
     names, relative = _names(table, load)
     job = KINDS[kind].make(Request(table, names, relative, load, folder))
@@ -154,6 +141,11 @@ def _sweep(
     factors = tuple(axis.parameter for axis in plan.axes if axis.relative)
     if set(factors) != set(relative):
         job = KINDS[kind].make(Request(table, names, factors, load, folder))
+    if chunk_rows is not None and chunk_rows % job.facts.block:
+        raise DataError(
+            f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, found "
+            f"{chunk_rows}; correct it, or leave it out."
+        )
     return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows, folder)
 
 
@@ -170,12 +162,12 @@ def _run_options(table: Any) -> tuple[float, int | None]:
         raise DataError("run: expected a table; write [run] and its keys below.")
     for key in table:
         if key not in _RUN:
-            raise DataError(f"run.{key}: expected a known key, found '{key}'; use {' and '.join(_RUN)}.")
+            raise DataError(f"run.{key}: expected a known key, found {shown(key)}; use {' and '.join(_RUN)}.")
     memory, rows = table.get("memory_MB", 256), table.get("chunk_rows")
     if isinstance(memory, bool) or not isinstance(memory, int | float) or not 1 <= memory <= _MOST_MB:
-        raise DataError(f"run.memory_MB: expected a number from 1 to {_MOST_MB:,}, found {memory!r}; correct it.")
+        raise DataError(f"run.memory_MB: expected a number from 1 to {_MOST_MB:,}, found {shown(memory)}.")
     if rows is not None and (isinstance(rows, bool) or not isinstance(rows, int) or rows < 1):
-        raise DataError(f"run.chunk_rows: expected a number of 1 or more, found {rows!r}; correct it.")
+        raise DataError(f"run.chunk_rows: expected a number of 1 or more, found {shown(rows)}; correct it.")
     return float(memory), rows
 
 

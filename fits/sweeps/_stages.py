@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._errors import DataError
+from fits._errors import DataError, shown
 from fits._model_file import load_model
 from fits.sweeps._files import in_a_file
 from fits.sweeps._jobs import Request
@@ -73,9 +73,9 @@ def requested_stage(request: Request) -> tuple[Stage, str]:
     """The stage and the initial memory that a sweep names by `model` and `initial`."""
     name, initial = request.table.get("model", NOMINAL), request.table.get("initial", INITIAL[0])
     if not isinstance(name, str):
-        raise DataError(f'model: expected "{NOMINAL}" or the name of a model file, found {name!r}; give one.')
+        raise DataError(f'model: expected "{NOMINAL}" or the name of a model file, found {shown(name)}; give one.')
     if initial not in INITIAL:
-        raise DataError(f"initial: expected one of {', '.join(INITIAL)}, found {initial!r}; choose one.")
+        raise DataError(f"initial: expected one of {', '.join(INITIAL)}, found {shown(initial)}; choose one.")
     return stage_from(None if name == NOMINAL else request.load(name), name), initial
 
 
