@@ -23,7 +23,7 @@ from fits.diagnosis._inside import Guard, Model
 from fits.diagnosis._path import limits_of
 from fits.diagnosis._programs import menu
 
-MOST = 2048
+MOST = 1024
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ name = "light"
 description = "A lightly damped stage."
 [rig]
 kind = "plays"
-plays = 600
+plays = 80
 [plant]
 time_constant_s = {tau}
 natural_frequency_Hz = {frequency}
