@@ -73,7 +73,7 @@ def test_files_that_belong_together_are_whole_at_any_moment(tmp_path, rng, sent,
     found = {
         path.relative_to(tmp_path): json.loads(path.read_text())["number"]
         for path in tmp_path.rglob("[a-z]*.json")
-        if not path.parent.name.startswith(".")
+        if not any(part.startswith(".") for part in path.relative_to(tmp_path).parts)
     }
     shown = {path: written for path, written in found.items() if path.parts[0] in ("model.json", "plots")}
     assert len(shown) == 4
