@@ -16,6 +16,7 @@ from typing import Any, NoReturn, TypeVar
 import click
 
 from fits._errors import DataError
+from fits._file_set import discard_all
 from fits._printable import printable
 
 # Signals that ask the command to end.
@@ -65,6 +66,7 @@ def _again(lost: Any) -> None:
 
 def stopped(stop: KeyboardInterrupt, what: str) -> NoReturn:
     """Say that the command was stopped, and what is left, and end with the status that shells have for it."""
+    discard_all()
     by_signal = isinstance(stop, Terminated)
     click.echo(f"{'Terminated' if by_signal else 'Interrupted'}: {what}.", err=True)
     raise Stopped(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))

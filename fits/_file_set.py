@@ -126,9 +126,10 @@ class FileSet:
             if move.staged is not None and not move.staged.is_dir():
                 flush(move.staged)
         with ExitStack() as undo:
-            for k, move in enumerate(moves):
-                # After the last one there is nothing to undo.
-                if k < len(moves) - 1:
+            for move in moves:
+                # A single one has happened or not. Of several the last is undone too: it may just have happened when
+                # an interruption comes.
+                if len(moves) > 1:
                     undo.callback(self._undoing(move))
                 with _told(move.shown):
                     _put(move)
@@ -192,6 +193,10 @@ class FileSet:
         return None
 
 
+# Those that are in use.
+_OPEN: list[FileSet] = []
+
+
 @contextmanager
 def file_set() -> Iterator[FileSet]:
     """Collect files that appear together at the end, or, on any exception, not at all.
@@ -206,6 +211,7 @@ def file_set() -> Iterator[FileSet]:
         A file cannot be written, or the disk is full.
     """
     files = FileSet()
+    _OPEN.append(files)
     try:
         yield files
         files.commit()
@@ -215,6 +221,16 @@ def file_set() -> Iterator[FileSet]:
             raise
         raise explained from error
     finally:
+        files.discard()
+        _OPEN.remove(files)
+
+
+def discard_all() -> None:
+    """Delete what is under temporary names, for a process that ends.
+
+    A signal may come at any moment, such as between the end of a block and what cleans up after it.
+    """
+    for files in _OPEN:
         files.discard()
 
 

@@ -268,3 +268,54 @@ def test_double_precision_is_on(bench):
     model = json.loads((bench[0] / "model.json").read_text())["model"]
     values = np.array(model["density"]["packed_um"]["value"])
     assert np.any(values.astype(np.float32).astype(float) != values)
+
+
+def test_a_name_is_shown_as_it_is_whatever_is_in_it(bench, tmp_path):
+    """A formula for Matplotlib, a command for a terminal, a tag, and a byte that is no character."""
+    folder, _, _ = bench
+    names = [os.fsencode(tmp_path) + b"/" + name for name in (b"a$x^$ \\$\xff.csv", b"<b>\x1b[31m\n.csv")]
+    train, heldout = map(os.fsdecode, names)
+    shutil.copy(folder / "csv" / "train.csv", train)
+    shutil.copy(folder / "csv" / "heldout.csv", heldout)
+    out, plots = os.fsdecode(os.fsencode(tmp_path) + b"/\xfe.json"), tmp_path / "plots$x^$"
+    fitted = run("fit", train, "--holdout", heldout, "--levels", 8, "--out", out, "--plots", plots, "--json")
+    assert fitted.exit_code == 0, fitted.stderr
+    content = json.loads(fitted.stdout)
+    assert [each["source"] for each in content["runs"]] == [r"a$x^$ \$\udcff.csv", r"<b>\x1b[31m\n.csv"]
+    assert content["out"] == out
+    assert len(list(plots.iterdir())) == 4
+    # Through a real pipe, which has an encoding.
+    process = shell("info", out)
+    stdout, stderr = process.communicate()
+    assert (process.returncode, stderr) == (0, "")
+    assert r"a$x^$ \$\udcff.csv" in stdout
+    assert "\x1b" not in stdout
+    process = shell("export", out, "--out", os.fsdecode(os.fsencode(tmp_path) + b"/\xfd"))
+    stdout, stderr = process.communicate()
+    assert (process.returncode, stderr) == (0, "")
+    assert r"\udcfd/compensator.h" in stdout
+    refused(run("fit", os.fsdecode(names[1]) + "none", "--out", out), r"\x1b[31m")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (["fit", "train.csv", "--out"], "out"),
+        (["fit", "train.csv", "--out", "m.json", "--plots"], "plots"),
+        (["diagnose", "train.csv", "--out"], "out"),
+        (["synth", "quickstart", "--out"], "out"),
+        (["export", "model.json", "--out"], "out"),
+        (["simulate", "model.json", "train.csv", "--out"], "out"),
+        (["compensate", "model.json", "train.csv", "--out"], "out"),
+    ],
+)
+def test_places_that_cannot_be_are_refused_before_the_work(bench, tmp_path, monkeypatch, arguments, option):
+    folder, _, _ = bench
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(folder / "csv" / "train.csv", "train.csv")
+    shutil.copy(folder / "model.json", "model.json")
+    os.mkfifo("pipe")
+    monkeypatch.setattr(fits._cli_fit, "read_runs", lambda *_: pytest.fail("the work has begun"))
+    for place in ("", "n" * 300, "pipe"):
+        refused(run(*arguments, place))
+    assert files(tmp_path) == ["model.json", "pipe", "train.csv"]

@@ -1,0 +1,201 @@
+"""Commands that are killed, or asked to end, at random moments: nothing is half written, and nothing stays behind."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from _command import OFF
+from _sweeps import small
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+# As many as the study of each command kills; real commands take seconds each.
+MOMENTS = int(os.environ.get("MICROID_MOMENTS", 50))
+SIGNALS = (signal.SIGKILL, signal.SIGTERM)
+# Of a sweep's folder and of the format of its results.
+OWN = {".lock", ".zarray", ".zattrs", ".zgroup", ".zmetadata"}
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no SIGKILL here")
+
+# What every command writes with, without what takes seconds before: one set of files after another.
+WRITER = """
+import json, sys
+from pathlib import Path
+from fits._cli_common import heed_signals, in_sentences
+from fits._file_set import file_set
+
+@in_sentences
+def write(folder, first, rounds):
+    for number in range(first, first + rounds):
+        with file_set() as files:
+            model = files.file(folder / "model.json")
+            places = [files.folder(folder / "plots"), files.folder(folder / f"new{number % 7}" / "below")]
+            for path in (model, *(place / f"{name}.json" for place in places for name in "abc")):
+                with open(path, "w") as file:
+                    json.dump({"number": number, "ballast": "x" * 5000}, file)
+        print(number, flush=True)
+
+heed_signals()
+folder, first, rounds = sys.argv[1:]
+write(Path(folder), int(first), int(rounds))
+"""
+
+
+def hidden(folder):
+    """What is there under names that a user does not look for."""
+    found = [path for path in folder.rglob("*") if path.name.startswith(".") or path.suffix == ".partial"]
+    return sorted(str(path.relative_to(folder)) for path in found if path.name not in OWN)
+
+
+def begin(*arguments, **options):
+    command = [sys.executable, *map(str, arguments)]
+    env = os.environ | {"PYTHONPATH": str(ROOT)} | OFF | options.pop("env", {})
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env, **options)
+
+
+@pytest.mark.parametrize("number", range(6))
+@pytest.mark.parametrize("sent", SIGNALS)
+def test_files_that_belong_together_are_whole_at_any_moment(tmp_path, rng, sent, number):
+    process = begin("-c", WRITER, tmp_path, 1, 10**6)
+    assert process.stdout.readline() == "1\n"
+    time.sleep(rng.uniform(0, 0.2))
+    process.send_signal(sent)
+    _, stderr = process.communicate()
+    assert process.returncode == (-sent if sent == signal.SIGKILL else 128 + sent), stderr
+    found = {
+        path.relative_to(tmp_path): json.loads(path.read_text())["number"]
+        for path in tmp_path.rglob("[a-z]*.json")
+        if not any(part.startswith(".") for part in path.relative_to(tmp_path).parts)
+    }
+    shown = {path: written for path, written in found.items() if path.parts[0] in ("model.json", "plots")}
+    assert len(shown) == 4
+    if sent == signal.SIGTERM:
+        assert stderr == "Terminated: no unfinished file was left.\n"
+        assert hidden(tmp_path) == []
+        # All are of one round, which the signal did not stop.
+        assert len(set(shown.values())) == 1
+    for folder in tmp_path.glob("new*"):
+        # A new folder appears with all that is in it.
+        names = sorted(path.name for path in (folder / "below").iterdir() if path.suffix)
+        assert names == ["a.json", "b.json", "c.json"]
+    # The next start removes what is left, and only that.
+    assert begin("-c", WRITER, tmp_path, 0, 7).communicate()[1] == ""
+    assert hidden(tmp_path) == []
+    assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 4 + 7 * 3
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A folder with records, a model, a sweep and a cache of compiled functions, and what the commands say of it."""
+    folder = tmp_path_factory.mktemp("bench")
+    (folder / "sweep.toml").write_text(small(1))
+    for command in ("synth quickstart --out csv --seed 5", "fit csv/train.csv --levels 8 --out model.json"):
+        run_whole(folder, folder, command)
+    return folder
+
+
+def start(bench, folder, command):
+    cache = bench / "cache"
+    arguments = [bench / part if (bench / part).exists() else part for part in command.split()]
+    return begin("-m", "fits", *arguments, cwd=folder, env={"MICROID_CACHE": str(cache)})
+
+
+def run_whole(bench, folder, command, status=0):
+    process = start(bench, folder, command)
+    _, stderr = process.communicate()
+    assert process.returncode == status, stderr
+
+
+def whole(path):
+    """Read a file with something that fails on half of it."""
+    if path.suffix == ".json":
+        return json.loads(path.read_text())
+    if path.suffix == ".png":
+        with Image.open(path) as picture:
+            return picture.load()
+    if path.suffix == ".csv":
+        return np.loadtxt(path, delimiter=",", skiprows=1)
+    if path.suffix == ".parquet":
+        return pd.read_parquet(path)
+    text = path.read_text(encoding="utf-8")
+    assert text.rstrip().endswith({".html": "</html>", ".toml": "256"}.get(path.suffix, ("}", "*/", "#endif")))
+    return text
+
+
+def shown(folder):
+    """What a user finds, but for the results of a sweep, which the table repeats."""
+    files = [path for path in folder.rglob("*") if path.is_file() and "results.zarr" not in path.parts]
+    names = [path.relative_to(folder) for path in files]
+    return {name: whole(folder / name) for name in names if not any(part.startswith(".") for part in name.parts)}
+
+
+# The command, one that starts in the same folder and is soon refused, and what it leaves in the end.
+COMMANDS = {
+    "fit": ("fit csv/train.csv --levels 8 --out m.json --plots plots", "fit none.csv --out m.json --plots plots"),
+    "diagnose": ("diagnose csv/train.csv --out report/new", "diagnose none.csv --out report/new"),
+    "export": ("export model.json --out c/code", None),
+    "sweep": ("sweep sweep.toml --out swept", None),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_commands_are_killed_at_many_random_moments(bench, tmp_path, seed, name):
+    command, refused = COMMANDS[name]
+    moments = random.Random(seed)
+
+    def resumed():
+        return f"{command} --resume" if name == "sweep" and (tmp_path / "swept" / "about.json").exists() else command
+
+    run_whole(bench, tmp_path, command)  # compiles
+    shutil.rmtree(tmp_path)
+    tmp_path.mkdir()
+    began = time.monotonic()
+    run_whole(bench, tmp_path, command)
+    longest = time.monotonic() - began
+    good = shown(tmp_path)
+    count = {}
+    for moment in range(MOMENTS):
+        if moments.random() < 0.5:
+            shutil.rmtree(tmp_path)
+            tmp_path.mkdir()
+        sent = SIGNALS[moment % 2]
+        process = start(bench, tmp_path, resumed())
+        # Half of them near the end, when files are written.
+        time.sleep(longest * moments.uniform(*moments.choice([(0, 1), (0.7, 1.05)])))
+        process.send_signal(sent)
+        _, stderr = process.communicate()
+        count[process.returncode] = count.get(process.returncode, 0) + 1
+        # The second is a request that comes before the command listens; nothing is there then.
+        assert process.returncode in {0, -sent, *((128 + sent,) if sent == signal.SIGTERM else ())}, stderr
+        assert "Traceback" not in stderr
+        there = set(shown(tmp_path))
+        assert there <= set(good)
+        # What is in one folder is there at once; SIGTERM undoes what is not.
+        assert name in ("fit", "sweep") or there in (set(), set(good))
+        assert name == "sweep" or sent == signal.SIGKILL or there in (set(), set(good))
+        left = hidden(tmp_path)
+        if sent == signal.SIGTERM and name != "sweep":
+            assert left == []
+        if name != "sweep" and not left:
+            continue
+        run_whole(bench, tmp_path, refused or resumed(), 2 if refused else 0)
+        assert hidden(tmp_path) == []
+        count["left"] = count.get("left", 0) + bool(left)
+    print(name, f"{longest:.1f} s", count)
+    run_whole(bench, tmp_path, resumed())
+    assert hidden(tmp_path) == []
+    for path, content in shown(tmp_path).items():
+        if path.suffix in (".h", ".c"):
+            assert content == good[path]
+        elif path.suffix == ".parquet":
+            assert content.equals(good[path])
+    assert set(shown(tmp_path)) == set(good)
