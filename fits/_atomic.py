@@ -3,6 +3,7 @@
 import csv
 import errno
 import gzip
+import json
 import os
 import secrets
 from collections.abc import Iterator, Mapping
@@ -85,6 +86,16 @@ def refuse_nonfinite(name: str, values: NDArray[Any]) -> None:
             f"{name}: the result is {values[row]} from sample {row + 1} on, so nothing was written; check the "
             "numbers of the model and of the file it was given."
         )
+
+
+def finite_json(content: Any) -> str:
+    """Put results into JSON; a `DataError` says that one of them is not finite."""
+    try:
+        return json.dumps(content, indent=1, allow_nan=False)
+    except ValueError:
+        raise DataError(
+            "a figure of the result is not finite; check the numbers of the files it was made from."
+        ) from None
 
 
 def write_csv(path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]]) -> None:

@@ -1,7 +1,6 @@
 """The command `microid sensitivity`: the work."""
 
 import dataclasses
-import json
 import math
 import os
 import re
@@ -11,7 +10,7 @@ from pathlib import Path
 import click
 
 import microid as m
-from fits._atomic import atomic_path
+from fits._atomic import atomic_path, finite_json
 from fits._cli_files import new_folder
 from fits._cli_jax import start_jax
 from fits._errors import DataError
@@ -48,7 +47,7 @@ def run_sensitivity(
         unfinished_stage = None if write_stage is None else stack.enter_context(atomic_path(write_stage))
         drawings = stack.enter_context(new_folder(plots))
         report = sensitivities(design, axes)
-        text = json.dumps(sensitivity_json(report), indent=1, allow_nan=False)
+        text = finite_json(sensitivity_json(report))
         claims = [] if stage or printed else [claim for claim in paper_claims(design) if {*claim.axes} & {*axes}]
         drawn: list[Path] = []
         if drawings is not None:

@@ -93,7 +93,9 @@ def test_a_small_file_that_unpacks_to_gigabytes_takes_little_memory(tmp_path):
     block = gzip.compress(b"0" * 50_000_000, 9)
     path.write_bytes(gzip.compress(HEAD.encode() + b"\n") + 100 * block)
     code = (
-        "import resource, sys, fits, fits._table\nfits._table.MOST_CSV_BYTES = 50_000_000\nresource.setrlimit(resource.RLIMIT_AS, (3 * 10**9, 3 * 10**9))\n"
+        "import resource, sys, fits, fits._table\n"
+        "fits._table.MOST_CSV_BYTES = 50_000_000\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9, 3 * 10**9))\n"
         "try: fits.read_csv(sys.argv[1])\nexcept fits.DataError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=False)
