@@ -2,6 +2,7 @@
 
 import csv
 import gzip
+import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -58,6 +59,16 @@ def refuse_nonfinite(name: str, values: NDArray[Any]) -> None:
             f"{name}: the result is {values[row]} from sample {row + 1} on, so nothing was written; check the "
             "numbers of the model and of the file it was given."
         )
+
+
+def finite_json(content: Any) -> str:
+    """Put results into JSON; a `DataError` says that one of them is not finite."""
+    try:
+        return json.dumps(content, indent=1, allow_nan=False)
+    except ValueError:
+        raise DataError(
+            "a figure of the result is not finite; check the numbers of the files it was made from."
+        ) from None
 
 
 def write_csv(

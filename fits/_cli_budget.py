@@ -1,6 +1,5 @@
 """The command `microid budget`: the work."""
 
-import json
 import math
 import re
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import click
 
 import microid as m
+from fits._atomic import finite_json
 from fits._budget import Measures, budget
 from fits._budget_report import budget_json, describe_budget
 from fits._cli_jax import start_jax
@@ -61,7 +61,7 @@ def run_budget(
         law = _law(model)
         axes = tuple(name for name in m.AXES if axis in (name, "all"))
         found = budget(design, law, noise, axes, measures=model_measures, arm_mm=arm_mm, zeroed=zeroed)
-        text = json.dumps(budget_json(found), indent=1, allow_nan=False)
+        text = finite_json(budget_json(found))
         drawn: list[Path] = []
         if drawings is not None:
             from fits._plot_budget import plot_budget

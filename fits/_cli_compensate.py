@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from fits._atomic import write_csv
+from fits._atomic import finite_json, refuse_nonfinite, write_csv
 from fits._cli_files import keep_inputs
 from fits._cli_jax import start_jax
 from fits._cli_work import preisach_of
@@ -69,6 +69,8 @@ def run_compensate(
         predicted = predicted_ranges(stage, program, found.displacement_um, initial, every)
         said = check_command(wanted.source, predicted, reached_in(loaded.report), stated, margin)
         sd_um = _displacement_sd_um(loaded, program, initial)
+        if sd_um is not None:
+            refuse_nonfinite("displacement_sd_um", sd_um)
         drawn = []
         if drawings is not None:
             drawn = plot_compensation(stage, wanted, found, sd_um, drawings, initial=initial)
@@ -95,7 +97,7 @@ def run_compensate(
         "remarks": remarks,
     }
     if as_json:
-        click.echo(json.dumps(summary, indent=1, allow_nan=False))
+        click.echo(finite_json(summary))
         return
     lines = [
         f"{len(wanted)} samples, {summary['voltage_min_V']:.6g} to {summary['voltage_max_V']:.6g} V",

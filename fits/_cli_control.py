@@ -1,6 +1,5 @@
 """The command `microid control`: the work."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import click
 import numpy as np
 
-from fits._atomic import write_csv
+from fits._atomic import finite_json, write_csv
 from fits._cli_compensate import parse_rig_limits
 from fits._cli_files import keep_inputs, progress_to_stderr
 from fits._cli_jax import start_jax
@@ -147,7 +146,7 @@ def run_control(
         about = {"controller": controller, "out": out, "plots": places}
         # Before the file is in its place: what cannot be told is not left behind either.
         summary = control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
-        told = json.dumps(summary, indent=1, allow_nan=False) if as_json else describe_control(summary)
+        told = finite_json(summary) if as_json else describe_control(summary)
     click.echo(told)
 
 

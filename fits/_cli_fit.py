@@ -1,6 +1,5 @@
 """The command `microid fit`: the work."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import click
 
+from fits._atomic import finite_json
 from fits._cli_files import fraction_or_files, keep_inputs, progress_to_stderr
 from fits._cli_jax import start_jax
 from fits._errors import DataError
@@ -87,7 +87,7 @@ def run_fit(
         unfinished.write_text(model_text(result.model, result.uncertainty, report), encoding="utf-8")
     places = [str(Path(plots) / path.name) for path in drawn] if plots else []
     if as_json:
-        click.echo(json.dumps({"out": out, "plots": places, **report}, indent=1, allow_nan=False))
+        click.echo(finite_json({"out": out, "plots": places, **report}))
     else:
         click.echo("\n".join([kind.describe(report), "", f"model  {out}", *(f"plot   {place}" for place in places)]))
 

@@ -1,6 +1,5 @@
 """The command `microid paper`: the work."""
 
-import json
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import data_synth
+from fits._atomic import finite_json
 from fits._cli_files import progress_to_stderr
 from fits._cli_jax import start_jax
 from fits._cli_paper_gains import INTERVAL_s
@@ -100,7 +100,7 @@ def paper_result(seeds: int, seed: int, folder: Path, tell: Tell) -> PaperResult
             _draw_tracks({AXIS_TITLES[name]: tracks[name] for name in AXIS_TITLES}, folder / "fig12.png"),
         ),
     ]
-    text = json.dumps(paper_json(result), indent=1, allow_nan=False)
+    text = finite_json(paper_json(result))
     (folder / "paper.json").write_text(f"{text}\n", encoding="utf-8")
     page = paper_page(result, [(caption, path.name) for caption, path in pictures])
     (folder / "paper.md").write_text(page, encoding="utf-8")

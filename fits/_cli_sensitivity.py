@@ -1,7 +1,6 @@
 """The command `microid sensitivity`: the work."""
 
 import dataclasses
-import json
 import math
 import os
 import re
@@ -10,6 +9,7 @@ from pathlib import Path
 import click
 
 import microid as m
+from fits._atomic import finite_json
 from fits._cli_jax import start_jax
 from fits._errors import DataError
 from fits._file_set import file_set
@@ -46,7 +46,7 @@ def run_sensitivity(
         unfinished_stage = None if write_stage is None else files.file(write_stage)
         drawings = files.folder(plots)
         report = sensitivities(design, axes)
-        text = json.dumps(sensitivity_json(report), indent=1, allow_nan=False)
+        text = finite_json(sensitivity_json(report))
         claims = [] if stage or printed else [claim for claim in paper_claims(design) if {*claim.axes} & {*axes}]
         drawn: list[Path] = []
         if drawings is not None:

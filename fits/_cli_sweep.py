@@ -1,10 +1,10 @@
 """The command `microid sweep`: the work."""
 
-import json
 from pathlib import Path
 
 import click
 
+from fits._atomic import finite_json
 from fits._cli_common import stopped
 from fits._cli_files import progress_to_stderr
 from fits._cli_jax import start_jax
@@ -35,7 +35,7 @@ def run_sweep(*, file: str, out: str, resume: bool, cluster: str | None, as_json
             "seconds": outcome.seconds,
             "files": files,
         }
-        click.echo(json.dumps(content, indent=1, allow_nan=False))
+        click.echo(finite_json(content))
         return
     failed = f", {outcome.failed:,} of them failed" if outcome.failed else ""
     click.echo(f"{outcome.rows:,} rows{failed}; {outcome.computed:,} computed in {outcome.seconds:.1f} s")
@@ -55,6 +55,6 @@ def show_sweep(*, folder: str, best: str | None, largest: bool, plots: str | Non
 
             drawn = plot_sweep(folder, drawings, best)
     if as_json:
-        click.echo(json.dumps(summary, indent=1, allow_nan=False))
+        click.echo(finite_json(summary))
         return
     click.echo("\n".join([describe(summary), *(f"plot  {Path(plots or '') / path.name}" for path in drawn)]))

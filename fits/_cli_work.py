@@ -1,11 +1,9 @@
 """The commands `microid simulate` and `microid info`: the work."""
 
-import json
-
 import click
 import numpy as np
 
-from fits._atomic import write_csv
+from fits._atomic import finite_json, write_csv
 from fits._cli_files import keep_inputs
 from fits._cli_jax import start_jax
 from fits._errors import DataError
@@ -47,7 +45,7 @@ def run_simulate(*, model: str, program: str, out: str, initial: str, columns: s
         "remarks": list(record.warnings),
     }
     if as_json:
-        click.echo(json.dumps(summary, indent=1, allow_nan=False))
+        click.echo(finite_json(summary))
         return
     spread = (
         f"standard deviation {summary['displacement_sd_median_um']:.3g} um in the median"
@@ -73,7 +71,7 @@ def run_info(*, model: str, as_json: bool) -> None:
     kind = type(loaded.model).__name__
     if as_json:
         content = {"written_by": loaded.written_by, "model": kind, "parameters": parameters, "fit": loaded.report}
-        click.echo(json.dumps(content, indent=1, allow_nan=False))
+        click.echo(finite_json(content))
         return
     lines = [f"{kind}, written by {loaded.written_by}"]
     for row in parameters:

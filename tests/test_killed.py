@@ -146,7 +146,7 @@ COMMANDS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands_are_killed_at_many_random_moments(bench, tmp_path, seed, name):
     command, refused = COMMANDS[name]

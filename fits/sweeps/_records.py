@@ -142,7 +142,8 @@ def requested_records(request: Request) -> Files | Simulated:
     if not isinstance(pattern, str) or os.path.isabs(pattern) or request.folder is None:
         raise DataError(f"records.files: expected a pattern such as data/*.csv, found {shown(pattern)}; correct it.")
     try:
-        names = tuple(sorted(str(path.relative_to(request.folder)) for path in request.folder.glob(pattern)))
+        files = [path for path in request.folder.glob(pattern) if path.is_file()]
+        names = tuple(sorted(str(path.relative_to(request.folder)) for path in files))
     except (ValueError, NotImplementedError, OSError) as error:
         raise DataError(
             f"records.files: expected a pattern such as data/*.csv, found {shown(pattern)} ({error}); correct it."

@@ -151,6 +151,8 @@ def _sweep(
 
 def _sum_of(path: Path) -> str:
     try:
+        if not path.is_file():  # a pipe would be waited for
+            return "unreadable"
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
