@@ -1,7 +1,7 @@
 """How fine a grid the records bear: resolutions tried until blocks are no longer predicted better."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,15 +11,20 @@ from fits._design import Grid
 from fits._errors import DataError
 from fits._grid import BELIEF_LEVELS, GridSolution, cross_validate, solve_grid
 from fits._moments import Data, gather
-from fits._noise import correlation_samples
+from fits._noise import correlation_samples, huber_weight
 from fits._prior import Hyper
 from fits._result import FitError, FitStatus, LevelTrial
 from fits._run import Run, simulate_run
+from fits.diagnosis._floor import quantum_um
 
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
 # Refining goes on while it takes this fraction off the error of predicted blocks.
 _WORTH = 0.005
+# Errors up to so many times what a last digit rounds off are rounding.
+_ROUNDED = 1.2
+# Rounds after which the weights of outliers have settled.
+_REWEIGHED = 8
 # A residual less correlated than this counts as white.
 _WHITE = 1.2
 # Correlation of displacement with voltage below which there is no loop.
@@ -67,17 +72,24 @@ def choose_grid(
         progress(f"{n} levels")
         return try_grid(gather(Grid(lower, upper, n), runs), runs, stroke, hyper, levels is None)
 
-    tried, trials = _resolve(trial, levels, finest)
+    digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
+    tried, trials = _resolve(trial, levels, finest, _ROUNDED * digit / 12**0.5)
     return stroke, tried, trials
 
 
 def _resolve(
-    trial: Callable[[int, Hyper], GridTrial], levels: int | None, finest: int
+    trial: Callable[[int, Hyper], GridTrial], levels: int | None, finest: int, rounding_um: float
 ) -> tuple[GridTrial, list[LevelTrial]]:
-    """Refine until it no longer pays; the finest that predicts no worse is kept, as its grid is least felt."""
+    """Refine until it no longer pays; the finest that predicts no worse is kept, as its grid is least felt.
+
+    What a last digit rounds off repeats itself with every loop, and a fine grid follows it from digit to digit: an
+    error that is no more than that is not worth refining.
+    """
     best = trial(levels or LADDER[0], Hyper.start())
     trials = [LevelTrial(best.data.grid.levels, best.error_um)]
     for n in [n for n in LADDER[1:] if n <= finest] if levels is None else ():
+        if best.error_um <= rounding_um:
+            break
         try:
             finer = trial(n, best.solution.hyper)
         except FitError:
@@ -98,7 +110,8 @@ def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compa
     _check(solution.result)
     model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
-    found = correlation_samples([(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs])
+    left = [run.weighed(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
+    found = correlation_samples(left)
     if found > _WHITE:
         correlation = found
         solution = solve_grid(data, stroke, correlation, hyper)
@@ -149,3 +162,25 @@ def _check(result: RESULTS) -> None:
     if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
         raise FitError(FitStatus.MAX_STEPS)
     raise FitError(FitStatus.NONFINITE)
+
+
+def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list[Run]:
+    """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid.
+
+    Raises
+    ------
+    DataError, FitError
+        As `choose_grid`.
+    """
+    progress("weighing outliers")
+    stroke = max(_stroke(run) for run in runs)
+    grid = Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), LADDER[0])
+    hyper = Hyper.start()
+    for _ in range(_REWEIGHED):
+        solution = solve_grid(gather(grid, runs), stroke, 1.0, hyper)
+        _check(solution.result)
+        hyper = solution.hyper
+        model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
+        left = [run.displacement_um - simulate_run(model, run) for run in runs]
+        runs = [replace(run, weight=huber_weight(one, run.fitted)) for run, one in zip(runs, left, strict=True)]
+    return list(runs)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fits._choose_grid import LADDER, choose_grid, try_grid
+from fits._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits._design import Grid, columns_of
 from fits._errors import DataError
 from fits._estimate import Estimate
@@ -16,6 +16,8 @@ from fits._grid import grid_estimate
 from fits._history import estimate_start
 from fits._metrics import Errors, errors, loop_width_pct
 from fits._moments import Data, gather
+from fits._noise import LOSSES
+from fits._parts_agree import check_loops
 from fits._prior import interpolation
 from fits._record import Record, refuse_repeats
 from fits._result import FitResult, FitStatus, RunReport
@@ -40,6 +42,7 @@ def fit(
     levels: int | None = None,
     holdout: float | Sequence[Record] = 0.2,
     initial: str = "unknown",
+    loss: str = "squares",
     starts: int = 8,
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
@@ -61,6 +64,8 @@ def fit(
         Fraction at the end of every run that is only predicted, or records that are.
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`.
+    loss
+        `squares`, or `huber`, to which outliers count less.
     starts, seed
         Number of starts, and their seed, for families whose fit is not convex.
     progress
@@ -74,7 +79,7 @@ def fit(
     Raises
     ------
     DataError
-        If the records cannot be fitted.
+        If the records cannot be fitted, or are not of one rig.
     FitError
         If a solver fails.
     RuntimeError
@@ -84,6 +89,8 @@ def fit(
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
     if family not in FAMILIES:
         raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
+    if loss not in LOSSES:
+        raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
     if levels is not None and not 4 <= levels <= 100:
         raise DataError(f"{levels} levels were asked for: choose between 4 and 100")
     fraction = holdout if isinstance(holdout, int | float) else 0.0
@@ -95,7 +102,13 @@ def fit(
     refuse_repeats([*records, *aside])
     voltages = [record.voltage_V for record in (*records, *aside)]
     lower, upper = min(v.min() for v in voltages), max(v.max() for v in voltages)
-    runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]
+
+    def prepare(record: Record) -> Run:
+        return prepare_run(record, lower, upper, initial, fraction)
+
+    runs = [prepare(record) for record in records]
+    if loss == "huber":
+        runs = weigh_robustly(runs, progress)
     stroke, tried, trials = choose_grid(runs, levels, progress)
     remarks = _remarks(runs)
     remarks += [warning for record in aside for warning in record.warnings]
@@ -119,6 +132,9 @@ def fit(
             "(creep, rate, drift or a density this family cannot follow) is left that this model does not describe"
         )
     model = found.model
+    progress("checking the records")
+    miss, told = check_loops(runs, prepare, model, stroke, tried.solution.hyper, loss == "huber")
+    remarks = [*told, *remarks]
     offsets = _offsets(model, tried.data)
 
     progress("comparing with the measurement")
@@ -139,6 +155,7 @@ def fit(
         smoothness=float(np.exp(tried.solution.hyper.log_density)),
         trials=tuple(trials),
         runs=tuple(reports),
+        misfit=miss,
     )
 
 

@@ -8,14 +8,16 @@ import jax.numpy as jnp
 
 from fits._errors import DataError
 from fits._fit import LADDER
+from fits._fit_checks import remarks_on
 from fits._floor import misfits, worst
+from fits._noise import LOSSES
 from fits._record import Record, refuse_repeats
 from fits._stage_checks import implausible, refuse_coarse
 from fits._stage_delay import own_up, take_out_delays
 from fits._stage_moments import Chain
 from fits._stage_result import StageFit
 from fits._stage_run import gain_ahead, place_of_hysteresis, prepare_stage_run
-from fits._stage_solve import LOSSES, Solved
+from fits._stage_solve import Solved
 from fits._stage_steps import Plan, Problem, refine_problem, start_problem
 from fits._stage_summary import summarise
 from fits._stage_uncertainty import Precision
@@ -107,12 +109,14 @@ def fit_stage(
     held = [prepare_stage_run(record, found.range_V, *settings) for record in aside]
     summary = summarise(found.stage, chain.coordinates, found.solved, found.precision, held)
     runs, sources = found.solved.runs, [record.source for record in records]
-    left = misfits(records, [one.residual_um for one in found.solved.sums], [run.fitted for run in runs])
+    known = [one.residual_um for one in found.solved.sums], [run.fitted for run in runs]
+    left = misfits(records, *known)
     refuse_coarse(found.stage, runs, left)
     undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
     if undelayed is not None:
         summary = own_up(summary, chain, undelayed)
-    odd = implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
+    odd = remarks_on(records, *known, robust=loss == "huber")
+    odd += implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
     notes = [warning for record in (*records, *aside) for warning in record.warnings]
     return replace(summary, misfit=worst(left), remarks=(*odd, *notes, *found.remarks, *summary.remarks))
 

@@ -238,12 +238,21 @@ def cross_validate(
         belief = posterior(rest.scaled(1 / correlation, stroke_um), rough, hyper)
         columns = np.asarray(belief.mean if basis is None else basis @ belief.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
-        off = [(run.displacement_um - simulate_run(model, run))[label == number] for run, label in pairs]
-        squares += sum(float(np.sum((o - o.mean()) ** 2)) for o in off)
+        off = [
+            _weighed_off(run, run.displacement_um - simulate_run(model, run), label == number) for run, label in pairs
+        ]
+        squares += sum(float(np.sum(o**2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)
         expected += float(_expected_square(belief, block)) * stroke_um**2
         count += float(block.count)
     return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
+
+
+def _weighed_off(run: Run, off_um: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Errors of some samples, without their mean, as large as they count."""
+    weight = None if run.weight is None else run.weight[samples]
+    centred = off_um - np.average(off_um[samples], weights=weight)
+    return np.asarray(run.weighed(centred)[samples])
 
 
 @eqx.filter_jit

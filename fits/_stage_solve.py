@@ -9,6 +9,7 @@ import optimistix as optx
 
 from fits._grid import solve_grid
 from fits._moments import Data, Moments
+from fits._noise import huber_weight
 from fits._prior import Hyper, roughness
 from fits._result import FitError, FitStatus
 from fits._stage_moments import Chain, RunSums, Weighing, run_sums, split_moments
@@ -21,9 +22,6 @@ _DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
 _STATIONARY = 0.02
 # Variance of the noise below which, in squares of the stroke, all is rounding.
 _ROUNDING = 1e-20
-# Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
-_HUBER = 1.345
-LOSSES = ("squares", "huber")
 
 
 @dataclass(frozen=True)
@@ -205,11 +203,7 @@ def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequen
 
 def robust(run: StageRun, residual_um: np.ndarray) -> StageRun:
     """Weigh a run's samples by what they leave: outliers count linearly (Huber)."""
-    left = residual_um[run.fitted]
-    middle = float(np.median(left))
-    # The median absolute deviation is not moved by the outliers themselves.
-    spread = 1.4826 * float(np.median(np.abs(left - middle))) + 1e-300
-    return run.weighted(_HUBER / np.maximum(np.abs(residual_um - middle) / spread, _HUBER))
+    return run.weighted(huber_weight(residual_um, run.fitted))
 
 
 def _step(

@@ -28,8 +28,8 @@ _SLOW = 4.0
 # Intervals are divided until the error of the finite step moves no parameter by this many standard deviations.
 _BIAS = 0.15
 _FINEST = 16
-# Where a part is left out more than noise is left, and no run counts as quieter than this part of the loudest.
-_EVEN = 0.3
+# Where a part is left out more than noise is left, and no run counts as quieter than another.
+_EVEN = 1.0
 # Samples that a driver lags by where its search begins.
 _LAG = 3.0
 # Parts of the sampling interval below which a driver has no time constant, and from which it may find one again.
