@@ -21,6 +21,8 @@ from fits.diagnosis._floor import quantum_um
 LADDER = (16, 23, 32, 45, 64, 90)
 # Refining goes on while it takes this fraction off the error of predicted blocks.
 _WORTH = 0.005
+# From so many levels on more, by the square of their number.
+_DEAR = 32
 # Errors up to so many times what a last digit rounds off are rounding.
 _ROUNDED = 1.2
 # Rounds after which the weights of outliers have settled.
@@ -96,7 +98,8 @@ def _resolve(
             # What is coarser has an answer.
             break
         trials.append(LevelTrial(n, finer.error_um))
-        pays = finer.error_um < (1 - _WORTH) * best.error_um
+        # A fit takes eight times as long for twice the levels, and must be worth it.
+        pays = finer.error_um < (1 - _WORTH * max(1.0, n / _DEAR) ** 2) * best.error_um
         best = finer if finer.error_um <= best.error_um else best
         if not pays:
             break

@@ -31,6 +31,8 @@ _ATOL = 1e-6
 _STEPS = 500
 # Steps per column where one column at a time is bounded or let go.
 _TURNS = 30
+# More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
+_SLOWLY = 1100
 # At least this many columns are bounded at first.
 _FEW = 64
 
@@ -119,11 +121,13 @@ def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
 def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
     precision = np.asarray(belief.precision)
+    over: Any = RESULTS.nonlinear_max_steps_reached
+    if len(precision) > _SLOWLY:
+        return jnp.maximum(belief.mean, 0), over
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
     done: Any = RESULTS.successful
-    over: Any = RESULTS.nonlinear_max_steps_reached
     try:
         columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_TURNS * len(scale))
     except RuntimeError:

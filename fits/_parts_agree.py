@@ -162,8 +162,8 @@ def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequ
         sentence = (
             f"{names}: these runs do not show one hysteresis: fitted together they leave {joint} % of their strokes, "
             f"each alone {apart} %; under the same voltage {runs[high].record.source} moves {ratio:.3g} "
-            f"times as far as {runs[low].record.source}: they are of different rigs or settings, or differ in rate, load or "
-            "temperature; fit them apart"
+            f"times as far as {runs[low].record.source}: they are of different rigs or settings, or differ in rate, "
+            "load or temperature; fit them apart"
         )
         if ratio > 1 + _REFUSED:
             raise DataError(sentence)
@@ -265,7 +265,7 @@ def delays(runs: Sequence[Run], prepare: Callable[[Record], Run], alone: Alone, 
 
 
 def _profile(residual: Callable[[float], np.ndarray]) -> tuple[float, float, float, float, float] | None:
-    """Delay in samples, its sd, the residual's rms without and with it, and the evidence; None where it does not end."""
+    """Delay in samples, its sd, the residual's rms without and with it, and the evidence; None if it has no end."""
     known = {0.0: residual(0.0)}
 
     def cost(samples: float) -> float:

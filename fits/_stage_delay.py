@@ -105,8 +105,9 @@ def take_out_delays(
     Undelayed or None
         None where no run has a delay, or taking it out does not help.
     """
-    if plan.hold == "zero":
-        # Between two samples a command in steps has no place where it could be shifted to.
+    # Between two samples a command in steps has no place where it could be shifted to, and without a resonance to
+    # measure it by a delay is part of the lag.
+    if plan.hold == "zero" or problem.even:
         return None
     shifts = np.zeros(len(plan.records))
     start = problem.z, solved.columns_um
@@ -133,7 +134,7 @@ def take_out_delays(
                     plan.progress,
                     even=problem.even,
                 )
-            except FitError:
+            except (FitError, np.linalg.LinAlgError):
                 return None
             sure = Precision(problem.chain, found, problem.stroke_um)
             start = found.z, found.columns_um
@@ -261,7 +262,7 @@ def _search(plan: Plan, problem: Problem, solved: Solved, far: Sequence[int]) ->
                 given = problem.chain, z, solved.columns_um, runs, None, problem.stroke_um, plan.loss, plan.progress
                 try:
                     found = solve_chain(*given, rough=True)
-                except FitError:
+                except (FitError, np.linalg.LinAlgError):
                     continue
                 if found.weighing.noise_um[k] < _BETTER * best.weighing.noise_um[k]:
                     best, shifts = found, there

@@ -201,7 +201,7 @@ def _lagging(
     plan.progress("a lag without a resonance")
     try:
         solved = solve_chain(chain, *start, plan.loss, plan.progress, even=_EVEN)
-    except FitError:
+    except (FitError, np.linalg.LinAlgError):
         return None
     precision = Precision(chain, solved, stroke_um)
     sd = np.sqrt(np.diagonal(precision.covariance(precision.influence())))
