@@ -45,7 +45,7 @@ def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) ->
 @click.option(
     "--loss",
     type=click.Choice(["squares", "huber"]),
-    help="What the fit of a stage minimises (default squares); outliers count less in huber.",
+    help="What the fit minimises (default squares); outliers count less in huber.",
 )
 @click.option(
     "--hold",

@@ -101,17 +101,15 @@ def _loop_options(
     initial: Sequence[str],
 ) -> tuple[str, dict[str, Any]]:
     """Memory before all runs, and the options of `fit`; what it cannot honour is refused."""
-    for name, value in (("loss", loss), ("hold", hold)):
-        if value is not None:
-            raise DataError(
-                f"--{name} {value}: only the fit of a stage has a choice; leave out --{name}, or use --model stage."
-            )
+    if hold is not None:
+        raise DataError(f"--hold {hold}: only the fit of a stage has a choice; leave it out, or use --model stage.")
     if len(initial) > 1:
         raise DataError(
             f"--initial: expected one state for all runs, found {len(initial)}; give one, or use --model stage."
         )
     return (initial[0] if initial else "unknown"), {
         "family": family or "grid",
+        "loss": loss or "squares",
         "starts": starts or 8,
         "seed": seed or 0,
     }

@@ -32,7 +32,7 @@ class Compressed:
     block
         Block of the record that the group belongs to, -1 where it is not used, shape `(groups,)`.
     count
-        Number of samples in each group that are used, shape `(groups,)`.
+        Number of samples in each group that are used, each as often as it counts, shape `(groups,)`.
     residue_um2
         Unexplainable sum of squares in each group, shape `(groups,)`.
     """
@@ -52,6 +52,7 @@ def compress(
     rising: np.ndarray,
     block: np.ndarray,
     levels_V: np.ndarray,
+    weight: np.ndarray | None = None,
 ) -> Compressed:
     """Group the samples of a record.
 
@@ -63,7 +64,10 @@ def compress(
         Block that each sample belongs to, -1 where it is not used, shape `(n,)`.
     levels_V
         The switching voltages, evenly spaced.
+    weight
+        Of each sample in the sums, shape `(n,)`; 1 by default.
     """
+    share = np.ones(len(voltage_V)) if weight is None else weight
     step = levels_V[1] - levels_V[0]
     cell = np.clip(((voltage_V - levels_V[0]) / step).astype(np.int64), 0, len(levels_V) - 2)
     changed = (np.diff(anchor_V) != 0) | (np.diff(rising) != 0) | (np.diff(cell) != 0) | (np.diff(block) != 0)
@@ -77,7 +81,9 @@ def compress(
     slot = np.minimum(np.arange(_SLOTS)[None, :], size[:, None] - 1) + first[:, None]
     filled = np.arange(_SLOTS)[None, :] < size[:, None]
     voltage, target = voltage_V[slot], np.where(filled, displacement_um[slot], 0.0)
-    mix = np.eye(_SLOTS)[None] * filled[:, :, None]
+    root = np.sqrt(share)[slot] * filled
+    target *= root
+    mix = np.eye(_SLOTS)[None] * root[:, :, None]
     residue = np.zeros(len(first))
 
     # Visits of many samples: moments of the fraction of the way, then the square root of their Gram matrix.
@@ -85,9 +91,10 @@ def compress(
     safe = np.where(span == 0, 1.0, span)
     way = (voltage_V - start[group]) / safe[group]
     powers = np.vander(way, 2 * _SLOTS - 1, increasing=True)
+    powers *= share[:, None]
     moments = np.add.reduceat(powers, first)[dense]
     cross = np.add.reduceat(powers[:, :_SLOTS] * displacement_um[:, None], first)[dense]
-    energy = np.add.reduceat(displacement_um**2, first)[dense]
+    energy = np.add.reduceat(share * displacement_um**2, first)[dense]
     hankel = moments[:, np.arange(_SLOTS)[:, None] + np.arange(_SLOTS)[None, :]]
     nodes, lagrange = _nodes()
     root, right, left = _square_root(lagrange @ hankel @ lagrange.T, cross @ lagrange.T, energy)
@@ -100,7 +107,7 @@ def compress(
         mix=np.where(used[:, None, None], mix, 0.0),
         target_um=np.where(used[:, None], target, 0.0),
         block=block[first],
-        count=np.where(used, size, 0),
+        count=np.where(used, np.add.reduceat(share, first), 0.0),
         residue_um2=np.where(used, residue, 0.0),
     )
 

@@ -1,57 +1,39 @@
 """From records to a fitted Preisach operator."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from optimistix import RESULTS
 
+from fits._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits._design import Grid, columns_of
 from fits._errors import DataError
 from fits._estimate import Estimate
-from fits._grid import BELIEF_LEVELS, GridSolution, cross_validate, grid_estimate, solve_grid
+from fits._grid import grid_estimate
 from fits._history import estimate_start
 from fits._limits import measured_ranges
 from fits._metrics import Errors, errors, loop_width_pct
 from fits._moments import Data, gather
-from fits._noise import correlation_samples
-from fits._prior import Hyper, interpolation
+from fits._noise import LOSSES
+from fits._parts_agree import check_loops
+from fits._prior import interpolation
 from fits._record import Record, refuse_repeats
-from fits._result import FitError, FitResult, FitStatus, LevelTrial, RunReport
+from fits._result import FitResult, FitStatus, RunReport
 from fits._run import Run, prepare_run, simulate_run
 from fits._shapes import solve_shape
 from fits._uncertainty import Uncertainty, perturbations
 from microid import FAMILIES, Preisach
 
-# Resolutions in steps of the square root of two.
-LADDER = (16, 23, 32, 45, 64, 90)
-# Refining goes on while it takes this fraction off the error of predicted blocks.
-_WORTH = 0.005
 # A residual less correlated than this counts as white.
 _WHITE = 1.2
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
-# Correlation of displacement with voltage below which there is no loop.
-_FOLLOWS = 0.3
-# Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
-_AHEAD = 0.5
 # Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
 _EDGE = 0.02
 _MINOR = 0.01
-
-
-@dataclass(frozen=True)
-class GridTrial:
-    """A resolution that was tried: its data, its solution, and how it predicts blocks from the others."""
-
-    data: Data
-    solution: GridSolution
-    correlation: float
-    error_um: float
-    discrepancy_um: float
 
 
 def fit(
@@ -61,6 +43,7 @@ def fit(
     levels: int | None = None,
     holdout: float | Sequence[Record] = 0.2,
     initial: str = "unknown",
+    loss: str = "squares",
     starts: int = 8,
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
@@ -82,6 +65,8 @@ def fit(
         Fraction at the end of every run that is only predicted, or records that are.
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`.
+    loss
+        `squares`, or `huber`, to which outliers count less.
     starts, seed
         Number of starts, and their seed, for families whose fit is not convex.
     progress
@@ -95,7 +80,7 @@ def fit(
     Raises
     ------
     DataError
-        If the records cannot be fitted.
+        If the records cannot be fitted, or are not of one rig.
     FitError
         If a solver fails.
     RuntimeError
@@ -105,6 +90,8 @@ def fit(
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
     if family not in FAMILIES:
         raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
+    if loss not in LOSSES:
+        raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
     if levels is not None and not 4 <= levels <= 100:
         raise DataError(f"{levels} levels were asked for: choose between 4 and 100")
     fraction = holdout if isinstance(holdout, int | float) else 0.0
@@ -116,7 +103,13 @@ def fit(
     refuse_repeats([*records, *aside])
     voltages = [record.voltage_V for record in (*records, *aside)]
     lower, upper = min(v.min() for v in voltages), max(v.max() for v in voltages)
-    runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]
+
+    def prepare(record: Record) -> Run:
+        return prepare_run(record, lower, upper, initial, fraction)
+
+    runs = [prepare(record) for record in records]
+    if loss == "huber":
+        runs = weigh_robustly(runs, progress)
     stroke, tried, trials = choose_grid(runs, levels, progress)
     remarks = _remarks(runs)
     remarks += [warning for record in aside for warning in record.warnings]
@@ -127,7 +120,7 @@ def fit(
     else:
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
             grid = Grid(tried.data.grid.lower_V, tried.data.grid.upper_V, _SHAPE_LEVELS)
-            tried = _try(gather(grid, runs), runs, stroke, tried.solution.hyper, True)
+            tried = try_grid(gather(grid, runs), runs, stroke, tried.solution.hyper, True)
         smooth, key = tried.solution.hyper, jax.random.key(seed)
         found, agree = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
         if not agree:
@@ -140,6 +133,9 @@ def fit(
             "(creep, rate, drift or a density this family cannot follow) is left that this model does not describe"
         )
     model = found.model
+    progress("checking the records")
+    miss, told = check_loops(runs, prepare, model, stroke, tried.solution.hyper, loss == "huber")
+    remarks = [*told, *remarks]
     offsets = _offsets(model, tried.data)
 
     progress("comparing with the measurement")
@@ -160,119 +156,8 @@ def fit(
         smoothness=float(np.exp(tried.solution.hyper.log_density)),
         trials=tuple(trials),
         runs=tuple(reports),
+        misfit=miss,
     )
-
-
-def choose_grid(
-    runs: Sequence[Run], levels: int | None, progress: Callable[[str], None], finest: int = LADDER[-1]
-) -> tuple[float, GridTrial, list[LevelTrial]]:
-    """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
-
-    Returns
-    -------
-    stroke_um
-        Unit of the columns.
-    kept
-        The finest grid that predicts no worse than the others, as it is least felt.
-    trials
-        All that were tried.
-
-    Raises
-    ------
-    DataError
-        If there is no loop to fit.
-    FitError
-        If a solver fails.
-    """
-    lower, upper = jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V)
-    stroke = max(_stroke(run) for run in runs)
-
-    def trial(n: int, hyper: Hyper) -> GridTrial:
-        progress(f"{n} levels")
-        return _try(gather(Grid(lower, upper, n), runs), runs, stroke, hyper, levels is None)
-
-    tried, trials = _resolve(trial, levels, finest)
-    return stroke, tried, trials
-
-
-def _resolve(
-    trial: Callable[[int, Hyper], GridTrial], levels: int | None, finest: int
-) -> tuple[GridTrial, list[LevelTrial]]:
-    """Refine until it no longer pays; the finest that predicts no worse is kept, as its grid is least felt."""
-    best = trial(levels or LADDER[0], Hyper.start())
-    trials = [LevelTrial(best.data.grid.levels, best.error_um)]
-    for n in [n for n in LADDER[1:] if n <= finest] if levels is None else ():
-        try:
-            finer = trial(n, best.solution.hyper)
-        except FitError:
-            # What is coarser has an answer.
-            break
-        trials.append(LevelTrial(n, finer.error_um))
-        pays = finer.error_um < (1 - _WORTH) * best.error_um
-        best = finer if finer.error_um <= best.error_um else best
-        if not pays:
-            break
-    return best, trials
-
-
-def _try(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compare: bool) -> GridTrial:
-    grid = data.grid
-    correlation = 1.0
-    solution = solve_grid(data, stroke, correlation, hyper)
-    _check(solution.result)
-    model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
-    # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
-    found = correlation_samples([(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs])
-    if found > _WHITE:
-        correlation = found
-        solution = solve_grid(data, stroke, correlation, hyper)
-        _check(solution.result)
-    n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
-    error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
-    return GridTrial(data, solution, correlation, error, discrepancy)
-
-
-def _stroke(run: Run) -> float:
-    voltage, displacement = run.record.voltage_V[run.fitted], run.displacement_um[run.fitted]
-    if np.ptp(displacement) == 0 or np.ptp(voltage) == 0:
-        raise DataError(f"{run.record.source}: nothing moves in the samples to be fitted; hold out less")
-    together = float(np.corrcoef(voltage, displacement)[0, 1])
-    if abs(together) < _FOLLOWS:
-        raise DataError(
-            f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so "
-            "there is no hysteresis loop to fit; check that --columns names the right ones"
-        )
-    if together < 0:
-        raise DataError(
-            f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
-            "change the sign of one of the two columns"
-        )
-    if _leads(voltage, displacement) > _AHEAD:
-        raise DataError(
-            f"{run.record.source}: the displacement runs ahead of the voltage round its loops, where a piezo stays "
-            "behind: the two columns are exchanged; correct the header, or name them the other way with --columns"
-        )
-    return float(np.ptp(displacement))
-
-
-def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:
-    """How the loops are run through: -1 where the displacement stays behind everywhere, 1 where it runs ahead.
-
-    That is the area of the loops about the smooth curve through them, over the same with all parts counted as
-    positive.
-    """
-    place = (voltage_V - voltage_V.mean()) / np.ptp(voltage_V)
-    beside = displacement_um - np.polyval(np.polyfit(place, displacement_um, 3), place)
-    parts = (beside[1:] + beside[:-1]) * np.diff(place)
-    return float(parts.sum() / (np.abs(parts).sum() + 1e-300))
-
-
-def _check(result: RESULTS) -> None:
-    if result == RESULTS.successful:
-        return
-    if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
-        raise FitError(FitStatus.MAX_STEPS)
-    raise FitError(FitStatus.NONFINITE)
 
 
 def _uncertainty(data: Data, found: Estimate) -> Uncertainty:

@@ -1,36 +1,27 @@
 """From slow and fast records to a whole fitted stage."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from fits._errors import DataError
-from fits._fit import LADDER, choose_grid
-from fits._prior import Hyper
+from fits._fit import LADDER
+from fits._fit_checks import remarks_on
+from fits._floor import misfits, worst
+from fits._noise import LOSSES
 from fits._record import Record, refuse_repeats
-from fits._result import FitError, FitStatus
-from fits._run import prepare_run, simulate_run
-from fits._stage_checks import compare_gains, refuse_slopes, refuse_unseen
+from fits._stage_checks import implausible, refuse_coarse
+from fits._stage_delay import own_up, take_out_delays
 from fits._stage_moments import Chain
 from fits._stage_result import StageFit
-from fits._stage_run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, simulate_stage
-from fits._stage_solve import LOSSES, Solved, solve_chain
-from fits._stage_start import measure_response, start_stages
+from fits._stage_run import gain_ahead, place_of_hysteresis, prepare_stage_run
+from fits._stage_solve import Solved
+from fits._stage_steps import Plan, Problem, refine_problem, start_problem
 from fits._stage_summary import summarise
-from fits._stage_uncertainty import Precision, offsets_out
+from fits._stage_uncertainty import Precision
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
-
-# Runs whose voltage moves less than this many times faster than that of the slowest are slow.
-_SLOW = 4.0
-# Intervals are divided until the error of the finite step moves no parameter by this many standard deviations.
-_BIAS = 0.15
-_FINEST = 16
-# Parts of the sampling interval below which a driver has no time constant, and from which it may find one again.
-_ASLEEP, _WAKE = 1e-2, 0.3
 
 
 def default_stage(hold: Hold = "first") -> Stage:
@@ -117,8 +108,17 @@ def fit_stage(
     settings = before, 1.0, found.solved.runs[-1].samples.stride, gain_ahead(found.stage), found.stage.hold
     held = [prepare_stage_run(record, found.range_V, *settings) for record in aside]
     summary = summarise(found.stage, chain.coordinates, found.solved, found.precision, held)
+    runs, sources = found.solved.runs, [record.source for record in records]
+    known = [one.residual_um for one in found.solved.sums], [run.fitted for run in runs]
+    left = misfits(records, *known)
+    refuse_coarse(found.stage, runs, left)
+    undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
+    if undelayed is not None:
+        summary = own_up(summary, chain, undelayed)
+    odd = remarks_on(records, *known, robust=loss == "huber")
+    odd += implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
     notes = [warning for record in (*records, *aside) for warning in record.warnings]
-    return replace(summary, remarks=(*notes, *found.remarks, *summary.remarks))
+    return replace(summary, misfit=worst(left), remarks=(*odd, *notes, *found.remarks, *summary.remarks))
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,8 @@ class Solution:
         Range of the commands.
     remarks
         What the user should know, one sentence each.
+    plan, problem
+        What was asked for, and where the fit began.
     """
 
     stage: Stage
@@ -150,6 +152,8 @@ class Solution:
     stroke_um: float
     range_V: tuple[float, float]
     remarks: tuple[str, ...]
+    plan: Plan
+    problem: Problem
 
 
 def solve_stage(
@@ -190,160 +194,12 @@ def solve_stage(
             "the stage holds its command in steps, which is fitted only with a driver ahead of the hysteresis: "
             "insert one, or use hold='first'"
         )
-    plan = _Plan(
+    plan = Plan(
         tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, anyway
     )
-    problem = _start(plan, stage, levels, finest)
-    problem, solved, precision = _refine(plan, problem)
+    problem = start_problem(plan, stage, levels, finest)
+    problem, solved, precision = refine_problem(plan, problem)
     fitted = problem.at(solved)
-    return Solution(fitted, problem.chain, solved, precision, problem.stroke_um, range_V, problem.remarks)
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """What was asked for."""
-
-    records: tuple[Record, ...]
-    states: tuple[str, ...]
-    fraction: float
-    range_V: tuple[float, float]
-    loss: str
-    progress: Callable[[str], None]
-    gain: float | None
-    hold: Hold
-    anyway: bool
-
-    def runs(self, stride: int) -> list[StageRun]:
-        """The records, each interval divided into so many steps."""
-        return [
-            prepare_stage_run(record, self.range_V, state, self.fraction, stride, self.gain, self.hold)
-            for record, state in zip(self.records, self.states, strict=True)
-        ]
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """A stage to be fitted, and where its fit begins."""
-
-    stage: Stage
-    chain: Chain
-    z: np.ndarray
-    columns_um: np.ndarray
-    hyper: Hyper | None
-    stroke_um: float
-    remarks: tuple[str, ...]
-
-    def at(self, solved: Solved) -> Stage:
-        """The stage that a solution stands for."""
-        return self.chain.stage(jnp.asarray(solved.z), jnp.asarray(solved.columns_um))
-
-
-def _start(plan: _Plan, stage: Stage, levels: int | None, finest: int) -> _Problem:
-    """Read a hysteresis off the slow runs and poles off the others."""
-    speed = [_speed_Hz(record) for record in plan.records]
-    slow = [k for k, one in enumerate(speed) if one <= _SLOW * min(speed)]
-    place = place_of_hysteresis(stage)
-    law = None if place is None else stage.parts[place]
-    grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
-    drives = [record.voltage_V for record in plan.records]
-    name = stage.names[place or 0]
-    if isinstance(law, Preisach) and isinstance(law.density, GridDensity) and name not in stage.frozen:
-        refuse_slopes([plan.records[k] for k in slow])
-        loose = [stage.named(row.path) for row in offsets_out(stage, True).table if row.path.endswith(".gain")]
-        if loose:
-            raise DataError(
-                f"{', '.join(loose)} and the weights of {name} are both free, but only their product is seen, "
-                f"not each: freeze {loose[0]}, or the {name}"
-            )
-        assert plan.gain is not None
-        lower, upper = plan.gain * plan.range_V[0], plan.gain * plan.range_V[1]
-        runs = [
-            prepare_run(replace(record, voltage_V=plan.gain * record.voltage_V), lower, upper, state, plan.fraction)
-            for record, state in zip(plan.records, plan.states, strict=True)
-        ]
-        plan.progress(f"hysteresis from {', '.join(plan.records[k].source for k in slow)}")
-        stroke, tried, _ = choose_grid([runs[k] for k in slow], levels, plan.progress, finest)
-        grid, hyper = tried.data.grid, tried.solution.hyper
-        columns = np.asarray(tried.solution.columns) * stroke
-        law = grid.model(columns, np.zeros(()))
-        stage = stage.swap(name, law)
-        drives = [simulate_run(law, run) for run in runs]
-    elif law is not None:
-        drives = [np.asarray(law(jnp.asarray(record.voltage_V))) for record in plan.records]  # type: ignore[operator]
-    runs_at_rate = plan.runs(1)
-    lively = [k for k in range(len(plan.records)) if k not in slow] or slow
-    responses = [measure_response(runs_at_rate[k], drives[k]) for k in lively]
-    candidates = start_stages(stage, responses)
-    place = place if grid is not None else None
-    best: tuple[float, Stage, Chain, Solved] | None = None
-    failure = FitError(FitStatus.NONFINITE)
-    for number, candidate in enumerate(candidates):
-        plan.progress(f"poles: start {number + 1} of {len(candidates)}")
-        chain = Chain(offsets_out(candidate, grid is not None), place, grid)
-        z = np.asarray(chain.coordinates.of(candidate))
-        try:
-            solved = solve_chain(chain, z, columns, runs_at_rate, None, stroke, plan.loss, plan.progress, rough=True)
-        except FitError as error:
-            failure = error
-            continue
-        cost = solved.cost
-        if best is None or cost < best[0]:
-            best = cost, candidate, chain, solved
-    if best is None:
-        raise failure
-    _, stage, chain, solved = best
-    found = chain.stage(jnp.asarray(solved.z), jnp.asarray(columns))
-    refuse_unseen(found, chain.coordinates, solved, drives, fast=lively != slow)
-    remarks = compare_gains(found, runs_at_rate)
-    return _Problem(stage, chain, solved.z, columns, hyper, stroke, tuple(remarks))
-
-
-def _speed_Hz(record: Record) -> float:
-    """Frequency of a sine that moves as fast as a voltage does, for its size."""
-    rate = np.diff(record.voltage_V) / np.diff(record.time_s)
-    size = float(np.std(record.voltage_V))
-    if size == 0:
-        raise DataError(f"{record.source}: the voltage does not move; there is nothing to fit")
-    return float(np.sqrt(np.mean(rate**2))) / (2 * np.pi * size)
-
-
-def _refine(plan: _Plan, problem: _Problem) -> tuple[_Problem, Solved, Precision]:
-    """Fit, and fit again with the intervals divided if the finite step moves a parameter noticeably."""
-    stride = 1
-    while True:
-        runs = plan.runs(stride)
-        start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
-        solved = solve_chain(problem.chain, *start, plan.loss, plan.progress, anyway=plan.anyway)
-        problem = replace(problem, z=solved.z, columns_um=solved.columns_um, hyper=solved.hyper)
-        precision = Precision(problem.chain, solved, problem.stroke_um)
-        if plan.gain is None or stride > 1:
-            return problem, solved, precision
-        influence, stage = precision.influence(), problem.at(solved)
-        sd = np.sqrt(np.diagonal(precision.covariance(influence)))
-        off = [simulate_stage(stage, a) - simulate_stage(stage, b) for a, b in zip(runs, plan.runs(2), strict=True)]
-        moved = [own @ (o - o[run.fitted].mean()) for own, o, run in zip(influence, off, runs, strict=True)]
-        # Halving the step takes three quarters of its error off, which falls with its square.
-        excess = float(np.max(np.abs(np.sum(moved, axis=0)) / sd)) / (0.75 * _BIAS)
-        if excess <= 1:
-            return problem, solved, precision
-        stride = min(_FINEST, 2 ** math.ceil(math.log2(excess) / 2))
-        plan.progress(f"{stride} steps per sample")
-        problem = replace(problem, z=_awake(plan, problem, solved))
-
-
-def _awake(plan: _Plan, problem: _Problem, solved: Solved) -> np.ndarray:
-    """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
-
-    A command that jumps at every sample has all of the driver's answer between two: whole steps do not see it, and
-    from no time constant at all there is no way back.
-    """
-    stage = problem.at(solved)
-    interval_s = min(float(np.median(np.diff(record.time_s))) for record in plan.records)
-    changed = False
-    for name, part in zip(stage.names, stage.parts, strict=True):
-        if isinstance(part, Driver) and float(part.time_constant_s) < _ASLEEP * interval_s:
-            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_WAKE * interval_s)))
-            changed = True
-    if plan.hold != "zero" or not changed:
-        return solved.z
-    return np.asarray(problem.chain.coordinates.of(stage))
+    return Solution(
+        fitted, problem.chain, solved, precision, problem.stroke_um, range_V, problem.remarks, plan, problem
+    )

@@ -31,6 +31,8 @@ _ATOL = 1e-6
 _STEPS = 500
 # Steps per column where one column at a time is bounded or let go.
 _TURNS = 30
+# More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
+_SLOWLY = 1100
 # At least this many columns are bounded at first.
 _FEW = 64
 
@@ -119,11 +121,13 @@ def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
 def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
     precision = np.asarray(belief.precision)
+    over: Any = RESULTS.nonlinear_max_steps_reached
+    if len(precision) > _SLOWLY:
+        return jnp.maximum(belief.mean, 0), over
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
     done: Any = RESULTS.successful
-    over: Any = RESULTS.nonlinear_max_steps_reached
     try:
         columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_TURNS * len(scale))
     except RuntimeError:
@@ -238,13 +242,24 @@ def cross_validate(
         belief = posterior(rest.scaled(1 / correlation, stroke_um), rough, hyper)
         columns = np.asarray(belief.mean if basis is None else basis @ belief.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
-        errors = [(run.displacement_um - simulate_run(model, run))[label == number] for run, label in pairs]
-        off = [error for error in errors if len(error)]
-        squares += sum(float(np.sum((o - o.mean()) ** 2)) for o in off)
+        # A short run may have no sample in a block.
+        off = [
+            _weighed_off(run, run.displacement_um - simulate_run(model, run), label == number)
+            for run, label in pairs
+            if np.any(label == number)
+        ]
+        squares += sum(float(np.sum(o**2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)
         expected += float(_expected_square(belief, block)) * stroke_um**2
         count += float(block.count)
     return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
+
+
+def _weighed_off(run: Run, off_um: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Errors of some samples, without their mean, as large as they count."""
+    weight = None if run.weight is None else run.weight[samples]
+    centred = off_um - np.average(off_um[samples], weights=weight)
+    return np.asarray(run.weighed(centred)[samples])
 
 
 @eqx.filter_jit

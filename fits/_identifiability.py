@@ -39,8 +39,12 @@ def unseen_directions(information: np.ndarray, names: Sequence[str], relative: n
 
 
 def _sentence(direction: np.ndarray, names: Sequence[str]) -> str:
+    # A parameter at its bound does not move with its coordinate.
+    direction = np.where(np.isfinite(direction), direction, 0.0)
     size = np.abs(direction)
     moved = [k for k in np.argsort(-size, kind="stable") if size[k] > _FAINT * size.max()]
+    if not moved:
+        return f"some combination of {', '.join(names)} is not seen in these runs"
     if len(moved) == 1:
         return f"{names[moved[0]]} is not seen in these runs"
     exponents = direction[moved] / direction[moved[0]]

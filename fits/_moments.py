@@ -120,7 +120,13 @@ def gather(grid: Grid, runs: Sequence[Run]) -> Data:
     levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
     for run in runs:
         squeezed = compress(
-            run.record.voltage_V, run.displacement_um, run.anchor_V, run.rising, blocks_of(run), levels_V
+            run.record.voltage_V,
+            run.displacement_um,
+            run.anchor_V,
+            run.rising,
+            blocks_of(run),
+            levels_V,
+            run.weight,
         )
         sums = _sums(grid, squeezed, run.starts[0])
         for block, part in enumerate(sums):

@@ -5,6 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import fft
 
+# Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
+_HUBER = 1.345
+LOSSES = ("squares", "huber")
 # Sokal's window: sum the correlations up to this many correlation times.
 _WINDOW = 5.0
 
@@ -57,3 +60,12 @@ def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     lag = np.arange(1, longest)
     inside = np.flatnonzero(lag >= _WINDOW * time)
     return float(max(1.0, time[inside[0]] if len(inside) else time.max(initial=1.0)))
+
+
+def huber_weight(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+    """Weigh samples by what they leave, shape `(n,)`: outliers count linearly (Huber)."""
+    left = residual_um[fitted]
+    middle = float(np.median(left))
+    # The median absolute deviation is not moved by the outliers themselves.
+    spread = 1.4826 * float(np.median(np.abs(left - middle))) + 1e-300
+    return np.asarray(_HUBER / np.maximum(np.abs(residual_um - middle) / spread, _HUBER))

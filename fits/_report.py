@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from fits._floor import Misfit
 from fits._limits import ranges_json
 from fits._metrics import Errors
 from fits._result import FitResult, RunReport
@@ -33,11 +34,41 @@ def fit_report(result: FitResult) -> dict[str, Any]:
         "discrepancy_um": float(result.uncertainty.discrepancy_um),
         "smoothness": result.smoothness,
         "trials": [{"levels": trial.levels, "error_um": trial.error_um} for trial in result.trials],
+        "misfit": misfit_report(result.misfit),
         "in_sample": _errors(result.in_sample),
         "held_out": _errors(result.held_out),
         "runs": [_run(run) for run in result.runs],
         "remarks": list(result.remarks),
     }
+
+
+def misfit_report(misfit: Misfit | None) -> dict[str, Any] | None:
+    """Put how far a residual is from noise into JSON values."""
+    if misfit is None:
+        return None
+    return {
+        "source": misfit.source,
+        "residual_um": misfit.residual_um,
+        "share_pct": misfit.share_pct,
+        "noise_um": misfit.noise_um,
+        "noise_shown_by": misfit.shown_by,
+        "times_noise": misfit.times_noise,
+        "far": misfit.far,
+    }
+
+
+def describe_misfit(misfit: Mapping[str, Any] | None) -> list[str]:
+    """Say first how far a residual is from noise; nothing of models that were written before it was looked at."""
+    if misfit is None:
+        return []
+    figures = (
+        f"{misfit['residual_um']:.4g} um rms in {misfit['source']}, {misfit['share_pct']:.3g} % of its stroke and "
+        f"{misfit['times_noise']:.3g} times the sensor's noise ({misfit['noise_um']:.3g} um, by "
+        f"{misfit['noise_shown_by']})"
+    )
+    if not misfit["far"]:
+        return [f"left over      {figures}", ""]
+    return [f"FAR FROM NOISE {figures}: the model misses something, and all below is no better than that", ""]
 
 
 def _errors(errors: Errors | None) -> dict[str, Any] | None:
@@ -71,6 +102,7 @@ def describe(report: Mapping[str, Any]) -> str:
     """Put a report into words: some twenty lines, without a newline at the end."""
     trials = report["trials"]
     lines = [
+        *describe_misfit(report.get("misfit")),
         f"density        {report['family']}, {report['levels']} levels from {report['lower_V']:g} to "
         f"{report['upper_V']:g} V",
         f"levels tried   {_joined(trials, 'levels', 'd')}",
@@ -120,6 +152,13 @@ def _verdict(report: Mapping[str, Any]) -> str:
     if held_out is None:
         return "Nothing was held out, so how well new voltages are predicted was not seen."
     ratio = held_out["rms_um"] / max(in_sample["rms_um"], 1e-300)
+    misfit = report.get("misfit")
+    if ratio <= _EQUAL and misfit is not None and misfit["far"]:
+        return (
+            f"Samples that the fit never saw are off by {held_out['e_rms_pct']:.3g} % of the range, those it did by "
+            f"{in_sample['e_rms_pct']:.3g} %, where noise alone would leave "
+            f"{100 * misfit['noise_um'] / in_sample['range_um']:.2g} %: the model misses the same in both."
+        )
     if ratio <= _EQUAL:
         return "Samples that the fit never saw are predicted as well as those it did."
     return (

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits._errors import DataError
+from fits._floor import Misfit
 from fits._limits import Ranges
 from fits._metrics import Errors
 from fits._record import Record
@@ -130,6 +131,8 @@ class FitResult:
         The resolutions tried, in order.
     runs
         One report per fitted run, then one per held-out record.
+    misfit
+        How far the residual of the run that is described worst is from noise.
     """
 
     model: Preisach
@@ -141,6 +144,7 @@ class FitResult:
     smoothness: float
     trials: tuple[LevelTrial, ...]
     runs: tuple[RunReport, ...]
+    misfit: Misfit | None = None
 
     @property
     def weights_um(self) -> Float[Array, "N N"]:

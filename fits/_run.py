@@ -42,6 +42,8 @@ class Run:
         Samples whose output does not depend on an unknown past, but for a constant, shape `(n,)`.
     fitted
         Samples that may be used for fitting: known and not held out, shape `(n,)`.
+    weight
+        Of each sample in the sum of squares, shape `(n,)`; None where all count alike.
     """
 
     record: Record
@@ -52,6 +54,11 @@ class Run:
     rising: np.ndarray
     known: np.ndarray
     fitted: np.ndarray
+    weight: np.ndarray | None = None
+
+    def weighed(self, residual_um: np.ndarray) -> np.ndarray:
+        """Make a residual as large as it counts, shape `(n,)`."""
+        return residual_um if self.weight is None else np.sqrt(self.weight) * residual_um
 
     @property
     def displacement_um(self) -> np.ndarray:

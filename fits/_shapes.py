@@ -178,7 +178,7 @@ def solve_shape(
     for number in range(_ROUNDS):
         progress(f"{family}: weighing the prior, round {number + 1} of {_ROUNDS}")
         model = coordinates(z)
-        off = [(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
+        off = [run.weighed(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
         off = [o - o.mean() for o in off]
         variance = sum(float(np.sum(o**2)) for o in off) / stroke_um**2 / max(count - determined, 1)
         correlation = correlation_samples(off)

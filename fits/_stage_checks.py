@@ -7,24 +7,33 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits._errors import DataError
+from fits._floor import Misfit
 from fits._noise import correlation_samples
 from fits._record import Record
 from fits._stage_run import StageRun, residual_of, simulate_stage
 from fits._stage_solve import Solved, marginal_information
-from microid import Coordinates, Mechanics, Stage
+from microid import Coordinates, Driver, Mechanics, Stage
 
 # Gains that differ by more than this are not those of one rig, and by more than that are worth a remark.
 _REFUSED, _REMARKED = 0.1, 0.05
 # A resonance above this fraction of the sampling rate is hardly told from its mirror image.
 _HIGHEST = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
-_UNSEEN, _LOST = 0.5, 5.0
+UNSEEN, _LOST = 0.5, 5.0
 # Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
-_WORTH = 40.0
+WORTH = 40.0
 # A run that leaves so many times what the quietest leaves moves in ways that its samples do not show.
 _LOUD = 3.0
 # Ranges of voltage that differ by less than this, as a fraction, are alike.
 _ALIKE = 0.05
+# And speeds that differ by less than this factor.
+_SAME_SPEED = 1.5
+# Rates beyond so many times the resonance show it well.
+_FINELY = 5.0
+# Share of a command's speed in the upper half of the band from which on it is not sampled finely.
+_UPPER = 0.1
+# Poles that piezo stages have, from slow macro stages and weak amplifiers to small ones with strong ones.
+_USUAL = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
 _POLES = ("time_constant_s", "natural_frequency_Hz")
 
 
@@ -37,15 +46,26 @@ def refuse_slopes(records: Sequence[Record]) -> None:
         If they cannot be of one rig.
     """
     spans = [
-        (float(np.ptp(record.voltage_V)), float(np.ptp(record.displacement_um)), record.source)
+        (float(np.ptp(record.voltage_V)), float(np.ptp(record.displacement_um)), speed_Hz(record), record.source)
         for record in records
         if record.displacement_um is not None
     ]
-    widest = max(span for span, _, _ in spans)
-    full = [(moved / span, source) for span, moved, source in spans if span > (1 - _ALIKE) * widest]
-    (low, other), (high, one) = min(full), max(full)
-    if high > (1 + _REFUSED) * low:
-        raise DataError(_not_one_rig(one, other, high / low))
+    widest = max(span for span, _, _, _ in spans)
+    full = [(moved / span, speed, source) for span, moved, speed, source in spans if span > (1 - _ALIKE) * widest]
+    for high, fast, one in full:
+        for low, slow, other in full:
+            # What is faster may move less far because of the dynamics, which are not known yet.
+            if high > (1 + _REFUSED) * low and max(fast, slow) < _SAME_SPEED * min(fast, slow):
+                raise DataError(_not_one_rig(one, other, high / low))
+
+
+def speed_Hz(record: Record) -> float:
+    """Frequency of a sine that moves as fast as a voltage does, for its size; a `DataError` if it does not move."""
+    rate = np.diff(record.voltage_V) / np.diff(record.time_s)
+    size = float(np.std(record.voltage_V))
+    if size == 0:
+        raise DataError(f"{record.source}: the voltage does not move; there is nothing to fit")
+    return float(np.sqrt(np.mean(rate**2))) / (2 * np.pi * size)
 
 
 def _not_one_rig(one: str, other: str, ratio: float) -> str:
@@ -57,8 +77,13 @@ def _not_one_rig(one: str, other: str, ratio: float) -> str:
 
 
 def refuse_unseen(
-    stage: Stage, coordinates: Coordinates[Stage], solved: Solved, drives: Sequence[np.ndarray], fast: bool
-) -> None:
+    stage: Stage,
+    coordinates: Coordinates[Stage],
+    solved: Solved,
+    drives: Sequence[np.ndarray],
+    fast: bool,
+    spare: bool = False,
+) -> str | None:
     """Refuse runs that do not show the dynamics they are fitted with.
 
     Parameters
@@ -71,6 +96,13 @@ def refuse_unseen(
         What the hysteresis alone would give, for each run, shape `(n,)`.
     fast
         Whether a run is faster than the others.
+    spare
+        Whether a mechanics may be left out where a driver alone may do.
+
+    Returns
+    -------
+    str or None
+        Name of a mechanics that the runs do not show, though they are sampled finely enough: leave it out.
 
     Raises
     ------
@@ -84,17 +116,29 @@ def refuse_unseen(
     names = _names(stage, coordinates)
     poles = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _POLES]
     if not poles:
-        return
+        return None
     spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     # At a bound the slope vanishes, however far the coordinate may run.
-    blurred = [names[k] for k in poles if spread[k] * slope[k] > _UNSEEN or spread[k] > _LOST]
+    blurred = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > _LOST]
     sources = ", ".join(run.record.source for run in solved.runs)
+    fastest = max(solved.runs, key=lambda run: run.rate_Hz)
+    mechanics = [
+        (name, float(part.natural_frequency_Hz))
+        for name, part in zip(stage.names, stage.parts, strict=True)
+        if isinstance(part, Mechanics)
+    ]
+    beyond = [(name, value) for name, value in mechanics if value > _HIGHEST * fastest.rate_Hz]
+    seen = gained(solved, drives) >= WORTH
+    some = bool(blurred) and (len(blurred) == len(poles) or not fast)
+    driven = any(isinstance(part, Driver) for part in stage.parts)
+    if spare and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
+        return (beyond or mechanics)[0][0]
     if blurred and not fast and len(blurred) < len(poles):
         raise DataError(
             f"{sources}: these runs are all about as slow, and do not show {', '.join(blurred)}; add a run with "
             "steps, a chirp or a multisine that goes beyond the resonance"
         )
-    if len(blurred) == len(poles) or _gained(solved, drives) < _WORTH:
+    if len(blurred) == len(poles) or not seen:
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
         if noise[loudest] > _LOUD * min(noise):
@@ -112,18 +156,67 @@ def refuse_unseen(
             "resonance, check that voltage and displacement are not exchanged, or fit the hysteresis alone with "
             "--model loop"
         )
-    fastest = max(solved.runs, key=lambda run: run.rate_Hz)
+    if beyond:
+        raise DataError(
+            f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, and what moves there is explained best "
+            "by a resonance beyond half of that, so these runs do not show where it is: sample at 5 times the "
+            "resonance or more, or fit the hysteresis alone with --model loop"
+        )
+    return None
+
+
+def refuse_coarse(stage: Stage, runs: Sequence[StageRun], left: Sequence[Misfit]) -> None:
+    """Refuse a fitted resonance that the runs cannot show: they are sampled too slowly for it, and leave much.
+
+    Raises
+    ------
+    DataError
+        If they are.
+    """
+    finest = max(run.rate_Hz for run in runs)
     for part in stage.parts:
-        if isinstance(part, Mechanics) and float(part.natural_frequency_Hz) > _HIGHEST * fastest.rate_Hz:
-            raise DataError(
-                f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, expected a rate well above twice the "
-                f"resonance, which seems to lie near {float(part.natural_frequency_Hz):.3g} Hz or beyond: sample at "
-                "5 times the resonance or more, or fit the hysteresis alone with --model loop"
-            )
+        if not isinstance(part, Mechanics):
+            continue
+        resonance = float(part.natural_frequency_Hz)
+        for run, one in zip(runs, left, strict=True):
+            blind = _HIGHEST * finest < resonance
+            where = "far beyond" if resonance > 2 * run.rate_Hz else f"near {resonance:.3g} Hz"
+            if one.far and (blind or (run.rate_Hz < _FINELY * resonance and not _resolved(run))):
+                raise DataError(
+                    f"{one.source}: sampled at {run.rate_Hz:.4g} Hz, which is too slow for what moves in it: "
+                    f"{one.share_pct:.3g} % of its stroke stay unexplained, {one.times_noise:.3g} times the sensor's "
+                    f"noise, and the resonance would lie {where}; sample at 5 times the resonance or more, or fit "
+                    "the hysteresis alone with --model loop"
+                )
 
 
-def _gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:
-    """Twice the logarithm of how much likelier the poles make the run that shows them best.
+def _resolved(run: StageRun) -> bool:
+    """Whether the command is sampled so finely that little of it lies in the upper half of the band."""
+    voltage = run.record.voltage_V
+    # By differences, so that a slow motion of large amplitude does not hide what is fast.
+    change = np.diff(voltage)
+    power = np.abs(np.fft.rfft((change - change.mean()) * np.hanning(len(change)))) ** 2
+    return float(power[len(power) // 2 :].sum()) < _UPPER * float(power.sum())
+
+
+def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> list[str]:
+    """Remark on poles that no piezo stage has: the time is probably in another unit."""
+    for name, value in zip(names, values, strict=True):
+        field = name.rpartition(".")[2]
+        low, high = _USUAL.get(field, (-np.inf, np.inf))
+        if low <= value <= high:
+            continue
+        unit = "Hz" if field.endswith("_Hz") else "s"
+        return [
+            f"{', '.join(sources)}: {name} comes out as {value:.3g} {unit}, where piezo stages have {low:g} to "
+            f"{high:g} {unit}: the time is probably in another unit than its column says, for example in ms instead "
+            "of s; name the right one as in --columns time_s=time_ms"
+        ]
+    return []
+
+
+def gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:
+    """Twice the logarithm of how much likelier poles make the run that shows them best.
 
     Slow runs may become less likely: the hysteresis read off them has taken in the driver's lag, which now counts
     twice.

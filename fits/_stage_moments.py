@@ -234,8 +234,7 @@ def pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> It
     """
     samples, grid, n = run.samples, chain.grid, len(run.record)
     if grid is None or chain.place is None or not free:
-        for first in range(0, n, _PIECE):
-            yield first, np.zeros((min(_PIECE, n - first), 0))
+        yield from ((first, np.zeros((min(_PIECE, n - first), 0))) for first in range(0, n, _PIECE))
         return
     voltage, system = _before_and_after(chain.coordinates, chain.place, z, samples)
     table = jnp.asarray(branch_table(grid.levels))
@@ -269,11 +268,14 @@ class Weighing:
         Samples of each run that are worth one independent one.
     counted
         The same, as its samples are counted.
+    even
+        No run counts as quieter than this part of the loudest.
     """
 
     noise_um: tuple[float, ...]
     correlation: tuple[float, ...]
     counted: tuple[float, ...]
+    even: float = 0.0
 
     @classmethod
     def of(cls, runs: Sequence[StageRun], residuals: Sequence[np.ndarray], *counted: float) -> "Weighing":
@@ -295,24 +297,26 @@ class Weighing:
     @property
     def least_um(self) -> float:
         """The smallest noise, in which the joint problem is measured."""
-        return min(self.noise_um)
+        return min(self._believed_um)
+
+    @property
+    def _believed_um(self) -> list[float]:
+        return [max(noise, self.even * max(self.noise_um)) for noise in self.noise_um]
 
     @property
     def shares(self) -> list[float]:
         """Independent samples of the quietest run that a sample of each run is worth."""
-        return [(self.least_um / noise) ** 2 / each for noise, each in zip(self.noise_um, self.counted, strict=True)]
+        return [(self.least_um / um) ** 2 / each for um, each in zip(self._believed_um, self.counted, strict=True)]
 
     def total(self, sums: Sequence[RunSums]) -> Moments:
         """Moments of all runs."""
-        scaled = [one.moments.scaled(share, 1.0) for one, share in zip(sums, self.shares, strict=True)]
-        return sum(scaled[1:], start=scaled[0])
+        first, *more = (one.moments.scaled(share, 1.0) for one, share in zip(sums, self.shares, strict=True))
+        return sum(more, start=first)
 
     def cost_um2(self, runs: Sequence[StageRun], residuals: Sequence[np.ndarray]) -> float:
         """Sum of squares that goes with `total`."""
-        cost = 0.0
-        for run, residual, share in zip(runs, residuals, self.shares, strict=True):
-            cost += share * float(np.sum(np.asarray(run.samples.weight)[: len(residual)] * residual**2))
-        return cost
+        each = zip(runs, residuals, self.shares, strict=True)
+        return sum(s * float(np.sum(np.asarray(run.samples.weight)[: len(r)] * r**2)) for run, r, s in each)
 
 
 def split_moments(total: Moments, size: int, damping: float) -> tuple[Moments, np.ndarray, np.ndarray]:

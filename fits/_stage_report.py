@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fits._report import _colour, _errors, _loop, _row, _run, _verdict
+from fits._report import _colour, _errors, _loop, _row, _run, _verdict, describe_misfit, misfit_report
 from fits._stage_result import StageFit
 from fits._stage_run import place_of_hysteresis
 from microid import Preisach
@@ -53,6 +53,7 @@ def stage_report(result: StageFit) -> dict[str, Any]:
         ],
         "correlation": [[_finite(value) for value in row] for row in np.asarray(result.correlation)],
         "unseen": list(result.unseen),
+        "misfit": misfit_report(result.misfit),
         "discrepancy_um": float(result.uncertainty.discrepancy_um),
         "in_sample": _errors(result.in_sample),
         "held_out": _errors(result.held_out),
@@ -68,7 +69,7 @@ def _finite(value: float) -> float | None:
 def describe_stage(report: Mapping[str, Any]) -> str:
     """Put a report from `stage_report` into words: some thirty lines, without a newline at the end."""
     chain = ", ".join(f"{part['name']} ({part['type']})" for part in report["parts"])
-    lines = [f"stage          {chain}"]
+    lines = [*describe_misfit(report.get("misfit")), f"stage          {chain}"]
     if report["family"] is not None:
         lines.append(
             f"density        {report['family']}, {report['levels']} levels from {report['lower_V']:g} to "

@@ -7,6 +7,7 @@ import numpy as np
 
 from fits._columns import PATH, columns_beside
 from fits._errors import DataError
+from fits._floor import Misfit
 from fits._metrics import Errors
 from fits._record import Record
 from fits._result import FitStatus, Prediction, RunReport, pool, refuse_outside
@@ -75,6 +76,8 @@ class StageFit:
         Steps into which each interval of each run was divided.
     runs
         One report per fitted run, then one per held-out record.
+    misfit
+        How far the residual of the run that is described worst is from noise.
     """
 
     model: Stage
@@ -88,6 +91,7 @@ class StageFit:
     correlation_samples: tuple[float, ...]
     substeps: tuple[int, ...]
     runs: tuple[RunReport, ...]
+    misfit: Misfit | None = None
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         for parameter in self.parameters:

@@ -1,7 +1,7 @@
 """Fitting a whole stage: damped Gauss-Newton steps, the columns of the hysteresis solved for exactly in each."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +9,7 @@ import optimistix as optx
 
 from fits._grid import solve_grid
 from fits._moments import Data, Moments
+from fits._noise import huber_weight
 from fits._prior import Hyper, roughness
 from fits._result import FitError, FitStatus
 from fits._stage_moments import Chain, RunSums, Weighing, run_sums, split_moments
@@ -21,9 +22,6 @@ _DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
 _STATIONARY = 0.02
 # Variance of the noise below which, in squares of the stroke, all is rounding.
 _ROUNDING = 1e-20
-# Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
-_HUBER = 1.345
-LOSSES = ("squares", "huber")
 
 
 @dataclass(frozen=True)
@@ -74,6 +72,7 @@ def solve_chain(
     progress: Callable[[str], None],
     rough: bool = False,
     anyway: bool = False,
+    even: float = 0.0,
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
@@ -101,6 +100,9 @@ def solve_chain(
         Whether the place found is only a start for another fit, so that it need not be stationary.
     anyway
         Whether the best place is an answer, too, if it does not become stationary: for those who go on from there.
+    even
+        No run counts as quieter than this part of the loudest. Where more than noise is left, one run would otherwise
+        be fitted ever better, and so count for ever more, at the cost of the others.
 
     Raises
     ------
@@ -110,7 +112,7 @@ def solve_chain(
     damping = _DAMPING
     counted: tuple[float, ...] = ()
     for number in range(_ROUGH if rough else _ROUNDS):
-        runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted)
+        runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
@@ -154,7 +156,7 @@ def solve_chain(
             counted = weighing.correlation
             continue
         if distance < _STATIONARY:
-            runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted)
+            runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
             return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
     if rough or anyway:
         return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
@@ -185,12 +187,13 @@ def _gather(
     loss: str,
     free: bool,
     counted: tuple[float, ...],
+    even: float,
 ) -> tuple[Sequence[StageRun], list[RunSums], Weighing]:
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
         runs = [robust(run, residual) for run, residual in zip(runs, left, strict=True)]
     sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
-    return runs, sums, Weighing.of(runs, [one.residual_um for one in sums], *counted)
+    return runs, sums, replace(Weighing.of(runs, [one.residual_um for one in sums], *counted), even=even)
 
 
 def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun]) -> list[np.ndarray]:
@@ -200,11 +203,7 @@ def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequen
 
 def robust(run: StageRun, residual_um: np.ndarray) -> StageRun:
     """Weigh a run's samples by what they leave: outliers count linearly (Huber)."""
-    left = residual_um[run.fitted]
-    middle = float(np.median(left))
-    # The median absolute deviation is not moved by the outliers themselves.
-    spread = 1.4826 * float(np.median(np.abs(left - middle))) + 1e-300
-    return run.weighted(_HUBER / np.maximum(np.abs(residual_um - middle) / spread, _HUBER))
+    return run.weighted(huber_weight(residual_um, run.fitted))
 
 
 def _step(

@@ -1,7 +1,7 @@
 """Where the fit of a stage begins: poles read off a measured frequency response, so that nobody has to guess them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -131,6 +131,24 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
     return [problem.applied(stage, moved, x) for x in [*ends, *best]]
 
 
+def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) -> list[float]:
+    """Order delays by how well some poles of a stage and the delay explain a measured response, the best first.
+
+    Of neighbours only the best is kept.
+    """
+    parts = [part for part in stage.parts if isinstance(part, Driver | Mechanics)]
+    if not parts or len(response.frequency_Hz) < _LINES:
+        return []
+    problem = _LogResponse.of([response], [isinstance(part, Driver) for part in parts], [])
+    costs = []
+    for shift in shifts_s:
+        turned = problem.measured * np.exp(2j * np.pi * problem.frequency_Hz * shift)
+        costs.append(replace(problem, measured=turned).least())
+    cost = np.asarray(costs)
+    low = np.flatnonzero((cost <= np.r_[np.inf, cost[:-1]]) & (cost <= np.r_[cost[1:], np.inf]))
+    return [float(shifts_s[k]) for k in low[np.argsort(cost[low])]]
+
+
 def _distinct(points: Sequence[np.ndarray], apart: float) -> list[np.ndarray]:
     kept: list[np.ndarray] = []
     for point in points:
@@ -203,8 +221,15 @@ class _LogResponse:
         pairs = [pair for one in self.drivers for pair in (driver if one else mechanics)]
         return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
 
+    def least(self) -> float:
+        """Misfit of the best candidate."""
+        return float(self._ranked()[0][0])
+
     def candidates(self) -> list[np.ndarray]:
         """All combinations of some poles for each part, the best first."""
+        return list(self._ranked()[1])
+
+    def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
         low, high = float(self.frequency_Hz.min()), float(self.frequency_Hz.max())
         size = np.abs(self.measured) * np.minimum(self.weight, 1)
         peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] > size[2:])) + 1
@@ -218,7 +243,8 @@ class _LogResponse:
             inverse = (inverse[:, None] * self._inverse(more)[None]).reshape(-1, inverse.shape[1])
             points = np.concatenate([np.repeat(points, len(more), axis=0), np.tile(more, (len(points), 1))], axis=1)
         cost = np.sum(np.abs(self._off(inverse)) ** 2, axis=1)
-        return list(points[np.argsort(cost)])
+        order = np.argsort(cost)
+        return cost[order], points[order]
 
     def exchanged(self, x: np.ndarray) -> list[np.ndarray]:
         """The same poles in other places: a response does not tell which real pole lies ahead of the hysteresis."""

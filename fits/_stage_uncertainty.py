@@ -152,7 +152,7 @@ class Precision:
         held = answer[:size].T @ self.prior[:size, :size] @ answer[:size] + _FAINT * answer[size:].T @ answer[size:]
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
             weight = np.asarray(run.samples.weight)[: len(run.record)]
-            held = held + _sandwich(own, np.sqrt(weight) * one.residual_um, run.fitted)
+            held = held + sandwich(own, np.sqrt(weight) * one.residual_um, run.fitted)
         return held
 
     def uncertainty(self) -> StageUncertainty:
@@ -181,7 +181,7 @@ class Precision:
         return list(zip(self.solved.sums, self.solved.runs, strict=True))
 
 
-def _sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """Covariance of `influence @ noise`, the noise having the autocovariance of a residual, shape `(p, p)`."""
     left = np.where(fitted, residual_um, 0.0)
     n = len(left)
