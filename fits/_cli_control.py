@@ -18,7 +18,7 @@ from fits._control_make import Loop, Maker
 from fits._control_report import control_json, describe_control
 from fits._control_setup import Setup, setup
 from fits._draw_plants import draw_plants
-from fits._errors import DataError, ModelError
+from fits._errors import DataError
 from fits._file_set import file_set
 from fits._limits import check_command, joined, measured_ranges, reached_in
 from fits._model_file import load_model
@@ -96,7 +96,9 @@ def run_control(
         unfinished, drawings = files.file(out), files.folder(plots)
         try:
             ready = setup(plant, wanted, feedforward, initial=initial, limits_V=volts)
-        except ModelError as error:
+        except DataError as error:
+            if not error.of_model:
+                raise
             raise DataError(f"{model}: {error}") from error
         skipped = _skipped(wanted, ready, skip)
         count = plants or (_PLANTS if known else 1)

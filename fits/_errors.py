@@ -14,17 +14,21 @@ class DataError(ValueError):
 
     The `microid` command prints the sentence on stderr and exits with status 2. Of more than 1,000 characters the
     middle is left out: what was expected stands at the beginning, and what to do at the end.
+
+    Parameters
+    ----------
+    sentence
+        What is wrong.
+    of_model
+        Whether a model cannot do what is asked; the command names its file before the sentence.
     """
 
-    def __init__(self, sentence: object = "") -> None:
+    def __init__(self, sentence: object = "", *, of_model: bool = False) -> None:
+        self.of_model = of_model
         text = str(sentence)
         if len(text) > _SENTENCE:
             text = f"{text[: _SENTENCE - _END - 5]} ... {text[-_END:]}"
         super().__init__(text)
-
-
-class ModelError(DataError):
-    """A model that cannot do what is asked; the command names its file before the sentence."""
 
 
 def shown(found: Any) -> str:

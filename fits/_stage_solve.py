@@ -12,8 +12,9 @@ from fits._moments import Data, Moments
 from fits._noise import huber_weight
 from fits._prior import Hyper, roughness
 from fits._result import FitError, FitStatus
-from fits._stage_moments import Chain, RunSums, Weighing, run_sums, split_moments
+from fits._stage_moments import Chain, RunSums, run_sums, split_moments
 from fits._stage_run import StageRun, residual_of
+from fits._weighing import Weighing
 
 _ROUNDS, _ROUGH = 40, 12
 # Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.

@@ -338,15 +338,3 @@ def test_every_float_is_read_exactly(table, dialect):
 def test_pandas_is_imported_only_when_a_file_is_read():
     code = "import sys, fits._read_csv, fits._atomic; assert 'pandas' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
-
-
-def test_a_sensor_at_its_end_is_noticed(tmp_path):
-    time = np.arange(400) / 100
-    voltage = 50 - 50 * np.cos(time)
-    whole = 0.3 * voltage + 0.01 * np.sin(40 * time)
-    for displacement, lines in ((whole, None), (np.minimum(whole, 27.0), "largest, 27 um")):
-        path = tmp_path / "run.csv"
-        rows = [f"{t:.4f},{v:.6f},{d:.6f}" for t, v, d in zip(time, voltage, displacement, strict=True)]
-        path.write_text("\n".join(["time_s,voltage_V,displacement_um", *rows]) + "\n")
-        warnings = read_csv(path).warnings
-        assert [lines in warning for warning in warnings] == ([True] if lines else [])

@@ -109,3 +109,15 @@ def test_real_multi_run_files_are_split_where_the_message_says(tmp_path, name):
     record = read_csv(tmp_path / "a.csv", columns)
     assert (len(record), record.warnings) == (16384, ())
     assert set(record.extra) == {"realization", "period", "u2_V", "u3_V", "y2_um", "y3_um"}
+
+
+def test_a_sensor_at_its_end_is_noticed(tmp_path):
+    time = np.arange(400) / 100
+    voltage = 50 - 50 * np.cos(time)
+    whole = 0.3 * voltage + 0.01 * np.sin(40 * time)
+    for displacement, lines in ((whole, None), (np.minimum(whole, 27.0), "largest, 27 um")):
+        path = tmp_path / "run.csv"
+        rows = [f"{t:.4f},{v:.6f},{d:.6f}" for t, v, d in zip(time, voltage, displacement, strict=True)]
+        path.write_text("\n".join(["time_s,voltage_V,displacement_um", *rows]) + "\n")
+        warnings = read_csv(path).warnings
+        assert [lines in warning for warning in warnings] == ([True] if lines else [])
