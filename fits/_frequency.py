@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits._errors import DataError
-from fits._plausible import check_size
+from fits._plausible import SHORTEST_STEP_s, check_size
 from fits._table import data_error, open_table
 
 # A line is excited if the input reaches this share of its largest.
@@ -147,8 +147,10 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
         raise data_error(table.path, "expected two samples or more per realization, found one", table.header_line)
     steps = np.diff(values["time_s"].reshape(-1, periods * lengths[0]), axis=1)
     interval_s = float(np.mean(steps))
-    if not interval_s > 0 or np.max(np.abs(steps - interval_s)) > 0.01 * interval_s:
-        raise data_error(table.path, "expected even time steps; sample evenly", table.header_line, "time_s")
+    if not interval_s >= SHORTEST_STEP_s or np.max(np.abs(steps - interval_s)) > 0.01 * interval_s:
+        raise data_error(
+            table.path, "expected even time steps of 1e-12 s or more; sample evenly", table.header_line, "time_s"
+        )
     shape = (-1, periods, lengths[0])
     u, y = (np.stack([values[name].reshape(shape) for name in names], axis=-1) for names in (inputs, outputs))
     return Multisine(interval_s, u, y, os.path.basename(table.path))

@@ -313,9 +313,7 @@ def test_lines_are_counted_as_an_editor_does(tmp_path, above, within):
         assert f", line {lines.index('20,bad,0') + 1}, column 'voltage_V'" in message
 
 
-FLOATS = st.floats(-1e9, 1e9)
-# Steps of a millisecond or more: shorter ones are refused where double precision does not resolve them.
-TIMES = st.integers(-(10**12), 10**12).map(lambda count: count * 1e-3)
+FLOATS, TIMES = st.floats(-1e9, 1e9), st.integers(-(10**12), 10**12).map(lambda count: count * 1e-3)
 
 
 @settings(max_examples=100, deadline=None, database=None)

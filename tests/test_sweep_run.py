@@ -288,7 +288,7 @@ def test_the_command_refuses_in_one_sentence(finished, tmp_path, seed):
     refused(run("sweep", file, "--out", whole), "add --resume")
     (tmp_path / "other.toml").write_text(small(seed + 1))
     refused(run("sweep", tmp_path / "other.toml", "--out", whole, "--resume"), "another sweep")
-    refused(run("sweep", tmp_path / "none.toml", "--out", whole), "cannot be read")
+    refused(run("sweep", tmp_path / "none.toml", "--out", whole), "no such file")
     refused(run("sweep", "show", tmp_path), "there is no sweep")
     refused(run("sweep", file, "--out", file), "expected a folder")
     about = json.loads((whole / "about.json").read_text())
