@@ -210,10 +210,10 @@ def solve_stage(
     try:
         problem, solved, precision = refine_problem(plan, problem)
     except FitError as error:
+        if anyway:
+            raise
         # What the best place leaves may show why.
         failure = error
         problem, solved, precision = refine_problem(replace(plan, anyway=True), problem)
-    fitted = problem.at(solved)
-    return Solution(
-        fitted, problem.chain, solved, precision, problem.stroke_um, range_V, problem.remarks, plan, problem
-    )
+    place = problem.at(solved), problem.chain, solved, precision, problem.stroke_um, range_V
+    return Solution(*place, problem.remarks, plan, problem, failure)
