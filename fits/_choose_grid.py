@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from optimistix import RESULTS
+from scipy import signal
 
 from fits._design import Grid
 from fits._errors import DataError
@@ -31,6 +33,8 @@ _REWEIGHED = 8
 _WHITE = 1.2
 # Correlation of displacement with voltage below which there is no loop.
 _FOLLOWS = 0.3
+# Coherence from which on it follows all the same, and segments whose spectra are averaged.
+_COHERENT, _SEGMENTS = 0.3, 16
 # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
 _AHEAD = 0.5
 
@@ -130,6 +134,7 @@ def _stroke(run: Run) -> float:
         raise DataError(f"{run.record.source}: nothing moves in the samples to be fitted; hold out less")
     together = float(np.corrcoef(voltage, displacement)[0, 1])
     if abs(together) < _FOLLOWS:
+        _refuse_ringing(run)
         raise DataError(
             f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so "
             "there is no hysteresis loop to fit; check that --columns names the right ones"
@@ -145,6 +150,27 @@ def _stroke(run: Run) -> float:
             "behind: the two columns are exchanged; correct the header, or name them the other way with --columns"
         )
     return float(np.ptp(displacement))
+
+
+def _refuse_ringing(run: Run) -> None:
+    """Refuse a run whose displacement follows its voltage, but not at once."""
+    which = np.flatnonzero(run.fitted)
+    piece = slice(which[0], which[-1] + 1)
+    voltage, displacement = run.record.voltage_V[piece], run.displacement_um[piece]
+    rate_Hz = float(1 / np.median(np.diff(run.record.time_s[piece])))
+    settings: dict[str, Any] = {"fs": rate_Hz, "nperseg": max(len(voltage) // _SEGMENTS, 16)}
+    frequency, cross = signal.csd(voltage, displacement, **settings)
+    power, out = (signal.welch(one, **settings)[1] for one in (voltage, displacement))
+    shared = np.abs(cross) ** 2 / (power * out + 1e-300)
+    follows = float(np.average(shared, weights=power))
+    if follows < _COHERENT:
+        return
+    gain = np.where((shared > _COHERENT) & (power > np.median(power)), np.abs(cross) / (power + 1e-300), 0.0)
+    raise DataError(
+        f"{run.record.source}: the displacement follows the voltage (coherence {follows:.2f}), but not at once, and "
+        f"most at {frequency[np.argmax(gain)]:.4g} Hz: this run plays up to a resonance and beyond, and shows no "
+        "hysteresis loop; give a slow run over the whole range of the voltage, beside this one for --model stage"
+    )
 
 
 def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:

@@ -12,8 +12,9 @@ from fits._fit_checks import remarks_on
 from fits._floor import misfits, worst
 from fits._noise import LOSSES
 from fits._record import Record, refuse_repeats
+from fits._result import FitError
 from fits._stage_checks import implausible, refuse_coarse
-from fits._stage_delay import own_up, take_out_delays
+from fits._stage_delay import own_up, refuse_delays, take_out_delays
 from fits._stage_moments import Chain
 from fits._stage_result import StageFit
 from fits._stage_run import gain_ahead, place_of_hysteresis, prepare_stage_run
@@ -101,6 +102,15 @@ def fit_stage(
     """
     asked = stage, levels, holdout, initial, loss, progress
     found = solve_stage(records, *asked)
+    runs, sources = found.solved.runs, [record.source for record in records]
+    known = [one.residual_um for one in found.solved.sums], [run.fitted for run in runs]
+    left = misfits(records, *known)
+    progress("looking for delays")
+    refuse_coarse(found.stage, runs, left)
+    undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
+    if found.failure is not None:
+        refuse_delays(undelayed)
+        raise found.failure
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
     before = initial if isinstance(initial, str) else "unknown"
@@ -108,11 +118,6 @@ def fit_stage(
     settings = before, 1.0, found.solved.runs[-1].samples.stride, gain_ahead(found.stage), found.stage.hold
     held = [prepare_stage_run(record, found.range_V, *settings) for record in aside]
     summary = summarise(found.stage, chain.coordinates, found.solved, found.precision, held)
-    runs, sources = found.solved.runs, [record.source for record in records]
-    known = [one.residual_um for one in found.solved.sums], [run.fitted for run in runs]
-    left = misfits(records, *known)
-    refuse_coarse(found.stage, runs, left)
-    undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
     if undelayed is not None:
         summary = own_up(summary, chain, undelayed)
     odd = remarks_on(records, *known, robust=loss == "huber")
@@ -143,6 +148,8 @@ class Solution:
         What the user should know, one sentence each.
     plan, problem
         What was asked for, and where the fit began.
+    failure
+        Why this is only the best place that was found; None where the fit converged.
     """
 
     stage: Stage
@@ -154,6 +161,7 @@ class Solution:
     remarks: tuple[str, ...]
     plan: Plan
     problem: Problem
+    failure: FitError | None
 
 
 def solve_stage(
@@ -198,8 +206,14 @@ def solve_stage(
         tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, anyway
     )
     problem = start_problem(plan, stage, levels, finest)
-    problem, solved, precision = refine_problem(plan, problem)
-    fitted = problem.at(solved)
-    return Solution(
-        fitted, problem.chain, solved, precision, problem.stroke_um, range_V, problem.remarks, plan, problem
-    )
+    failure = None
+    try:
+        problem, solved, precision = refine_problem(plan, problem)
+    except FitError as error:
+        if anyway:
+            raise
+        # What the best place leaves may show why.
+        failure = error
+        problem, solved, precision = refine_problem(replace(plan, anyway=True), problem)
+    place = problem.at(solved), problem.chain, solved, precision, problem.stroke_um, range_V
+    return Solution(*place, problem.remarks, plan, problem, failure)

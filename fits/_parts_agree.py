@@ -212,8 +212,8 @@ def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
         f"{run.record.source}: something changed near sample {place + 1} ({run.record.time_s[place]:.6g} s): fitted "
         f"as one hysteresis the run leaves {100 * rms_um / stroke:.2g} % of its stroke, its parts before and after "
         f"{100 * split / stroke:.2g} %; after it the stage moves {ratio:.3g} times as far as before: two rigs or "
-        "settings, a sensor that jumped or stuck, or a part that came loose; split the file there, and fit the parts "
-        "apart"
+        "settings, a sensor that jumped or stuck, creep over a hold, or a part that came loose; split the file "
+        "there, and fit the parts apart"
     )
     return [sentence]
 

@@ -33,6 +33,9 @@ _NEAR, _MUCH = 2.0, 0.4
 _FAINT = 1e-8
 # Half the width of a 95 % interval, in standard deviations.
 _NORMAL = 1.959964
+_REMEDY = (
+    "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
+)
 # A delay ruins a fit where it moves a parameter by more than this part of it.
 _RUINED = 0.5
 
@@ -80,6 +83,10 @@ class Undelayed:
     delays: tuple[Delay, ...]
     solved: Solved
     precision: Precision
+
+    def words(self) -> str:
+        """Say what the columns of the runs look like."""
+        return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
 
 
 def take_out_delays(
@@ -159,6 +166,12 @@ def take_out_delays(
     return Undelayed(seen, found, sure)
 
 
+def refuse_delays(undelayed: Undelayed | None) -> None:
+    """Refuse runs whose delays kept a fit from an answer, in a `DataError`; nothing where there are none."""
+    if undelayed is not None:
+        raise DataError(f"{undelayed.words()}, and no fit was found with that: {_REMEDY}")
+
+
 def own_up(fit: StageFit, chain: Chain, undelayed: Undelayed) -> StageFit:
     """Name the delays of a fit, and widen the intervals by what they did to its parameters.
 
@@ -172,7 +185,7 @@ def own_up(fit: StageFit, chain: Chain, undelayed: Undelayed) -> StageFit:
     values, low, high = (
         np.asarray(chain.coordinates.values(jnp.asarray(z + sign * _NORMAL * sd))) for sign in (0.0, -1.0, 1.0)
     )
-    said = "; ".join(f"{one.run.record.source}: {one.words()}" for one in undelayed.delays)
+    said = undelayed.words()
     moved = [abs(v - p.value) for v, p in zip(values, fit.parameters, strict=True)]
     ruined = [
         f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
@@ -180,10 +193,7 @@ def own_up(fit: StageFit, chain: Chain, undelayed: Undelayed) -> StageFit:
         if m > _RUINED * min(abs(v), abs(p.value))
     ]
     if ruined:
-        raise DataError(
-            f"{said}, and {ruined[0]}: check which columns and time stamps belong together, shift the displacement "
-            "by as many lines, and fit again"
-        )
+        raise DataError(f"{said}, and {ruined[0]}: {_REMEDY}")
     parameters = tuple(
         replace(
             p,

@@ -52,16 +52,13 @@ class Weighing:
     @property
     def least_um(self) -> float:
         """The smallest noise, in which the joint problem is measured."""
-        return min(self._believed_um)
-
-    @property
-    def _believed_um(self) -> list[float]:
-        return [max(noise, self.even * max(self.noise_um)) for noise in self.noise_um]
+        return max(min(self.noise_um), self.even * max(self.noise_um))
 
     @property
     def shares(self) -> list[float]:
         """Independent samples of the quietest run that a sample of each run is worth."""
-        return [(self.least_um / um) ** 2 / each for um, each in zip(self._believed_um, self.counted, strict=True)]
+        noises = zip(self.noise_um, self.counted, strict=True)
+        return [(self.least_um / max(um, self.least_um)) ** 2 / each for um, each in noises]
 
     def total(self, sums: Sequence[RunSums]) -> Moments:
         """Moments of all runs."""

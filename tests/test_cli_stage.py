@@ -204,8 +204,8 @@ def test_compensate_leads_the_mechanics_and_says_how_sure_it_is(bench, tmp_path)
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--model", "loop", "--loss", "huber"], ["--loss", "stage"]),
-        (["--loss", "squares"], ["--loss", "stage"]),
+        (["--model", "loop", "--hold", "steps"], ["--hold", "stage"]),
+        (["--hold", "lines"], ["--hold", "stage"]),
         (["--model", "stage", "--family", "mixture"], ["--family", "mixture", "grid"]),
         (["--model", "stage", "--starts", "4"], ["--starts"]),
         (["--model", "stage", "--seed", "0"], ["--seed"]),

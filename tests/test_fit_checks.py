@@ -1,0 +1,132 @@
+"""Loops that are not what they seem: each is refused, or named for what it is; clean ones are left in peace."""
+
+import re
+
+import numpy as np
+import pytest
+from _wrong_records import bench, delayed, in_ms, joined, read, stuck, thinned, with_outliers
+
+import fits
+from fits._fit_checks import impulsive
+from fits._fit_checks import stuck as told_stuck
+from fits._floor import sensor_noise_um
+
+LEVELS = 16
+ALARMS = ("BEFORE", "AFTER", "stuck", "outliers", "apart", "samples are")
+
+
+@pytest.fixture(scope="module")
+def slow():
+    return bench()[0]
+
+
+def fit(*records, **options):
+    return fits.fit(list(records), levels=LEVELS, initial="negative", **options)
+
+
+def said(result, word):
+    (remark,) = [remark for remark in result.remarks if word in remark]
+    return remark
+
+
+def test_a_clean_record_gets_no_such_remark_and_its_noise_is_known(slow):
+    result = fit(slow)
+    assert not [remark for remark in result.remarks if any(word in remark for word in ALARMS)]
+    assert not result.misfit.far
+    assert result.misfit.noise_um == pytest.approx(0.05, rel=0.15)
+    first = fits.describe(fits.fit_report(result)).splitlines()[0]
+    assert first.startswith("left over")
+    assert "times the sensor's noise" in first
+
+
+def test_two_rigs_in_two_files(slow):
+    other = bench(stroke_um=34.0)[0]
+    second = read(other, other.displacement_um, "second.csv")
+    with pytest.raises(
+        fits.DataError, match=r"slow\.csv, second\.csv: .* not show one hysteresis: .* fit them apart"
+    ):
+        fit(slow, second)
+    # The same stroke, and another shape: no gain tells them apart.
+    other = bench()[0]
+    same = read(other, other.displacement_um, "second.csv")
+    result = fit(slow, same)
+    assert "not show one hysteresis" in said(result, "fit them apart")
+    first, *_ = fits.describe(fits.fit_report(result)).splitlines()
+    assert first.startswith("FAR FROM NOISE")
+
+
+def test_two_rigs_joined_in_one_file(slow):
+    result = fit(joined(slow, bench(stroke_um=26.0)[0]))
+    remark = said(result, "something changed")
+    sample = int(re.search(r"near sample (\d+)", remark)[1])
+    assert abs(sample - len(slow)) < 0.02 * len(slow)
+    ratio = float(re.search(r"moves ([\d.]+) times", remark)[1])
+    assert ratio == pytest.approx(26 / 40, rel=0.1)
+    text = fits.describe(fits.fit_report(result))
+    assert text.startswith("FAR FROM NOISE")
+    assert "as well as" not in text
+
+
+def test_a_sensor_that_sticks_is_named_with_its_samples(slow, rng):
+    count = int(0.1 * len(slow))
+    rising = np.flatnonzero((slow.voltage_V[1:] > slow.voltage_V[:-1]) & (slow.voltage_V[1:] < 30))
+    first = int(rng.choice(rising[(rising > 100) & (rising < len(slow) // 2)]))
+    remark = said(fit(stuck(slow, first, count)), "stuck")
+    begin, end = map(int, re.search(r"samples (\d+) to (\d+)", remark).groups())
+    assert abs(begin - 1 - first) <= 1
+    assert abs(end - (first + count)) <= 1
+
+
+def test_readings_of_a_coarse_sensor_and_a_backlash_are_not_stuck(slow):
+    coarse = read(slow, np.round(slow.displacement_um / 2) * 2)
+    assert told_stuck(coarse) == []
+
+
+def test_outliers_are_counted_and_the_robust_loss_gets_past_them(slow, rng):
+    spoilt, hit = with_outliers(rng, slow)
+    result = fit(spoilt)
+    remark = said(result, "outliers")
+    fitted = hit[: len(slow) - round(0.2 * len(slow))]
+    count = int(re.search(r"(\d+) readings", remark)[1])
+    assert count == pytest.approx(fitted.sum(), rel=0.2)
+    assert float(re.search(r"by ([\d.]+) um", remark)[1]) == pytest.approx(50, rel=0.05)
+    assert "--loss huber" in remark
+    robust = fit(spoilt, loss="huber")
+    clean = fit(slow)
+    off = [np.std(r.predict(slow).displacement_um - clean.predict(slow).displacement_um) for r in (result, robust)]
+    assert off[1] < 0.05
+    assert off[1] < off[0] / 5
+    assert "count less in this fit" in said(robust, "outliers")
+    with pytest.raises(fits.DataError, match="unknown loss 'absolute'"):
+        fit(slow, loss="absolute")
+
+
+def test_readings_ahead_of_their_voltage(slow):
+    remark = said(fit(delayed(slow, -4)), "BEFORE")
+    size = float(re.search(r"comes ([\d.]+) \+-", remark)[1])
+    assert abs(size - 4) < 1
+
+
+def test_times_in_another_unit(slow):
+    assert "if the time is in ms" in said(fit(in_ms(thinned(slow, 2))), "samples are 20 s apart")
+
+
+def test_rounding_ends_the_search_for_a_resolution(slow):
+    rounded = read(slow, np.round(slow.displacement_um / 5) * 5)
+    result = fits.fit([rounded], initial="negative")
+    assert result.trials[-1].levels <= 32
+    assert result.misfit.noise_um == pytest.approx(5 / 12**0.5, rel=1e-6)
+    assert not result.misfit.far
+
+
+def test_noise_and_impulses_are_read_off_signals(rng):
+    n = 4000
+    time = np.arange(n) / 1000
+    move = 10 * np.sin(2 * np.pi * 3 * time)
+    noise = 0.02 * rng.standard_normal(n)
+    record = fits.Record(time, move, move + noise, source="a.csv")
+    assert sensor_noise_um(record, noise)[0] == pytest.approx(0.02, rel=0.15)
+    assert impulsive(noise).sum() <= 1
+    hit = np.zeros(n, dtype=bool)
+    hit[rng.choice(np.arange(20, n - 20, 37), 30, replace=False)] = True
+    assert np.array_equal(impulsive(noise + np.where(hit, 1.0, 0.0)) & hit, hit)
