@@ -14,7 +14,7 @@ from fits._cli_jax import start_jax
 from fits._cli_sensitivity import _keep_apart
 from fits._cli_work import preisach_of
 from fits._compensate_stage import static_equivalent
-from fits._errors import DataError, ModelError
+from fits._errors import DataError
 from fits._file_set import file_set
 from fits._idle import idle_noise, read_idle
 from fits._model_file import load_model
@@ -84,7 +84,7 @@ def _law(path: str) -> m.Preisach:
         return preisach_of(path, loaded)
     try:
         return static_equivalent(loaded.model)
-    except ModelError as error:
+    except DataError as error:
         raise DataError(f"{path}: {error}") from error
 
 

@@ -20,7 +20,7 @@ from fits._control_make import Loop, Maker
 from fits._control_report import control_json, describe_control
 from fits._control_setup import Setup, setup
 from fits._draw_plants import draw_plants
-from fits._errors import DataError, ModelError
+from fits._errors import DataError
 from fits._file_set import file_set
 from fits._model_file import load_model
 from fits._read_csv import read_reference
@@ -94,7 +94,9 @@ def run_control(
         unfinished, drawings = files.file(out), files.folder(plots)
         try:
             ready = setup(plant, wanted, feedforward, initial=initial, limits_V=_limits(limits))
-        except ModelError as error:
+        except DataError as error:
+            if not error.of_model:
+                raise  # it says itself which option or file is meant
             raise DataError(f"{model}: {error}") from error
         skipped = _skipped(wanted, ready, skip)
         count = plants or (_PLANTS if known else 1)

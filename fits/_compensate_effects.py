@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fits._errors import ModelError
+from fits._errors import model_error
 from fits._record import Record, Reference
 from microid import AbstractEffect, Stage, innermost
 
@@ -56,7 +56,7 @@ def follow(
     """
     needs = sorted({name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs})
     if needs:
-        raise ModelError(
+        raise model_error(
             f"the model depends on {', '.join(needs)}, which a reference does not tell; use baseline.json."
         )
     wanted = np.asarray(reference.displacement_um)

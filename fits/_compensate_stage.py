@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 import microid
 from fits._compensate_effects import plain_of
-from fits._errors import DataError, ModelError
+from fits._errors import DataError, model_error
 from fits._record import Record
 from fits._run import initial_state, prepare_run, simulate_run
 from microid import AbstractLinear, GridDensity, Preisach, Reversible, Stage, Staircase, Start, innermost
@@ -44,7 +44,7 @@ def hysteresis_of(stage: Stage) -> Preisach:
     found = [innermost(part) for part in stage.parts if isinstance(innermost(part), Preisach)]
     if not found:
         parts = ", ".join(f"{n} ({type(p).__name__})" for n, p in zip(stage.names, stage.parts, strict=True))
-        raise ModelError(f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.")
+        raise model_error(f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.")
     return found[0]
 
 
@@ -57,7 +57,7 @@ def gains_of(stage: Stage) -> Gains:
             continue
         gain = float(part.static_gain)
         if not (np.isfinite(gain) and gain > 0):
-            raise ModelError(
+            raise model_error(
                 f"part {stage.names[k]!r} of the stage: expected a positive static gain, found {gain:g}; turn the "
                 "sign of the column of its signal, and fit again."
             )

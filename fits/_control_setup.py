@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits._compensate import Compensation, Way, compensate
-from fits._errors import DataError, ModelError
+from fits._errors import DataError, model_error
 from fits._record import Reference
 from fits._run import initial_state
 from fits._stage_result import range_of
@@ -88,13 +88,15 @@ def setup(
     try:
         sampled = SampledStage(stage, interval)
     except ValueError as error:
-        raise ModelError(f"the model cannot be stepped from sample to sample: {error}") from error
+        raise model_error(f"the model cannot be stepped from sample to sample: {error}") from error
     place = place_of_hysteresis(stage)
     if place is None:
         return _linear(stage, sampled, reference, interval, feedforward, limits_V)
     law = stage.parts[place]
     if not isinstance(law, Preisach):
-        raise ModelError(f"{stage.names[place]!r} is a {type(law).__name__}, expected a Preisach hysteresis; fit one")
+        raise model_error(
+            f"{stage.names[place]!r} is a {type(law).__name__}, expected a Preisach hysteresis; fit one"
+        )
     found = _compensation(stage, reference, initial, limits_V, "static")
     remarks = []
     if found.clipped.any():
@@ -102,7 +104,7 @@ def setup(
     ahead = found.voltage_V if feedforward == "static" else None
     if feedforward == "dynamic":
         if isinstance(model, Preisach) or len(stage.parts) == 1:
-            raise ModelError("expected a model with mechanics for --feedforward dynamic, found a hysteresis alone")
+            raise model_error("expected a model with mechanics for --feedforward dynamic, found a hysteresis alone")
         led = _compensation(stage, reference, initial, limits_V, "dynamic")
         ahead, remarks = led.voltage_V, [*remarks, *led.remarks]
     memory = initial_state(initial, float(law.density.lower_V), float(law.density.upper_V))
@@ -135,7 +137,9 @@ def _linear(
 ) -> Setup:
     gain, offset = float(stage.static_gain), float(sampled.init(Start(jnp.asarray(0.0)))[1])
     if not (np.isfinite(gain) and gain > 0):
-        raise ModelError(f"the stage gives {gain:g} um/V at rest, expected a positive one; turn the sign of a column")
+        raise model_error(
+            f"the stage gives {gain:g} um/V at rest, expected a positive one; turn the sign of a column"
+        )
     wanted = np.asarray(reference.displacement_um)
     static = (wanted - offset) / gain
     ahead = static if feedforward == "static" else None
@@ -143,7 +147,7 @@ def _linear(
         try:
             ahead = np.asarray(two_degrees(stage, interval_s, jnp.asarray(wanted)).feedforward_V)
         except ValueError as error:
-            raise ModelError(f"the model has no dynamic inverse: {error}") from error
+            raise model_error(f"the model has no dynamic inverse: {error}") from error
     limits = (-np.inf, np.inf) if limits_V is None else limits_V
     remarks = []
     if ahead is not None and not np.array_equal(np.clip(ahead, *limits), ahead):
