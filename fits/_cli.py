@@ -16,7 +16,7 @@ from fits._cli_commands_model import compensate, export, fit, info, simulate, sy
 from fits._cli_commands_paper import paper
 from fits._cli_commands_stage import budget, sensitivity
 from fits._cli_commands_sweep import sweep
-from fits._cli_common import Stopped, heed_signals, stopped
+from fits._cli_common import Stopped, heed_signals, stopped, system_refuses
 
 
 def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -70,6 +70,8 @@ def main() -> None:
             cli(prog_name="microid")
         except KeyboardInterrupt as stop:
             stopped(stop, "no unfinished file was left")
+        except OSError as error:
+            system_refuses(error)
     except Stopped as stop:
         # All that is kept is written. Threads that still compile crash an interpreter that is taken down.
         for stream in (sys.stdout, sys.stderr):

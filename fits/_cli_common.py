@@ -72,6 +72,16 @@ def stopped(stop: KeyboardInterrupt, what: str) -> NoReturn:
     raise Stopped(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))
 
 
+def system_refuses(error: OSError) -> NoReturn:
+    """Say what the system does not allow, such as more on a full disk, and end with status 2."""
+    if error.errno == errno.EPIPE:
+        raise error  # click ends without a word: who reads has read enough
+    place = error.filename if isinstance(error.filename, str) else "output"
+    sentence = f"{printable(place)}: the system refuses it ({error.strerror or error}); mend that and start again."
+    click.echo(sentence, err=True)
+    sys.exit(2)
+
+
 class Stopped(SystemExit):
     """The end of a command that was stopped."""
 
@@ -90,12 +100,7 @@ def in_sentences(command: _Command) -> _Command:
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
             sys.exit(2)
         except OSError as error:
-            if error.errno == errno.EPIPE:
-                raise  # click ends without a word: who reads has read enough
-            # What the system refuses is no mistake of the program's, and says itself what it is.
-            place = error.filename if isinstance(error.filename, str) else "output"
-            click.echo(f"{printable(place)}: refused by the system ({error.strerror or error}).", err=True)
-            sys.exit(2)
+            system_refuses(error)
 
     return run  # type: ignore[return-value]
 

@@ -247,7 +247,9 @@ def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path
             _length_checked(target, anchor)
         good = anchor.is_dir() and os.access(anchor, os.W_OK | os.X_OK)
     except (OSError, ValueError) as error:
-        raise DataError(f"{shown}: cannot be the name of a folder ({_reason(error)}); choose another.") from None
+        raise DataError(
+            f"{shown}: cannot be the name of a folder ({_reason(error)}); choose another for {option}."
+        ) from None
     if not good:
         raise DataError(f"{shown}: expected a folder that can be written to; choose another for {option}.")
     remove_stale(anchor)
@@ -256,7 +258,7 @@ def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path
 
 def _length_checked(target: Path, anchor: Path) -> None:
     for name in target.relative_to(anchor).parts:
-        with suppress(FileNotFoundError):
+        with suppress(FileNotFoundError, NotADirectoryError):
             os.lstat(anchor / name)
 
 

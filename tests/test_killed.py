@@ -49,6 +49,24 @@ write(Path(folder), int(first), int(rounds))
 """
 
 
+# The command, whose diagnosis is made up: the real one takes long, and touches no file.
+DIAGNOSE = """
+import sys, types
+from fits._cli import main
+
+def diagnose(*_, **__):
+    import numpy as np
+    from _diagnosis import diagnosis
+    return diagnosis(np.random.default_rng(1))
+
+made_up = types.ModuleType("fits.diagnosis._diagnose")
+made_up.diagnose = diagnose
+sys.modules[made_up.__name__] = made_up
+sys.argv = ["microid", *sys.argv[1:]]
+main()
+"""
+
+
 def hidden(folder):
     """What is there under names that a user does not look for."""
     found = [path for path in folder.rglob("*") if path.name.startswith(".") or path.suffix == ".partial"]
@@ -57,7 +75,8 @@ def hidden(folder):
 
 def begin(*arguments, **options):
     command = [sys.executable, *map(str, arguments)]
-    env = os.environ | {"PYTHONPATH": str(ROOT)} | OFF | options.pop("env", {})
+    paths = os.pathsep.join((str(ROOT), str(ROOT / "tests")))
+    env = os.environ | {"PYTHONPATH": paths} | OFF | options.pop("env", {})
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env, **options)
 
 
@@ -103,9 +122,9 @@ def bench(tmp_path_factory):
 
 
 def start(bench, folder, command):
-    cache = bench / "cache"
+    cache, program = bench / "cache", ("-c", DIAGNOSE) if command.startswith("diagnose") else ("-m", "fits")
     arguments = [bench / part if (bench / part).exists() else part for part in command.split()]
-    return begin("-m", "fits", *arguments, cwd=folder, env={"MICROID_CACHE": str(cache)})
+    return begin(*program, *arguments, cwd=folder, env={"MICROID_CACHE": str(cache)})
 
 
 def run_whole(bench, folder, command, status=0):
@@ -194,7 +213,7 @@ def test_commands_are_killed_at_many_random_moments(bench, tmp_path, seed, name)
     run_whole(bench, tmp_path, resumed())
     assert hidden(tmp_path) == []
     for path, content in shown(tmp_path).items():
-        if path.suffix in (".h", ".c"):
+        if path.suffix in (".h", ".c", ".html"):
             assert content == good[path]
         elif path.suffix == ".parquet":
             assert content.equals(good[path])

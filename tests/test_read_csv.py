@@ -132,7 +132,7 @@ UNITS = [
 def test_units_are_converted_by_suffix(tmp_path, header, cell, column, value):
     stem = header.rsplit("_", 1)[0]
     names = [name for name in HEAD.split(",") if not name.startswith(stem + "_")] + [header]
-    rows = [["-1"] * (len(names) - 1) + [cell]] + [[str(1000.0 + i)] * len(names) for i in range(N)]
+    rows = [["-1"] * (len(names) - 1) + [cell]] + [[str(101.0 + i)] * len(names) for i in range(N)]
     record = read_csv(saved(tmp_path, "\n".join(",".join(row) for row in [names, *rows])))
     found = record.extra[column] if column in record.extra else getattr(record, column)
     assert found[0] == value
