@@ -18,6 +18,8 @@ _IMPULSE, _TOGETHER, _AROUND, _ALONE = 8.0, 3, 16, 4.0
 _FEW, _LISTED = 3, 6
 # Impulses count where they make such a part of the residual's squares.
 _MATTERS = 0.1
+# And are so large, beside the root mean square of all.
+_PULLED = 0.2
 # Samples farther apart than this, in s, are rare with piezo stages.
 _SPARSE_s = 1.0
 
@@ -81,11 +83,13 @@ def stuck(record: Record) -> list[str]:
 def impulses(record: Record, residual_um: np.ndarray, fitted: np.ndarray, robust: bool) -> list[str]:
     """Find single readings that are far off their neighbours, and name their number and size."""
     bad = impulsive(residual_um) & fitted
+    height = np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
+    if bad.any():
+        # Where large ones pull the fit, what it leaves beside them jumps, too.
+        bad &= height > _PULLED * float(np.sqrt(np.mean(height[bad] ** 2)))
     count = int(bad.sum())
-    if count < _FEW:
-        return []
-    height = np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))[bad]
-    if np.sum(height**2) < _MATTERS * np.sum(residual_um[fitted] ** 2):
+    height = height[bad]
+    if count < _FEW or np.sum(height**2) < _MATTERS * np.sum(residual_um[fitted] ** 2):
         return []
     listed = ", ".join(str(k + 1) for k in np.flatnonzero(bad)[:_LISTED])
     more = ", ..." if count > _LISTED else ""

@@ -145,7 +145,8 @@ def test_parameters_that_go_together_and_remarks_are_said(bench):
     assert f"{names[0]} and {names[1]}: -0.70" in told
     assert told.count("correlated") == 1
     assert told.endswith("Unseen: a and b\nNote: Mind this")
-    assert " ".join(told.split("\n")[3].split()).endswith("± unknown (95 % unknown..unknown) s")
+    (line,) = [line for line in told.split("\n") if line.startswith(parameter["name"])]
+    assert " ".join(line.split()).endswith("± unknown (95 % unknown..unknown) s")
 
 
 def test_the_pictures_are_drawn(bench):
