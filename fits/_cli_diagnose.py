@@ -13,8 +13,9 @@ from fits._atomic import write_csv
 from fits._cli_files import bar_to_stderr, fraction_or_files, keep_inputs
 from fits._cli_jax import start_jax
 from fits._errors import DataError
-from fits._file_set import file_set, usable_folder
+from fits._file_set import file_set
 from fits._limits import parse_limits, ranges_json
+from fits._places import usable_folder
 from fits._read_csv import read_csv, read_runs
 from fits._result import FitError
 from fits._units import parse_columns

@@ -2,8 +2,9 @@
 
 import copy
 import json
-import secrets
 import shutil
+import subprocess
+import sys
 import tomllib
 
 import numpy as np
@@ -155,7 +156,13 @@ def test_what_a_killed_process_left_is_no_other_file(kept, tmp_path):
     file, _ = kept
     out = tmp_path / "begun"
     (out / "ledger").mkdir(parents=True)
-    left = [out / f".{secrets.token_hex(8)}-about.json", out / "ledger" / f".{secrets.token_hex(8)}-00000000.json"]
+    # Names as a process made them that has ended since.
+    code = "from fits._temporary import temporary_name; print(temporary_name('.json'))"
+    ended = [
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.strip()
+        for _ in range(2)
+    ]
+    left = [out / ended[0], out / "ledger" / ended[1]]
     for path in left:
         path.write_text("{")
     run_sweep(read_sweep(file), str(out))

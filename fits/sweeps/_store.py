@@ -19,7 +19,8 @@ import numpy as np
 
 from fits._atomic import atomic_write_text
 from fits._errors import DataError
-from fits._file_set import flush, usable_folder
+from fits._file_set import flush
+from fits._places import usable_folder
 from fits._temporary import is_temporary
 from fits.sweeps._about import ABOUT, SCHEMA, about_of
 from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of
