@@ -223,7 +223,7 @@ def test_the_small_signal_response_needs_a_slope(rng):
         (lambda: m.Stage((m.Piezo(1.0), m.Sensor()), ("a", "a")), "no two alike"),
         (lambda: m.Stage((), ()), "one part or more"),
         (lambda: m.Stage.of(a=m.Piezo(1.0), hold="second"), "hold must be 'first', 'zero' or 'smooth'"),
-        (lambda: m.Stage.of(a=m.Piezo(1.0), substeps=0), "substeps positive"),
+        (lambda: m.Stage.of(a=m.Piezo(1.0), substeps=0), "substeps 1 to"),
         (lambda: m.Stage.of(a=m.Piezo(1.0)).freeze("b"), "nothing called 'b' to freeze: choose some of a.gain"),
         (lambda: m.Stage.of(a=m.Piezo(1.0)).freeze("a.gain"), "nothing called 'a.gain'"),
         (lambda: m.Stage.of(a=m.Piezo(1.0)).swap("b", m.Sensor()), "no part 'b': choose one of a"),
