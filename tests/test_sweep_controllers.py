@@ -185,12 +185,12 @@ def test_gains_that_nothing_can_be_learnt_around_and_unstable_loops_fail_as_rows
         (
             "resonnant",
             "",
-            "controller.kind: expected one of pid, bp-pid, cmac-pid, resonant, found 'resonnant'; did you",
+            'controller.kind: expected one of pid, bp-pid, cmac-pid, resonant, found "resonnant"; did you',
         ),
-        ("pid", "learning_rate = 0.1", "found 'learning_rate', which is of cmac-pid; "),
+        ("pid", "learning_rate = 0.1", 'found "learning_rate", which is of cmac-pid; '),
         ("bp-pid", "learning_rate = 0.1", "which is of cmac-pid; did you mean learning_rate_per_um2?"),
-        ("bp-pid", "reference_weight = 0.5", "expected a known key of bp-pid, found 'reference_weight'"),
-        ("cmac-pid", "learnin_rate = 0.1", "found 'learnin_rate'; did you mean learning_rate?"),
+        ("bp-pid", "reference_weight = 0.5", 'expected a known key of bp-pid, found "reference_weight"'),
+        ("cmac-pid", "learnin_rate = 0.1", 'found "learnin_rate"; did you mean learning_rate?'),
         ("cmac-pid", "learning_rate = 2.5", "controller.learning_rate: expected 0 to 2, found 2.5"),
         ("cmac-pid", "lower_um = 9.0", "controller.lower_um: expected less than upper_um, which is 5.1 um, found 9"),
         ("cmac-pid", "fastest_um_per_s = 0.0", "controller.fastest_um_per_s: expected 1e-09 to inf um/s, found 0"),
@@ -211,7 +211,7 @@ def test_what_is_wrong_with_a_controller_is_a_sentence(tmp_path, kind, stated, w
 
 
 def test_axes_of_another_kind_are_refused_with_the_nearest_names():
-    with pytest.raises(fits.DataError, match=r"no parameter 'controller.learning_rate'; did you mean controller\."):
+    with pytest.raises(fits.DataError, match=r"no parameter \"controller.learning_rate\"; did you mean controller\."):
         made("bp-pid", reference=STEP, axis='parameter = "controller.learning_rate"\nvalues = [0.1]')
     short = STEP.replace("samples = 40", "samples = 8")
     with pytest.raises(fits.DataError, match=r"controller.limit_V: no default is found \(.*16 samples.*\); state it"):
