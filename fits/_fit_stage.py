@@ -14,7 +14,7 @@ from fits._noise import LOSSES
 from fits._record import Record, refuse_repeats
 from fits._result import FitError
 from fits._stage_checks import implausible, refuse_coarse
-from fits._stage_delay import own_up, refuse_delays, take_out_delays
+from fits._stage_delay import GROSS_PCT, own_up, refuse_delays, take_out_delays
 from fits._stage_moments import Chain
 from fits._stage_result import StageFit
 from fits._stage_run import gain_ahead, place_of_hysteresis, prepare_stage_run
@@ -108,9 +108,17 @@ def fit_stage(
     progress("looking for delays")
     refuse_coarse(found.stage, runs, left)
     undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
-    if found.failure is not None:
+    if found.failure is not None or found.problem.even:
         refuse_delays(undelayed)
+    if found.failure is not None:
         raise found.failure
+    gross = worst(left)
+    if found.problem.even and gross.share_pct > GROSS_PCT:
+        raise DataError(
+            f"{gross.source}: neither a lag nor a resonance explains what moves in it: {gross.share_pct:.3g} % of "
+            f"its stroke stay unexplained, {gross.times_noise:.3g} times the sensor's noise; check columns, time stamps "
+            "and sampling rate, or fit the hysteresis alone with --model loop"
+        )
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
     before = initial if isinstance(initial, str) else "unknown"

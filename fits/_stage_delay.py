@@ -33,6 +33,8 @@ _NEAR, _MUCH = 2.0, 0.4
 _FAINT = 1e-8
 # Half the width of a 95 % interval, in standard deviations.
 _NORMAL = 1.959964
+# What a stage leaves, in % of the stroke, that is more than creep and its like would be.
+GROSS_PCT = 2.0
 _REMEDY = (
     "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
 )
@@ -90,7 +92,7 @@ class Undelayed:
 
 
 def take_out_delays(
-    plan: Plan, problem: Problem, solved: Solved, precision: Precision, left: Sequence[Misfit]
+    plan: Plan, problem: Problem, solved: Solved, precision: Precision | None, left: Sequence[Misfit]
 ) -> Undelayed | None:
     """Look for delays in what a fit leaves, and fit again without them.
 
@@ -103,7 +105,7 @@ def take_out_delays(
     plan, problem
         What was asked for.
     solved, precision
-        The fit.
+        The fit; without a precision, only large delays are looked for.
     left
         What it leaves of each run.
 
@@ -114,15 +116,19 @@ def take_out_delays(
     """
     # Between two samples a command in steps has no place where it could be shifted to, and without a resonance to
     # measure it by a delay is part of the lag.
-    if plan.hold == "zero" or problem.even:
+    if plan.hold == "zero":
         return None
+    if problem.even:
+        # Unless much is left, which may hide the resonance that was not found.
+        gross = problem.full is not None and max(one.share_pct for one in left) > GROSS_PCT
+        return take_out_delays(plan, *problem.full, None, left) if gross and problem.full is not None else None
     shifts = np.zeros(len(plan.records))
     start = problem.z, solved.columns_um
     far = [k for k, one in enumerate(left) if one.far]
     searched = _search(plan, problem, solved, far)
     if searched is not None:
         shifts, start = searched
-    elif not any(one.seen for one in _scores(plan, solved, precision, shifts)):
+    elif precision is None or not any(one.seen for one in _scores(plan, solved, precision, shifts)):
         return None
     found, sure = solved, precision
     known: list[Delay] = []
@@ -145,6 +151,7 @@ def take_out_delays(
                 return None
             sure = Precision(problem.chain, found, problem.stroke_um)
             start = found.z, found.columns_um
+        assert sure is not None
         more = _scores(plan, found, sure, shifts)
         known = [replace(one, delay_s=one.delay_s + shift) for one, shift in zip(more, shifts, strict=True)]
         steps = [one.delay_s if total.seen else 0.0 for one, total in zip(more, known, strict=True)]
@@ -160,9 +167,12 @@ def take_out_delays(
         # Where much is left with it as without it, it is something else.
         if one.seen and shift and after < (_MUCH if after > miss.noise_um * _NEAR else 1.0) * before
     )
-    moved = np.abs(found.z - solved.z) / np.sqrt(np.diagonal(precision.covariance(precision.influence())))
-    if not seen or (np.max(moved) < _MOVED and searched is None):
+    if not seen or sure is None:
         return None
+    if searched is None and precision is not None:
+        moved = np.abs(found.z - solved.z) / np.sqrt(np.diagonal(precision.covariance(precision.influence())))
+        if np.max(moved) < _MOVED:
+            return None
     return Undelayed(seen, found, sure)
 
 

@@ -72,7 +72,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Problem:
-    """A stage to be fitted, and where its fit begins."""
+    """A stage to be fitted, and where its fit begins; where a part was left out, the same with it, roughly fitted."""
 
     stage: Stage
     chain: Chain
@@ -82,6 +82,7 @@ class Problem:
     stroke_um: float
     remarks: tuple[str, ...]
     even: float = 0.0
+    full: "tuple[Problem, Solved] | None" = None
 
     def at(self, solved: Solved) -> Stage:
         """The stage that a solution stands for."""
@@ -156,7 +157,8 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
             raise
         return lagging
     if spare is not None:
-        return _spared(plan, asked, spare, levels, finest)
+        full = Problem(stage, chain, solved.z, columns, hyper, stroke, ()), solved
+        return replace(_spared(plan, asked, spare, levels, finest), full=full)
     remarks = compare_gains(found, runs_at_rate)
     return Problem(stage, chain, solved.z, columns, hyper, stroke, tuple(remarks))
 
