@@ -116,8 +116,8 @@ def fit_stage(
     if found.problem.even and gross.share_pct > GROSS_PCT:
         raise DataError(
             f"{gross.source}: neither a lag nor a resonance explains what moves in it: {gross.share_pct:.3g} % of "
-            f"its stroke stay unexplained, {gross.times_noise:.3g} times the sensor's noise; check columns, time stamps "
-            "and sampling rate, or fit the hysteresis alone with --model loop"
+            f"its stroke stay unexplained, {gross.times_noise:.3g} times the sensor's noise; check columns, time "
+            "stamps and sampling rate, or fit the hysteresis alone with --model loop"
         )
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
