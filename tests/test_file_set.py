@@ -273,7 +273,7 @@ def test_what_another_user_left_stays(tmp_path, ended):
 
 
 LOST = """
-import sys, time
+import signal, sys, time
 from fits._cli_common import heed_signals, in_sentences
 
 class Noisy:
@@ -288,6 +288,9 @@ def work():
     Noisy()
     time.sleep(1000)
 
+# A session without a terminal may have left them ignored.
+for number in (signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.SIG_DFL)
 heed_signals()
 work()
 """
@@ -302,7 +305,10 @@ def test_a_request_to_end_is_not_lost_in_a_finaliser(number):
     )  # fmt: skip
     assert [process.stdout.readline() for _ in range(2)] == ["begin\n", "inside\n"]
     process.send_signal(number)
-    _, stderr = process.communicate()
+    try:
+        _, stderr = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert (process.returncode, stderr) == (128 + number, "Terminated: no unfinished file was left.\n")
 
 
