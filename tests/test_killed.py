@@ -141,7 +141,8 @@ def whole(path):
         with Image.open(path) as picture:
             return picture.load()
     if path.suffix == ".csv":
-        return np.loadtxt(path, delimiter=",", skiprows=1)
+        comments = sum(line.startswith("#") for line in path.read_text(encoding="utf-8").splitlines())
+        return np.loadtxt(path, delimiter=",", skiprows=comments + 1)
     if path.suffix == ".parquet":
         return pd.read_parquet(path)
     text = path.read_text(encoding="utf-8")
