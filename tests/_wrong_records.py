@@ -1,9 +1,9 @@
 """Records of the bench with what goes wrong with records: late, thinned, stuck, joined, in other units."""
 
-import secrets
 from dataclasses import replace
 
 import numpy as np
+from _seed import seed_of
 
 import data_synth
 from fits import Record
@@ -64,9 +64,8 @@ TRUTH = {
 
 
 def bench(stroke_um=40.0):
-    """Slow and fast records of a fresh rig, whose seed is printed."""
-    seed = secrets.randbelow(2**31)
-    print(f"rig of seed {seed}")
+    """Slow and fast records of a rig."""
+    seed = seed_of(f"bench {stroke_um}")
     made = data_synth.simulate(data_synth.parse_scenario(SCENARIO.format(stroke=stroke_um)), seed)
     return [Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in made.records]
 

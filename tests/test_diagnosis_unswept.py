@@ -8,7 +8,7 @@ import pytest
 from test_diagnosis_tangent import baseline_of
 
 from fits import FitError, Record, diagnose
-from fits._fit import _resolve
+from fits._choose_grid import _resolve
 from fits._result import FitStatus
 from fits._run import UNSWEPT, known_samples
 from fits.diagnosis._candidates import Bench
@@ -113,7 +113,7 @@ def test_a_grid_that_fails_leaves_the_coarser():
 
         return trial
 
-    kept, trials = _resolve(failing_beyond(20), None, 64)
+    kept, trials = _resolve(failing_beyond(20), None, 64, 0.0)
     assert kept.data.grid.levels == trials[-1].levels <= 20
     with pytest.raises(FitError):
-        _resolve(failing_beyond(0), None, 64)
+        _resolve(failing_beyond(0), None, 64, 0.0)
