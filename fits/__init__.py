@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from fits._budget import budget as budget
     from fits._budget_report import budget_json as budget_json
     from fits._budget_report import describe_budget as describe_budget
+    from fits._choose_grid import LADDER as LADDER
     from fits._compensate import Compensation as Compensation
     from fits._compensate import compensate as compensate
     from fits._draw_plants import draw_plants as draw_plants
     from fits._errors import DataError as DataError
     from fits._export_c import export_c as export_c
-    from fits._fit import LADDER as LADDER
     from fits._fit import fit as fit
     from fits._fit_stage import default_stage as default_stage
     from fits._fit_stage import fit_stage as fit_stage
@@ -150,7 +150,7 @@ _HOMES = {
     "Gain": "diagnosis._result",
     "Goal": "_tune_problem",
     "IdleNoise": "_idle",
-    "LADDER": "_fit",
+    "LADDER": "_choose_grid",
     "LevelTrial": "_result",
     "LoopReport": "_tune_result",
     "ModalFit": "_modal_fit",

@@ -1,9 +1,10 @@
 """What is wrong with records themselves: sensors that stick, readings that jump out and back, times in odd units."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import median_filter, rank_filter
+from scipy.ndimage import median_filter
 
 from fits._record import Record
 from fits.diagnosis._floor import quantum_um
@@ -104,14 +105,25 @@ def impulses(record: Record, residual_um: np.ndarray, fitted: np.ndarray, robust
     ]
 
 
-def impulsive(residual_um: np.ndarray) -> np.ndarray:
-    """Mark readings that are far off their neighbours, shape `(n,)`."""
+def without_impulses(record: Record) -> Record:
+    """The same record; readings that jump out and back are the median of those around them."""
+    reading = record.displacement_um
+    assert reading is not None
+    bad = impulsive(reading, quantum_um(reading))
+    if bad.sum() < _FEW:
+        return record
+    mended = np.where(bad, median_filter(reading, 7, mode="nearest"), reading)
+    return replace(record, displacement_um=mended, extra=dict(record.extra))
+
+
+def impulsive(residual_um: np.ndarray, digit_um: float = 0.0) -> np.ndarray:
+    """Mark readings that are far off their neighbours, in last digits, too, shape `(n,)`."""
     off = np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
-    spread = np.maximum(median_filter(off, 101, mode="nearest"), float(np.median(off)))
+    spread = np.maximum(median_filter(off, 101, mode="nearest"), max(float(np.median(off)), digit_um))
     far = off > _IMPULSE * 1.4826 * spread + 1e-300
-    # What rings, or moves, has neighbours nearly as large: few may be.
-    usual = rank_filter(off, -1 - 2 * _AROUND // 4, size=2 * _AROUND + 1, mode="nearest")
-    far &= off > _ALONE * usual
+    # What rings, or turns back, goes on as fast as it came: its neighbours move about as far from sample to sample.
+    steps = np.abs(np.diff(residual_um, append=residual_um[-1]))
+    far &= off > _ALONE * median_filter(steps, 2 * _AROUND + 1, mode="nearest")
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
         if stop - first > _TOGETHER:

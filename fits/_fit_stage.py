@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 
+from fits._choose_grid import LADDER
 from fits._errors import DataError
-from fits._fit import LADDER
 from fits._fit_checks import remarks_on
 from fits._floor import misfits, worst
 from fits._noise import LOSSES
@@ -131,7 +131,8 @@ def fit_stage(
     odd = remarks_on(records, *known, robust=loss == "huber")
     odd += implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
     notes = [warning for record in (*records, *aside) for warning in record.warnings]
-    return replace(summary, misfit=worst(left), remarks=(*odd, *notes, *found.remarks, *summary.remarks))
+    told = tuple(dict.fromkeys((*odd, *notes, *found.remarks, *summary.remarks)))
+    return replace(summary, misfit=worst(left), remarks=told)
 
 
 @dataclass(frozen=True)

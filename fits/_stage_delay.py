@@ -20,7 +20,7 @@ from fits._stage_uncertainty import Precision, sandwich
 # A delay counts from so many standard deviations on, if it is as many samples long, and moves a parameter by so many
 # of its own; from there on it is followed until it changes by less than a part of its standard deviation.
 _SURE, _LEAST, _MOVED = 5.0, 0.02, 0.5
-_ROUNDS, _SETTLED = 6, 0.3
+_ROUNDS, _SETTLED = 10, 0.3
 # Part of a sample by which a command is shifted to see what a delay does.
 _STEP = 0.25
 # Runs far from noise are searched for delays up to so many samples either way; so many are tried.
@@ -154,10 +154,12 @@ def take_out_delays(
         assert sure is not None
         more = _scores(plan, found, sure, shifts)
         known = [replace(one, delay_s=one.delay_s + shift) for one, shift in zip(more, shifts, strict=True)]
-        steps = [one.delay_s if total.seen else 0.0 for one, total in zip(more, known, strict=True)]
-        if all(abs(step) <= _SETTLED * one.sd_s for step, one in zip(steps, more, strict=True)):
+        # One at a time, the surest first: the parameters bend to a delay, which makes other runs look late, too.
+        steps = [one.delay_s / one.sd_s if total.seen else 0.0 for one, total in zip(more, known, strict=True)]
+        first = int(np.argmax(np.abs(steps)))
+        if abs(steps[first]) <= _SETTLED:
             break
-        shifts = shifts + np.asarray(steps)
+        shifts[first] += more[first].delay_s
         plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts)} ms")
     seen = tuple(
         one

@@ -126,6 +126,7 @@ def prepare_stage_run(
     stride: int = 1,
     gain: float | None = 1.0,
     hold: Hold = "first",
+    usable: np.ndarray | None = None,
 ) -> StageRun:
     """Make a record ready.
 
@@ -146,6 +147,8 @@ def prepare_stage_run(
         lasts until the voltage has been at both ends.
     hold
         How the command runs between samples, as in `Stage`.
+    usable
+        Which samples may be fitted, shape `(n,)`; by default all.
 
     Raises
     ------
@@ -162,7 +165,7 @@ def prepare_stage_run(
     lower, upper = range_V
     n, unknown = len(record), initial in ("unknown", UNSWEPT)
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
-    fitted = known.copy()
+    fitted = known.copy() if usable is None else known & usable
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False
     if holdout < 1 and fitted.sum() < 50:

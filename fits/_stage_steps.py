@@ -8,9 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from fits._choose_grid import choose_grid
 from fits._design import Grid
 from fits._errors import DataError
-from fits._fit import choose_grid
+from fits._fit_checks import without_impulses
 from fits._prior import Hyper
 from fits._record import Record
 from fits._result import FitError, FitStatus
@@ -58,12 +59,19 @@ class Plan:
 
     def run(self, k: int, stride: int, shift_s: float = 0.0) -> StageRun:
         """One of them, its command that much later."""
-        record = self.records[k]
+        record, usable = self.records[k], None
         if shift_s:
-            later = np.interp(record.time_s - shift_s, record.time_s, record.voltage_V)
+            time = record.time_s - shift_s
+            # Beyond the record's ends nobody knows the command.
+            usable = (time >= record.time_s[0]) & (time <= record.time_s[-1])
+            later = np.interp(time, record.time_s, record.voltage_V)
             record = replace(record, voltage_V=later, extra=dict(record.extra))
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
-        return prepare_stage_run(record, *settings)
+        return prepare_stage_run(record, *settings, usable)
+
+    def smoothed(self) -> "Plan":
+        """The same without readings that jump out and back, of which a start must not be read off."""
+        return replace(self, records=tuple(map(without_impulses, self.records)))
 
     def shifted(self, shifts_s: np.ndarray) -> "Plan":
         """The same with the command of each run that much later, in s, shape `(runs,)`."""
@@ -91,7 +99,7 @@ class Problem:
 
 def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> Problem:
     """Read a hysteresis off the slow runs and poles off the others."""
-    asked = stage
+    plan, asked = plan.smoothed(), stage
     speed = [speed_Hz(record) for record in plan.records]
     slow = [k for k, one in enumerate(speed) if one <= _SLOW * min(speed)]
     place = place_of_hysteresis(stage)

@@ -63,9 +63,9 @@ TRUTH = {
 }
 
 
-def bench(stroke_um=40.0):
-    """Slow and fast records of a rig."""
-    seed = seed_of(f"bench {stroke_um}")
+def bench(stroke_um=40.0, rig=0):
+    """Slow and fast records of a rig; each number is another one."""
+    seed = seed_of("bench") + rig
     made = data_synth.simulate(data_synth.parse_scenario(SCENARIO.format(stroke=stroke_um)), seed)
     return [Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in made.records]
 

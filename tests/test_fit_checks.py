@@ -40,14 +40,14 @@ def test_a_clean_record_gets_no_such_remark_and_its_noise_is_known(slow):
 
 
 def test_two_rigs_in_two_files(slow):
-    other = bench(stroke_um=34.0)[0]
+    other = bench(stroke_um=34.0, rig=1)[0]
     second = read(other, other.displacement_um, "second.csv")
     with pytest.raises(
         fits.DataError, match=r"slow\.csv, second\.csv: .* not show one hysteresis: .* fit them apart"
     ):
         fit(slow, second)
     # The same stroke, and another shape: no gain tells them apart.
-    other = bench()[0]
+    other = bench(rig=1)[0]
     same = read(other, other.displacement_um, "second.csv")
     result = fit(slow, same)
     assert "not show one hysteresis" in said(result, "fit them apart")
@@ -56,7 +56,7 @@ def test_two_rigs_in_two_files(slow):
 
 
 def test_two_rigs_joined_in_one_file(slow):
-    result = fit(joined(slow, bench(stroke_um=26.0)[0]))
+    result = fit(joined(slow, bench(stroke_um=26.0, rig=1)[0]))
     remark = said(result, "something changed")
     sample = int(re.search(r"near sample (\d+)", remark)[1])
     assert abs(sample - len(slow)) < 0.02 * len(slow)

@@ -8,10 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from fits._choose_grid import choose_grid
 from fits._columns import PATH
 from fits._design import columns_of
 from fits._errors import DataError
-from fits._fit import choose_grid
 from fits._fit_stage import default_stage, solve_stage
 from fits._prior import roughness
 from fits._record import Record
