@@ -21,6 +21,8 @@ from fits._stage_uncertainty import Precision, sandwich
 # of its own; from there on it is followed until it changes by less than a part of its standard deviation.
 _SURE, _LEAST, _MOVED = 5.0, 0.02, 0.5
 _ROUNDS, _SETTLED = 10, 0.3
+# A step is halved so often where it leaves more of its run.
+_HALVED, _NO_WORSE = 4, 1.01
 # Part of a sample by which a command is shifted to see what a delay does.
 _STEP = 0.25
 # Runs far from noise are searched for delays up to so many samples either way; so many are tried.
@@ -131,27 +133,14 @@ def take_out_delays(
     elif precision is None or not any(one.seen for one in _scores(plan, solved, precision, shifts)):
         return None
     found, sure = solved, precision
+    if np.any(shifts):
+        again = _solved_with(plan, problem, solved, start, shifts)
+        if again is None:
+            return None
+        found, sure = again
+    assert sure is not None
     known: list[Delay] = []
     for _ in range(_ROUNDS):
-        if np.any(shifts):
-            shifted = plan.shifted(shifts)
-            runs = shifted.runs(solved.runs[0].samples.stride)
-            try:
-                found = solve_chain(
-                    problem.chain,
-                    *start,
-                    runs,
-                    problem.hyper,
-                    problem.stroke_um,
-                    plan.loss,
-                    plan.progress,
-                    even=problem.even,
-                )
-            except (FitError, np.linalg.LinAlgError):
-                return None
-            sure = Precision(problem.chain, found, problem.stroke_um)
-            start = found.z, found.columns_um
-        assert sure is not None
         more = _scores(plan, found, sure, shifts)
         known = [replace(one, delay_s=one.delay_s + shift) for one, shift in zip(more, shifts, strict=True)]
         # One at a time, the surest first: the parameters bend to a delay, which makes other runs look late, too.
@@ -159,8 +148,18 @@ def take_out_delays(
         first = int(np.argmax(np.abs(steps)))
         if abs(steps[first]) <= _SETTLED:
             break
-        shifts[first] += more[first].delay_s
-        plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts)} ms")
+        step = np.zeros(len(shifts))
+        step[first] = more[first].delay_s
+        # Where a parameter is at its bound, a line goes too far.
+        for _ in range(_HALVED):
+            plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts + step)} ms")
+            again = _solved_with(plan, problem, solved, (found.z, found.columns_um), shifts + step)
+            if again is not None and again[0].weighing.noise_um[first] <= _NO_WORSE * found.weighing.noise_um[first]:
+                break
+            step /= 2
+        if again is None:
+            return None
+        shifts, (found, sure) = shifts + step, again
     seen = tuple(
         one
         for one, shift, miss, before, after in zip(
@@ -169,13 +168,26 @@ def take_out_delays(
         # Where much is left with it as without it, it is something else.
         if one.seen and shift and after < (_MUCH if after > miss.noise_um * _NEAR else 1.0) * before
     )
-    if not seen or sure is None:
+    if not seen:
         return None
     if searched is None and precision is not None:
         moved = np.abs(found.z - solved.z) / np.sqrt(np.diagonal(precision.covariance(precision.influence())))
         if np.max(moved) < _MOVED:
             return None
     return Undelayed(seen, found, sure)
+
+
+def _solved_with(
+    plan: Plan, problem: Problem, solved: Solved, start: tuple[np.ndarray, np.ndarray], shifts_s: np.ndarray
+) -> tuple[Solved, Precision] | None:
+    """Fit again with the command of each run that much later; None where that fails."""
+    runs = plan.shifted(shifts_s).runs(solved.runs[0].samples.stride)
+    given = problem.chain, *start, runs, problem.hyper, problem.stroke_um, plan.loss, plan.progress
+    try:
+        found = solve_chain(*given, even=problem.even)
+    except (FitError, np.linalg.LinAlgError):
+        return None
+    return found, Precision(problem.chain, found, problem.stroke_um)
 
 
 def refuse_delays(undelayed: Undelayed | None) -> None:
