@@ -162,8 +162,8 @@ def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequ
         sentence = (
             f"{names}: these runs do not show one hysteresis: fitted together they leave {joint} % of their strokes, "
             f"each alone {apart} %; under the same voltage {runs[high].record.source} moves {ratio:.3g} "
-            f"times as far as {runs[low].record.source}: they are of different rigs or settings, or differ in rate, drift, "
-            "load or temperature; fit them apart"
+            f"times as far as {runs[low].record.source}: they are of different rigs or settings, or differ in rate, "
+            "drift, load or temperature; fit them apart"
         )
         if ratio > 1 + _REFUSED:
             raise DataError(sentence)
