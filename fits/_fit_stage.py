@@ -106,8 +106,10 @@ def fit_stage(
     known = [one.residual_um for one in found.solved.sums], [run.fitted for run in runs]
     left = misfits(records, *known)
     progress("looking for delays")
-    refuse_coarse(found.stage, runs, left)
     undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
+    # What is sampled too slowly may look late; a delay is believed that leaves little else.
+    if undelayed is None or any(one.far for one in undelayed.left(records)):
+        refuse_coarse(found.stage, runs, left)
     if found.failure is not None or found.problem.even:
         refuse_delays(undelayed)
     if found.failure is not None:

@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
+from fits._design import columns_of
 from fits._errors import DataError
-from fits._floor import Misfit
+from fits._floor import Misfit, misfits
+from fits._record import Record
 from fits._result import FitError
 from fits._stage_moments import Chain, along, linearise, pieces
 from fits._stage_result import StageFit
@@ -16,6 +18,7 @@ from fits._stage_solve import Solved, solve_chain
 from fits._stage_start import best_shifts, measure_response, start_stages
 from fits._stage_steps import Plan, Problem, hysteresis_alone
 from fits._stage_uncertainty import Precision, sandwich
+from microid import Preisach, Stage
 
 # A delay counts from so many standard deviations on, if it is as many samples long, and moves a parameter by so many
 # of its own; from there on it is followed until it changes by less than a part of its standard deviation.
@@ -25,9 +28,10 @@ _ROUNDS, _SETTLED = 10, 0.3
 _HALVED, _NO_WORSE = 4, 1.01
 # Part of a sample by which a command is shifted to see what a delay does.
 _STEP = 0.25
-# Runs far from noise are searched for delays up to so many samples either way; so many are tried.
-_FARTHEST, _TRIED = 64, 3
-# What leaves less than this of the residual is a better answer.
+# Runs that leave so many times the noise are searched for delays up to so many samples either way, and so many of
+# these are tried.
+_LOUD, _FARTHEST, _TRIED = 1.5, 64, 3
+# What is as much likelier as leaving this part of a run's residual is a better answer.
 _BETTER = 0.7
 # Where more than so many times the noise is left, a delay counts if it takes all but this part away.
 _NEAR, _MUCH = 2.0, 0.4
@@ -88,6 +92,11 @@ class Undelayed:
     solved: Solved
     precision: Precision
 
+    def left(self, records: Sequence[Record]) -> list[Misfit]:
+        """What stays of each run without its delay."""
+        known = [one.residual_um for one in self.solved.sums], [run.fitted for run in self.solved.runs]
+        return misfits(records, *known)
+
     def words(self) -> str:
         """Say what the columns of the runs look like."""
         return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
@@ -126,7 +135,7 @@ def take_out_delays(
         return take_out_delays(plan, *problem.full, None, left) if gross and problem.full is not None else None
     shifts = np.zeros(len(plan.records))
     start = problem.z, solved.columns_um
-    far = [k for k, one in enumerate(left) if one.far]
+    far = [k for k, one in enumerate(left) if one.times_noise > _LOUD]
     searched = _search(plan, problem, solved, far)
     if searched is not None:
         shifts, start = searched
@@ -275,7 +284,9 @@ def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray
 
 def _search(plan: Plan, problem: Problem, solved: Solved, far: Sequence[int]) -> tuple | None:
     """Large delays of the runs that are far from noise: shifts, and what to go on from; None where none helps."""
-    stage = problem.at(solved)
+    # As it began: a delay bends the hysteresis of a joint fit, and the slow runs hardly feel it.
+    stage = problem.stage
+    columns_um = _columns(problem, stage)
     drives = hysteresis_alone(stage, plan)
     shifts, best = np.zeros(len(plan.records)), solved
     for k in far:
@@ -293,11 +304,18 @@ def _search(plan: Plan, problem: Problem, solved: Solved, far: Sequence[int]) ->
             runs = plan.shifted(there).runs(run.samples.stride)
             for candidate in start_stages(stage, [moved])[:1]:
                 z = np.asarray(problem.chain.coordinates.of(candidate))
-                given = problem.chain, z, solved.columns_um, runs, None, problem.stroke_um, plan.loss, plan.progress
+                given = problem.chain, z, columns_um, runs, None, problem.stroke_um, plan.loss, plan.progress
                 try:
                     found = solve_chain(*given, rough=True)
                 except (FitError, np.linalg.LinAlgError):
                     continue
-                if found.weighing.noise_um[k] < _BETTER * best.weighing.noise_um[k]:
+                if found.cost < best.cost + float(run.fitted.sum()) * np.log(_BETTER):
                     best, shifts = found, there
-    return (shifts, (best.z, solved.columns_um)) if np.any(shifts) else None
+    return (shifts, (best.z, columns_um)) if np.any(shifts) else None
+
+
+def _columns(problem: Problem, stage: Stage) -> np.ndarray:
+    """Columns of a stage's grid, in um, shape `(D,)`; none where none is fitted."""
+    place = problem.chain.place
+    law = None if place is None else stage.parts[place]
+    return np.asarray(columns_of(law)) if isinstance(law, Preisach) else np.zeros(0)
