@@ -189,11 +189,11 @@ def take_out_delays(
 def _solved_with(
     plan: Plan, problem: Problem, solved: Solved, start: tuple[np.ndarray, np.ndarray], shifts_s: np.ndarray
 ) -> tuple[Solved, Precision] | None:
-    """Fit again with the command of each run that much later; None where that fails."""
+    """Fit again with the command of each run that much later, as well as can be; None where that fails."""
     runs = plan.shifted(shifts_s).runs(solved.runs[0].samples.stride)
     given = problem.chain, *start, runs, problem.hyper, problem.stroke_um, plan.loss, plan.progress
     try:
-        found = solve_chain(*given, even=problem.even)
+        found = solve_chain(*given, anyway=True, even=problem.even)
     except (FitError, np.linalg.LinAlgError):
         return None
     return found, Precision(problem.chain, found, problem.stroke_um)

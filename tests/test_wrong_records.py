@@ -34,12 +34,6 @@ def cases(rig, rng):
     yield "3 samples early", lambda: stage(slow, delayed(fast, -3)), r"fast\.csv: .* BEFORE"
     yield "thinned", lambda: stage(slow, thinned(fast, 37)), r"fast\.csv: sampled at 135\.1 Hz, .*too slow"
     yield "ms called s", lambda: stage(in_ms(slow), in_ms(fast)), "in ms instead of s"
-    yield (
-        "two rigs, two files",
-        lambda: loops(slow, read(other, other.displacement_um, "other.csv")),
-        "one hysteresis",
-    )
-    yield "two strokes", lambda: loops(slow, read(short, short.displacement_um, "other.csv")), "one hysteresis"
     # By chance two rigs may be twins: what is no more than 8 times the noise apart is not asked for.
     if np.std(slow.displacement_um - other.displacement_um) > 8 * NOISE_UM:
         second = read(other, other.displacement_um, "other.csv")
