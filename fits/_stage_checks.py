@@ -144,11 +144,19 @@ def refuse_unseen(
         if noise[loudest] > _LOUD * min(noise):
             compare_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
+            what = (
+                f"{noise[loudest]:.3g} um of it stay unexplained, {noise[loudest] / min(noise):.3g} times as much as "
+                "of the quietest run"
+            )
+            if _resolved(loud):
+                raise DataError(
+                    f"{loud.record.source}: no lag and no resonance was found that explains what moves in it: {what}; "
+                    "record it for longer, with a slower chirp or a longer period, or fit the hysteresis alone with "
+                    "--model loop"
+                )
             raise DataError(
                 f"{loud.record.source}: sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it: "
-                f"{noise[loudest]:.3g} um of it stay unexplained, {noise[loudest] / min(noise):.3g} times as much as "
-                "of the quietest run; sample at 5 times the resonance or more, or fit the hysteresis alone with "
-                "--model loop"
+                f"{what}; sample at 5 times the resonance or more, or fit the hysteresis alone with --model loop"
             )
         raise DataError(
             f"{sources}: the displacement follows the voltage without delay or ringing, so these runs hold nothing "

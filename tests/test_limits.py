@@ -181,7 +181,9 @@ class Rig:
         reached, _ = reached_by(found.model, self.records, range_V, ["negative"] * 2, known)
         drawn = fits.draw_plants(found.model, found.uncertainty, 5, seed=seed)
         limits = allowed({**reached, "voltage": range_V}, {}, 0.02)
-        self.guard = Guard([Model(stage, 0.0) for stage in drawn], limits, self.records[0], range_V)
+        self.guard = Guard(
+            [Model(stage, 0.0, found.misfit.residual_um) for stage in drawn], limits, self.records[0], range_V
+        )
         self.found, self.frequency_Hz, self.rng = found, frequency, rng
 
     def played(self, time_s, voltage_V):

@@ -34,10 +34,21 @@ _ROUNDS, _MORE, _NARROW = 12, 1.1, 0.1
 
 @dataclass(frozen=True)
 class Model:
-    """A stage that the records allow, and what the sensor reads in um where its own displacement is zero."""
+    """A stage that the records allow.
+
+    Attributes
+    ----------
+    stage
+        The stage.
+    zero_um
+        What the sensor reads where the stage's own displacement is zero.
+    left_um
+        What the stage leaves of the records, root mean square: it predicts no better than that.
+    """
 
     stage: Stage
     zero_um: float
+    left_um: float
 
 
 class Guard:
@@ -77,7 +88,7 @@ class Guard:
             for state in ("negative",) if whole else ("negative", "positive"):
                 ranges, _ = motion(model.stage, record, self._range_V, state)
                 low, high = (end + model.zero_um for end in ranges["displacement"])
-                yield {**ranges, "displacement": (low, high)}
+                yield {**ranges, "displacement": (low - model.left_um, high + model.left_um)}
 
     def narrowed(self, limits: Limits) -> Limits | None:
         """Limits of commands whose slow loops stay inside; None where hardly any voltage does."""
@@ -147,7 +158,8 @@ def guard_of(
 
     def model(stage: Stage) -> Model:
         _, own_um = motion(stage, like, baseline.range_V)
-        return Model(stage, float(np.mean((read_um - own_um)[known[longest]])))
+        left_um = (read_um - own_um)[known[longest]]
+        return Model(stage, float(np.mean(left_um)), float(np.std(left_um)))
 
     beside = found.bench.baseline
     stages = [baseline.stage]
