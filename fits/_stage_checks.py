@@ -150,8 +150,8 @@ def refuse_unseen(
             )
             if _resolved(loud):
                 raise DataError(
-                    f"{loud.record.source}: no lag and no resonance was found that explains what moves in it: {what}; "
-                    "record it for longer, with a slower chirp or a longer period, or fit the hysteresis alone with "
+                    f"{loud.record.source}: no lag and no resonance was found that explains what moves in it: "
+                    f"{what}; record it for longer, with a slower chirp or a longer period, or fit the hysteresis alone with "
                     "--model loop"
                 )
             raise DataError(
