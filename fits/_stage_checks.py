@@ -151,8 +151,8 @@ def refuse_unseen(
             if _resolved(loud):
                 raise DataError(
                     f"{loud.record.source}: no lag and no resonance was found that explains what moves in it: "
-                    f"{what}; record it for longer, with a slower chirp or a longer period, or fit the hysteresis alone with "
-                    "--model loop"
+                    f"{what}; record it for longer, with a slower chirp or a longer period, or fit the hysteresis "
+                    "alone with --model loop"
                 )
             raise DataError(
                 f"{loud.record.source}: sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it: "
