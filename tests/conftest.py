@@ -23,10 +23,10 @@ if os.environ.get("MICROID_SEED") != "fresh":
 
 
 # Every compiled function maps some memory, of which a process on Linux may have 65530 pieces. Beyond that it crashes.
-_MAPPINGS = 15_000
+_MAPPINGS = 20_000
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True)
 def _few_mappings() -> Iterator[None]:
     """Forget what was compiled, once there is too much of it."""
     yield
