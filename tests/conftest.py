@@ -23,7 +23,7 @@ if os.environ.get("MICROID_SEED") != "fresh":
 
 
 # Every compiled function maps some memory, of which a process on Linux may have 65530 pieces. Beyond that it crashes.
-_MAPPINGS = 20_000
+_MAPPINGS = 10_000
 
 
 @pytest.fixture(autouse=True)
