@@ -166,8 +166,9 @@ def take_out_delays(
             if again is not None and again[0].weighing.noise_um[first] <= _NO_WORSE * found.weighing.noise_um[first]:
                 break
             step /= 2
-        if again is None:
-            return None
+        else:
+            break
+        assert again is not None
         shifts, (found, sure) = shifts + step, again
     seen = tuple(
         one
