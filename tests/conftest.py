@@ -23,16 +23,25 @@ if os.environ.get("MICROID_SEED") != "fresh":
 
 
 # Every compiled function maps some memory, of which a process on Linux may have 65530 pieces. Beyond that it crashes.
-_MAPPINGS = 10_000
+# One diagnosis takes up to 35,000. Between the tests of a module less is forgotten, as they share what is compiled.
+_BETWEEN_MODULES, _BETWEEN_TESTS = 10_000, 20_000
+
+
+def _forget_beyond(most: int) -> None:
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > most:
+        jax.clear_caches()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_mappings_before_a_module() -> None:
+    _forget_beyond(_BETWEEN_MODULES)
 
 
 @pytest.fixture(autouse=True)
 def _few_mappings() -> Iterator[None]:
-    """Forget what was compiled, once there is too much of it."""
     yield
-    mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > _MAPPINGS:
-        jax.clear_caches()
+    _forget_beyond(_BETWEEN_TESTS)
 
 
 @pytest.fixture
