@@ -14,6 +14,8 @@ from data_synth._types import FloatArray
 
 Hold: TypeAlias = Literal["first", "zero"]
 
+# Longest time constant and highest resonance of any stage: beyond it a number stands in another unit.
+_LARGEST = {"time_constant_s": 1e6, "natural_frequency_Hz": 1e9, "damping_ratio": 1e3}
 _BLOCK = 2048
 _NODES = 4
 
@@ -49,10 +51,10 @@ class Plant:
 
     def __post_init__(self) -> None:
         """Raise ValueError for a plant that cannot be."""
-        for name in ("time_constant_s", "natural_frequency_Hz", "damping_ratio"):
+        for name, largest in _LARGEST.items():
             value = getattr(self, name)
-            if not (value is None or 0 < value < math.inf):
-                raise ValueError(f"{name} must be positive, got {value}")
+            if not (value is None or 0 < value <= largest):
+                raise ValueError(f"{name} must be positive and at most {largest:g}, got {value}")
         if (self.natural_frequency_Hz is None) != (self.damping_ratio is None):
             raise ValueError(
                 "natural_frequency_Hz and damping_ratio must be stated together or not at all, "

@@ -25,6 +25,8 @@ from data_synth._types import FloatArray, Initial
 
 # Of a run, and of all runs together: a CSV of 1 GB.
 _MOST_SAMPLES = 10_000_000
+# No record of a stage is sampled more slowly or faster.
+_RATES_Hz = (1e-3, 1e8)
 
 
 def _require(holds: bool, sentence: str) -> None:
@@ -191,7 +193,7 @@ class Run:
     name
         Name of the CSV, without the ending.
     sample_rate_Hz
-        Samples per second.
+        Samples per second, from 0.001 to 1e8.
     program
         What is played, one program after another.
     initial
@@ -212,7 +214,11 @@ class Run:
             re.fullmatch(r"[A-Za-z0-9_-]+", self.name) is not None,
             f"name must be made of letters, digits, '_' and '-', got {self.name!r}",
         )
-        _require(0 < self.sample_rate_Hz < math.inf, f"sample_rate_Hz must be positive, got {self.sample_rate_Hz}")
+        low_Hz, high_Hz = _RATES_Hz
+        _require(
+            low_Hz <= self.sample_rate_Hz <= high_Hz,
+            f"sample_rate_Hz must lie in {low_Hz:g} to {high_Hz:g}, got {self.sample_rate_Hz}",
+        )
         _require(len(self.program) > 0, "program must hold at least one table")
 
     def voltage_V(self, start_V: float, lower_V: float, upper_V: float, rng: np.random.Generator) -> FloatArray:

@@ -81,17 +81,28 @@ def stuck(record: Record) -> list[str]:
     ]
 
 
-def impulses(record: Record, residual_um: np.ndarray, fitted: np.ndarray, robust: bool) -> list[str]:
-    """Find single readings that are far off their neighbours, and name their number and size."""
+def outlying(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+    """Mark the readings that are far off their neighbours where there are enough to matter to a fit, shape `(n,)`."""
     bad = impulsive(residual_um) & fitted
-    height = np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
+    height = _height(residual_um)
     if bad.any():
         # Where large ones pull the fit, what it leaves beside them jumps, too.
         bad &= height > _PULLED * float(np.sqrt(np.mean(height[bad] ** 2)))
-    count = int(bad.sum())
-    height = height[bad]
-    if count < _FEW or np.sum(height**2) < _MATTERS * np.sum(residual_um[fitted] ** 2):
+    if bad.sum() < _FEW or np.sum(height[bad] ** 2) < _MATTERS * np.sum(residual_um[fitted] ** 2):
+        return np.zeros_like(bad)
+    return bad
+
+
+def _height(residual_um: np.ndarray) -> np.ndarray:
+    return np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
+
+
+def impulses(record: Record, residual_um: np.ndarray, fitted: np.ndarray, robust: bool) -> list[str]:
+    """Find single readings that are far off their neighbours, and name their number and size."""
+    bad = outlying(residual_um, fitted)
+    if not bad.any():
         return []
+    count, height = int(bad.sum()), _height(residual_um)[bad]
     listed = ", ".join(str(k + 1) for k in np.flatnonzero(bad)[:_LISTED])
     more = ", ..." if count > _LISTED else ""
     remedy = (

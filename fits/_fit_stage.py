@@ -16,6 +16,7 @@ from fits._result import FitError
 from fits._stage_checks import implausible, refuse_coarse
 from fits._stage_delay import GROSS_PCT, own_up, refuse_delays, take_out_delays
 from fits._stage_moments import Chain
+from fits._stage_reach import leave_outliers
 from fits._stage_result import StageFit
 from fits._stage_run import gain_ahead, place_of_hysteresis, prepare_stage_run
 from fits._stage_solve import Solved
@@ -130,6 +131,10 @@ def fit_stage(
     summary = summarise(found.stage, chain.coordinates, found.solved, found.precision, held)
     if undelayed is not None:
         summary = own_up(summary, chain, undelayed)
+    outliers = leave_outliers(found.plan, found.problem, found.solved)
+    if outliers is not None:
+        said = f"{', '.join(outliers[0])}: outliers pull this fit"
+        summary = outliers[1].widen(summary, said, "fit again with --loss huber, or leave them out")
     odd = remarks_on(records, *known, robust=loss == "huber")
     odd += implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
     notes = [warning for record in (*records, *aside) for warning in record.warnings]

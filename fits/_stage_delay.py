@@ -12,6 +12,7 @@ from fits._floor import Misfit, misfits
 from fits._record import Record
 from fits._result import FitError
 from fits._stage_moments import Chain, along, linearise, pieces
+from fits._stage_reach import Reach
 from fits._stage_result import StageFit
 from fits._stage_run import StageRun, lead_ins, simulate_stage, without
 from fits._stage_solve import Solved, solve_chain
@@ -37,15 +38,11 @@ _BETTER = 0.7
 _NEAR, _MUCH = 2.0, 0.4
 # Precision, in scaled coordinates, that stands in for none.
 _FAINT = 1e-8
-# Half the width of a 95 % interval, in standard deviations.
-_NORMAL = 1.959964
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
 _REMEDY = (
     "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
 )
-# A delay ruins a fit where it moves a parameter by more than this part of it.
-_RUINED = 0.5
 
 
 @dataclass(frozen=True)
@@ -214,35 +211,10 @@ def own_up(fit: StageFit, chain: Chain, undelayed: Undelayed) -> StageFit:
     DataError
         If a parameter moves so much that the fit says nothing.
     """
-    z = undelayed.solved.z
-    sd = np.sqrt(np.diagonal(undelayed.precision.covariance(undelayed.precision.influence())))
-    values, low, high = (
-        np.asarray(chain.coordinates.values(jnp.asarray(z + sign * _NORMAL * sd))) for sign in (0.0, -1.0, 1.0)
-    )
-    said = undelayed.words()
-    moved = [abs(v - p.value) for v, p in zip(values, fit.parameters, strict=True)]
-    ruined = [
-        f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
-        for p, v, m in zip(fit.parameters, values, moved, strict=True)
-        if m > _RUINED * min(abs(v), abs(p.value))
-    ]
-    if ruined:
+    reach, said = Reach.of(chain, undelayed.solved, undelayed.precision), undelayed.words()
+    if ruined := reach.ruined(fit):
         raise DataError(f"{said}, and {ruined[0]}: {_REMEDY}")
-    parameters = tuple(
-        replace(
-            p,
-            sd=float(np.hypot(p.sd, m)),
-            lower=min(p.lower, float(a), float(b)),
-            upper=max(p.upper, float(a), float(b)),
-        )
-        for p, m, a, b in zip(fit.parameters, moved, low, high, strict=True)
-    )
-    remark = (
-        f"{said}; without that the parameters would be "
-        f"{', '.join(f'{p.name} {v:.5g} {p.unit}' for p, v in zip(fit.parameters, values, strict=True))}, and the "
-        "intervals reach there: check columns and time stamps, or the delay of the sensor's electronics"
-    )
-    return replace(fit, parameters=parameters, remarks=(remark, *fit.remarks))
+    return reach.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
 
 
 def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray) -> list[Delay]:

@@ -301,9 +301,18 @@ def test_random_plants_keep_to_their_limits_and_to_what_is_stated(seed):
 @pytest.mark.parametrize(
     ("table", "sentence"),
     [
-        ("time_constant_s = -1e-3", "lab.toml: plant: time_constant_s must be positive, got -0.001"),
-        ("natural_frequency_Hz = 0", "lab.toml: plant: natural_frequency_Hz must be positive, got 0.0"),
-        ("random = true\ndamping_ratio = 0.0", "lab.toml: plant: damping_ratio must be positive, got 0.0"),
+        (
+            "time_constant_s = -1e-3",
+            "lab.toml: plant: time_constant_s must be positive and at most 1e+06, got -0.001",
+        ),
+        (
+            "natural_frequency_Hz = 0",
+            "lab.toml: plant: natural_frequency_Hz must be positive and at most 1e+09, got 0.0",
+        ),
+        (
+            "random = true\ndamping_ratio = 0.0",
+            "lab.toml: plant: damping_ratio must be positive and at most 1000, got 0.0",
+        ),
         ("natural_frequency_Hz = 180", "lab.toml: plant: natural_frequency_Hz and damping_ratio must be stated"),
         ("damping_ratio = 0.04", "lab.toml: plant: natural_frequency_Hz and damping_ratio must be stated together"),
         ("", "lab.toml: plant: time_constant_s, or natural_frequency_Hz and damping_ratio, or random = true must"),

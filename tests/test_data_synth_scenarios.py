@@ -89,7 +89,11 @@ def test_a_scenario_is_read_as_it_is_written():
         ("noise_um = 0.03", "noise_um = -1", "lab.toml: sensor: noise_um must be zero or positive, got -1.0"),
         ("demagnetised", "annealed", "lab.toml: runs[0]: initial must be one of negative, positive, demagnetised"),
         ('name = "train"', 'name = "../x"', "lab.toml: runs[0]: name must be made of letters, digits"),
-        ("sample_rate_Hz = 10.0", "sample_rate_Hz = 0", "lab.toml: runs[0]: sample_rate_Hz must be positive"),
+        (
+            "sample_rate_Hz = 10.0",
+            "sample_rate_Hz = 0",
+            "lab.toml: runs[0]: sample_rate_Hz must lie in 0.001 to 1e+08, got 0.0",
+        ),
         ("[80, 40.5]", "[130]", "lab.toml: runs[0]: program[0] (forc): reversals_V must lie in 0.0 to 120.0 V, got"),
         ("amplitude_V = 20", "amplitude_V = 80", "lab.toml: runs[0]: program[1] (nested): the program reaches"),
         ("amplitude_V = 20", "amplitude_V = -2", "lab.toml: runs[0]: program[1] (nested): amplitude_V must be"),

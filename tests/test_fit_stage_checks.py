@@ -93,9 +93,13 @@ def test_times_in_ms_are_told_by_the_resonance(runs):
 def test_outliers_and_a_stuck_sensor_are_named(runs, rng):
     slow, fast = runs
     spoilt, hit = with_outliers(rng, fast)
-    remark = said(fit(slow, spoilt), "outliers")
+    pulled = fit(slow, spoilt)
+    remark = said(pulled, "jump out")
     assert int(re.search(r"(\d+) readings", remark)[1]) == pytest.approx(0.8 * hit.sum(), rel=0.25)
     assert "--loss huber" in remark
+    assert "driver.time_constant_s" in said(pulled, "the intervals reach there")
+    for name, value in TRUTH.items():
+        assert 0.995 * pulled[name].lower < value < 1.005 * pulled[name].upper
     robust = fit(slow, spoilt, loss="huber")
     assert "count less" in said(robust, "outliers")
     result = fit(slow, stuck(fast, len(fast) // 2, 400))

@@ -25,6 +25,8 @@ from _fuzz_files import LEVELS, csv, good_files, loops
 import data_synth
 import fits
 from data_synth import ScenarioError
+from data_synth._engine import refinement
+from data_synth._plant import Plant
 from fits._control_gains import read_gains
 from fits.sweeps._chunks import chunk_rows, compute_chunk
 from fits.sweeps._spec import read_sweep
@@ -218,11 +220,15 @@ def test_the_command_refuses_them_with_status_2_or_writes_finite_files(good, tmp
 
 
 def work(name, path):
-    """How much a file that was taken asks for: samples of a scenario, substeps of a stage."""
+    """How much a file that was taken asks for: fine steps of a scenario, substeps of a stage."""
     if name == "scenario.toml":
         scenario = data_synth.load_scenario(str(path))
         rng, rig = np.random.default_rng(0), scenario.rig
-        return sum(len(each.voltage_V(rig.lower_V, rig.lower_V, rig.upper_V, rng)) for each in scenario.runs)
+        plant = Plant() if scenario.plant is None else scenario.plant.draw(rng)
+        counts = [len(each.voltage_V(rig.lower_V, rig.lower_V, rig.upper_V, rng)) for each in scenario.runs]
+        return sum(
+            n * refinement(plant, each.sample_rate_Hz, n) for n, each in zip(counts, scenario.runs, strict=True)
+        )
     return fits.load_model(path).model.substeps if name == "stage.json" else 1
 
 
@@ -272,4 +278,5 @@ def test_study(good, tmp_path, seed):
             print("command", broken[-1], flush=True)
     print({found: count for (name, found), count in figures.items() if name == "command"}, f"{len(broken)} faults")
     assert not faults
+    assert not slow
     assert not broken
