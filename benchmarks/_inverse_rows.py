@@ -15,7 +15,7 @@ from _inputs import learning_path, model_of, random_path, smooth_density
 from _timing import Line, Table, cpu_seconds, seconds, side_by_side
 
 import fits
-from fits._network_inverse import NetworkInverse, fit_network_inverse
+from fits.control._network_inverse import NetworkInverse, fit_network_inverse
 from microid import Preisach, invert
 
 _UPPER_V, _STROKE_um, _LEVELS = 120.0, 40.0, 100

@@ -51,7 +51,7 @@ def source_digest() -> str:
 def begin() -> None:
     """Prepare a worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from fits._cli_jax import start_jax
+    from fits.io._jax_setup import start_jax
 
     start_jax()
 

@@ -1,6 +1,6 @@
 """The `microid` command as `python -m fits`."""
 
-from fits._cli import main
+from fits.cli._main import main
 
 if __name__ == "__main__":
     main()

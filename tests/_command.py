@@ -4,7 +4,7 @@ import re
 
 from click.testing import CliRunner
 
-from fits._cli import cli
+from fits.cli._main import cli
 
 OFF = {"MICROID_CACHE": "off"}
 

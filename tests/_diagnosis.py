@@ -3,7 +3,6 @@
 import numpy as np
 
 from fits import default_stage
-from fits._limits import Extreme
 from fits.diagnosis._result import (
     Bound,
     Diagnosis,
@@ -14,6 +13,7 @@ from fits.diagnosis._result import (
     RunView,
     Test,
 )
+from fits.io._limits import Extreme
 
 KINDS = ("no_effect", "effect_found", "unexplained")
 ODD = "a <b> & \"c\" 'd'"

@@ -7,8 +7,8 @@ import numpy as np
 
 import fits
 import microid as m
-from fits._control_gains import GAINS
-from fits._stage_toml import design_text
+from fits.control._gains import GAINS
+from fits.machining._design_file import design_text
 from microid import Stage
 
 SAMPLES, LEVELS = 120, 4

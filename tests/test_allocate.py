@@ -8,9 +8,9 @@ from _gain_formulas import ARGUMENTS, TABLE_1, TWINS, gains, slopes
 
 import fits
 from fits import _allocate
-from fits._allocate import AllocationError, allocate
-from fits._errors import DataError
-from fits._stage_design import Together, paper_design
+from fits.io._errors import DataError
+from fits.machining._allocate import AllocationError, allocate
+from fits.machining._design import Together, paper_design
 
 WIDE_MM = (1e-5, 0.35)
 LEGS = {"alpha1": 9.0, "alpha2": 9.0, "alpha3": 14.0}

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits._atomic import atomic_path, atomic_write_bytes, atomic_write_text, write_csv
-from fits._errors import DataError
-from fits._record import Record
+from fits.io._atomic import atomic_path, atomic_write_bytes, atomic_write_text, write_csv
+from fits.io._errors import DataError
+from fits.io._record import Record
 
 
 def test_text_and_bytes_are_written_as_they_are(tmp_path):

@@ -15,10 +15,10 @@ from _models import densities_of, limits_V, random_model
 from matplotlib.image import imread
 
 import fits
-import fits._cli_budget
+import fits.cli._budget
 import microid as m
-from fits._cli import cli
-from fits._design import Grid
+from fits.cli._main import cli
+from fits.loop._design import Grid
 
 NAMES = {
     "x": ["l1", "t1", "la1", "alpha1", "l2", "t2", "l3"],
@@ -239,7 +239,7 @@ def test_a_rotation_needs_an_arm_for_its_sensor(folder):
 )
 def test_bad_input_ends_in_one_sentence(folder, monkeypatch, arguments, words):
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(fits._cli_budget, "budget", lambda *_, **__: pytest.fail("worked before refusing"))
+    monkeypatch.setattr(fits.cli._budget, "budget", lambda *_, **__: pytest.fail("worked before refusing"))
     Path("short.csv").write_text("\n".join(Path("idle.csv").read_text().splitlines()[:50]))
     linear = m.Stage.of(piezo=m.Piezo(jnp.asarray(0.3)))
     unsure = fits.load_model("model.json").uncertainty
@@ -252,4 +252,4 @@ def test_bad_input_ends_in_one_sentence(folder, monkeypatch, arguments, words):
 def test_choices_in_the_help_are_those_of_the_library():
     options = {option.name: option for option in cli.commands["budget"].params}
     assert tuple(options["axis"].type.choices) == (*m.AXES, "all")
-    assert tuple(options["model_measures"].type.choices) == fits._budget.MEASURES
+    assert tuple(options["model_measures"].type.choices) == fits.machining._budget.MEASURES

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fits import DataError
-from fits._cli_jax import _cache_folder
+from fits.io._jax_setup import _cache_folder
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="there are no such rights here")

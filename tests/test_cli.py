@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from _command import OFF, files, refused, run
 
-import fits._cli_fit
-from fits._cli import cli
-from fits._cli_jax import _cache_folder
-from fits._run import INITIAL_STATES
+import fits.cli._fit
+from fits.cli._main import cli
+from fits.io._jax_setup import _cache_folder
+from fits.loop._run import INITIAL_STATES
 from microid import FAMILIES
 
 ROOT = Path(__file__).parents[1]
@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 
 # A shell that runs in the background makes its children ignore interrupts.
 HEEDING = (
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from fits._cli import main; main()"
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from fits.cli._main import main; main()"
 )
 
 
@@ -143,7 +143,7 @@ def test_an_interruption_leaves_nothing(bench, tmp_path, monkeypatch, step):
                 (argument / "loops.png").write_bytes(b"half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fits._cli_fit, step, interrupt)
+    monkeypatch.setattr(fits.cli._fit, step, interrupt)
     csv = folder / "csv" / "train.csv"
     result = run("fit", csv, "--out", old, "--plots", tmp_path / "plots", "--levels", 8)
     assert result.exit_code == 130
@@ -233,7 +233,7 @@ def test_compiled_functions_are_kept_where_the_user_says(tmp_path, monkeypatch):
 def test_help_does_not_wait_for_heavy_libraries():
     code = (
         "import sys\n"
-        "from fits._cli import cli\n"
+        "from fits.cli._main import cli\n"
         "for arguments in (['--help'], ['fit', '--help'], ['synth', '--help'], ['--version']):\n"
         "    cli(arguments, standalone_mode=False)\n"
         "print(sorted({'jax', 'pandas', 'matplotlib', 'numpy', 'scipy'} & set(sys.modules)))\n"
@@ -315,7 +315,7 @@ def test_places_that_cannot_be_are_refused_before_the_work(bench, tmp_path, monk
     shutil.copy(folder / "csv" / "train.csv", "train.csv")
     shutil.copy(folder / "model.json", "model.json")
     os.mkfifo("pipe")
-    monkeypatch.setattr(fits._cli_fit, "read_runs", lambda *_: pytest.fail("the work has begun"))
+    monkeypatch.setattr(fits.cli._fit, "read_runs", lambda *_: pytest.fail("the work has begun"))
     for place in ("", "n" * 300, "pipe"):
         refused(run(*arguments, place))
     assert files(tmp_path) == ["model.json", "pipe", "train.csv"]

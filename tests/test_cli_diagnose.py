@@ -8,8 +8,8 @@ from _command import files, refused, run
 from _diagnosis import diagnosis
 
 from fits import DataError, FitError, FitStatus, read_csv
-from fits.diagnosis._report import report_html
 from fits.diagnosis._steps import Step
+from fits.report._diagnosis import report_html
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def test_what_cannot_be_written_whole_is_not_written(bench, monkeypatch):
     def full(*_):
         raise DataError("the disk is full")
 
-    monkeypatch.setattr("fits._cli_diagnose.write_csv", full)
+    monkeypatch.setattr("fits.cli._diagnose.write_csv", full)
     refused(run("diagnose", "run.csv", "--out", "d"), "full")
     assert files(bench.folder / "d") == []
 

@@ -8,9 +8,9 @@ import pytest
 from _command import files, refused, run
 
 import fits
-import fits._cli_sensitivity
+import fits.cli._sensitivity
 import microid as m
-from fits._cli import cli
+from fits.cli._main import cli
 
 
 def axes(path):
@@ -101,7 +101,7 @@ def draw(design, report, folder):
 @pytest.fixture
 def drawing(monkeypatch):
     def use(function):
-        module = types.ModuleType("fits._plot_sensitivity")
+        module = types.ModuleType("fits.plots._sensitivity")
         module.plot_sensitivity = function
         monkeypatch.setitem(sys.modules, module.__name__, module)
 
@@ -154,7 +154,7 @@ def test_an_interruption_leaves_nothing(stage, tmp_path, drawing):
 )
 def test_bad_input_ends_in_one_sentence(stage, monkeypatch, options, words):
     monkeypatch.chdir(stage.parent)
-    monkeypatch.setattr(fits._cli_sensitivity, "sensitivities", lambda *_: pytest.fail("worked before refusing"))
+    monkeypatch.setattr(fits.cli._sensitivity, "sensitivities", lambda *_: pytest.fail("worked before refusing"))
     Path("broken.toml").write_text(stage.read_text().replace("t1 = { value = 0.8", "t1 = { value = -0.8"))
     before = stage.read_bytes()
     refused(run("sensitivity", *options), *words)

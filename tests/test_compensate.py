@@ -20,7 +20,7 @@ from fits import (
     read_reference,
     save_model,
 )
-from fits._design import Grid
+from fits.loop._design import Grid
 
 STATES = ("negative", "positive", "demagnetised")
 SAMPLES = 200

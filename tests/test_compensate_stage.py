@@ -147,7 +147,7 @@ def test_the_driver_alone_can_be_what_asks_for_too_much(rng):
 
 def test_the_command_takes_stages(rng, model_file, tmp_path, monkeypatch):
     """Reading them from a file is tested elsewhere: here the model in the file is put into a stage."""
-    from fits import _cli_compensate
+    from fits.cli import _compensate as _cli_compensate
 
     law, path = model_file
     stage = stage_of(rng, law)

@@ -9,22 +9,22 @@ from scipy.signal import lsim
 
 from data_synth._mechanics import Mechanics, Mode
 from fits import Record
-from fits._design import Grid
-from fits._fit_stage import default_stage
-from fits._stage_moments import Chain
-from fits._stage_run import place_of_hysteresis, prepare_stage_run
-from fits._stage_uncertainty import offsets_out
 from fits.diagnosis import _contest, _select
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._contest import INEXACT, Rival, best_of, contest
 from fits.diagnosis._law import Law
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._score import score
 from fits.diagnosis._select import _inexact, select
+from fits.loop._design import Grid
+from fits.stage._fit import default_stage
+from fits.stage._moments import Chain
+from fits.stage._run import place_of_hysteresis, prepare_stage_run
+from fits.stage._uncertainty import offsets_out
+from fits.stats._whiten import Noise
 from microid import EFFECTS, Sensor
 from microid.effects.aging import Aging
 from microid.effects.voltage_dependent_capacitance import VoltageDependentCapacitance

@@ -11,12 +11,12 @@ from scipy.signal import fftconvolve, lsim
 
 from fits import Record, diagnose
 from fits import _grid as grid
-from fits._evidence import Posterior
-from fits._run import known_samples
 from fits.diagnosis._floor import Floor, pooled
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._regression import _alive
 from fits.diagnosis._regulated import held_creep
+from fits.loop._evidence import Posterior
+from fits.loop._run import known_samples
+from fits.stats._whiten import Noise
 
 RATE_Hz, FINE = 1000.0, 16
 

@@ -12,14 +12,15 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from fits import Record
-from fits._motion import pass_signal
 from fits.diagnosis import _evaluate
 from fits.diagnosis._candidates import Probe
 from fits.diagnosis._evaluate import drop_programs
-from fits.diagnosis._floor import band_of, floor_of, jitter_s, quantum_um, spikes
-from fits.diagnosis._noise import Noise, learn_noise
+from fits.diagnosis._floor import band_of, floor_of, jitter_s, spikes
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._score import Family, evidence, score
+from fits.stage._motion import pass_signal
+from fits.stats._at_rest import quantum_um
+from fits.stats._whiten import Noise, learn_noise
 from microid import EFFECTS, AbstractPart, Scene, Signal
 
 WHITE = np.zeros(0)

@@ -11,13 +11,13 @@ from test_diagnosis_contest import NOISE_UM, stage_on
 from fits import Record
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._profiled import profiled
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._settle import released
 from fits.diagnosis._tell import _parameters
+from fits.stats._whiten import Noise
 from microid import EFFECTS, Driver
 
 STEP_S, COUNT = 0.01, 3300

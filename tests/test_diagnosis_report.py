@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from _diagnosis import KINDS, diagnosis, run_view
 
-from fits.diagnosis._json import diagnosis_json, diagnosis_schema
-from fits.diagnosis._report import report_html
-from fits.diagnosis._report_plots import _envelope
-from fits.diagnosis._report_views import VIEWS
-from fits.diagnosis._report_words import chance, estimate, number, parameter_name, percent, shown_unit, sigmas
 from fits.diagnosis._result import EffectParameter, Gain, RunView
+from fits.diagnosis._views import VIEWS
+from fits.diagnosis._words import chance, estimate, number, parameter_name, percent, shown_unit, sigmas
+from fits.plots._diagnosis import _envelope
+from fits.report._diagnosis import report_html
+from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 

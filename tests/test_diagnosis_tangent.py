@@ -9,22 +9,22 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lsim
 
 from fits import Record
-from fits._design import Grid
-from fits._fit_stage import default_stage
-from fits._stage_moments import Chain
-from fits._stage_run import place_of_hysteresis, prepare_stage_run
-from fits._stage_uncertainty import offsets_out
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import simulate, with_effects
 from fits.diagnosis._law import Law
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._settle import settled
 from fits.diagnosis._through import passed
+from fits.loop._design import Grid
+from fits.stage._fit import default_stage
+from fits.stage._moments import Chain
+from fits.stage._run import place_of_hysteresis, prepare_stage_run
+from fits.stage._uncertainty import offsets_out
+from fits.stats._whiten import Noise
 from microid.effects.backlash import Backlash
 from microid.effects.clock_mismatch import ClockMismatch
 from microid.effects.driver_saturation import DriverSaturation

@@ -8,15 +8,15 @@ import pytest
 from test_diagnosis_tangent import baseline_of
 
 from fits import FitError, Record, diagnose
-from fits._choose_grid import _resolve
-from fits._result import FitStatus
-from fits._run import UNSWEPT, known_samples
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
+from fits.loop._choose_grid import _resolve
+from fits.loop._result import FitStatus
+from fits.loop._run import UNSWEPT, known_samples
+from fits.stats._whiten import Noise
 from microid.effects.backlash import Backlash
 
 NOISE_um = 0.02

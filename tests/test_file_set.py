@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from fits import DataError
-from fits._atomic import atomic_write_text
-from fits._file_set import file_set
-from fits._temporary import is_temporary, remove_stale, temporary_name
+from fits.io._atomic import atomic_write_text
+from fits.io._file_set import file_set
+from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
 ROOT = Path(__file__).parents[1]
 
@@ -181,8 +181,8 @@ def test_a_folder_that_is_removed_meanwhile_is_one_sentence(tmp_path, what):
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from fits._errors import DataError
-from fits._file_set import file_set
+from fits.io._errors import DataError
+from fits.io._file_set import file_set
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
 try:
@@ -274,7 +274,7 @@ def test_what_another_user_left_stays(tmp_path, ended):
 
 LOST = """
 import signal, sys, time
-from fits._cli_common import heed_signals, in_sentences
+from fits.cli._common import heed_signals, in_sentences
 
 class Noisy:
     def __del__(self):

@@ -164,8 +164,8 @@ def test_single_precision_is_refused(bench):
 
 def test_a_solver_that_runs_out_of_steps_gives_no_answer(bench, monkeypatch):
     train, _ = records(bench)
-    monkeypatch.setattr("fits._shapes._STEPS", 1)
-    monkeypatch.setattr("fits._shapes._TIMES", 1)
+    monkeypatch.setattr("fits.loop._shapes._STEPS", 1)
+    monkeypatch.setattr("fits.loop._shapes._TIMES", 1)
     with pytest.raises(fits.FitError, match="the cost still falls") as caught:
         # A number of levels of its own: what is compiled here must not be met again.
         fits.fit([train], family="mixture", levels=9, starts=1, initial="negative")

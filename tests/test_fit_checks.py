@@ -7,9 +7,9 @@ import pytest
 from _wrong_records import bench, delayed, in_ms, joined, read, stuck, thinned, with_outliers
 
 import fits
-from fits._fit_checks import impulsive
-from fits._fit_checks import stuck as told_stuck
-from fits._floor import sensor_noise_um
+from fits.loop._fit_checks import impulsive
+from fits.loop._fit_checks import stuck as told_stuck
+from fits.loop._misfit import sensor_noise_um
 
 LEVELS = 16
 ALARMS = ("BEFORE", "AFTER", "stuck", "outliers", "apart", "samples are")

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.signal import StateSpace, lsim
 
 import fits
-import fits._modal_fit
+import fits.stage._modal_fit
 import microid as m
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -225,14 +225,14 @@ def test_data_that_say_too_little_are_refused(rng):
 
 def test_a_search_that_does_not_arrive_has_no_answer(rng, monkeypatch):
     slow = optx.RESULTS.nonlinear_max_steps_reached
-    solve = fits._modal_fit._solve
+    solve = fits.stage._modal_fit._solve
     data = noisy(rng, plant(rng, coupled=False), 1e-2)
 
     def stop_short(model, spectra):
         found, _ = solve(model, spectra)
         return eqx.tree_at(lambda modes: modes.damping_ratio, found, 1.1 * found.damping_ratio), slow
 
-    monkeypatch.setattr("fits._modal_fit._solve", stop_short)
+    monkeypatch.setattr("fits.stage._modal_fit._solve", stop_short)
     with pytest.raises(fits.FitError) as caught:
         fits.fit_response(data, 2)
     assert caught.value.status is fits.FitStatus.MAX_STEPS

@@ -27,7 +27,7 @@ import fits
 from data_synth import ScenarioError
 from data_synth._engine import refinement
 from data_synth._plant import Plant
-from fits._control_gains import read_gains
+from fits.control._gains import read_gains
 from fits.sweeps._chunks import chunk_rows, compute_chunk
 from fits.sweeps._spec import read_sweep
 

@@ -10,7 +10,7 @@ from _seed import seed_of
 from test_diagnosis_report import violations
 
 import data_synth
-from fits.diagnosis._json import diagnosis_schema
+from fits.report._diagnosis_json import diagnosis_schema
 
 # Effects of the library that are found as good as always at five times the noise.
 FOUND = ("creep",)

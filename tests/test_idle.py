@@ -6,9 +6,9 @@ from matplotlib.image import imread
 from scipy import signal, stats
 
 import fits
-from fits._idle import idle_noise, read_idle
-from fits._noise_spectrum import find_lines
-from fits._plot_idle import plot_idle
+from fits.machining._idle import idle_noise, read_idle
+from fits.plots._idle import plot_idle
+from fits.stats._noise_spectrum import find_lines
 
 RATE_Hz = 1000.0
 

@@ -29,8 +29,8 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no SIG
 WRITER = """
 import json, sys
 from pathlib import Path
-from fits._cli_common import heed_signals, in_sentences
-from fits._file_set import file_set
+from fits.cli._common import heed_signals, in_sentences
+from fits.io._file_set import file_set
 
 @in_sentences
 def write(folder, first, rounds):
@@ -52,7 +52,7 @@ write(Path(folder), int(first), int(rounds))
 # The command, whose diagnosis is made up: the real one takes long, and touches no file.
 DIAGNOSE = """
 import sys, types
-from fits._cli import main
+from fits.cli._main import main
 
 def diagnose(*_, **__):
     import numpy as np

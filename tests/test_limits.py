@@ -7,7 +7,10 @@ from _seed import seed_of
 import data_synth
 import fits
 from fits import DataError, Record
-from fits._limits import (
+from fits.diagnosis._inside import Guard, Model
+from fits.diagnosis._path import limits_of
+from fits.diagnosis._programs import menu
+from fits.io._limits import (
     Extreme,
     allowed,
     beyond,
@@ -18,10 +21,7 @@ from fits._limits import (
     reached_in,
     stated_as,
 )
-from fits._motion import motion, reached_by
-from fits.diagnosis._inside import Guard, Model
-from fits.diagnosis._path import limits_of
-from fits.diagnosis._programs import menu
+from fits.stage._motion import motion, reached_by
 
 MOST = 1024
 

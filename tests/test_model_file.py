@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import fits
-import fits._model_file
+import fits.stage._model_file
 import microid
 from fits import DataError, Uncertainty, load_model, save_model
-from fits._design import Grid
-from fits._run import prepare_run, simulate_run
+from fits.loop._design import Grid
+from fits.loop._run import prepare_run, simulate_run
 
 REPORT = {"status": "converged", "noise_um": 0.1 + 0.2, "remarks": ["a: b"], "held_out": None}
 
@@ -84,7 +84,7 @@ def test_the_documented_lines_read_the_file_without_microid(tmp_path, rng, monke
     model, uncertainty = draw("grid", rng)
     save_model(tmp_path / "model.json", model, uncertainty, REPORT)
     monkeypatch.chdir(tmp_path)
-    lines = re.findall(r"(?m)^ {4}(.*)$", fits._model_file.__doc__.split("are read by\n")[1])
+    lines = re.findall(r"(?m)^ {4}(.*)$", fits.stage._model_file.__doc__.split("are read by\n")[1])
     assert len(lines) < 10
     found = {}
     exec("\n".join(lines), found)

@@ -9,7 +9,7 @@ from test_model_file import REPORT, bits, hashed, refusal
 
 import microid
 from fits import DataError, StageUncertainty, Uncertainty, load_model, save_model
-from fits._design import Grid
+from fits.loop._design import Grid
 
 PARAMETERS, LEVELS, PERTURBATIONS = 3, 5, 6
 

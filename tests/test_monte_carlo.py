@@ -10,11 +10,11 @@ from scipy import stats
 from scipy.optimize import brentq
 
 import microid as m
-from fits import _second_order
-from fits._errors import DataError
-from fits._monte_carlo import draw, gains_of, mixing, monte_carlo
-from fits._second_order import second_order
-from fits._stage_design import Together, paper_design
+from fits.io._errors import DataError
+from fits.machining import _second_order
+from fits.machining._design import Together, paper_design
+from fits.machining._monte_carlo import draw, gains_of, mixing, monte_carlo
+from fits.machining._second_order import second_order
 
 LAWS = {
     "normal": lambda half: stats.norm(0, half / 3),

@@ -7,7 +7,7 @@ from _models import compiled
 from _reference import branches
 
 from fits import DataError, Record
-from fits._network_inverse import fit_network_inverse
+from fits.control._network_inverse import fit_network_inverse
 
 SAMPLES = 1200
 # One size for all tests: compiling the training takes longer than the training.

@@ -8,13 +8,11 @@ import pytest
 
 import data_synth
 from fits import Record
-from fits._stage_run import prepare_stage_run
 from fits.diagnosis import _baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._contest import Rival
 from fits.diagnosis._experiment import Wish, _open, refine, suggest
 from fits.diagnosis._law import Law, law_of
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._path import Limits, limits_of, paces
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._programs import Program, menu
@@ -24,6 +22,8 @@ from fits.diagnosis._regression import regress
 from fits.diagnosis._result import FoundCause
 from fits.diagnosis._score import score
 from fits.diagnosis._select import Cause, select
+from fits.stage._run import prepare_stage_run
+from fits.stats._whiten import Noise
 from microid import EFFECTS
 
 MOST = 3000

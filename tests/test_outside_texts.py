@@ -12,10 +12,10 @@ import pytest
 from _diagnosis import diagnosis, run_view
 
 from fits import Record
-from fits._plot_style import figure, verbatim
-from fits._printable import printable
-from fits._record import Reference
-from fits.diagnosis._report import report_html
+from fits.io._printable import printable
+from fits.io._record import Reference
+from fits.plots._style import figure, verbatim
+from fits.report._diagnosis import report_html
 
 NAMES = ["a$x^$.csv", r"\$5.csv", "$$", "a$b.csv", "<b>&.csv", "50 %_{x}.csv", r"C:\alpha$\frac$", "Messung µ.csv"]
 

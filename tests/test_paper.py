@@ -11,11 +11,11 @@ from _command import files, refused, run
 from _seed import seed_of
 
 import data_synth as ds
-import fits._cli_paper as paper
-import fits._cli_paper_runs as runs
-from fits._cli_paper_gains import PaperMode, paper_controller, placed_pid, shown_reference
-from fits._cli_paper_loop import run_feedback, stacked
-from fits._paper_tables import PAPER, Measured, PaperResult, paper_json, paper_page
+import fits.cli._paper as paper
+import fits.paper._runs as runs
+from fits.paper._gains import PaperMode, paper_controller, placed_pid, shown_reference
+from fits.paper._loop import run_feedback, stacked
+from fits.paper._tables import PAPER, Measured, PaperResult, paper_json, paper_page
 
 T = 1e-3
 MODE = PaperMode(34.7, 0.13, 1.8)

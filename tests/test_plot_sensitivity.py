@@ -9,8 +9,8 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 import fits
-import fits._plot_sensitivity
-from fits._plot_sensitivity import _apart
+import fits.plots._sensitivity
+from fits.plots._sensitivity import _apart
 
 LEG = {"alpha1": "la1", "alpha2": "la2", "alpha3": "la3"}
 AXES = ("z", "alpha", "gamma")
@@ -38,15 +38,15 @@ def other():
 
 def draw(design, axes, folder):
     figures = []
-    save = fits._plot_sensitivity.save
+    save = fits.plots._sensitivity.save
 
     def remember(picture, path):
         figures.append(picture)
         return save(picture, path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fits._plot_sensitivity, "save", remember)
-        patch.setattr(fits._plot_sensitivity, "paper_claims", lambda _: CLAIMS)
+        patch.setattr(fits.plots._sensitivity, "save", remember)
+        patch.setattr(fits.plots._sensitivity, "paper_claims", lambda _: CLAIMS)
         paths = fits.plot_sensitivity(design, fits.sensitivities(design, axes), folder)
     return paths, figures
 

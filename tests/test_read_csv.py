@@ -11,9 +11,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from fits._errors import DataError
-from fits._read_csv import read_csv, read_runs
-from fits._units import parse_columns
+from fits.io._errors import DataError
+from fits.io._read_csv import read_csv, read_runs
+from fits.io._units import parse_columns
 
 N = 60
 TIME = [i / 2 for i in range(N)]  # dyadic numbers: exact in binary and in decimal
@@ -334,5 +334,5 @@ def test_every_float_is_read_exactly(table, dialect):
 
 
 def test_pandas_is_imported_only_when_a_file_is_read():
-    code = "import sys, fits._read_csv, fits._atomic; assert 'pandas' not in sys.modules"
+    code = "import sys, fits.io._read_csv, fits.io._atomic; assert 'pandas' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])

@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits._errors import DataError
-from fits._read_csv import read_csv
-from fits._units import parse_columns
+from fits.io._errors import DataError
+from fits.io._read_csv import read_csv
+from fits.io._units import parse_columns
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 

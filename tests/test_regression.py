@@ -9,13 +9,13 @@ from scipy.optimize import nnls
 from scipy.stats import multivariate_normal
 
 import fits
-from fits._design import Grid, columns_of
-from fits._evidence import _negative_log, maximise_evidence, posterior
-from fits._moments import gather
-from fits._noise import correlation_samples, shared_square
-from fits._nonnegative import BlockPivoting
-from fits._prior import Hyper, interpolation, roughness
-from fits._run import prepare_run, simulate_run
+from fits.loop._design import Grid, columns_of
+from fits.loop._evidence import _negative_log, maximise_evidence, posterior
+from fits.loop._moments import gather
+from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._run import prepare_run, simulate_run
+from fits.stats._noise import correlation_samples, shared_square
+from fits.stats._nonnegative import BlockPivoting
 
 LEVELS = 6
 

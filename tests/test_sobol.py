@@ -8,9 +8,9 @@ from _gain_formulas import ARGUMENTS, TABLE_1, gains, slopes
 from scipy import stats
 from scipy.optimize import brentq
 
-from fits._errors import DataError
-from fits._sobol import indices, intervals, outputs_of, sobol
-from fits._stage_design import Together, paper_design
+from fits.io._errors import DataError
+from fits.machining._design import Together, paper_design
+from fits.machining._sobol import indices, intervals, outputs_of, sobol
 
 
 def ishigami(x, a=7.0, b=0.1):

@@ -3,7 +3,7 @@
 import numpy as np
 
 import fits
-from fits._stage_start import MeasuredResponse, start_stages
+from fits.stage._start import MeasuredResponse, start_stages
 
 
 def poles_of(stage):

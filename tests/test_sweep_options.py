@@ -11,13 +11,14 @@ from _command import refused, run
 from _sweeps import parsed
 
 from fits import DataError, fit
-from fits._design import branch_table
-from fits._prior import roughness
-from fits._run import initial_state, known_samples
+from fits.loop._design import branch_table
+from fits.loop._prior import roughness
+from fits.loop._run import initial_state, known_samples
+from fits.plots._sweep import _edges, _logarithmic
 from fits.sweeps._chunks import chunk_count, compute_chunk
 from fits.sweeps._fit_batch import fit_batch
 from fits.sweeps._run import run_sweep
-from fits.sweeps._show import _edges, _logarithmic, open_sweep
+from fits.sweeps._show import open_sweep
 from microid import Staircase
 
 HEAD = """

@@ -157,7 +157,7 @@ def test_what_a_killed_process_left_is_no_other_file(kept, tmp_path):
     out = tmp_path / "begun"
     (out / "ledger").mkdir(parents=True)
     # Names as a process made them that has ended since.
-    code = "from fits._temporary import temporary_name; print(temporary_name('.json'))"
+    code = "from fits.io._temporary import temporary_name; print(temporary_name('.json'))"
     ended = [
         subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.strip()
         for _ in range(2)

@@ -13,8 +13,8 @@ from _seed import seed_of
 import fits
 import microid as m
 import microid.control as c
-from fits._tune import _problem
-from fits._tune_problem import Goal, judge
+from fits.control._tune import _problem
+from fits.control._tune_problem import Goal, judge
 
 T = 1e-3
 SAMPLES = 160

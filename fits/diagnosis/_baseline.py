@@ -8,20 +8,20 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from fits._choose_grid import choose_grid
-from fits._columns import PATH
-from fits._design import columns_of
-from fits._errors import DataError
-from fits._fit_stage import default_stage, solve_stage
-from fits._prior import roughness
-from fits._record import Record
-from fits._result import FitError
-from fits._run import prepare_run
-from fits._stage_moments import Chain
-from fits._stage_run import StageRun, prepare_stage_run
-from fits._stage_solve import prior_precision
 from fits.diagnosis._evaluate import simulate
-from fits.diagnosis._noise import rough_noise_um
+from fits.io._columns import PATH
+from fits.io._errors import DataError
+from fits.io._record import Record
+from fits.loop._choose_grid import choose_grid
+from fits.loop._design import columns_of
+from fits.loop._prior import roughness
+from fits.loop._result import FitError
+from fits.loop._run import prepare_run
+from fits.stage._fit import default_stage, solve_stage
+from fits.stage._moments import Chain
+from fits.stage._run import StageRun, prepare_stage_run
+from fits.stage._solve import prior_precision
+from fits.stats._whiten import rough_noise_um
 from microid import Hold, Preisach, Stage
 
 # What a finer grid would follow has a prior of its own in the projection.

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits._columns import columns_beside
-from fits._motion import Prepared, prepare, signals
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import respond_again, with_effects
+from fits.io._columns import columns_beside
+from fits.stage._motion import Prepared, prepare, signals
 from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host
 
 # Strength at which an effect's derivative is taken, as a share of that of its probe.
@@ -181,7 +181,7 @@ def _scaled(effect: AbstractEffect, share: float) -> AbstractEffect:
 
 def one_sided(form: type[AbstractEffect]) -> bool:
     """Whether the strength of an effect cannot be negative."""
-    from fits._encode import _spec
+    from fits.stage._encode import _spec
 
     fields = form.__dataclass_fields__
     specs = [_spec(fields[name]) for name in form.strength]

@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from fits._limits import measured_ranges
-from fits._record import Record
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._experiment import Wish, suggest
@@ -25,6 +23,8 @@ from fits.diagnosis._select import Selection
 from fits.diagnosis._steps import Step
 from fits.diagnosis._structure import cycles, further_views, look, together, views
 from fits.diagnosis._tell import bounds, causes_of
+from fits.io._limits import measured_ranges
+from fits.io._record import Record
 from microid import AbstractEffect, Stage
 
 # Causes explain at least this part of what is reproducible, or the true ones are not in the library; with less than

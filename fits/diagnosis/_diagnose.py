@@ -7,10 +7,6 @@ from types import MappingProxyType
 import jax
 import numpy as np
 
-from fits._errors import DataError
-from fits._limits import MARGIN, UNITS
-from fits._record import Record, refuse_repeats
-from fits._run import UNSWEPT
 from fits.diagnosis._conclude import conclude
 from fits.diagnosis._experiment import Wish
 from fits.diagnosis._prepare import HOLDS, Prepared, prepare_diagnosis
@@ -18,6 +14,10 @@ from fits.diagnosis._result import Diagnosis
 from fits.diagnosis._select import Selection, select
 from fits.diagnosis._steps import Step
 from fits.diagnosis._unswept import FirstWaysError
+from fits.io._errors import DataError
+from fits.io._limits import MARGIN, UNITS
+from fits.io._record import Record, refuse_repeats
+from fits.loop._run import UNSWEPT
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.backend import get_backend
 
-from fits._motion import Prepared, pass_signal, prepare, programs, signals
-from fits._record import Record
-from fits._stage_run import StageRun
+from fits.io._record import Record
+from fits.stage._motion import Prepared, pass_signal, prepare, programs, signals
+from fits.stage._run import StageRun
 from microid import AbstractEffect, Signal, Stage, extend, host, refined
 
 # Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits._limits import MARGIN
 from fits.diagnosis._contest import best_of
 from fits.diagnosis._inside import guard_of
 from fits.diagnosis._path import limits_of, repeated
@@ -15,6 +14,7 @@ from fits.diagnosis._programs import Program
 from fits.diagnosis._refit import Refit, law_of
 from fits.diagnosis._result import Experiment, FoundCause
 from fits.diagnosis._select import Selection
+from fits.io._limits import MARGIN
 from microid import Mechanics
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class Wish:
         Of the program; that of the longest run if None.
     limits, margin
         Limits of the rig, by name, and by how much of its range a predicted quantity may otherwise go beyond what the
-        records reached; see `fits._limits.allowed`.
+        records reached; see `fits.io._limits.allowed`.
     """
 
     duration_s: float | None = None

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._motion import Prepared, signals
-from fits._stage_run import StageRun, without
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import with_effects
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import Gain
+from fits.stage._motion import Prepared, signals
+from fits.stage._run import StageRun, without
 from microid import AbstractEffect, Stage
 
 _BLOCKS = 24

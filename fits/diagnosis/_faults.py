@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits._record import Record
-from fits.diagnosis._floor import Band, band_of, floor_of, jitter_s, pooled, quantum_um, spikes
-from fits.diagnosis._noise import Noise, rough_noise_um
+from fits.diagnosis._floor import Band, band_of, floor_of, jitter_s, pooled, spikes
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
+from fits.io._record import Record
+from fits.stats._at_rest import quantum_um
+from fits.stats._whiten import Noise, rough_noise_um
 
 # Effects that are looked for in single samples and in the noise.
 SINGLE = ("outliers", "quantisation", "timestamp_jitter", "floor_vibration")

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import median_filter, rank_filter, uniform_filter1d
 
-from fits._stage_run import StageRun
-from fits.diagnosis._noise import Noise, learn_noise, rough_noise_um
+from fits.stage._run import StageRun
+from fits.stats._at_rest import idle_stretches
+from fits.stats._whiten import Noise, learn_noise, rough_noise_um
 
-# A command that rests for this many samples is idle from a third of the rest on; so many idle samples are a floor.
-_REST, _IDLE = 24, 150
+# So many idle samples are a floor.
+_IDLE = 150
 # Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
 _COLOURED = 4.0
 # Standard deviations by which noise of runs may differ that is the same.
@@ -55,18 +56,6 @@ class Floor:
 
     noise: Noise
     idle: int
-
-
-def idle_stretches(voltage_V: np.ndarray, settling: int) -> list[slice]:
-    """Stretches in which the command has rested for a while, and for so many samples at least."""
-    still = np.concatenate([[False], np.diff(voltage_V) == 0, [False]])
-    edges = np.flatnonzero(np.diff(still.astype(int)))
-    found = []
-    for first, stop in zip(edges[::2], edges[1::2], strict=True):
-        begin = max(first + (stop - first) // 3, first + settling)
-        if stop - begin >= 2 * _REST // 3:
-            found.append(slice(int(begin), int(stop)))
-    return found
 
 
 def floor_of(run: StageRun, residual_um: np.ndarray, settling_s: float) -> Floor:
@@ -163,25 +152,6 @@ def spikes(run: StageRun, residual_um: np.ndarray, least_um: float = 0.0) -> np.
         if stop - first > _TOGETHER:
             far[first:stop] = False
     return far
-
-
-def quantum_um(values_um: np.ndarray) -> float:
-    """Last digit of a sensor: the spacing of which all readings are multiples; 0 where there is none."""
-    distinct = np.unique(values_um)
-    if len(distinct) < 3 or len(distinct) > 0.7 * len(values_um):
-        return 0.0
-    gaps = np.diff(distinct)
-    gaps = gaps[gaps > 1e-9 * float(np.ptp(distinct))]
-    smallest = float(np.quantile(gaps, 0.05))
-    spacing = float(np.median(gaps[gaps < 1.5 * smallest]))
-    turns = (distinct - distinct[0]) / spacing
-    # Refined over the whole range, where a small error of the spacing adds up.
-    whole = np.round(turns)
-    for _ in range(3):
-        spacing = float(whole @ (distinct - distinct[0]) / (whole @ whole))
-        whole = np.round((distinct - distinct[0]) / spacing)
-    off = np.abs((distinct - distinct[0]) / spacing - whole)
-    return spacing if float(np.mean(off < 0.1)) > 0.95 else 0.0
 
 
 def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float = 0.0) -> tuple[float, float, float]:

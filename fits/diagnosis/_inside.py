@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits._limits import Extreme, Ranges, allowed, beyond, compared, joined
-from fits._motion import motion, reached_by
-from fits._record import Record
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import with_effects
 from fits.diagnosis._path import Limits, Path, Samples
 from fits.diagnosis._predict import Hypothesis
 from fits.diagnosis._programs import Program, menu
 from fits.diagnosis._projector import Projector
+from fits.io._limits import Extreme, Ranges, allowed, beyond, compared, joined
+from fits.io._record import Record
+from fits.stage._motion import motion, reached_by
 from microid import Stage
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def guard_of(
     hypotheses
         Effects that the stage may have.
     stated, margin
-        See `fits._limits.allowed`.
+        See `fits.io._limits.allowed`.
     seed
         Of the draws from what the records leave open.
     """

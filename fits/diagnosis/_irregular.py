@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from fits.diagnosis._noise import learn_noise
 from fits.diagnosis._projector import Projector
+from fits.stats._whiten import learn_noise
 
 # Lags of neighbours, stretches of a run, and samples that a stretch needs at least.
 _LAGS, _STRETCHES, _FEWEST = 20, 24, 20

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits._record import Record
+from fits.io._record import Record
 
 # Share of a program that its first full loop takes, unless the rig is slower.
 _LOOP = 0.12

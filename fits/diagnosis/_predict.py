@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
-from fits._record import Record
-from fits._stage_run import prepare_stage_run
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Kinds, Regression, regress
 from fits.diagnosis._through import passed
+from fits.io._record import Record
+from fits.stage._run import prepare_stage_run
+from fits.stats._whiten import Noise
 from microid import AbstractEffect
 
 _STEP = 1e-3

@@ -7,8 +7,6 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import qr
 
-from fits._record import Record
-from fits._run import UNSWEPT
 from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
 from fits.diagnosis._evaluate import along_curves, drop_programs, simulate
@@ -19,6 +17,8 @@ from fits.diagnosis._regulated import held_creep
 from fits.diagnosis._score import rescore, score
 from fits.diagnosis._steps import Step
 from fits.diagnosis._unswept import first_ways, unswept
+from fits.io._record import Record
+from fits.loop._run import UNSWEPT
 from microid import EFFECTS, Hold, Scales, Stage
 from microid.effects.transport_delay import TransportDelay
 

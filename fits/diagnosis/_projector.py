@@ -8,12 +8,12 @@ from optimistix import RESULTS
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
 
-from fits._evidence import Posterior
-from fits._grid import non_negative
-from fits._result import FitError, FitStatus
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._noise import Noise
 from fits.diagnosis._regression import Regression
+from fits.loop._evidence import Posterior
+from fits.loop._grid import non_negative
+from fits.loop._result import FitError, FitStatus
+from fits.stats._whiten import Noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
 _ROUGHEST = 0.5

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
-from fits._columns import columns_beside
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law, law_of, remembering, strength_of
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Scored
+from fits.io._columns import columns_beside
 from microid import AbstractEffect
 
 _STEP = 1e-3

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import cholesky
 
-from fits._design import Grid
-from fits._prior import interpolation
-from fits._stage_moments import Chain, linearise, pieces
-from fits._stage_run import StageRun
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import simulate, with_effects
 from fits.diagnosis._through import answering, behind, dressed, passed
+from fits.loop._design import Grid
+from fits.loop._prior import interpolation
+from fits.stage._moments import Chain, linearise, pieces
+from fits.stage._run import StageRun
 from microid import AbstractEffect
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits._record import Record
 from fits.diagnosis._result import EffectParameter, FoundCause
+from fits.io._record import Record
 
 # A hold lasts so long and has so many samples; meanwhile the displacement keeps within this part of its range, and
 # the voltage moves by more than that part of its own.

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fits._limits import Extreme
+from fits.io._limits import Extreme
 from microid import Stage
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
-from fits._evidence import maximise_evidence
-from fits._grid import EVIDENCE_LEVELS
-from fits._moments import Moments
-from fits._prior import Hyper, interpolation, roughness
-from fits._stage_solve import prior_precision
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import root_of
+from fits.loop._evidence import maximise_evidence
+from fits.loop._grid import EVIDENCE_LEVELS
+from fits.loop._moments import Moments
+from fits.loop._prior import Hyper, interpolation, roughness
+from fits.stage._solve import prior_precision
 
 
 def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from fits._columns import columns_beside
-from fits._stage_run import StageRun
 from fits.diagnosis._projector import Projector
+from fits.io._columns import columns_beside
+from fits.stage._run import StageRun
 
 _WAVES, _POWERS = 12, 4
 _CYCLES = 240

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._stage_moments import Chain
-from fits._stage_run import StageRun, joined, place_of_hysteresis
 from fits.diagnosis._evaluate import with_effects
+from fits.stage._moments import Chain
+from fits.stage._run import StageRun, joined, place_of_hysteresis
 from microid import PLACES, AbstractEffect, Coordinates, Signal, Stage
 
 # Directions that are passed on at a time.

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from fits._run import UNSWEPT, known_samples
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._score import evidence
+from fits.loop._run import UNSWEPT, known_samples
 
 # Waves over the first way, evidence from which it counts, the share of that for the best effect from which it is the
 # likelier reason, and the part of the range through which the voltage goes up, and down, beside it.

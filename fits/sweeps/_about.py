@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from fits._errors import DataError
-from fits._read_file import MOST_JSON_BYTES, parse_json, read_text
+from fits.io._errors import DataError
+from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
 
 SCHEMA = "microid.sweep.results/1"
 ABOUT = "about.json"

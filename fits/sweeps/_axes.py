@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from fits._errors import DataError
+from fits.io._errors import DataError
 from fits.sweeps._types import FloatArray
 
 SAMPLERS = ("random", "latin_hypercube", "sobol")

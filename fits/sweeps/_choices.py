@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._errors import DataError, shown
-from fits._stage_design import nearest
+from fits.io._errors import DataError, shown
+from fits.machining._design import nearest
 from fits.sweeps._types import FloatArray, Output, Parameter
 
 

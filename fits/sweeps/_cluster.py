@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fits._errors import DataError, shown
+from fits.io._errors import DataError, shown
 from fits.sweeps._chunks import compute_chunk
 from fits.sweeps._extra import need
 from fits.sweeps._spec import Sweep, parse_sweep
@@ -243,7 +243,7 @@ def work(payload: _Payload, chunk: int) -> _Answer:
 
 def _sweep(payload: _Payload) -> Sweep:
     if payload.digest not in _SWEEPS:
-        from fits._cli_jax import start_jax
+        from fits.io._jax_setup import start_jax
 
         start_jax()
         sweep = parse_sweep(payload.text, payload.name, payload.inputs.__getitem__, Path(payload.folder))

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._control_defaults import PERIODS, bp_defaults, cmac_defaults, strongest_Hz
-from fits._control_gains import GAINS
-from fits._control_setup import setup
-from fits._errors import DataError, shown
-from fits._record import Reference
-from fits._stage_design import nearest
-from fits._tune_start import slope_array
+from fits.control._defaults import PERIODS, bp_defaults, cmac_defaults, strongest_Hz
+from fits.control._gains import GAINS
+from fits.control._setup import setup
+from fits.control._tune_start import slope_array
+from fits.io._errors import DataError, shown
+from fits.io._record import Reference
+from fits.machining._design import nearest
 from fits.sweeps._choices import check_plain
 from fits.sweeps._programs import Program, number
 from fits.sweeps._stages import memory_before, range_of

@@ -3,7 +3,7 @@
 import importlib
 from typing import Any
 
-from fits._errors import DataError
+from fits.io._errors import DataError
 
 _EXTRA = {"distributed": "cluster"}
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fits._errors import DataError
+from fits.io._errors import DataError
 
 
 def in_a_file(content: bytes, name: str, read: Callable[[Path], Any]) -> Any:

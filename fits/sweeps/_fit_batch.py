@@ -12,11 +12,11 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float
 
-from fits._design import Grid, design
-from fits._evidence import effective, posterior, renew_noise
-from fits._moments import Moments
-from fits._nonnegative import BlockPivoting
-from fits._prior import Hyper, Roughness
+from fits.loop._design import Grid, design
+from fits.loop._evidence import effective, posterior, renew_noise
+from fits.loop._moments import Moments
+from fits.loop._prior import Hyper, Roughness
+from fits.stats._nonnegative import BlockPivoting
 from fits.sweeps._devices import by_rows
 from microid import Staircase
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from fits._tune_problem import linear_part
+from fits.control._tune_problem import linear_part
 from fits.sweeps._controllers import Controllers, read_controllers
 from fits.sweeps._devices import by_rows, in_turn, place
 from fits.sweeps._jobs import Request

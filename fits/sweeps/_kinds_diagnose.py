@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._errors import DataError, shown
-from fits._record import Record
-from fits._result import FitError
-from fits._run import INITIAL_STATES
-from fits._stage_design import nearest
+from fits.io._errors import DataError, shown
+from fits.io._record import Record
+from fits.loop._result import FitError
+from fits.loop._run import INITIAL_STATES
+from fits.machining._design import nearest
 from fits.sweeps._choices import choice, chosen
 from fits.sweeps._jobs import Request
 from fits.sweeps._programs import number

@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from fits._design import branch_table
-from fits._errors import DataError, shown
-from fits._fit import fit
-from fits._metrics import errors
-from fits._prior import roughness
-from fits._record import Record
-from fits._result import FitError
-from fits._run import INITIAL_STATES, initial_state, known_samples
-from fits._stage_design import nearest
+from fits.io._errors import DataError, shown
+from fits.io._record import Record
+from fits.loop._design import branch_table
+from fits.loop._fit import fit
+from fits.loop._prior import roughness
+from fits.loop._result import FitError
+from fits.loop._run import INITIAL_STATES, initial_state, known_samples
+from fits.machining._design import nearest
+from fits.stats._metrics import errors
 from fits.sweeps._choices import choice, chosen
 from fits.sweeps._devices import in_turn, on_cpu, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 import microid as m
-from fits._errors import DataError, shown
-from fits._stage_design import Design, paper_design
-from fits._stage_toml import read_design
+from fits.io._errors import DataError, shown
+from fits.machining._design import Design, paper_design
+from fits.machining._design_file import read_design
 from fits.sweeps._devices import by_rows, place
 from fits.sweeps._files import in_a_file
 from fits.sweeps._jobs import Request

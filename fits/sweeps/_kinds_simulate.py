@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from fits._errors import DataError, shown
+from fits.io._errors import DataError, shown
 from fits.sweeps._devices import by_rows, on_cpu, place
 from fits.sweeps._jobs import Request
 from fits.sweeps._kernel import respond

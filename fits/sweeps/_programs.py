@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._errors import DataError, shown
-from fits._plausible import SHORTEST_STEP_s
-from fits._read_csv import read_csv, read_reference
-from fits._stage_design import nearest
-from fits._table import open_table
-from fits._units import recognise
+from fits.io._errors import DataError, shown
+from fits.io._plausible import SHORTEST_STEP_s
+from fits.io._read_csv import read_csv, read_reference
+from fits.io._table import open_table
+from fits.io._units import recognise
+from fits.machining._design import nearest
 from fits.sweeps._files import in_a_file
 from fits.sweeps._types import FloatArray, Parameter
 

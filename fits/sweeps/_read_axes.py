@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fits._errors import DataError, shown
+from fits.io._errors import DataError, shown
 from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
 from fits.sweeps._choices import check_plain, code_of
 from fits.sweeps._programs import number

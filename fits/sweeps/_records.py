@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._errors import DataError, shown
-from fits._read_csv import read_csv
-from fits._record import Record
-from fits._stage_design import nearest
-from fits._units import parse_columns
+from fits.io._errors import DataError, shown
+from fits.io._read_csv import read_csv
+from fits.io._record import Record
+from fits.io._units import parse_columns
+from fits.machining._design import nearest
 from fits.sweeps._devices import on_cpu, place
 from fits.sweeps._jobs import Request
 from fits.sweeps._kernel import respond

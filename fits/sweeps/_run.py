@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from fits._atomic import atomic_path
+from fits.io._atomic import atomic_path
 from fits.sweeps._chunks import chunk_count, compute_chunk, rows_of
 from fits.sweeps._extra import need
 from fits.sweeps._spec import Sweep

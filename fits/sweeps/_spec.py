@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from fits._errors import DataError, shown
-from fits._read_file import MOST_CSV_BYTES, MOST_TOML_BYTES, parse_toml, read_bytes, read_text
+from fits.io._errors import DataError, shown
+from fits.io._read_file import MOST_CSV_BYTES, MOST_TOML_BYTES, parse_toml, read_bytes, read_text
 from fits.sweeps._axes import Plan
 from fits.sweeps._jobs import KINDS, Request
 from fits.sweeps._read_axes import read_list, read_plan

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits._errors import DataError, shown
-from fits._model_file import load_model
+from fits.io._errors import DataError, shown
+from fits.stage._model_file import load_model
 from fits.sweeps._files import in_a_file
 from fits.sweeps._jobs import Request
 from fits.sweeps._types import Parameter

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from fits._atomic import atomic_write_text
-from fits._errors import DataError
-from fits._file_set import flush
-from fits._places import usable_folder
-from fits._temporary import is_temporary
+from fits.io._atomic import atomic_write_text
+from fits.io._errors import DataError
+from fits.io._file_set import flush
+from fits.io._places import usable_folder
+from fits.io._temporary import is_temporary
 from fits.sweeps._about import ABOUT, SCHEMA, about_of
 from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of
 from fits.sweeps._extra import need

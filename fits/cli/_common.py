@@ -1,0 +1,130 @@
+"""What the commands share: options, and bad input in sentences.
+
+Of other packages only click is imported here and in the `_commands_...` modules; the work, and what it imports,
+is in the modules those call.
+"""
+
+import errno
+import functools
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
+
+import click
+
+from fits.io._errors import DataError
+from fits.io._file_set import discard_all
+from fits.io._printable import printable
+
+# Signals that ask the command to end.
+_SIGNALS = ("SIGTERM", "SIGHUP")
+_AGAIN_s = 0.05
+_Command = TypeVar("_Command", bound=Callable[..., None])
+
+
+class Terminated(KeyboardInterrupt):
+    """A signal that asks the command to end; what cleans up after Ctrl-C does so after this.
+
+    Attributes
+    ----------
+    number
+        Of the signal.
+    """
+
+    def __init__(self, number: int):
+        super().__init__()
+        self.number = number
+
+
+def heed_signals() -> None:
+    """Let a request to end clean up as Ctrl-C does; one that is ignored, as under `nohup`, stays ignored."""
+
+    def stop(number: int, _: object) -> None:
+        raise Terminated(number)
+
+    for name in _SIGNALS:
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, stop)
+    sys.unraisablehook = _again
+
+
+def _again(lost: Any) -> None:
+    """Send a signal again whose exception came while Python ran a finaliser or a callback, where it goes nowhere."""
+    stop = lost.exc_value
+    if not isinstance(stop, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    number = stop.number if isinstance(stop, Terminated) else signal.SIGINT
+    timer = threading.Timer(_AGAIN_s, os.kill, (os.getpid(), number))
+    timer.daemon = True
+    timer.start()
+
+
+def stopped(stop: KeyboardInterrupt, what: str) -> NoReturn:
+    """Say that the command was stopped, and what is left, and end with the status that shells have for it."""
+    discard_all()
+    by_signal = isinstance(stop, Terminated)
+    click.echo(f"{'Terminated' if by_signal else 'Interrupted'}: {what}.", err=True)
+    raise Stopped(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))
+
+
+def system_refuses(error: OSError) -> NoReturn:
+    """Say what the system does not allow, such as more on a full disk, and end with status 2."""
+    if error.errno == errno.EPIPE:
+        raise error  # click ends without a word: who reads has read enough
+    place = error.filename if isinstance(error.filename, str) else "output"
+    sentence = f"{printable(place)}: the system refuses it ({error.strerror or error}); mend that and start again."
+    click.echo(sentence, err=True)
+    sys.exit(2)
+
+
+class Stopped(SystemExit):
+    """The end of a command that was stopped."""
+
+
+def in_sentences(command: _Command) -> _Command:
+    """Turn bad input and interruption into one line on stderr and an exit status."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except KeyboardInterrupt as stop:
+            stopped(stop, "no unfinished file was left")
+        except DataError as error:
+            sentence = printable(" ".join(str(error).split()))
+            click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
+            sys.exit(2)
+        except OSError as error:
+            system_refuses(error)
+
+    return run  # type: ignore[return-value]
+
+
+columns = click.option(
+    "--columns",
+    metavar="NAME=SOURCE,...",
+    default="",
+    help="Which columns to read, such as voltage_V=u1_V,displacement_um=-height[nm].",
+)
+limits = click.option("--limits", metavar="LOW,HIGH", help="Voltages allowed, in V; the model's range by default.")
+limit = click.option(
+    "--limit",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="What the rig may be asked for, such as displacement=0:40um or slew=2kV/s; again for more of voltage, slew, "
+    "displacement, velocity, acceleration and current (per farad of the piezo). By default what the runs reached.",
+)
+margin = click.option(
+    "--margin",
+    type=float,
+    default=0.02,
+    show_default=True,
+    help="Share of its range by which what is predicted may go beyond what the runs reached.",
+)
+json_output = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")

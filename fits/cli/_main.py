@@ -1,0 +1,87 @@
+"""The `microid` command.
+
+Only the standard library and click are imported before a command runs.
+"""
+
+import contextlib
+import io
+import os
+import sys
+
+import click
+
+from fits.cli._commands_control import control
+from fits.cli._commands_diagnosis import diagnose
+from fits.cli._commands_model import compensate, export, fit, info, simulate, synth
+from fits.cli._commands_paper import paper
+from fits.cli._commands_stage import budget, sensitivity
+from fits.cli._commands_sweep import sweep
+from fits.cli._common import Stopped, heed_signals, stopped, system_refuses
+
+
+def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        from fits.io._version import written_by
+
+        click.echo(written_by())
+        context.exit()
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=_show_version,
+    help="Show the version and exit.",
+)
+def cli() -> None:
+    """Identify a piezo-driven micro-positioner from CSV files of voltage and displacement.
+
+    Bad input ends with status 2 and one sentence on stderr. Compiled functions are kept in the user's cache folder;
+    MICROID_CACHE names another, and MICROID_CACHE=off keeps none.
+    """
+
+
+for _command in (
+    fit,
+    simulate,
+    compensate,
+    export,
+    synth,
+    info,
+    sensitivity,
+    budget,
+    diagnose,
+    control,
+    paper,
+    sweep,
+):
+    cli.add_command(_command)
+
+
+def main() -> None:
+    """Run the command."""
+    heed_signals()
+    _bear_any_text()
+    try:
+        try:
+            cli(prog_name="microid")
+        except KeyboardInterrupt as stop:
+            stopped(stop, "no unfinished file was left")
+        except OSError as error:
+            system_refuses(error)
+    except Stopped as stop:
+        # All that is kept is written. Threads that still compile crash an interpreter that is taken down.
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, AttributeError):
+                stream.flush()
+        os._exit(int(str(stop.code)))
+
+
+def _bear_any_text() -> None:
+    """Write what a terminal or a file cannot show, such as half a character in a file's name, as its code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")

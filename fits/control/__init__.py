@@ -1,0 +1,1 @@
+"""What makes a stage follow: inverse feedforward, tuned loops, and C for a controller."""

@@ -1,0 +1,245 @@
+"""Feedforward: the voltage that makes a stage follow a reference (Eq. 19-21)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.control._compensate_effects import follow, has_effects, plain_of
+from fits.control._compensate_stage import begins_in_motion, command, demand, simulate_model, static_equivalent, turns
+from fits.io._errors import DataError
+from fits.io._record import Record, Reference
+from fits.loop._run import initial_state
+from microid import Inversion, Preisach, Stage, Staircase, invert
+
+Way = Literal["static", "dynamic"]
+
+# References pass through compiled functions in multiples of this many samples.
+_PIECE = 8192
+# Short of an end of its range by this fraction of it, a reference is still within reach: files round.
+_SLACK = 1e-9
+# What can be reached depends on the past, so it is found again until it stays; two or three times are usual.
+_PASSES = 50
+# At an end of the range what a stage needs may overshoot by this fraction of it, and is cut, before that is refused.
+_TOLERABLE = 0.01
+# What is cut off a command by less than this fraction of the limits' width does not show.
+_WORTH_SAYING = 1e-4
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """A voltage for a reference, and what the model does with it.
+
+    Attributes
+    ----------
+    voltage_V
+        Shape `(n,)`, within the limits.
+    displacement_um
+        Response of the whole model, sensor offset included, shape `(n,)`.
+    reference_um
+        What was asked for, shape `(n,)`.
+    clipped
+        Samples out of reach, where the nearest voltage or displacement that can be reached was taken, shape `(n,)`.
+    remarks
+        What keeps a stage from following, one sentence each.
+    """
+
+    voltage_V: np.ndarray
+    displacement_um: np.ndarray
+    reference_um: np.ndarray
+    clipped: np.ndarray
+    remarks: tuple[str, ...] = ()
+
+
+def compensate(
+    model: Preisach | Stage,
+    reference: Reference | Record,
+    initial: str = "negative",
+    clip: bool = False,
+    limits_V: tuple[float, float] | None = None,
+    way: Way = "static",
+) -> Compensation:
+    """Find the voltage whose displacement is the reference.
+
+    Parameters
+    ----------
+    model
+        From a fit or a model file.
+    reference
+        Displacement wanted, as the sensor would read it: the model's `offset_um`, its reading at negative
+        saturation, is included.
+    initial
+        Memory before the first sample: `negative`, `positive` or `demagnetised`.
+    clip
+        Take the nearest that can be reached where the reference is out of reach, instead of refusing it.
+    limits_V
+        Lowest and highest voltage allowed; the range the model was fitted on by default. For a stage these are
+        commands, and its range is that of its hysteresis over the gain of its driver.
+    way
+        `"static"`: by the exact inverse of the hysteresis, with the static gains of a stage; its response then lags
+        and rings. `"dynamic"`: by the inverse of the whole stage, for references that are smooth and begin at rest;
+        see `microid.invert_stage`.
+
+    Raises
+    ------
+    DataError
+        If the reference cannot be followed, the limits are not within the model's range, or the model has nothing
+        dynamic to compensate.
+    """
+    if reference.displacement_um is None:
+        raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
+    wanted, time_s = reference.displacement_um, reference.time_s
+    if isinstance(model, Stage) and has_effects(model):
+        rounds: list[Compensation] = []
+
+        def inverse(asked: Reference) -> np.ndarray:
+            rounds.append(compensate(plain_of(model), asked, initial, clip=clip, limits_V=limits_V, way=way))
+            return rounds[-1].voltage_V
+
+        def response(stage: Stage, voltage_V: np.ndarray) -> np.ndarray:
+            return simulate_model(stage, Record(time_s, voltage_V, None, source=reference.source), initial)
+
+        voltage = follow(model, reference, inverse, response)
+        return Compensation(voltage, response(model, voltage), wanted, rounds[-1].clipped, rounds[-1].remarks)
+    law = static_equivalent(model) if isinstance(model, Stage) else model
+    needed, doubt_um = wanted, 0.0
+    if way == "dynamic":
+        if not isinstance(model, Stage):
+            raise DataError("expected a stage for --dynamic, found a Preisach model, which has no mechanics.")
+        needed, doubt_um = demand(model, time_s, wanted, reference.source)
+    elif way != "static":
+        raise ValueError(f"way must be 'static' or 'dynamic', got {way!r}")
+    turning = turns(wanted, doubt_um)
+    remarks = turning + begins_in_motion(wanted, needed, doubt_um)
+    lower, upper = float(law.density.lower_V), float(law.density.upper_V)
+    limits = within_range(law, limits_V)
+    start = initial_state(initial, lower, upper)
+    voltage, lowest, highest = _follow(law, needed, start, limits)
+    # Less than it is uncertain by is not out of reach: splines swing a little where a reference leaves an end.
+    stroke = float(np.max(highest) - np.min(lowest))
+    slack = max(_SLACK * stroke, min(doubt_um, _TOLERABLE * stroke))
+    clipped = (needed < lowest - slack) | (needed > highest + slack)
+    if clipped.any() and not clip:
+        k = int(np.argmax(clipped))
+        asked = f"asks for {wanted[k]:.6g} um"
+        if way == "dynamic":
+            asked += f", which takes {needed[k]:.6g} um of the piezo in the sensor's units"
+        if turning and lowest[k] <= wanted[k] <= highest[k]:
+            raise DataError(f"{reference.source}: sample {k + 1} (time {time_s[k]:g} s) {asked}, but {turning[0]}")
+        raise DataError(
+            f"{reference.source}: sample {k + 1} (time {time_s[k]:g} s) {asked}, but "
+            f"{lowest[k]:.6g} to {highest[k]:.6g} um can be reached there, sensor offset included, because "
+            f"{_bind(limits, (lower, upper))}; {int(clipped.sum())} of {len(wanted)} samples are out of reach: shift "
+            f"or shrink the reference,{' slow it down,' if way == 'dynamic' else ''} or take the nearest that can be "
+            "reached with --clip."
+        )
+    if isinstance(model, Stage) and way == "dynamic":
+        voltage, cut, more = _led(model, reference, voltage, limits, clip, _bind(limits, (lower, upper)))
+        clipped, remarks = clipped | cut, remarks + more
+    played = simulate_model(model, Record(time_s, voltage, None, source=reference.source), initial)
+    return Compensation(voltage, played, wanted, clipped, tuple(remarks))
+
+
+def _bind(limits: tuple[float, float], whole: tuple[float, float]) -> str:
+    if limits == whole:
+        return f"the model was fitted between {whole[0]:g} and {whole[1]:g} V"
+    return f"the voltage is limited to {limits[0]:g} to {limits[1]:g} V"
+
+
+def _led(
+    stage: Stage,
+    reference: Reference | Record,
+    static_V: np.ndarray,
+    limits: tuple[float, float],
+    clip: bool,
+    bind: str,
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Lead the driver, within the limits; which samples were cut, and what to say of that."""
+    asked_V = command(stage, reference.time_s, static_V)
+    if stage.hold == "zero":
+        # A step stands for the line across its interval.
+        asked_V = np.append((asked_V[:-1] + asked_V[1:]) / 2, asked_V[-1])
+    voltage_V = np.clip(asked_V, *limits)
+    excess_V, width_V = np.abs(asked_V - voltage_V), limits[1] - limits[0]
+    if excess_V.max() > _TOLERABLE * width_V and not clip:
+        k = int(np.argmax(excess_V > _TOLERABLE * width_V))
+        raise DataError(
+            f"{reference.source}: sample {k + 1} (time {reference.time_s[k]:g} s) needs a command of "
+            f"{asked_V[k]:.6g} V to make up for the driver's lag, but {bind}; slow the reference down, keep it away "
+            "from the ends of the range, or cut the command there with --clip."
+        )
+    cut = excess_V > _WORTH_SAYING * width_V
+    said = [
+        f"the command was cut to the limits at {int(cut.sum())} of its samples, by at most {excess_V.max():.3g} V."
+    ]
+    return voltage_V, cut, said if cut.any() else []
+
+
+def within_range(model: Preisach, limits_V: tuple[float, float] | None) -> tuple[float, float]:
+    """Check voltage limits against the range of the model, which they are by default."""
+    lower, upper = float(model.density.lower_V), float(model.density.upper_V)
+    if limits_V is None:
+        return lower, upper
+    low, high = map(float, limits_V)
+    if not lower <= low < high <= upper:
+        raise DataError(
+            f"--limits: expected two rising voltages between {lower:g} and {upper:g} V, where the model was fitted, "
+            f"found {low:g},{high:g}."
+        )
+    return low, high
+
+
+def _follow(
+    model: Preisach, wanted_um: np.ndarray, start: Staircase, limits: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Voltage within the limits, and what could have been reached at every sample."""
+    n = len(wanted_um)
+    padded = np.pad(wanted_um, (0, -n % _PIECE), mode="edge")
+    found = _invert(model, jnp.asarray(padded), start)
+    lowest, highest = (np.full(n, float(end)) for end in (found.lowest_um, found.highest_um))
+    voltage = np.asarray(found.voltage_V)[:n]
+    if limits == (float(model.density.lower_V), float(model.density.upper_V)):
+        return voltage, lowest, highest
+    tip = float(start.extremes_V[int(start.count) - 1])
+    # Each pass makes at least one more sample right, since what can be reached depends on earlier ones only.
+    for _ in range(_PASSES):
+        before = voltage = np.clip(voltage, *limits)
+        lowest = _reach(model, np.maximum.accumulate(_earlier(voltage, tip)), limits[0], start)
+        highest = _reach(model, np.minimum.accumulate(_earlier(voltage, tip)), limits[1], start)
+        padded[:n] = np.clip(wanted_um, lowest, highest)
+        padded[n:] = padded[n - 1]
+        voltage = np.clip(np.asarray(_invert(model, jnp.asarray(padded), start).voltage_V)[:n], *limits)
+        # To the last digit, which the root leaves open.
+        voltage = np.where(wanted_um >= highest, limits[1], np.where(wanted_um <= lowest, limits[0], voltage))
+        if np.allclose(voltage, before, rtol=0, atol=_SLACK * (limits[1] - limits[0])):
+            return voltage, lowest, highest
+    raise DataError("the reference keeps crossing what the voltage limits allow; widen --limits or shrink it.")
+
+
+def _earlier(voltage_V: np.ndarray, tip_V: float) -> np.ndarray:
+    return np.append(tip_V, voltage_V[:-1])
+
+
+def _reach(model: Preisach, extremes_V: np.ndarray, limit_V: float, start: Staircase) -> np.ndarray:
+    """Displacement at a voltage limit, after each of the running extremes on the other side.
+
+    Going to a limit wipes out all that happened within the limits. What remains is what the start remembers beyond
+    them, and how far away from this limit the voltage has been since.
+    """
+    n = len(extremes_V)
+    path = np.stack([extremes_V, np.full(n, limit_V)], axis=1).ravel()
+    path = np.pad(path, (0, -2 * n % (2 * _PIECE)), mode="edge")
+    return np.asarray(_respond(model, jnp.asarray(path), start))[1 : 2 * n : 2]
+
+
+@eqx.filter_jit
+def _invert(model: Preisach, displacement_um: Float[Array, " n"], start: Staircase) -> Inversion:
+    return invert(model, displacement_um, start)
+
+
+@eqx.filter_jit
+def _respond(model: Preisach, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
+    return model(voltage_V, start)

@@ -1,0 +1,190 @@
+"""A whole stage in feedforward: what its driver and mechanics ask for beyond the inverse of the hysteresis."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import microid
+from fits.control._compensate_effects import plain_of
+from fits.io._errors import DataError
+from fits.io._record import Record
+from fits.loop._run import initial_state, prepare_run, simulate_run
+from microid import AbstractLinear, GridDensity, Preisach, Reversible, Stage, Staircase, Start, innermost
+
+# Doubt about the displacement needed, or a start in motion, that is worth a remark: a fraction of the span.
+_WORTH_SAYING = 0.01
+_FEWEST = 16
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What the linear parts of a stage do at rest.
+
+    Attributes
+    ----------
+    ahead
+        Piezo voltage per command.
+    behind
+        Measured displacement per displacement of the piezo.
+    offset_um
+        Measured displacement where the piezo's is zero.
+    """
+
+    ahead: float
+    behind: float
+    offset_um: float
+
+
+def hysteresis_of(stage: Stage) -> Preisach:
+    """Find the one Preisach hysteresis of a stage."""
+    found = [innermost(part) for part in stage.parts if isinstance(innermost(part), Preisach)]
+    if not found:
+        parts = ", ".join(f"{n} ({type(p).__name__})" for n, p in zip(stage.names, stage.parts, strict=True))
+        raise DataError(
+            f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.", of_model=True
+        )
+    return found[0]
+
+
+def gains_of(stage: Stage) -> Gains:
+    """Static gains of a stage ahead of its hysteresis and behind it; they must be positive."""
+    law = stage.parts.index(hysteresis_of(stage))
+    ahead, behind, offset = 1.0, 1.0, 0.0
+    for k, part in enumerate(stage.parts):
+        if not isinstance(part, AbstractLinear):
+            continue
+        gain = float(part.static_gain)
+        if not (np.isfinite(gain) and gain > 0):
+            raise DataError(
+                f"part {stage.names[k]!r} of the stage: expected a positive static gain, found {gain:g}; turn the "
+                "sign of the column of its signal, and fit again.",
+                of_model=True,
+            )
+        if k < law:
+            ahead *= gain
+        else:
+            behind, offset = behind * gain, gain * offset + float(part.system().offset)
+    return Gains(ahead, behind, offset)
+
+
+def static_equivalent(stage: Stage) -> Preisach:
+    """Return the hysteresis between command and sensor, as slow commands see it: the static gains folded in.
+
+    Raises
+    ------
+    DataError
+        If the stage has no Preisach hysteresis, or a static gain that is not positive.
+    """
+    stage = plain_of(stage)
+    law, gains = hysteresis_of(stage), gains_of(stage)
+    lower, upper = law.density.lower_V / gains.ahead, law.density.upper_V / gains.ahead
+    weights = law.weights_um[np.tril_indices(law.density.levels)]
+    return Preisach(
+        GridDensity(gains.behind * weights, lower, upper),
+        Reversible(gains.behind * gains.ahead * law.reversible.slope_um_per_V, lower, upper),
+        gains.offset_um + gains.behind * law.offset_um,
+    )
+
+
+def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: str) -> tuple[np.ndarray, float]:
+    """Find what the sensor would have to read at rest for the mechanics to follow a reference, and how sure that is.
+
+    Parameters
+    ----------
+    stage, time_s, reference_um
+        The times have shape `(n,)`, as the reference has.
+    source
+        Named in the refusal.
+
+    Returns
+    -------
+    tuple
+        The displacement in um, shape `(n,)`, and the largest estimate of its error: a third of what it would be off
+        if every other sample were missing.
+    """
+    if len(time_s) < _FEWEST:
+        raise DataError(
+            f"{source}: expected {_FEWEST} samples or more for --dynamic, found {len(time_s)}; sample the reference "
+            "more finely, or use --static."
+        )
+    gains = gains_of(stage)
+    every, other = (
+        gains.offset_um + gains.behind * np.asarray(_demand(stage, jnp.asarray(t), jnp.asarray(r)))
+        for t, r in ((time_s, reference_um), (time_s[::2], reference_um[::2]))
+    )
+    # Away from the ends, where splines are less sure than the reference is.
+    return every, float(np.max(np.abs(every[::2] - other)[2:-2]) / 3)
+
+
+def turns(reference_um: np.ndarray, doubt_um: float) -> list[str]:
+    """Say that a reference turns faster than its samples show, if the doubt from `demand` is that large."""
+    if doubt_um <= _WORTH_SAYING * float(np.ptp(reference_um)):
+        return []
+    return [
+        "the reference turns within a sample, so that the displacement its acceleration asks for is uncertain by "
+        f"{doubt_um:.3g} um; smooth it, sample it more finely, or use --static."
+    ]
+
+
+def begins_in_motion(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: float) -> list[str]:
+    """Say that a stage at rest cannot take up a reference that moves; needed and doubt are from `demand`."""
+    start_um = abs(float(needed_um[0] - reference_um[0]))
+    if start_um <= max(_WORTH_SAYING * float(np.ptp(reference_um)), doubt_um):
+        return []
+    return [
+        f"the reference begins in motion and the stage at rest, {start_um:.3g} um away from what it would need; "
+        "begin with a rest and a smooth start."
+    ]
+
+
+def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarray:
+    """Lead the driver: the command whose response is that of a static voltage, shape `(n,)`."""
+    gain = gains_of(stage).ahead
+    return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(gain * static_V)))
+
+
+def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.ndarray:
+    """Displacement of a hysteresis or a whole stage under a voltage, in um, shape `(n,)`.
+
+    Parameters
+    ----------
+    model
+        From a fit or a model file.
+    record
+        Times and voltages.
+    initial
+        Memory before the first sample: `negative`, `positive` or `demagnetised`.
+    """
+    law = model if isinstance(model, Preisach) else hysteresis_of(model)
+    lower, upper = float(law.density.lower_V), float(law.density.upper_V)
+    if isinstance(model, Preisach):
+        return simulate_run(model, prepare_run(record, lower, upper, initial, 1.0))
+    n = len(record)
+    step_s = record.duration_s / max(n - 1, 1) or 1.0
+    # Even times are given as the one interval between them: that takes half as long to compile.
+    uneven_s = np.abs(record.time_s - (record.time_s[0] + step_s * np.arange(n))).max()
+    even = uneven_s <= _ROUNDING * max(np.abs(record.time_s).max(), step_s)
+    time_s = step_s if even else record.time_s
+    start = initial_state(initial, lower, upper)
+    return np.asarray(_respond(model, jnp.asarray(time_s), jnp.asarray(record.voltage_V), start))
+
+
+@eqx.filter_jit
+def _demand(stage: Stage, time_s: Float[Array, " n"], reference_um: Float[Array, " n"]) -> Float[Array, " n"]:
+    return microid.piezo_demand(stage, time_s, reference_um)
+
+
+@eqx.filter_jit
+def _command(stage: Stage, time_s: Float[Array, " n"], piezo_voltage_V: Float[Array, " n"]) -> Float[Array, " n"]:
+    return microid.driver_command(stage, time_s, piezo_voltage_V)
+
+
+@eqx.filter_jit
+def _respond(
+    stage: Stage, time_s: Float[Array, "..."], voltage_V: Float[Array, " n"], start: Staircase
+) -> Float[Array, " n"]:
+    return stage(time_s, voltage_V, Start(memory=start))

@@ -1,0 +1,128 @@
+"""A fitted model as C for a controller: the hysteresis and its exact inverse, one sample at a time."""
+
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from string import Template
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.control._compensate import within_range
+from fits.io._errors import DataError
+from fits.io._file_set import file_set
+from fits.io._version import written_by
+from microid import Everett, Preisach
+
+# That of a demagnetised staircase in `microid`.
+_SWINGS = 31
+_SMALLEST, _LARGEST = 8, 65_536
+_LINE = 118
+
+
+def export_c(
+    model: Preisach,
+    folder: str | os.PathLike[str],
+    name: str = "compensator",
+    *,
+    size: int = 128,
+    limits_V: tuple[float, float] | None = None,
+) -> list[Path]:
+    """Write a header and a source in C99 that do what `model` and `microid.invert` do, sample by sample.
+
+    The C needs no library, allocates nothing, loops a bounded number of times and computes in double precision. It
+    holds `8 ((N + 1)**2 + 8 (N - 1))` bytes of constants for `N` levels; a state takes 16 bytes per extreme.
+
+    Parameters
+    ----------
+    model
+        To export.
+    folder
+        Where `name.h` and `name.c` go; it is made if need be.
+    name
+        Of the files, and before every name in them.
+    size
+        Extremes that a state remembers, two per nested loop. Where more are needed the smallest swing is dropped
+        and the status says so: outputs are then off by no more than that swing until a wider loop wipes it out.
+    limits_V
+        Lowest and highest voltage that the inverse may give; the range of the model by default.
+
+    Returns
+    -------
+    list of Path
+        The header and the source.
+
+    Raises
+    ------
+    DataError
+        If the name is not one in C, the size is too small, the limits are not in the model's range, or a file cannot
+        be written.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,30}", name):
+        raise DataError(
+            f"--name: expected a letter and then up to 30 letters, digits or underscores, found '{name}'; rename it."
+        )
+    if not _SMALLEST <= size <= _LARGEST:
+        raise DataError(
+            f"--memory: expected {_SMALLEST} to {_LARGEST} extremes, found {size}; 128 suit most references."
+        )
+    fields = _fields(model, name, size, within_range(model, limits_V))
+    written = [f"{name}.{ending}" for ending in ("h", "c")]
+    with file_set() as files:
+        place = files.folder(folder, "--out")
+        for file in written:
+            template = Path(__file__).with_name("templates") / f"controller{Path(file).suffix}"
+            text = Template(template.read_text(encoding="utf-8")).substitute(fields)
+            (place / file).write_bytes(text.encode())
+    return [Path(folder) / file for file in written]
+
+
+@eqx.filter_jit
+def _tables(model: Preisach) -> tuple[Everett, Float[Array, ""]]:
+    surface = model.everett
+    return surface, surface(surface.upper_V, surface.lower_V)
+
+
+def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]) -> dict[str, str]:
+    surface, stroke = _tables(model)
+    window, branch = np.asarray(surface.window_um), np.asarray(surface.branch_um)
+    lower, upper, offset, stroke_um = map(float, (surface.lower_V, surface.upper_V, model.offset_um, stroke))
+    if not np.isfinite([*window, *branch.ravel(), lower, upper, offset]).all():
+        raise DataError("the model holds numbers that are not finite, which no controller can use; fit it again.")
+    n = surface.intervals
+    return {
+        "name": name,
+        "NAME": name.upper(),
+        "provenance": f"Written by {written_by()} from a model with {n + 1} levels; do not edit, export again.",
+        "lower_V": repr(lower),
+        "upper_V": repr(upper),
+        "lowest_V": repr(limits_V[0]),
+        "highest_V": repr(limits_V[1]),
+        "lowest_um": repr(offset),
+        "highest_um": repr(offset + stroke_um),
+        "rounding_um": repr(2 * float(np.finfo(float).eps) * max(abs(offset), abs(offset + stroke_um))),
+        "size": str(size),
+        "swings": str(min(_SWINGS, (size - 4) // 2)),
+        "intervals": str(n),
+        "per_V": repr(n / (upper - lower)),
+        "window_um": _lines(window, 4),
+        "rising_um": _rows(branch[:, :n]),
+        "falling_um": _rows(branch[:, n:]),
+    }
+
+
+def _lines(values: Iterable[float], indent: int) -> str:
+    """Write constants with as many digits as reading them back exactly takes."""
+    lines = [" " * (indent - 1)]
+    for value in values:
+        text = f" {float(value)!r},"
+        if len(lines[-1]) + len(text) > _LINE:
+            lines.append(" " * (indent - 1))
+        lines[-1] += text
+    return "\n".join(lines)
+
+
+def _rows(cubics: np.ndarray) -> str:
+    return "\n".join(f"        {{{', '.join(repr(float(c)) for c in cubic)}}}," for cubic in cubics.T)

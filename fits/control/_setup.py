@@ -1,0 +1,177 @@
+"""A model and a reference made ready for a closed loop: interval, feedforward, limits, and how the stage stands."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from fits.control._compensate import Compensation, Way, compensate
+from fits.io._errors import DataError
+from fits.io._record import Reference
+from fits.loop._run import initial_state
+from fits.stage._result import range_of
+from fits.stage._run import place_of_hysteresis
+from microid import Preisach, SampledStage, Stage, Start, two_degrees
+
+Feedforward = Literal["none", "static", "dynamic"]
+
+_FEWEST = 16
+# Intervals that differ by less than this from their mean, as a fraction of it, count as even.
+_EVEN = 1e-3
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a closed loop needs beside its controller.
+
+    Attributes
+    ----------
+    stage
+        Under a held command.
+    interval_s
+        Between two samples.
+    reference_um, feedforward_V
+        Shape `(t,)`; the latter None without feedforward.
+    limits_V
+        Of the command.
+    start
+        At rest where the reference begins.
+    static_V
+        Command that would hold the stage at the reference, shape `(t,)`.
+    remarks
+        One sentence each.
+    """
+
+    stage: Stage
+    interval_s: float
+    reference_um: np.ndarray
+    feedforward_V: np.ndarray | None
+    limits_V: tuple[float, float]
+    start: Start
+    static_V: np.ndarray
+    remarks: tuple[str, ...]
+
+
+def setup(
+    model: Preisach | Stage,
+    reference: Reference,
+    feedforward: Feedforward = "static",
+    *,
+    initial: str = "negative",
+    limits_V: tuple[float, float] | None = None,
+) -> Setup:
+    """Make a model and a reference ready for a closed loop.
+
+    Parameters
+    ----------
+    model
+        A hysteresis, which becomes a stage of one part, or a stage of parts that have a form for single samples.
+    reference
+        With even times; the stage is at rest at its first sample.
+    feedforward
+        None, the inverse of the hysteresis alone, or that of the whole stage.
+    initial
+        Memory before the reference: `negative`, `positive` or `demagnetised`.
+    limits_V
+        Of the command; by default the range that the model was fitted on.
+
+    Raises
+    ------
+    DataError
+        If the times are uneven or too few, the stage cannot be stepped or inverted, or the limits are not within the
+        model's range.
+    """
+    stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
+    stage = Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
+    interval = _interval_s(reference)
+    try:
+        sampled = SampledStage(stage, interval)
+    except ValueError as error:
+        raise DataError(f"the model cannot be stepped from sample to sample: {error}", of_model=True) from error
+    place = place_of_hysteresis(stage)
+    if place is None:
+        return _linear(stage, sampled, reference, interval, feedforward, limits_V)
+    law = stage.parts[place]
+    if not isinstance(law, Preisach):
+        raise DataError(
+            f"{stage.names[place]!r} is a {type(law).__name__}, expected a Preisach hysteresis; fit one",
+            of_model=True,
+        )
+    found = _compensation(stage, reference, initial, limits_V, "static")
+    remarks = []
+    if found.clipped.any():
+        remarks.append(f"{int(found.clipped.sum())} samples of the reference are out of reach within the limits")
+    ahead = found.voltage_V if feedforward == "static" else None
+    if feedforward == "dynamic":
+        if isinstance(model, Preisach) or len(stage.parts) == 1:
+            raise DataError(
+                "expected a model with mechanics for --feedforward dynamic, found a hysteresis alone", of_model=True
+            )
+        led = _compensation(stage, reference, initial, limits_V, "dynamic")
+        ahead, remarks = led.voltage_V, [*remarks, *led.remarks]
+    memory = initial_state(initial, float(law.density.lower_V), float(law.density.upper_V))
+    rest_V = float(found.voltage_V[0] if ahead is None else ahead[0])
+    return Setup(
+        stage,
+        interval,
+        np.asarray(reference.displacement_um),
+        ahead,
+        range_of(stage) if limits_V is None else limits_V,
+        Start(jnp.asarray(rest_V), memory),
+        found.voltage_V,
+        tuple(remarks),
+    )
+
+
+def _compensation(
+    stage: Stage, reference: Reference, initial: str, limits_V: tuple[float, float] | None, way: Way
+) -> Compensation:
+    return compensate(stage, reference, initial, clip=True, limits_V=limits_V, way=way)
+
+
+def _linear(
+    stage: Stage,
+    sampled: SampledStage,
+    reference: Reference,
+    interval_s: float,
+    feedforward: Feedforward,
+    limits_V: tuple[float, float] | None,
+) -> Setup:
+    gain, offset = float(stage.static_gain), float(sampled.init(Start(jnp.asarray(0.0)))[1])
+    if not (np.isfinite(gain) and gain > 0):
+        raise DataError(
+            f"the stage gives {gain:g} um/V at rest, expected a positive one; turn the sign of a column",
+            of_model=True,
+        )
+    wanted = np.asarray(reference.displacement_um)
+    static = (wanted - offset) / gain
+    ahead = static if feedforward == "static" else None
+    if feedforward == "dynamic":
+        try:
+            ahead = np.asarray(two_degrees(stage, interval_s, jnp.asarray(wanted)).feedforward_V)
+        except ValueError as error:
+            raise DataError(f"the model has no dynamic inverse: {error}", of_model=True) from error
+    limits = (-np.inf, np.inf) if limits_V is None else limits_V
+    remarks = []
+    if ahead is not None and not np.array_equal(np.clip(ahead, *limits), ahead):
+        remarks.append("the feedforward was cut to the limits")
+        ahead = np.clip(ahead, *limits)
+    rest_V = float(np.clip(static[0] if ahead is None else ahead[0], *limits))
+    return Setup(stage, interval_s, wanted, ahead, limits, Start(jnp.asarray(rest_V)), static, tuple(remarks))
+
+
+def _interval_s(reference: Reference) -> float:
+    if len(reference) < _FEWEST:
+        raise DataError(
+            f"{reference.source}: expected {_FEWEST} samples or more, found {len(reference)}; sample it more finely"
+        )
+    steps = np.diff(reference.time_s)
+    interval = float(steps.mean())
+    worst = int(np.argmax(np.abs(steps - interval)))
+    if abs(steps[worst] - interval) > _EVEN * interval:
+        raise DataError(
+            f"{reference.source}: expected even times, as of a controller, found a step of {steps[worst]:.6g} s "
+            f"at sample {worst + 2} where the mean is {interval:.6g} s; resample the reference"
+        )
+    return interval

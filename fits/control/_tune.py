@@ -1,0 +1,286 @@
+"""Controllers tuned by differentiating through the closed loop, for all plants that a fit leaves possible."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fits.control._tune_problem import REACH, Figures, Goal, Problem, descend, judge
+from fits.control._tune_result import Tuning, reports
+from fits.control._tune_start import steepest_slope
+from fits.io._errors import DataError
+from fits.loop._result import FitError, FitStatus
+from microid import AbstractController, Coordinates, ParameterInfo, Stage, Start, parameter_table
+
+_Controller = TypeVar("_Controller", bound=AbstractController)
+
+_ROUNDS = 12
+_FIRST_WEIGHT, _FACTOR, _MOST_WEIGHT = 10.0, 4.0, 1e6
+# Limits are kept to this share; the search stops where it moves no gain by more than this.
+_TOLERANCE = 2e-3
+_STILL = 1e-2
+# Relative change of the cost per e-fold of a gain that counts as none.
+_FLAT = 2e-2
+_SPREAD = 1.0
+_SHRINKS = 8
+_EDGE = 0.8 * REACH
+_ALIKE = 0.01
+
+
+@dataclass(frozen=True)
+class _End:
+    y: Any
+    gradient: np.ndarray
+    figures: Figures
+    over: dict[str, np.ndarray]
+    cost_um: float
+    settled: bool
+
+    @property
+    def kept(self) -> bool:
+        return bool(np.all(np.asarray(self.figures.stable))) and _worst(self.over)[0] <= _TOLERANCE
+
+    @property
+    def converged(self) -> bool:
+        return self.settled and bool(np.max(np.abs(self.gradient)) < _FLAT)
+
+
+def tune_controller(
+    controller: _Controller,
+    plants: Stage | Sequence[Stage],
+    reference_um: ArrayLike,
+    *,
+    goal: Goal | None = None,
+    feedforward_V: ArrayLike | None = None,
+    noise_um: ArrayLike | None = None,
+    delay: int = 0,
+    resolution_um: float | None = None,
+    start: Start | None = None,
+    skip: int = 0,
+    free: Sequence[str] | None = None,
+    starts: int = 2,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Tuning[_Controller]:
+    """Tune a controller on models, by the derivatives of whole closed loops.
+
+    Gains are searched for in their logarithm (a BFGS method within an augmented Lagrangian for the limits), from the
+    controller that is given and from places drawn around it.
+
+    Parameters
+    ----------
+    controller
+        Where the search begins: its loop must be stable with every plant; see `relay_start`. `BPPID` and `CMACPID`
+        have the margins of the PID controller that they are at first.
+    plants
+        One stage, or several of one structure, as from `draw_plants`; the first is the nominal one.
+    reference_um
+        One or several references, shape `(t,)` or `(r, t)`.
+    goal
+        Cost and limits; see `Goal` for the default.
+    feedforward_V, noise_um
+        Of each reference, or of all, in the shapes of references; none by default. The same noise is used throughout.
+    delay, resolution_um, start
+        See `microid.simulate_loop`.
+    skip
+        How many samples at the beginning do not count.
+    free
+        Paths of the parameters that move, such as `"pid"` or `"integral_V_per_um_s"`; by default gains: what
+        cannot be negative, is not zero and is no time.
+    starts
+        Number of places to search from.
+    seed
+        Of the places.
+    progress
+        Told what is being done.
+
+    Returns
+    -------
+    Tuning
+        The best that was found within all limits.
+
+    Raises
+    ------
+    DataError
+        If plants differ in structure, signals in shape, or there is nothing to tune.
+    FitError
+        If the loop is unstable at the start, no place within all limits was found, or none better than the start,
+        although that is not an optimum.
+    """
+    stages = [plants] if isinstance(plants, Stage) else list(plants)
+    goal = Goal() if goal is None else goal
+    problem = _problem(
+        controller, stages, goal, reference_um, feedforward_V, noise_um, delay, resolution_um, start, skip, free
+    )
+    origin = jnp.zeros_like(problem.origin)
+    figures, over, cost = judge(problem, origin)
+    if not np.all(np.asarray(figures.stable)):
+        which = np.flatnonzero(~np.asarray(figures.stable)) + 1
+        detail = f"at the start, with plant {', '.join(map(str, which))} of {len(stages)}"
+        raise FitError(FitStatus.UNSTABLE, detail, "tuning")
+    progress(f"start: cost {float(cost):.4g} um, {_said(over)}")
+    first = _worst(over)
+    rng, ends = np.random.default_rng(seed), []
+    for number in range(starts):
+        y = origin if number == 0 else _stable_place(problem, rng)
+        ends.append(_search(problem, y, len(stages)))
+        progress(f"search {number + 1} of {starts}: cost {ends[-1].cost_um:.4g} um, {_said(ends[-1].over)}")
+    kept = [end for end in ends if end.kept]
+    if not kept:
+        nearest = min(ends, key=lambda end: _worst(end.over)[0])
+        raise FitError(FitStatus.LIMITS, _said(nearest.over), "tuning")
+    best = min(kept, key=lambda end: end.cost_um)
+    remarks = []
+    if first[0] > _TOLERANCE:
+        remarks.append(f"the controller at the start was beyond a limit ({_said(over)}), so its cost is no bound")
+    elif best.cost_um > float(cost) * (1 - 1e-9) or float(jnp.max(jnp.abs(best.y))) < _TOLERANCE:
+        if not best.converged or best.cost_um > float(cost) * (1 + _TOLERANCE):
+            detail = "no search found better gains than those at the start"
+            raise FitError(FitStatus.NOT_STATIONARY, detail, "tuning")
+        remarks.append("the gains at the start were already as good as any near them")
+    if not best.converged:
+        remarks.append("the search stopped before the slope of the cost was nothing: other starts may do better")
+    remarks += _remarks(problem, best, ends)
+    tuned = problem.controller(best.y)
+    before, after = parameter_values(controller), parameter_values(tuned)
+    gains = {row.path: (before[row.path], after[row.path]) for row in problem.coordinates.table}
+    return Tuning(tuned, float(cost), best.cost_um, best.converged, reports(best.figures), gains, tuple(remarks))
+
+
+def _problem(
+    controller: Any,
+    stages: Sequence[Stage],
+    goal: Goal,
+    reference_um: ArrayLike,
+    feedforward_V: ArrayLike | None,
+    noise_um: ArrayLike | None,
+    delay: int,
+    resolution_um: float | None,
+    start: Start | None,
+    skip: int,
+    free: Sequence[str] | None,
+) -> Problem:
+    kinds: set[Any] = {jax.tree.structure(one) for one in stages}
+    if len(kinds) != 1:
+        raise DataError("expected one plant or more, all of the same parts in the same order")
+    reference = np.atleast_2d(np.asarray(reference_um, dtype=float))
+    given = {}
+    for name, signal in {"feedforward_V": feedforward_V, "noise_um": noise_um}.items():
+        if signal is not None:
+            signal = np.asarray(signal, dtype=float)
+            if signal.shape not in (reference.shape, reference.shape[1:]):
+                raise DataError(f"{name} has shape {signal.shape}, expected {reference.shape} or one row of it")
+            signal = jnp.asarray(np.broadcast_to(signal, reference.shape))
+        given[name] = signal
+    if not 0 <= skip < reference.shape[1]:
+        raise DataError(f"skip: expected a number of samples below {reference.shape[1]}, found {skip}")
+    values = parameter_values(controller)
+    coordinates = Coordinates(controller, lambda row: _moves(row, values[row.path], free))
+    for name in free or ():
+        if not any(_below(row.path, name) for row in coordinates.table):
+            raise DataError(f"there is no parameter {name!r} to tune: choose some of {', '.join(values)}")
+    origin = coordinates.of(controller)
+    steps = jax.jvp(coordinates.values, (origin,), (jnp.ones_like(origin),))[1]
+    now = jnp.abs(coordinates.values(origin))
+    stretch = jnp.where(now > 0, now, 1) / steps
+    slopes = [steepest_slope(stage) for stage in stages]
+    return Problem(
+        coordinates,
+        origin,
+        stretch,
+        jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *stages),
+        None if slopes[0] is None else jnp.asarray(np.asarray(slopes, dtype=float)),
+        jnp.asarray(reference),
+        given["feedforward_V"],
+        given["noise_um"],
+        jnp.asarray((np.arange(reference.shape[1]) >= skip).astype(float)),
+        Start() if start is None else start,
+        (jnp.asarray(float(goal.effort_um_per_V)), jnp.asarray(float(goal.rate_um_per_V))),
+        {name: jnp.asarray(limit) for name, limit in goal.limits().items()},
+        jnp.asarray(goal.command_width_V()),
+        None if resolution_um is None else jnp.asarray(float(resolution_um)),
+        delay,
+    )
+
+
+def parameter_values(controller: Any) -> dict[str, np.ndarray]:
+    """The parameters of a controller by their path, in their units."""
+    leaves = jax.tree_util.tree_flatten_with_path(controller)[0]
+    found = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
+    return {row.path: np.asarray(found[row.path]) for row in parameter_table(controller)}
+
+
+def _moves(row: ParameterInfo, value: np.ndarray, free: Sequence[str] | None) -> bool:
+    if free is not None:
+        return any(_below(row.path, name) for name in free)
+    # What is on its bound stands infinitely far away in the search; 1e-6 of the scale is where it is put.
+    gain = row.spec.lower == 0 and row.spec.unit != "s"
+    return bool(gain and np.all(value > 2e-6 * row.spec.scale))
+
+
+def _below(path: str, name: str) -> bool:
+    return path == name or path.startswith((f"{name}.", f"{name}["))
+
+
+def _stable_place(problem: Problem, rng: np.random.Generator) -> Any:
+    """A place drawn around the start, drawn nearer until all loops are stable."""
+    y = jnp.asarray(rng.normal(0, _SPREAD, problem.origin.shape))
+    for _ in range(_SHRINKS):
+        if np.all(np.asarray(judge(problem, y)[0].stable)):
+            return y
+        y = y / 2
+    return jnp.zeros_like(y)
+
+
+def _search(problem: Problem, y: Any, plants: int) -> _End:
+    over = judge(problem, y)[1]
+    multipliers = {name: jnp.zeros_like(share) for name, share in over.items()}
+    weight, worst, settled = _FIRST_WEIGHT, np.inf, False
+    for _ in range(_ROUNDS):
+        moved, gradient = descend(problem, y, over, multipliers, jnp.asarray(weight))
+        figures, over, cost = judge(problem, moved)
+        distance, y = float(jnp.max(jnp.abs(moved - y))), moved
+        now = _worst(over)[0]
+        pressed = any(bool(jnp.any(one > 0)) for one in multipliers.values())
+        # Without a limit that presses, nothing changes from here on.
+        settled = (now <= 0 and not pressed) or (now <= _TOLERANCE and distance < _STILL)
+        if settled or not np.isfinite(now):
+            break
+        multipliers = {name: jnp.maximum(one + weight * over[name], 0) for name, one in multipliers.items()}
+        weight = min(weight * (_FACTOR if now > worst / 2 else 1.0), _MOST_WEIGHT)
+        worst = max(now, 0.0)
+    return _End(y, np.asarray(gradient), figures, {k: np.asarray(v) for k, v in over.items()}, float(cost), settled)
+
+
+def _worst(over: dict[str, Any]) -> tuple[float, str]:
+    """The largest excess and its limit."""
+    found = max((float(np.max(share)), name) for name, share in over.items())
+    return found if np.isfinite(found[0]) else (np.inf, found[1])
+
+
+def _said(over: dict[str, Any]) -> str:
+    share, name = _worst(over)
+    # That of the overshoot is a logarithm.
+    passed = np.expm1(share) if name == "overshoot_max_pct" else share
+    return "within all limits" if share <= _TOLERANCE else f"{name} passed by {100 * passed:.3g} %"
+
+
+def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> list[str]:
+    out = []
+    alike = sum(end.kept and end.cost_um <= best.cost_um * (1 + _ALIKE) for end in ends)
+    if len(ends) > 1 and alike < len(ends):
+        out.append(f"{alike} of {len(ends)} searches ended within 1 % of the best cost: the others at worse optima")
+    place = 0
+    for row in problem.coordinates.table:
+        size = int(np.prod(row.shape))
+        if np.any(np.abs(np.asarray(best.y)[place : place + size]) > _EDGE):
+            out.append(f"{row.path} is at the edge of what is searched: it hardly matters, or the start was far off")
+        place += size
+    pressing = [name for name, share in best.over.items() if np.max(share) > -_TOLERANCE]
+    if pressing:
+        out.append(f"at its limit: {', '.join(pressing)}")
+    return out

@@ -1,0 +1,94 @@
+"""What tuning gives back."""
+
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import jax
+import numpy as np
+
+from fits.control._tune_problem import Figures
+from microid import AbstractController, Margins
+
+_Controller = TypeVar("_Controller", bound=AbstractController)
+
+
+@dataclass(frozen=True)
+class LoopReport:
+    """One plant under a tuned controller; figures of several references are the worst.
+
+    Attributes
+    ----------
+    margins
+        Of the linearised loop; the hysteresis stands at its steepest slope.
+    error_rms_um, error_max_um
+        Over the samples that count.
+    overshoot_pct
+        See `Goal`.
+    command_min_V, command_max_V, command_step_max_V
+        Range of the command, and its largest change between samples.
+    """
+
+    margins: Margins
+    error_rms_um: float
+    error_max_um: float
+    overshoot_pct: float
+    command_min_V: float
+    command_max_V: float
+    command_step_max_V: float
+
+
+@dataclass(frozen=True)
+class Tuning(Generic[_Controller]):
+    """A tuned controller, and what it is worth.
+
+    Attributes
+    ----------
+    controller
+        Stable with every plant, and within all limits.
+    cost_before_um, cost_after_um
+        Of the controller it began with, and of this one; see `Goal`.
+    converged
+        Whether nothing is left to gain nearby: the slope of the cost is small, or balanced by limits.
+    plants
+        One report per plant, the nominal one first.
+    gains
+        Before and after, in their units, by their path in the controller.
+    remarks
+        What the user should know, one sentence each.
+    """
+
+    controller: _Controller
+    cost_before_um: float
+    cost_after_um: float
+    converged: bool
+    plants: tuple[LoopReport, ...]
+    gains: dict[str, tuple[np.ndarray, np.ndarray]]
+    remarks: tuple[str, ...]
+
+    @property
+    def worst(self) -> LoopReport:
+        """The plant with the largest error."""
+        return max(self.plants, key=lambda one: one.error_rms_um)
+
+
+def reports(found: Figures) -> tuple[LoopReport, ...]:
+    """One report per plant."""
+
+    def worst(values: Any, plant: int) -> float:
+        return float(np.max(np.asarray(values)[plant]))
+
+    out = []
+    for k in range(found.error_um2.shape[0]):
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], found.margins)
+        out.append(
+            LoopReport(
+                one,
+                worst(found.error_um2, k) ** 0.5,
+                worst(found.error_max_um, k),
+                worst(found.overshoot_pct, k),
+                float(np.min(np.asarray(found.command_min_V)[k])),
+                worst(found.command_max_V, k),
+                worst(found.command_step_V, k),
+            )
+        )
+    return tuple(out)

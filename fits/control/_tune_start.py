@@ -1,0 +1,175 @@
+"""Where the tuning of a controller begins: the ultimate point of a loop, and the rules of Ziegler and Nichols."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.io._errors import DataError
+from fits.stage._run import place_of_hysteresis
+from microid import PID, PrandtlIshlinskii, Preisach, Stage, loop_gain, margins
+
+_DECADES = 5
+_POINTS = 4001
+# Each narrows the bracket of a crossing by the number of points.
+_ZOOMS = 3
+# Voltages per level on which the slope of a hysteresis is looked at.
+_FINE = 64
+# The start keeps at least this gain margin; ever smaller gains reach it on any stage that is stable by itself.
+_MARGIN = 2.0
+_HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class UltimatePoint:
+    """Where a loop under a proportional controller oscillates for ever; about where one with a relay does.
+
+    Attributes
+    ----------
+    gain_V_per_um
+        The gain of the controller.
+    period_s
+        Of the oscillation.
+    """
+
+    gain_V_per_um: float
+    period_s: float
+
+
+def steepest_slope(stage: Stage) -> float | None:
+    """Slope of a stage's hysteresis where it is steepest, in um/V: there the loop is least stable.
+
+    Parameters
+    ----------
+    stage
+        With a `Preisach`, whose slope is largest somewhere on its major loop, or with a `PrandtlIshlinskii`.
+
+    Returns
+    -------
+    float or None
+        None for a stage that is linear.
+
+    Raises
+    ------
+    DataError
+        If the hysteresis is another one.
+    """
+    place = place_of_hysteresis(stage)
+    if place is None:
+        return None
+    law = stage.parts[place]
+    if isinstance(law, PrandtlIshlinskii):
+        return float(law.slope_um_per_V + np.sum(np.asarray(law.weight_um_per_V)))
+    if not isinstance(law, Preisach):
+        raise DataError(
+            f"{stage.names[place]!r} is a {type(law).__name__}, which has no form for single samples: "
+            "control a stage with a Preisach or a PrandtlIshlinskii hysteresis"
+        )
+    lower, upper = float(law.density.lower_V), float(law.density.upper_V)
+    rise = np.linspace(lower, upper, _FINE * law.density.levels)
+    out = np.asarray(_respond(law, jnp.asarray(np.append(rise, rise[::-1]))))
+    steps = np.abs(np.diff(out)) / (rise[1] - rise[0])
+    return float(steps.max())
+
+
+@eqx.filter_jit
+def _respond(law: Preisach, voltage_V: Float[Array, " n"]) -> Float[Array, " n"]:
+    return law(voltage_V)
+
+
+def slope_array(stage: Stage) -> Float[Array, ""] | None:
+    """The same as an array: compiled functions take a bare number for a constant, and are made again for each."""
+    slope = steepest_slope(stage)
+    return None if slope is None else jnp.asarray(slope)
+
+
+def ultimate_point(stage: Stage, interval_s: float, *, delay: int = 0) -> UltimatePoint:
+    """Find the ultimate point of a stage: where its sampled response, delay included, is real and most negative.
+
+    Parameters
+    ----------
+    stage
+        Of linear parts, and at most one hysteresis, for which its steepest slope stands.
+    interval_s
+        Between two samples of the controller.
+    delay
+        How many samples old the reading is.
+
+    Raises
+    ------
+    DataError
+        If the stage moves down for a voltage that goes up, or does not move at all.
+    """
+    unit, slope = PID.from_times(1.0, jnp.inf, 0.0, interval_s), slope_array(stage)
+
+    def response(frequency_Hz: np.ndarray) -> np.ndarray:
+        found = loop_gain(unit, stage, jnp.asarray(frequency_Hz), delay=delay, slope_um_per_V=slope)
+        return np.asarray(found)
+
+    nyquist = 0.5 / interval_s
+    grid = nyquist * np.logspace(-_DECADES, 0, _POINTS)
+    whole = response(grid)
+    if not (np.all(np.isfinite(whole)) and whole[0].real > 0):
+        raise DataError(
+            f"the stage gives {whole[0].real:.3g} um/V at rest, expected a positive gain: turn the sign of a column"
+        )
+    candidates = [(grid[-1], whole[-1].real)]
+    for k in np.flatnonzero(np.diff(np.sign(whole[:-1].imag))):
+        low, high = grid[k], grid[k + 1]
+        for _ in range(_ZOOMS):
+            fine = np.linspace(low, high, _POINTS)
+            values = response(fine)
+            turned = np.flatnonzero(np.diff(np.sign(values.imag)))
+            place = int(turned[0]) if len(turned) else 0
+            low, high = fine[place], fine[place + 1]
+        candidates.append((low, values[place].real))
+    frequency, depth = min(candidates, key=lambda one: one[1])
+    if not depth < 0:
+        raise DataError("no gain makes this loop oscillate: state its interval and the delay of the sensor")
+    return UltimatePoint(float(-1 / depth), float(1 / frequency))
+
+
+def relay_start(plants: Stage | Sequence[Stage], interval_s: float, *, delay: int = 0) -> PID:
+    """Find a PID controller to start from: the rules of Ziegler and Nichols (1942), made safe.
+
+    They give `0.6 K_u`, `P_u / 2` and `P_u / 8` for the gain and the times of integral and derivative, from the gain
+    and the period at which a relay experiment would see the loop oscillate; here they come from the model. Stages
+    with a light resonance are unstable under them, so the gains are halved until every plant has a gain margin of 2.
+
+    Parameters
+    ----------
+    plants
+        One stage, or several that are all to be stable; the first gives the ultimate point.
+    interval_s
+        Between two samples of the controller.
+    delay
+        How many samples old the reading is.
+
+    Returns
+    -------
+    PID
+        Without limits, with a filter of a tenth of the derivative's time.
+
+    Raises
+    ------
+    DataError
+        See `ultimate_point`; or if no gains are small enough.
+    """
+    stages = [plants] if isinstance(plants, Stage) else list(plants)
+    point = ultimate_point(stages[0], interval_s, delay=delay)
+    slopes = [slope_array(stage) for stage in stages]
+    gain = 0.6 * point.gain_V_per_um
+    for _ in range(_HALVINGS):
+        integral_s, derivative_s = point.period_s / 2, point.period_s / 8
+        pid = PID.from_times(gain, integral_s, derivative_s, interval_s, filter_s=derivative_s / 10)
+        found = [
+            margins(pid, stage, delay=delay, slope_um_per_V=slope)
+            for stage, slope in zip(stages, slopes, strict=True)
+        ]
+        if all(bool(one.stable) and float(one.gain_margin) >= _MARGIN for one in found):
+            return pid
+        gain /= 2
+    raise DataError("no gains were small enough for a stable loop: the stage itself is not stable")

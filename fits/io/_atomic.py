@@ -1,0 +1,104 @@
+"""Whole files or none: written under a temporary name in the same folder, then renamed."""
+
+import csv
+import gzip
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.io._errors import DataError
+from fits.io._file_set import file_set
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path; on success it becomes `path`, on any exception it is deleted.
+
+    The temporary path does not exist yet, lies in the same folder and ends as `path` does, so that Matplotlib
+    infers the format. A file that was at `path` before is replaced in one step or left as it was. What is written is
+    on the disk before it is at `path`. For several files that belong together, see `file_set`.
+
+    Parameters
+    ----------
+    path
+        File to write. A symbolic link is followed.
+
+    Raises
+    ------
+    DataError
+        The folder is missing or cannot be written to, `path` is write-protected or anything but a regular file, or
+        the disk is full.
+    """
+    with file_set() as files:
+        yield files.file(path)
+
+
+def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write bytes to `path`, whole or not at all; errors are those of `atomic_path`."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write text to `path` as UTF-8 with its line ends kept, whole or not at all; errors as `atomic_path`."""
+    atomic_write_bytes(path, text.encode())
+
+
+def refuse_nonfinite(name: str, values: NDArray[Any]) -> None:
+    """Refuse, in a `DataError`, to pass on results that are not finite, shape `(n,)`: no file holds any."""
+    finite = np.isfinite(values) if values.dtype.kind in "fc" else np.ones(values.shape, dtype=bool)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise DataError(
+            f"{name}: the result is {values[row]} from sample {row + 1} on, so nothing was written; check the "
+            "numbers of the model and of the file it was given."
+        )
+
+
+def finite_json(content: Any) -> str:
+    """Put results into JSON; a `DataError` says that one of them is not finite."""
+    try:
+        return json.dumps(content, indent=1, allow_nan=False)
+    except ValueError:
+        raise DataError(
+            "a figure of the result is not finite; check the numbers of the files it was made from."
+        ) from None
+
+
+def write_csv(
+    path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]], comments: Sequence[str] = ()
+) -> None:
+    """Write columns as CSV, with as many digits as reading them back exactly takes.
+
+    Parameters
+    ----------
+    path
+        File to write; a name that ends in ``.gz`` is compressed.
+    columns
+        Header to values, each of shape (n,).
+    comments
+        Lines before the header, each written behind ``#``, which the reader passes over.
+
+    Raises
+    ------
+    ValueError
+        The columns differ in length.
+    DataError
+        As `atomic_path`, or a value is not finite.
+    """
+    for name, values in columns.items():
+        refuse_nonfinite(name, np.asarray(values))
+    lists = [np.asarray(values).tolist() for values in columns.values()]
+    with atomic_path(path) as temporary:
+        opener: Any = gzip.open if temporary.suffix == ".gz" else open
+        with opener(temporary, "wt", encoding="utf-8", newline="") as file:
+            file.writelines(f"# {' '.join(comment.split())}\n" for comment in comments)
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(zip(*lists, strict=True))  # csv writes floats by repr, which is exact

@@ -1,0 +1,294 @@
+"""Files that appear together, or not at all: all are written under temporary names, then all are renamed."""
+
+import errno
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import overload
+
+from fits.io._errors import DataError
+from fits.io._places import check_file, reason_of, usable_folder
+from fits.io._temporary import is_temporary, remove_stale, temporary_name
+
+_DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+# Of file systems that have no such thing as flushing.
+_NO_FLUSH = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
+
+
+@dataclass(frozen=True)
+class _Move:
+    """What is at `staged` goes to `target`; None deletes what is there. `shown` is its name in sentences."""
+
+    staged: Path | None
+    target: Path
+    shown: str
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """A folder to be: `made` is the temporary one, and becomes `first`, the first that is missing on the way."""
+
+    made: Path
+    first: Path
+    files: Path
+    target: Path
+    shown: str
+    option: str
+
+
+class FileSet:
+    """Files that appear together at the end of `file_set`."""
+
+    def __init__(self) -> None:
+        self._files: list[_Move] = []
+        self._folders: list[_Folder] = []
+        self._scraps: list[Path] = []
+
+    def file(self, path: str | os.PathLike[str]) -> Path:
+        """Give a temporary name for a file to write; it does not exist yet, and ends as `path` does.
+
+        Raises
+        ------
+        DataError
+            `path` cannot be written to: its folder is missing or protected, or it is anything but a regular file.
+        """
+        target = check_file(path)
+        if any(is_temporary(part) for part in target.parts):
+            # Of another set, which puts it in its place or deletes it.
+            return target
+        self._refuse_twice(target, os.fspath(path))
+        remove_stale(target.parent)
+        staged = target.with_name(temporary_name(target.suffix))
+        self._files.append(_Move(staged, target, os.fspath(path)))
+        return staged
+
+    def absent(self, path: str | os.PathLike[str]) -> None:
+        """Have no file at `path` in the end; a missing one is fine."""
+        self._files.append(_Move(None, Path(os.path.realpath(path)), os.fspath(path)))
+
+    @overload
+    def folder(self, path: str | os.PathLike[str], option: str = ...) -> Path: ...
+    @overload
+    def folder(self, path: None, option: str = ...) -> None: ...
+    @overload
+    def folder(self, path: str | os.PathLike[str] | None, option: str = ...) -> Path | None: ...
+    def folder(self, path: str | os.PathLike[str] | None, option: str = "--plots") -> Path | None:
+        """Make a temporary folder, whose files go to the folder `path`, which is made if need be.
+
+        Parameters
+        ----------
+        path
+            Of the folder; for None, None comes back.
+        option
+            That named it.
+
+        Raises
+        ------
+        DataError
+            `path` cannot be written to, or is no folder.
+        """
+        if path is None:
+            return None
+        target, anchor = usable_folder(path, option)
+        missing = target.relative_to(anchor).parts
+        made = anchor / temporary_name()
+        files = made.joinpath(*missing[1:])
+        folder = _Folder(made, anchor.joinpath(*missing[:1]), files, target, os.fspath(path), option)
+        self._refuse_twice(target, folder.shown)
+        # Known before it is there, so that an interruption at any moment finds it.
+        self._folders.append(folder)
+        try:
+            files.mkdir(parents=True)
+        except OSError as error:
+            raise _refused(folder, error) from error
+        return files
+
+    def _refuse_twice(self, target: Path, shown: str) -> None:
+        if target in {*(move.target for move in self._files), *(folder.target for folder in self._folders)}:
+            raise DataError(f"{shown}: two results would go to this place; choose another for one of them.")
+
+    def commit(self) -> None:
+        """Put all files in their places, or none."""
+        files = [move for move in self._files if move.staged is not None or os.path.lexists(move.target)]
+        moves = [*self._from_folders(), *files]
+        seen: dict[Path, str] = {}
+        for move in moves:
+            if move.target in seen:
+                raise DataError(f"{move.shown}: two results would go to this place; choose another for one of them.")
+            seen[move.target] = move.shown
+            if move.staged is None or not move.staged.is_dir():
+                check_file(move.target, move.shown)
+        for move in moves:
+            if move.staged is not None and not move.staged.is_dir():
+                flush(move.staged)
+        with ExitStack() as undo:
+            for move in moves:
+                # A single one has happened or not. Of several the last is undone too: it may just have happened when
+                # an interruption comes.
+                if len(moves) > 1:
+                    undo.callback(self._undoing(move))
+                with _told(move.shown):
+                    _put(move)
+            undo.pop_all()
+        for folder in {move.target.parent for move in moves}:
+            _flush_folder(folder)
+
+    def _from_folders(self) -> list[_Move]:
+        moves = []
+        for folder in self._folders:
+            try:
+                if not os.path.lexists(folder.first):
+                    for file in folder.files.iterdir():
+                        flush(file)
+                    # All of it in one step.
+                    moves.append(_Move(folder.made, folder.first, folder.shown))
+                    continue
+                folder.target.mkdir(parents=True, exist_ok=True)
+                files = sorted(folder.files.iterdir())
+            except OSError as error:
+                raise _refused(folder, error) from error
+            for file in files:
+                real = Path(os.path.realpath(folder.target / file.name))
+                moves.append(_Move(file, real, str(Path(folder.shown) / file.name)))
+        return moves
+
+    def _undoing(self, move: _Move) -> Callable[[], None]:
+        """Make what undoes a move, whether or not it has been made."""
+        if not move.target.exists():
+            return partial(_take_back, move.target, move.staged)
+        kept = move.target.with_name(temporary_name())
+        self._scraps.append(kept)
+        with _told(move.shown):
+            try:
+                # A second name: at no moment there is no file under the first.
+                os.link(move.target, kept)
+            except OSError:
+                shutil.copy2(move.target, kept)
+        return partial(_restore, kept, move.target)
+
+    def discard(self) -> None:
+        """Delete all that is left under temporary names."""
+        for path in [*self._scraps, *(move.staged for move in self._files if move.staged)]:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        for folder in self._folders:
+            shutil.rmtree(folder.made, ignore_errors=True)
+
+    def explain(self, error: OSError) -> DataError | None:
+        """Put what the system says of these files into a sentence; errors of others are not ours to explain."""
+        name = os.fspath(error.filename) if isinstance(error.filename, str | os.PathLike) else ""
+        for move in self._files:
+            if name == str(move.staged):
+                return _unwritable(move.shown, error)
+        for folder in self._folders:
+            if name == str(folder.made) or name.startswith(f"{folder.made}{os.sep}"):
+                return _refused(folder, error)
+        if error.errno in _DISK_TROUBLE:
+            shown = [move.shown for move in self._files] + [folder.shown for folder in self._folders]
+            return _unwritable(shown[0], error) if shown else None
+        return None
+
+
+# Those that are in use.
+_OPEN: list[FileSet] = []
+
+
+@contextmanager
+def file_set() -> Iterator[FileSet]:
+    """Collect files that appear together at the end, or, on any exception, not at all.
+
+    All are written to the disk before the first is renamed. If a rename fails, those before it are undone. A process
+    that is killed meanwhile leaves each file as it was or whole, and temporary ones that the next `file_set` in the
+    same folder removes; a folder that was not there appears in one step with all that is in it.
+
+    Raises
+    ------
+    DataError
+        A file cannot be written, or the disk is full.
+    """
+    files = FileSet()
+    _OPEN.append(files)
+    try:
+        yield files
+        files.commit()
+    except OSError as error:
+        explained = files.explain(error)
+        if explained is None:
+            raise
+        raise explained from error
+    finally:
+        files.discard()
+        _OPEN.remove(files)
+
+
+def discard_all() -> None:
+    """Delete what is under temporary names, for a process that ends.
+
+    A signal may come at any moment, such as between the end of a block and what cleans up after it.
+    """
+    for files in _OPEN:
+        files.discard()
+
+
+def _put(move: _Move) -> None:
+    if move.staged is None:
+        move.target.unlink(missing_ok=True)
+    elif move.staged.is_dir():
+        os.rename(move.staged, move.target)
+    else:
+        os.replace(move.staged, move.target)
+
+
+def _take_back(target: Path, staged: Path | None) -> None:
+    if staged is not None and not staged.exists():
+        os.rename(target, staged)
+
+
+def _restore(kept: Path, target: Path) -> None:
+    if kept.exists():
+        os.replace(kept, target)
+
+
+def flush(path: Path) -> None:
+    """Have a file on the disk before it gets its name; an OSError says that the disk is full after all."""
+    with open(path, "r+b") as file:
+        try:
+            os.fsync(file.fileno())
+        except OSError as error:
+            if error.errno not in _NO_FLUSH:
+                raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _flush_folder(path: Path) -> None:
+    # Not all systems can; and what is renamed stays renamed.
+    with suppress(OSError):
+        folder = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+@contextmanager
+def _told(shown: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise _unwritable(shown, error) from error
+
+
+def _unwritable(shown: str, error: OSError) -> DataError:
+    return DataError(
+        f"{shown}: cannot be written ({reason_of(error)}); "
+        "free the disk, close the file in other programs or choose another place."
+    )
+
+
+def _refused(folder: _Folder, error: OSError) -> DataError:
+    return DataError(
+        f"{folder.shown}: files cannot be put there ({reason_of(error)}); choose another for {folder.option}."
+    )

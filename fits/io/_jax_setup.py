@@ -1,0 +1,89 @@
+"""JAX as the command needs it: double precision, and compiled functions kept between calls."""
+
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+import click
+import jax
+
+from fits.io._errors import DataError
+
+# Functions that compile faster than this are not worth a file.
+_KEPT_S = 0.3
+
+
+def start_jax() -> None:
+    """Configure JAX; call it before any computation.
+
+    Raises
+    ------
+    DataError
+        If MICROID_CACHE names a folder that other users can write to.
+    """
+    jax.config.update("jax_enable_x64", True)
+    folder = _cache_folder()
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", _KEPT_S)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _cache_folder() -> Path | None:
+    """Make the folder for compiled functions; None where there is none or it cannot be written to.
+
+    What is in it runs as the user's own code. One that others can write to is refused where it was asked for; without
+    a wish nothing is kept then, and a note says so.
+    """
+    stated = os.environ.get("MICROID_CACHE")
+    if stated in ("", "0", "off"):
+        return None
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(stated).expanduser() if stated else Path(base) / "microid" / "jax"
+        # The user's alone, whatever new files are by default.
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            return None
+        found = _open_to_others(folder)
+    except (OSError, RuntimeError):
+        return None
+    if found is None:
+        return folder
+    why, remedy = found
+    why += ", and what is in it would be run as your own code"
+    if stated:
+        raise DataError(f"MICROID_CACHE: {why}; {remedy}, or name another folder.")
+    click.echo(f"Note: {why}, so nothing is kept; {remedy}, or name another folder in MICROID_CACHE.", err=True)
+    return None
+
+
+def _open_to_others(folder: Path) -> tuple[str, str] | None:
+    """Say what of a folder other users could change, and the remedy; None where there is nothing."""
+    if not hasattr(os, "geteuid"):
+        return None
+    real = Path(os.path.realpath(folder))
+    for place in {*Path(os.path.abspath(folder)).parents, *real.parents}:
+        mode = place.lstat().st_mode
+        # Whoever can rename a folder can put another in its place; a sticky one, such as /tmp, forbids that.
+        if not stat.S_ISLNK(mode) and mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+            return f"anyone can write to {place}", f"run chmod o-w {place}"
+    remedy = f"delete {folder}, which is then made anew for you alone"
+    whole = real.stat()
+    if whole.st_uid != os.geteuid():
+        return f"{real} belongs to another user", remedy
+    if whole.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return f"other users can write to {real}", remedy
+    enterable = whole.st_mode & (stat.S_IXGRP | stat.S_IXOTH)
+    for above, folders, files in os.walk(real):
+        for path in (os.path.join(above, name) for name in (*folders, *files)):
+            with suppress(FileNotFoundError):  # deleted by another process of the user
+                found = os.lstat(path)
+                if found.st_uid != os.geteuid():
+                    return f"{path} belongs to another user", remedy
+                loose = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not stat.S_ISLNK(found.st_mode)
+                if enterable and loose:
+                    return f"other users can write to {path}", remedy
+    return None

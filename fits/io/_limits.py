@@ -1,0 +1,325 @@
+"""Limits of a rig: what its records have reached, what a user states, and whether a command stays inside."""
+
+import math
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fits.io._errors import DataError
+from fits.io._record import Record
+
+# Range of each quantity, by name: lowest and highest value.
+Ranges = dict[str, tuple[float, float]]
+
+UNITS = {
+    "voltage": "V",
+    "slew": "V/s",
+    "displacement": "um",
+    "velocity": "um/s",
+    "acceleration": "um/s^2",
+    "current": "A/F",
+}
+"""Quantities that are limited, and their units. The driver's current is stated per farad of the piezo: it is the slew
+of the voltage at the piezo, C dU/dt, and records of voltage and displacement do not tell C."""
+
+# By how much of its range a predicted quantity may go beyond what the records reached.
+MARGIN = 0.02
+
+# What the command is, as against what it makes the rig do; a margin is for predictions.
+_COMMANDED = ("voltage", "slew")
+# These have a sign that means something; of the others the size is limited.
+_TWO_SIDED = ("voltage", "displacement")
+_PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "n": 1e-9}
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_RANGE = re.compile(rf"(?:({_NUMBER}):)?({_NUMBER})\s*([^\d\s.:].*)?")
+# Part of a limit by which rounding may exceed it.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Extreme:
+    """What a command is predicted to reach of one quantity, beside its limits.
+
+    Attributes
+    ----------
+    name
+        One of `UNITS`.
+    low, high
+        Reached, in the unit of the quantity.
+    lowest, highest
+        Allowed; infinite where nothing is.
+    """
+
+    name: str
+    low: float
+    high: float
+    lowest: float
+    highest: float
+
+    @property
+    def unit(self) -> str:
+        """Unit of all four."""
+        return UNITS[self.name]
+
+    @property
+    def excess(self) -> float:
+        """How far the worse side is beyond its limit; 0 or less where it is inside."""
+        slack = _ROUNDING * max(abs(self.low), abs(self.high), abs(self.lowest), abs(self.highest))
+        if math.isinf(slack):
+            slack = _ROUNDING * max(abs(self.low), abs(self.high))
+        return max(self.high - self.highest, self.lowest - self.low) - slack
+
+    def __str__(self) -> str:
+        """As in `displacement 0.1 to 38.2 um (limits 0 to 40 um)`."""
+        return (
+            f"{self.name} {self.low:.4g} to {self.high:.4g} {self.unit} "
+            f"(limits {self.lowest:.4g} to {self.highest:.4g} {self.unit})"
+        )
+
+
+def parse_limits(texts: Iterable[str]) -> Ranges:
+    """Read the texts of the option `--limit`, such as `displacement=0:40um` or `slew=2kV/s`.
+
+    Parameters
+    ----------
+    texts
+        ``NAME=LOW:HIGH`` or, for what has a size only, ``NAME=HIGH``, each with or without a unit at its end.
+
+    Raises
+    ------
+    DataError
+        A name that is not in `UNITS`, a unit of another quantity, or no range of two rising numbers.
+    """
+    found: Ranges = {}
+    for text in texts:
+        name, _, words = text[:200].partition("=")
+        name = name.strip()
+        if name not in UNITS:
+            raise DataError(f"--limit: expected one of {', '.join(UNITS)}, found {name!r}; write NAME=LOW:HIGH.")
+        if name in found:
+            raise DataError(f"--limit {name}: expected it once, found it twice; leave one out.")
+        match = _RANGE.fullmatch(words.strip())
+        example = f"{name}=0:100{UNITS[name]}" if name in _TWO_SIDED else f"{name}=100{UNITS[name]}"
+        if match is None:
+            raise DataError(f"--limit {name}: expected a range such as {example}, found {words!r}; write it so.")
+        factor = _factor(name, (match[3] or "").strip())
+        high = float(match[2]) * factor
+        if match[1] is None:
+            if name in _TWO_SIDED:
+                raise DataError(f"--limit {name}: expected two numbers such as {example}, found {words!r}.")
+            low = -high
+        else:
+            low = float(match[1]) * factor
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise DataError(f"--limit {name}: expected the lower of two numbers first, found {words!r}; swap them.")
+        found[name] = low, high
+    return found
+
+
+def _factor(name: str, unit: str) -> float:
+    """What a stated unit is in that of the quantity."""
+    expected = UNITS[name]
+    if unit in ("", expected):
+        return 1.0
+    plain = unit.replace("µ", "u").replace("μ", "u").replace("²", "^2").replace("s2", "s^2")
+    head, slash, tail = plain.partition("/")
+    own, own_slash, own_tail = expected.partition("/")
+    base = "m" if own == "um" else own
+    prefix = head.removesuffix(base)
+    if head.endswith(base) and prefix in _PREFIXES and (slash, tail) == (own_slash, own_tail):
+        return _PREFIXES[prefix] * (1e6 if own == "um" else 1.0)
+    raise DataError(f"--limit {name}: expected the unit {expected} or a multiple of it, found {unit!r}; convert it.")
+
+
+def measured_ranges(record: Record, offset_um: float = 0.0) -> Ranges:
+    """What a record shows without a model: voltage, slew, and displacement less an offset."""
+    ranges = {"voltage": record.voltage_V, "slew": np.append(np.diff(record.voltage_V) / np.diff(record.time_s), 0.0)}
+    if record.displacement_um is not None:
+        ranges["displacement"] = record.displacement_um - offset_um
+    return {name: (float(np.min(values)), float(np.max(values))) for name, values in ranges.items()}
+
+
+def reached_in(report: Mapping[str, Any]) -> Ranges:
+    """What the runs reached that a model was fitted to.
+
+    Parameters
+    ----------
+    report
+        What a model file keeps under `fit`.
+
+    Returns
+    -------
+    dict
+        Empty where the file does not say. Displacements are as the sensor read them in the first run, whose offset is
+        the model's.
+    """
+    runs = [run for run in report.get("runs", ()) if isinstance(run, Mapping) and run.get("reached")]
+    found = []
+    for run in runs:
+        ranges = ranges_of_json(run["reached"])
+        shift_um = float(runs[0].get("offset_um", 0.0)) - float(run.get("offset_um", 0.0))
+        if "displacement" in ranges:
+            low, high = ranges["displacement"]
+            ranges["displacement"] = low + shift_um, high + shift_um
+        found.append(ranges)
+    return joined(found)
+
+
+def joined(ranges: Iterable[Mapping[str, tuple[float, float]]]) -> Ranges:
+    """The smallest ranges that hold all of several."""
+    found: Ranges = {}
+    for one in ranges:
+        for name, (low, high) in one.items():
+            before = found.get(name, (low, high))
+            found[name] = min(low, before[0]), max(high, before[1])
+    return found
+
+
+def allowed(
+    reached: Mapping[str, tuple[float, float]], stated: Mapping[str, tuple[float, float]], margin: float
+) -> Ranges:
+    """Limits: what was stated, or else what was reached.
+
+    Parameters
+    ----------
+    reached
+        By the records. Of what has no sign that matters, the larger size counts both ways.
+    stated
+        By the user, as they are.
+    margin
+        By how much of its range a predicted quantity may go beyond what was reached; the command may not.
+
+    Raises
+    ------
+    DataError
+        If the margin is negative or not finite.
+    """
+    if not (math.isfinite(margin) and margin >= 0):
+        raise DataError(f"--margin: expected a share of the ranges reached, 0 or more, found {margin:g}.")
+    found: Ranges = {}
+    for name in UNITS:
+        if name in stated:
+            found[name] = stated[name]
+        elif name in reached:
+            low, high = reached[name]
+            if name not in _TWO_SIDED:
+                high = max(abs(low), abs(high))
+                low = -high
+            more = 0.0 if name in _COMMANDED else margin * (high - low) * (1.0 if name in _TWO_SIDED else 0.5)
+            found[name] = low - more, high + more
+    return found
+
+
+def compared(
+    predicted: Mapping[str, tuple[float, float]], limits: Mapping[str, tuple[float, float]]
+) -> tuple[Extreme, ...]:
+    """What is predicted beside its limits, for all that is limited."""
+    return tuple(
+        Extreme(name, *predicted[name], *limits[name]) for name in UNITS if name in predicted and name in limits
+    )
+
+
+def beyond(extremes: Iterable[Extreme]) -> tuple[Extreme, ...]:
+    """Those that leave their limits."""
+    return tuple(one for one in extremes if one.excess > 0)
+
+
+def check_command(
+    source: str,
+    predicted: Mapping[str, tuple[float, float]],
+    reached: Mapping[str, tuple[float, float]],
+    stated: Mapping[str, tuple[float, float]],
+    margin: float,
+    spared: Collection[str] = (),
+) -> list[str]:
+    """Refuse a command that leaves what the rig has shown.
+
+    Parameters
+    ----------
+    source
+        Of the reference that the command follows.
+    predicted
+        What the command is, and makes the rig do.
+    reached, stated, margin
+        See `allowed`.
+    spared
+        Quantities of which a remark is made instead, unless their limit is stated.
+
+    Returns
+    -------
+    list of str
+        Remarks.
+
+    Raises
+    ------
+    DataError
+        If something is beyond its limit.
+    """
+    unknown = [name for name in stated if name not in predicted]
+    if unknown:
+        raise DataError(f"--limit {unknown[0]}: nothing says how large it becomes here; leave it out.")
+    remarks = []
+    if not reached:
+        remarks.append(
+            "the model file does not say what its runs reached, so that only the range of the voltage was checked; "
+            "fit again, or state limits with --limit"
+        )
+    for one in beyond(compared(predicted, allowed(reached, stated, margin))):
+        worst = one.high if one.high - one.highest >= one.lowest - one.low else one.low
+        limit = one.highest if worst == one.high else one.lowest
+        words = f"{source}: to follow it takes a {one.name} of {worst:.4g} {one.unit}, "
+        if one.name in stated:
+            raise DataError(
+                f"{words}but --limit allows {limit:.4g} {one.unit}; slow it down, shrink it, or widen that."
+            )
+        words += f"where the runs that the model was fitted to reached {limit:.4g} {one.unit}"
+        if one.name in spared:
+            remarks.append(f"{words}; state what the rig stands with {stated_as(one)} to have it kept")
+            continue
+        raise DataError(
+            f"{words}; slow the reference down or shrink it, or state what the rig stands with {stated_as(one)}."
+        )
+    return remarks
+
+
+def stated_as(one: Extreme) -> str:
+    """The option that would allow what is predicted, such as `--limit displacement=-1.2:43um`."""
+    if one.name in _TWO_SIDED:
+        return f"--limit {one.name}={_below(min(one.low, one.lowest))}:{_above(max(one.high, one.highest))}{one.unit}"
+    return f"--limit {one.name}={_above(max(-one.low, one.high))}{one.unit}"
+
+
+def _above(value: float) -> str:
+    """A number of three digits that is not smaller."""
+    if value == 0:
+        return "0"
+    unit = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
+    return f"{math.ceil(value / unit - 1e-9) * unit:.4g}"
+
+
+def _below(value: float) -> str:
+    return f"{-float(_above(-value)):.4g}"
+
+
+def ranges_json(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
+    """Ranges as a model file keeps them, each under its name with the unit, as in `velocity_um_per_s`."""
+    return {_key(name): [float(low), float(high)] for name, (low, high) in ranges.items()}
+
+
+def ranges_of_json(content: object) -> Ranges:
+    """Ranges from what `ranges_json` wrote; nothing where there is none, or it is not of that form."""
+    if not isinstance(content, Mapping):
+        return {}
+    found: Ranges = {}
+    for name in UNITS:
+        pair = content.get(_key(name))
+        if isinstance(pair, list) and len(pair) == 2 and all(isinstance(value, int | float) for value in pair):
+            found[name] = float(pair[0]), float(pair[1])
+    return found
+
+
+def _key(name: str) -> str:
+    return f"{name}_{UNITS[name].replace('/', '_per_').replace('^', '')}"

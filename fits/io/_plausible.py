@@ -1,0 +1,64 @@
+"""Which numbers can be measurements: what lies beyond is a slip of a unit or of an export, and overflows later."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.io._table import Table, data_error
+
+FloatArray = NDArray[np.float64]
+
+# Largest size of a value by its unit. Slips of a unit by 1e6 stay within, so that they are warned of in words.
+LARGEST = {
+    "s": 1e11,
+    "V": 1e9,
+    "um": 1e9,
+    "degC": 1e9,
+    "A": 1e9,
+    "Hz": 1e9,
+    "um/V": 1e9,
+    "um^2/V^2": 1e18,
+    "dB": 180.0,
+    "deg": 1e9,
+    "rad": 1e9,
+    "1": 1e9,
+}
+# What changes by less than so much, in V or um, was not measured.
+LEAST_CHANGE = 1e-9
+SHORTEST_STEP_s = 1e-12
+# Steps of fewer last digits than these are not even where the clock was.
+_DIGITS = 8
+# Further columns serve for little, and may hold anything that has a square and a cube.
+LARGEST_EXTRA = 1e30
+
+
+def check_size(table: Table, column: str, values: FloatArray, unit: str, given: str = "") -> None:
+    """Refuse, in a `DataError`, values too large to be measurements, shape `(n,)`, in a unit of `LARGEST`.
+
+    Voltages and displacements that change must also change by enough. `given` is the unit in the file, if another.
+    """
+    most = LARGEST[unit]
+    wrong = ~(np.abs(values) <= most)
+    remedy = f"correct the cell, or the unit {given or unit}"
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        what = f"expected numbers from {-most:g} to {most:g} {unit}, found {values[row]:.6g}; {remedy}"
+        raise data_error(table.path, what, table.line(row), column)
+    change = float(np.ptp(values))
+    if unit in ("V", "um") and 0 < change < LEAST_CHANGE:
+        what = f"expected changes of at least {LEAST_CHANGE:g} {unit}, found {change:.3g} in all; {remedy}"
+        raise data_error(table.path, what, table.line(0), column)
+
+
+def check_steps(table: Table, column: str, time_s: FloatArray) -> None:
+    """Refuse, in a `DataError`, increasing times, shape `(n,)`, whose steps double precision cannot resolve."""
+    steps_s = np.diff(time_s)
+    if not len(steps_s):
+        return
+    row = int(np.argmin(steps_s))
+    least_s = max(SHORTEST_STEP_s, _DIGITS * float(np.spacing(np.abs(time_s[[0, -1]]).max())))
+    if steps_s[row] < least_s:
+        what = (
+            f"expected time steps of at least {least_s:.3g} s, which is what double precision resolves here, found "
+            f"{steps_s[row]:.3g} s; begin at 0 s, or check the unit"
+        )
+        raise data_error(table.path, what, table.line(row + 1), column)

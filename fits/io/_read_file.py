@@ -1,0 +1,196 @@
+"""Reading a file that a user names: regular files only, of bounded size, and JSON and TOML of bounded depth."""
+
+import gzip
+import io
+import json
+import math
+import os
+import stat
+import tomllib
+import zlib
+from typing import Any
+
+from fits.io._errors import DataError, shown
+
+# Each is many times what real files need, and fits in the memory of a small computer.
+MOST_CSV_BYTES = 512_000_000
+MOST_JSON_BYTES = 64_000_000
+MOST_TOML_BYTES = 1_000_000
+MOST_DEPTH = 32
+_PIECE = 1 << 20
+_LONGEST_PATH = 200
+_LARGEST_INTEGER = 2**63 - 1
+
+
+def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
+    """Read a file.
+
+    Parameters
+    ----------
+    path
+        Its name as the user gave it.
+    what
+        What is expected there, such as `a CSV file`.
+    most
+        Bytes that it may have.
+
+    Raises
+    ------
+    DataError
+        If there is no such file, it is a folder, a device or a pipe, it has more bytes, or it cannot be read.
+    """
+    name = os.fspath(path)
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            raise DataError(f"{name}: expected {what}, found a folder; name a file in it.")
+        if not stat.S_ISREG(mode):
+            # Reading these may wait, or go on, for ever.
+            raise DataError(f"{name}: expected {what}, found a device or a pipe; name a regular file.")
+        with open(path, "rb") as file:
+            return _bounded(file, name, most)
+    except DataError:
+        raise
+    except (FileNotFoundError, NotADirectoryError):
+        raise DataError(f"{name}: no such file; check the name and the folder.") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror or error if isinstance(error, OSError) else error
+        raise DataError(f"{name}: cannot be read ({reason}); check the name and the permissions.") from None
+
+
+def read_text(path: str | os.PathLike[str], what: str, most: int) -> str:
+    """Read a file of UTF-8 text, with or without a byte-order mark; arguments and errors as of `read_bytes`."""
+    data = read_bytes(path, what, most)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DataError(f"{os.fspath(path)}: expected {what}, found no UTF-8 text; name another file.") from None
+
+
+def unpack(data: bytes, name: str, most: int) -> bytes:
+    """Unpack gzip data of a file; a `DataError` says that they are damaged, or more than `most` bytes."""
+    try:
+        # A few kilobytes may unpack to gigabytes, so no more is unpacked than is read.
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            return _bounded(file, name, most)
+    except DataError:
+        raise
+    except (OSError, EOFError, zlib.error) as error:
+        what = str(error).rstrip(".")
+        raise DataError(f"{name}: expected whole gzip data, found damage ({what}); copy or pack it again.") from None
+
+
+def parse_json(text: str, place: str, what: str) -> Any:
+    """Read JSON text.
+
+    Parameters
+    ----------
+    text
+        The JSON.
+    place
+        Begins the sentence of an error.
+    what
+        What is expected, such as `a model file`.
+
+    Raises
+    ------
+    DataError
+        If it is not JSON, a key stands twice, it nests more than 32 deep, or it holds a number or a character that
+        cannot be kept.
+    """
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(dict(pairs)) < len(pairs):
+            raise json.JSONDecodeError("a key stands twice", "", 0)
+        return dict(pairs)
+
+    def refuse(name: str) -> None:
+        raise json.JSONDecodeError(f"{name} is not JSON", "", 0)
+
+    try:
+        found = json.loads(text, object_pairs_hook=once, parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise DataError(
+            f"{place}: expected {what} in JSON, found a broken or cut one ({_why(error)}); restore the file, or have "
+            "it written again."
+        ) from None
+    _check(found, place, finite=True)
+    return found
+
+
+def parse_toml(text: str, place: str) -> dict[str, Any]:
+    """Read TOML text.
+
+    Parameters
+    ----------
+    text
+        The TOML.
+    place
+        Begins the sentence of an error.
+
+    Raises
+    ------
+    DataError
+        If it is not TOML, nests more than 32 deep, or holds an integer beyond 64 bits.
+    """
+    try:
+        found = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{place}: expected TOML, found a mistake: {_why(error)}; correct it.") from None
+    _check(found, place, finite=False)
+    return found
+
+
+def _why(error: ValueError | RecursionError) -> str:
+    if isinstance(error, RecursionError):
+        return f"more than {MOST_DEPTH} nested levels"
+    if isinstance(error, json.JSONDecodeError):
+        return f"{error.msg}, line {error.lineno}" if error.pos else error.msg
+    # All else comes from Python's `int`, and is for programmers.
+    return (
+        str(error).rstrip(".") if isinstance(error, tomllib.TOMLDecodeError) else "an integer of thousands of digits"
+    )
+
+
+def _check(found: Any, place: str, finite: bool) -> None:
+    """Refuse what later steps could not work with: deep nests, enormous numbers, halves of characters."""
+    left: list[tuple[Any, str, int]] = [(found, "", 0)]
+    while left:
+        value, path, depth = left.pop()
+        if depth > MOST_DEPTH:
+            raise DataError(f"{place}: expected up to {MOST_DEPTH} nested levels, found more; flatten it.")
+        items: Any = enumerate(value) if isinstance(value, list) else value.items() if isinstance(value, dict) else ()
+        for key, item in items:
+            wrong = _fault(item, finite) or (isinstance(key, str) and _fault(key, finite))
+            if wrong or isinstance(item, dict | list):
+                name = f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}".lstrip(".")
+                if wrong:
+                    raise DataError(f"{place}: {shown(name)[1:-1]}: expected {wrong}; correct it.")
+                left.append((item, name[:_LONGEST_PATH], depth + 1))
+
+
+def _fault(item: Any, finite: bool) -> str:
+    """What is expected instead of a single value, nothing if it is fine."""
+    if isinstance(item, float):
+        return "" if not finite or math.isfinite(item) else "a number that fits in 64 bits, found a larger one"
+    if isinstance(item, int):
+        return "" if abs(item) <= _LARGEST_INTEGER else "an integer of up to 64 bits, found an enormous number"
+    if isinstance(item, str) and not item.isascii():
+        try:
+            item.encode()
+        except UnicodeEncodeError:
+            return "whole characters, found half of one"
+    return ""
+
+
+def _bounded(file: Any, name: str, most: int) -> bytes:
+    pieces, size = [], 0
+    while piece := file.read(_PIECE):
+        pieces.append(piece)
+        size += len(piece)
+        if size > most:
+            raise DataError(
+                f"{name}: expected at most {most / 1e6:,.0f} MB, unpacked if it is packed, found more; "
+                "split the file or name another."
+            )
+    return b"".join(pieces)

@@ -1,0 +1,152 @@
+"""One measured run, or a reference to follow: read-only arrays in s, V and um."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fits.io._errors import DataError
+from fits.io._printable import printable
+
+FloatArray = NDArray[np.float64]
+
+
+def _read_only(values: ArrayLike) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.flags.writeable:
+        array = array.copy()  # the caller's own array stays writeable
+        array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One run of one rig, `n` samples long.
+
+    Parameters
+    ----------
+    time_s
+        Sample times in s, shape (n,), strictly increasing; the steps may be uneven.
+    voltage_V
+        Commanded voltage in V, shape (n,).
+    displacement_um
+        Measured displacement in um, shape (n,), or None for a voltage programme.
+    extra
+        All other numeric columns by name, each of shape (n,), such as ``temperature_degC``.
+    source
+        Name of the file, without its folder; what cannot be printed of it is kept as codes.
+    warnings
+        What looked odd when the file was read, one sentence each.
+
+    Raises
+    ------
+    ValueError
+        The arrays are not one-dimensional or differ in length.
+    """
+
+    time_s: FloatArray
+    voltage_V: FloatArray
+    displacement_um: FloatArray | None
+    extra: Mapping[str, FloatArray] = field(default_factory=dict)
+    source: str = ""
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        extra = {name: _read_only(values) for name, values in self.extra.items()}
+        arrays = {"time_s": _read_only(self.time_s), "voltage_V": _read_only(self.voltage_V)}
+        if self.displacement_um is not None:
+            arrays["displacement_um"] = _read_only(self.displacement_um)
+        for name, array in (arrays | extra).items():
+            if array.shape != (arrays["time_s"].size,):
+                raise ValueError(f"{name} has shape {array.shape}, expected ({arrays['time_s'].size},) as time_s.")
+        for name, array in arrays.items():
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "extra", MappingProxyType(extra))
+        _make_printable(self)
+
+    def __len__(self) -> int:
+        return self.time_s.size
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first sample to the last, in s."""
+        return float(self.time_s[-1] - self.time_s[0])
+
+    def __getitem__(self, samples: slice) -> "Record":
+        """Return the samples of a slice, as a record; time keeps running from the original start."""
+        if not isinstance(samples, slice) or (samples.step or 1) < 1:
+            raise TypeError("A record is sliced forwards, as in record[100:200].")
+        displacement = None if self.displacement_um is None else self.displacement_um[samples]
+        extra = {name: values[samples] for name, values in self.extra.items()}
+        return Record(self.time_s[samples], self.voltage_V[samples], displacement, extra, self.source, self.warnings)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A MappingProxyType cannot be pickled, and records travel to worker processes.
+        return Record, (
+            self.time_s,
+            self.voltage_V,
+            self.displacement_um,
+            dict(self.extra),
+            self.source,
+            self.warnings,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A displacement wanted over time, `n` samples long.
+
+    Parameters
+    ----------
+    time_s
+        Sample times in s, shape (n,), strictly increasing.
+    displacement_um
+        Displacement in um as the sensor would read it, shape (n,).
+    source
+        Name of the file, without its folder; what cannot be printed of it is kept as codes.
+    warnings
+        What looked odd when the file was read, one sentence each.
+
+    Raises
+    ------
+    ValueError
+        The arrays are not one-dimensional or differ in length.
+    """
+
+    time_s: FloatArray
+    displacement_um: FloatArray
+    source: str = ""
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "displacement_um"):
+            object.__setattr__(self, name, _read_only(getattr(self, name)))
+        if self.displacement_um.shape != (self.time_s.size,):
+            raise ValueError(
+                f"displacement_um has shape {self.displacement_um.shape}, expected ({self.time_s.size},)."
+            )
+        _make_printable(self)
+
+    def __len__(self) -> int:
+        return self.time_s.size
+
+
+def _make_printable(record: Record | Reference) -> None:
+    """Names of files may hold what no report, page or picture can."""
+    object.__setattr__(record, "source", printable(record.source))
+    object.__setattr__(record, "warnings", tuple(map(printable, record.warnings)))
+
+
+def refuse_repeats(records: Sequence[Record]) -> None:
+    """Refuse, in a `DataError`, records that are given twice: they would count twice, or be held out in vain."""
+    for k, one in enumerate(records):
+        for other in records[:k]:
+            if _same(one.voltage_V, other.voltage_V) and _same(one.displacement_um, other.displacement_um):
+                raise DataError(f"{other.source} and {one.source} hold the same samples: give each run once")
+
+
+def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
+    return one is not None and other is not None and np.array_equal(one, other)

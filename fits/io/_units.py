@@ -1,0 +1,248 @@
+"""Names and units of columns: what a header means, and which source column serves which quantity."""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import SequenceMatcher, get_close_matches
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.io._errors import DataError
+
+FloatArray = NDArray[np.float64]
+
+_PLAIN_SIGNS = {"µ": "u", "μ": "u", "°C": "degC"}  # both Unicode micro signs, and the degree sign
+_BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]")
+_KELVIN_AT_0_DEGC = 273.15
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measured quantity: its canonical column and the units it may come in.
+
+    Parameters
+    ----------
+    stem
+        Name without unit, for example ``voltage``.
+    unit
+        Canonical unit, for example ``V``.
+    powers
+        Power of ten that takes each known unit to the canonical one.
+    """
+
+    stem: str
+    unit: str
+    powers: Mapping[str, int]
+
+    @property
+    def column(self) -> str:
+        """Canonical column name: stem and unit."""
+        return f"{self.stem}_{self.unit}"
+
+    def convert(self, values: FloatArray, unit: str) -> FloatArray:
+        """Values, shape (n,), of a known unit in the canonical unit."""
+        if unit == "K":
+            return values - _KELVIN_AT_0_DEGC
+        # Dividing by an exact power is rounded once; multiplying by 1e-3 would be rounded twice.
+        power = self.powers[unit]
+        return values * 10.0**power if power >= 0 else values / 10.0**-power
+
+    def shifted(self, unit: str, power: int) -> str | None:
+        """Name the unit 10**power times as large as `unit`, if there is one."""
+        wanted = self.powers[unit] + power
+        return next((name for name, value in self.powers.items() if value == wanted), None)
+
+
+_LENGTH = {"um": 0, "nm": -3, "mm": 3, "m": 6, "pm": -6}
+_VOLT = {"V": 0, "mV": -3, "uV": -6, "kV": 3}
+QUANTITIES = (
+    Quantity("time", "s", {"s": 0, "ms": -3, "us": -6, "ns": -9}),
+    Quantity("voltage", "V", _VOLT),
+    Quantity("displacement", "um", _LENGTH),
+    Quantity("temperature", "degC", {"degC": 0, "C": 0, "K": 0}),
+    Quantity("y_displacement", "um", _LENGTH),
+    Quantity("drive_monitor", "V", _VOLT),
+    Quantity("current", "A", {"A": 0, "mA": -3, "uA": -6, "nA": -9}),
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a canonical column comes from: the source column, its unit and its sign."""
+
+    column: str
+    unit: str
+    sign: int = 1
+
+    def spec(self, flip: bool = False, unit: str | None = None) -> str:
+        """Write the right-hand side of a mapping that reads this column, optionally changed."""
+        sign = -self.sign if flip else self.sign
+        unit = unit or self.unit
+        stated = "" if split_unit(self.column)[1] == unit else f"[{unit}]"
+        return f"{'-' if sign < 0 else ''}{self.column}{stated}"
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Split ``height_nm``, ``height[nm]`` or ``height (nm)`` into stem and unit; None where there is no unit."""
+    match = _BRACKETS.fullmatch(name)
+    stem, unit = (match["stem"], match["unit"]) if match else _split_suffix(name)
+    for sign, plain in _PLAIN_SIGNS.items():
+        unit = unit.replace(sign, plain)
+    return stem, unit or None
+
+
+def _split_suffix(name: str) -> tuple[str, str]:
+    stem, _, unit = name.rpartition("_")
+    return (stem, unit) if stem else (name, "")
+
+
+def recognise(name: str) -> tuple[Quantity, str] | None:
+    """Quantity and unit of a header such as ``voltage_mV``, or None where either is unknown."""
+    stem, unit = split_unit(name)
+    plain = "_".join(stem.lower().split())
+    for quantity in QUANTITIES:
+        if quantity.stem == plain and unit in quantity.powers:
+            return quantity, str(unit)
+    return None
+
+
+def parse_columns(text: str) -> dict[str, str]:
+    """Read the text of the option ``--columns``.
+
+    Parameters
+    ----------
+    text
+        Pairs such as ``voltage_V=u1_V,displacement_um=-height[m]``.
+
+    Returns
+    -------
+    dict
+        Canonical column to source, as `read_csv` takes it.
+
+    Raises
+    ------
+    DataError
+        A pair without ``=``, an unknown or a repeated canonical column.
+    """
+    columns: dict[str, str] = {}
+    for pair in filter(str.strip, text.split(",")):
+        column, equals, source = (part.strip() for part in pair.partition("="))
+        if not (column and equals and source):
+            raise DataError(
+                f"--columns: expected pairs such as voltage_V=u1_V separated by commas, found '{pair.strip()}'."
+            )
+        if column in columns:
+            raise DataError(f"--columns: {column} is given twice; keep one.")
+        known_quantity(column)
+        columns[column] = source
+    return columns
+
+
+def known_quantity(column: str) -> Quantity:
+    """Quantity of a canonical column; a `DataError` where there is none of that name."""
+    for quantity in QUANTITIES:
+        if quantity.column == column:
+            return quantity
+    known = ", ".join(quantity.column for quantity in QUANTITIES)
+    raise DataError(f"--columns: '{column}' is not a column of a record; name one of {known}.")
+
+
+def find_sources(
+    names: Sequence[str], columns: Mapping[str, str], required: Collection[str], place: str
+) -> dict[str, Source]:
+    """Choose the source column of every canonical column that the headers or the mapping give.
+
+    Parameters
+    ----------
+    names
+        Headers of the file.
+    columns
+        Mapping that the user gave; it wins over the headers.
+    required
+        Canonical columns that must be found.
+    place
+        File and line of the header, to begin error messages with.
+
+    Raises
+    ------
+    DataError
+        Missing column, duplicate column, missing or unknown unit.
+    """
+    sources = {column: _mapped(column, text, names, place) for column, text in columns.items()}
+    taken = {source.column for source in sources.values()}
+    for name in names:
+        found = recognise(name)
+        if found is None or name in taken:
+            continue
+        column = found[0].column
+        if column in columns:
+            continue
+        if column in sources:
+            raise DataError(
+                f"{place}, column '{name}': expected one column for {column}, found also '{sources[column].column}'; "
+                f"choose one with --columns {column}={name}."
+            )
+        sources[column] = Source(name, found[1])
+    missing = [column for column in required if column not in sources]
+    if missing:
+        raise DataError(_missing(missing, names, sources, place))
+    return sources
+
+
+def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
+    quantity = known_quantity(column)
+    text = text.strip()
+    sign, stated = 1, None
+    # A header may itself begin with a minus or end with brackets, so the literal name is tried first.
+    if text not in names and text.startswith("-"):
+        sign, text = -1, text[1:].strip()
+    if text not in names:
+        match = _BRACKETS.fullmatch(text)
+        if match:
+            text, stated = match["stem"], split_unit(text)[1]
+    if text not in names:
+        near = get_close_matches(text, names, 3, 0.5) or names
+        raise DataError(
+            f"{place}, column '{text}': expected by --columns {column}={text}, found no such column; "
+            f"the nearest are {_listed(near)}."
+        )
+    unit = stated or split_unit(text)[1]
+    if unit not in quantity.powers:
+        found = f"found unit '{unit}'" if unit else "found no unit"
+        raise DataError(
+            f"{place}, column '{text}': expected a unit out of {', '.join(quantity.powers)} for {column}, {found}; "
+            f"state the unit with --columns {column}={text}[{quantity.unit}]."
+        )
+    return Source(text, str(unit), sign)
+
+
+def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str, Source], place: str) -> str:
+    message = f"{place}, column '{missing[0]}': expected this column, found {_listed(names)}; "
+    if len(names) == 1:
+        return f"{message}separate the columns by commas, semicolons or tabs."
+    taken = {source.column for source in sources.values()}
+    free = [name for name in names if name not in taken]
+    guesses = []
+    for quantity in map(known_quantity, missing):
+        near = _nearest(quantity, free) if free else "NAME"
+        free = [name for name in free if name != near]  # a column serves once
+        stem, unit = split_unit(near)
+        known = unit in quantity.powers
+        guesses.append(f"{quantity.column}={Source(near, str(unit) if known else quantity.unit).spec()}")
+        if unit and not known and stem.lower() == quantity.stem:
+            message += f"'{near}' has the unknown unit '{unit}' instead of one out of {', '.join(quantity.powers)}; "
+    message += f"name what is missing, for instance --columns {','.join(guesses)}"
+    if not any(recognise(name) for name in names):
+        message += ", or put # before this line if it is not the header"
+    return f"{message}."
+
+
+def _nearest(quantity: Quantity, names: Sequence[str]) -> str:
+    with_unit = [name for name in names if split_unit(name)[1] in quantity.powers]
+    return max(with_unit or names, key=lambda name: SequenceMatcher(None, quantity.column, name.lower()).ratio())
+
+
+def _listed(names: Sequence[str], most: int = 12) -> str:
+    shown = ", ".join(f"'{name[:40]}'" for name in names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

@@ -1,0 +1,1 @@
+"""The hysteresis alone, fitted to slow loops."""

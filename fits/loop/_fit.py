@@ -1,0 +1,237 @@
+"""From records to a fitted Preisach operator."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fits.io._errors import DataError
+from fits.io._limits import measured_ranges
+from fits.io._record import Record, refuse_repeats
+from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
+from fits.loop._design import Grid, columns_of
+from fits.loop._grid import grid_estimate
+from fits.loop._history import estimate_start
+from fits.loop._moments import Data, gather
+from fits.loop._parts_agree import check_loops
+from fits.loop._prior import interpolation
+from fits.loop._result import FitResult, FitStatus, RunReport
+from fits.loop._run import Run, prepare_run, simulate_run
+from fits.loop._shapes import solve_shape
+from fits.loop._uncertainty import Uncertainty, perturbations
+from fits.stats._estimate import Estimate
+from fits.stats._metrics import Errors, errors, loop_width_pct
+from fits.stats._noise import LOSSES
+from microid import FAMILIES, Preisach
+
+# A residual less correlated than this counts as white.
+_WHITE = 1.2
+# Families that are not grids are evaluated on at least this many levels.
+_SHAPE_LEVELS = 34
+# Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
+_EDGE = 0.02
+_MINOR = 0.01
+
+
+def fit(
+    records: Sequence[Record],
+    *,
+    family: str = "grid",
+    levels: int | None = None,
+    holdout: float | Sequence[Record] = 0.2,
+    initial: str = "unknown",
+    loss: str = "squares",
+    starts: int = 8,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> FitResult:
+    """Fit a Preisach operator to measured voltage and displacement (Eq. 8-11).
+
+    The weights are found by a smooth, non-negative regression whose smoothness and noise level maximise the
+    evidence; the resolution is raised until blocks of the record are no longer predicted better from the others.
+
+    Parameters
+    ----------
+    records
+        Runs of one rig. Each has its own sensor offset.
+    family
+        Name in `microid.FAMILIES`.
+    levels
+        Number of switching voltages; chosen from the data by default.
+    holdout
+        Fraction at the end of every run that is only predicted, or records that are.
+    initial
+        Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`.
+    loss
+        `squares`, or `huber`, to which outliers count less.
+    starts, seed
+        Number of starts, and their seed, for families whose fit is not convex.
+    progress
+        Told what is being done, a sentence at a time.
+
+    Returns
+    -------
+    FitResult
+        Never the start: a fit that fails raises.
+
+    Raises
+    ------
+    DataError
+        If the records cannot be fitted, or are not of one rig.
+    FitError
+        If a solver fails.
+    RuntimeError
+        If JAX computes in single precision.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
+    if family not in FAMILIES:
+        raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
+    if loss not in LOSSES:
+        raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
+    if levels is not None and not 4 <= levels <= 100:
+        raise DataError(f"{levels} levels were asked for: choose between 4 and 100")
+    fraction = holdout if isinstance(holdout, int | float) else 0.0
+    if not 0 <= fraction <= 0.9:
+        raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
+    aside = () if isinstance(holdout, int | float) else tuple(holdout)
+    if not records:
+        raise DataError("there is no record to fit")
+    refuse_repeats([*records, *aside])
+    voltages = [record.voltage_V for record in (*records, *aside)]
+    lower, upper = min(v.min() for v in voltages), max(v.max() for v in voltages)
+
+    def prepare(record: Record) -> Run:
+        return prepare_run(record, lower, upper, initial, fraction)
+
+    runs = [prepare(record) for record in records]
+    if loss == "huber":
+        runs = weigh_robustly(runs, progress)
+    stroke, tried, trials = choose_grid(runs, levels, progress)
+    remarks = _remarks(runs)
+    remarks += [warning for record in aside for warning in record.warnings]
+    if family == "grid":
+        found = grid_estimate(tried.data, tried.solution, stroke, tried.correlation, tried.discrepancy_um)
+        if levels is None and tried.data.grid.levels == LADDER[-1]:
+            remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try --levels 100")
+    else:
+        if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
+            grid = Grid(tried.data.grid.lower_V, tried.data.grid.upper_V, _SHAPE_LEVELS)
+            tried = try_grid(gather(grid, runs), runs, stroke, tried.solution.hyper, True)
+        smooth, key = tried.solution.hyper, jax.random.key(seed)
+        found, agree = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
+        if not agree:
+            remarks.append(
+                f"the best two of {starts} starts ended at different fits; there may be a better one: raise --starts"
+            )
+    if found.correlation > _WHITE:
+        remarks.append(
+            f"neighbouring residuals agree over {found.correlation:.0f} samples: something other than sensor noise "
+            "(creep, rate, drift or a density this family cannot follow) is left that this model does not describe"
+        )
+    model = found.model
+    progress("checking the records")
+    miss, told = check_loops(runs, prepare, model, stroke, tried.solution.hyper, loss == "huber")
+    remarks = [*told, *remarks]
+    offsets = _offsets(model, tried.data)
+
+    progress("comparing with the measurement")
+    noise = found.noise_um
+    reports = [_report(_with_offset(model, o), run, noise) for o, run in zip(offsets, runs, strict=True)]
+    for record in aside:
+        run = prepare_run(record, lower, upper, initial, holdout=1.0)
+        run = replace(run, fitted=np.zeros_like(run.known))
+        off = float(np.mean((run.displacement_um - simulate_run(model, run))[run.known]))
+        reports.append(_report(_with_offset(model, off), run, noise))
+    return FitResult(
+        model=_with_offset(model, offsets[0]),
+        uncertainty=_uncertainty(tried.data, found),
+        status=FitStatus.CONVERGED,
+        remarks=tuple(remarks),
+        noise_um=noise,
+        correlation_samples=found.correlation,
+        smoothness=float(np.exp(tried.solution.hyper.log_density)),
+        trials=tuple(trials),
+        runs=tuple(reports),
+        misfit=miss,
+    )
+
+
+def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
+    mean = data.means[0]
+    response = mean.response
+    if found.levels < data.grid.levels:
+        response = interpolation(found.levels, data.grid.levels).T @ response
+    return perturbations(
+        Grid(data.grid.lower_V, data.grid.upper_V, found.levels),
+        found.factor_um,
+        jnp.asarray(response),
+        jnp.asarray(found.noise_um * (found.correlation / mean.count) ** 0.5),
+        jnp.asarray(found.discrepancy_um),
+    )
+
+
+def _offsets(model: Preisach, data: Data) -> list[float]:
+    columns = np.asarray(columns_of(model))
+    return [mean.displacement_um - float(mean.response @ columns) for mean in data.means]
+
+
+def _with_offset(model: Preisach, offset_um: float) -> Preisach:
+    return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offset_um))
+
+
+def _report(model: Preisach, run: Run, noise_um: float) -> RunReport:
+    start = estimate_start(model, run, noise_um)
+    predicted = simulate_run(model, run)
+    measured = run.displacement_um
+    range_um = float(np.ptp(measured[run.known]))
+
+    def compare(samples: np.ndarray) -> Errors | None:
+        if not samples.any() or range_um == 0:
+            return None
+        return errors(measured[samples], predicted[samples], range_um)
+
+    voltage = run.record.voltage_V[run.known]
+    return RunReport(
+        source=run.record.source,
+        offset_um=float(model.offset_um),
+        in_sample=compare(run.fitted),
+        held_out=compare(run.held_out),
+        unknown=int(np.sum(~run.known)),
+        start=run.starts[0] if start is None else start,
+        loop_measured_pct=loop_width_pct(voltage, measured[run.known]),
+        loop_model_pct=loop_width_pct(voltage, predicted[run.known]),
+        reached=measured_ranges(run.record),
+    )
+
+
+def _remarks(runs: list[Run]) -> list[str]:
+    remarks = []
+    for run in runs:
+        remarks += list(run.record.warnings)
+        lost = int(np.sum(~run.known))
+        if lost:
+            remarks.append(
+                f"{run.record.source}: the first {lost} samples depend on what the rig went through before; "
+                "they were not used for the weights, and the initial state was estimated from them"
+            )
+    lower, upper = min(run.lower_V for run in runs), max(run.upper_V for run in runs)
+    edge = _EDGE * (upper - lower)
+    anchors = np.concatenate([run.anchor_V[run.fitted] for run in runs])
+    if np.mean((anchors > lower + edge) & (anchors < upper - edge)) < _MINOR:
+        remarks.append(
+            "the fitted samples hold no loop smaller than the full range: what the model says about smaller loops "
+            "rests on the smoothness of the density alone and its band there is too narrow; "
+            "record reversals inside the range"
+        )
+    voltage = np.concatenate([run.record.voltage_V[run.fitted] for run in runs])
+    low, high = float(voltage.min()), float(voltage.max())
+    if low > lower + edge or high < upper - edge:
+        remarks.append(
+            f"the fitted samples only span {low:.4g} to {high:.4g} V of {lower:.4g} to {upper:.4g} V: "
+            "beyond them the model is extrapolated"
+        )
+    return remarks

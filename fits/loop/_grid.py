@@ -1,0 +1,269 @@
+"""Fitting the weights of a grid: a smooth, non-negative regression, convex and therefore without a start."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+from optimistix import RESULTS
+from scipy.optimize import nnls
+
+from fits.loop._evidence import Posterior, effective, maximise_evidence, posterior, renew_noise
+from fits.loop._moments import Data, Moments, blocks_of
+from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._run import Run, simulate_run
+from fits.stats._estimate import Estimate
+from fits.stats._noise import shared_square
+from fits.stats._nonnegative import BlockPivoting
+
+# The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
+EVIDENCE_LEVELS = 16
+# And this many to say how sure predictions are; finer perturbations move no displacement.
+BELIEF_LEVELS = 24
+# Noise that changes by less, in the logarithm of its variance, is not worth another factorisation.
+_SAME_NOISE = 0.02
+_ATOL = 1e-6
+_STEPS = 500
+# Steps per column where one column at a time is bounded or let go.
+_TURNS = 30
+# More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
+_SLOWLY = 1100
+# At least this many columns are bounded at first.
+_FEW = 64
+
+
+@dataclass(frozen=True)
+class GridSolution:
+    """Weights and slopes of a grid, in strokes.
+
+    Attributes
+    ----------
+    columns
+        Non-negative solution, shape `(D,)`.
+    belief
+        Gaussian posterior it is the constrained mode of.
+    hyper
+        Smoothness and noise that the data chose.
+    result
+        Status of the regression.
+    """
+
+    columns: Float[Array, " D"]
+    belief: Posterior
+    hyper: Hyper
+    result: RESULTS
+
+
+def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -> GridSolution:
+    """Find the most probable non-negative columns, smoothness and noise.
+
+    Parameters
+    ----------
+    data
+        Moments of the runs.
+    stroke_um
+        Unit of the columns and the noise.
+    correlation
+        Samples that are worth one independent one.
+    start
+        Smoothness and noise to start the search from.
+    """
+    moments = data.total.scaled(1 / correlation, stroke_um)
+    rough = roughness(data.grid.levels)
+    if data.grid.levels > EVIDENCE_LEVELS:
+        basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
+        few, even = moments.project(basis), rough.project(basis)
+        hyper = maximise_evidence(few, even, start)
+        belief = posterior(moments, rough, hyper)
+        # What the coarse levels could not follow was noise to them.
+        determined = effective(even, hyper, posterior(few, even, hyper))
+        renewed = renew_noise(moments, hyper, belief, determined)
+        if abs(float(renewed.log_variance - hyper.log_variance)) > _SAME_NOISE:
+            hyper, belief = renewed, posterior(moments, rough, renewed)
+    else:
+        hyper = maximise_evidence(moments, rough, start)
+        belief = posterior(moments, rough, hyper)
+    if np.all(np.asarray(belief.mean) >= 0):
+        done: Any = RESULTS.successful
+        return GridSolution(belief.mean, belief, hyper, done)
+    columns, result = non_negative(belief)
+    return GridSolution(columns, belief, hyper, result)
+
+
+def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+    """Find the mode of the belief among non-negative columns.
+
+    Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
+    those ends up below zero, more are bounded. The answer is that of all bounds together.
+    """
+    scale = np.sqrt(np.diagonal(belief.precision))
+    lowest = np.asarray(belief.mean) * scale
+    size = len(lowest)
+    bounded = _FEW
+    while True:
+        bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
+        order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
+        columns, result = _bounded(belief, jnp.asarray(order))
+        left = np.asarray(columns) * scale
+        if result != RESULTS.successful:
+            return _one_by_one(belief)
+        if bounded == size or np.all(left >= -_ATOL):
+            return jnp.maximum(columns, 0), result
+        lowest = np.minimum(lowest, left)
+        bounded *= 2
+
+
+def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+    """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
+    precision = np.asarray(belief.precision)
+    over: Any = RESULTS.nonlinear_max_steps_reached
+    if len(precision) > _SLOWLY:
+        return jnp.maximum(belief.mean, 0), over
+    scale = np.sqrt(np.diagonal(precision))
+    value, vector = np.linalg.eigh(precision / scale / scale[:, None])
+    root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
+    done: Any = RESULTS.successful
+    try:
+        columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_TURNS * len(scale))
+    except RuntimeError:
+        return jnp.maximum(belief.mean, 0), over
+    return jnp.asarray(columns / scale), done
+
+
+def _bounded(belief: Posterior, which: Int[Array, " k"]) -> tuple[Float[Array, " D"], RESULTS]:
+    spread, precision, mean, scale = _marginal(belief, which)
+    y, result = _pivot(precision, mean)
+    return _follow(belief, which, spread, precision, (y - mean, y), scale), result
+
+
+@eqx.filter_jit
+def _marginal(
+    belief: Posterior, which: Int[Array, " k"]
+) -> tuple[Float[Array, "D k"], Float[Array, "k k"], Float[Array, " k"], Float[Array, " k"]]:
+    """Covariance of all columns with the chosen ones, which ascend, and the belief about those alone, scaled."""
+    rows = jax.nn.one_hot(which, belief.mean.shape[0], dtype=belief.mean.dtype)
+    spread = jax.scipy.linalg.cho_solve((belief.root, True), rows.T)
+    # With the chosen ones last, the end of the Cholesky factor is that of their marginal precision. The inverse of
+    # their covariance would be the same, but for rounding, which may leave it indefinite.
+    last = jnp.argsort(jnp.sum(rows, axis=0), stable=True)
+    root = jnp.linalg.cholesky(belief.precision[last][:, last])[-which.shape[0] :, -which.shape[0] :]
+    precision = root @ root.T
+    # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
+    scale = jnp.sqrt(jnp.diagonal(precision))
+    return spread, precision / (scale[:, None] * scale[None, :]), belief.mean[which] * scale, scale
+
+
+@eqx.filter_jit
+def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Float[Array, " k"], RESULTS]:
+    solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
+    solution: Any = optx.minimise(
+        _distance,
+        solver,
+        jnp.maximum(mean, 0),
+        args=(precision, mean),
+        options={"hessian": precision},
+        max_steps=_STEPS,
+        throw=False,
+    )
+    return solution.value, solution.result
+
+
+@eqx.filter_jit
+def _follow(
+    belief: Posterior,
+    which: Int[Array, " k"],
+    spread: Float[Array, "D k"],
+    precision: Float[Array, "k k"],
+    moved: tuple[Float[Array, " k"], Float[Array, " k"]],
+    scale: Float[Array, " k"],
+) -> Float[Array, " D"]:
+    """Move all columns along with the chosen ones; where a bound holds it holds exactly."""
+    by, to = moved
+    return (belief.mean + spread @ (scale * (precision @ by))).at[which].set(to / scale)
+
+
+def _distance(y: Float[Array, " k"], args: tuple[Float[Array, "k k"], Float[Array, " k"]]) -> Float[Array, ""]:
+    precision, mean = args
+    off = y - mean
+    return off @ (precision @ off) / 2
+
+
+def grid_estimate(
+    data: Data, solution: GridSolution, stroke_um: float, correlation: float, discrepancy_um: float
+) -> Estimate:
+    """Turn a solution in strokes into an estimate in um; the last two arguments are those of `Estimate`."""
+    levels = min(data.grid.levels, BELIEF_LEVELS)
+    belief = solution.belief
+    if levels < data.grid.levels:
+        basis = interpolation(levels, data.grid.levels)
+        moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
+        belief = posterior(moments, roughness(data.grid.levels).project(basis), solution.hyper)
+    return Estimate(
+        model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
+        levels=levels,
+        factor_um=belief.factor() * stroke_um,
+        noise_um=float(jnp.exp(solution.hyper.log_variance / 2)) * stroke_um,
+        correlation=correlation,
+        discrepancy_um=discrepancy_um,
+    )
+
+
+def cross_validate(
+    data: Data, runs: Sequence[Run], stroke_um: float, correlation: float, hyper: Hyper, levels: int
+) -> tuple[float, float]:
+    """Predict each block of every run from the others, with the smoothness and noise given.
+
+    Done with at most `levels` levels: the grid's own to compare resolutions, fewer where only the discrepancy counts.
+
+    Returns
+    -------
+    error_um
+        Root mean square error, up to a constant in each block.
+    discrepancy_um
+        Standard deviation of what the posterior does not own up to: the part of the error that neighbouring samples
+        share, and that therefore is not noise, beyond the posterior's own. Zero where there is none.
+    """
+    rough, blocks, basis = roughness(data.grid.levels), data.blocks, None
+    if levels < data.grid.levels:
+        basis = interpolation(levels, data.grid.levels)
+        rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
+    whole = sum(blocks[1:], start=blocks[0])
+    pairs = [(run, blocks_of(run)) for run in runs]
+    squares = shared = expected = count = 0.0
+    for number, block in enumerate(blocks):
+        if not block.count > 0:
+            continue
+        rest = Moments(*(a - b for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(block), strict=True)))
+        belief = posterior(rest.scaled(1 / correlation, stroke_um), rough, hyper)
+        columns = np.asarray(belief.mean if basis is None else basis @ belief.mean)
+        model = data.grid.model(columns * stroke_um, np.zeros(()))
+        # A short run may have no sample in a block.
+        off = [
+            _weighed_off(run, run.displacement_um - simulate_run(model, run), label == number)
+            for run, label in pairs
+            if np.any(label == number)
+        ]
+        squares += sum(float(np.sum(o**2)) for o in off)
+        shared += sum(shared_square(o) * len(o) for o in off)
+        expected += float(_expected_square(belief, block)) * stroke_um**2
+        count += float(block.count)
+    return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
+
+
+def _weighed_off(run: Run, off_um: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Errors of some samples, without their mean, as large as they count."""
+    weight = None if run.weight is None else run.weight[samples]
+    centred = off_um - np.average(off_um[samples], weights=weight)
+    return np.asarray(run.weighed(centred)[samples])
+
+
+@eqx.filter_jit
+def _expected_square(belief: Posterior, block: Moments) -> Float[Array, ""]:
+    """Sum over a block of the variances that the posterior gives its predictions."""
+    half = jax.scipy.linalg.solve_triangular(belief.root, block.gram, lower=True)
+    return jnp.trace(jax.scipy.linalg.solve_triangular(belief.root, half.T, lower=True))

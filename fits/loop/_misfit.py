@@ -1,0 +1,107 @@
+"""How far a residual is from noise, against the noise that the records themselves show."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fits.io._record import Record
+from fits.stats._at_rest import idle_stretches, quantum_um
+from fits.stats._whiten import rough_noise_um
+
+# So many samples of a command at rest say what the noise is.
+_IDLE = 150
+# A residual beyond so many times the noise, and such a part of the stroke in %, is far from it.
+_FAR, _FAR_PCT = 2.0, 0.1
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What a fit leaves of the run that it describes worst, against what the sensor's noise would leave.
+
+    Attributes
+    ----------
+    source
+        The run.
+    residual_um
+        Root mean square of its residual over the fitted samples.
+    share_pct
+        The same in % of the run's stroke.
+    noise_um
+        Standard deviation of the sensor's noise, its last digit included.
+    shown_by
+        What the noise was read off, in words.
+    """
+
+    source: str
+    residual_um: float
+    share_pct: float
+    noise_um: float
+    shown_by: str
+
+    @property
+    def times_noise(self) -> float:
+        """How many times the noise the residual is."""
+        return self.residual_um / self.noise_um
+
+    @property
+    def far(self) -> bool:
+        """Whether more than noise is left, and more than a trifle of the stroke."""
+        return self.times_noise > _FAR and self.share_pct > _FAR_PCT
+
+
+def misfits(records: Sequence[Record], residuals: Sequence[np.ndarray], fitted: Sequence[np.ndarray]) -> list[Misfit]:
+    """Compare the residual of each run with the noise of the sensor, which is that of its quietest run.
+
+    Parameters
+    ----------
+    records
+        The fitted runs.
+    residuals
+        What the fit leaves of each, in um, shape `(n,)`.
+    fitted
+        Which samples were fitted, shape `(n,)`.
+    """
+    noise, shown_by = min(
+        (sensor_noise_um(record, residual) for record, residual in zip(records, residuals, strict=True)),
+        key=lambda one: one[0],
+    )
+    out = []
+    for record, residual, used in zip(records, residuals, fitted, strict=True):
+        assert record.displacement_um is not None
+        left = residual[used] - residual[used].mean()
+        rms = float(np.sqrt(np.mean(left**2)))
+        stroke = float(np.ptp(record.displacement_um[used]))
+        out.append(Misfit(record.source, rms, 100 * rms / max(stroke, 1e-300), noise, shown_by))
+    return out
+
+
+def worst(found: Sequence[Misfit]) -> Misfit:
+    """The run that is furthest from noise."""
+    return max(found, key=lambda one: (one.far, one.times_noise))
+
+
+def sensor_noise_um(record: Record, residual_um: np.ndarray) -> tuple[float, str]:
+    """Standard deviation of a sensor's noise, whatever a model leaves, and what shows it.
+
+    Where the command rests long enough it is that of the readings there; elsewhere that of the fastest changes of the
+    readings, or of what a fit leaves of them, as if noise were white. No less than the last digit makes.
+    """
+    reading = record.displacement_um
+    assert reading is not None
+    pieces = []
+    for stretch in idle_stretches(record.voltage_V, 0):
+        piece = reading[stretch]
+        time = np.linspace(-1, 1, len(piece))
+        # What settles is no noise.
+        pieces.append(piece - np.polyval(np.polyfit(time, piece, min(3, len(piece) // 12)), time))
+    found = []
+    if sum(map(len, pieces)) >= _IDLE:
+        joined = np.concatenate(pieces)
+        found.append((1.4826 * float(np.median(np.abs(joined))), f"{record.source} at rest"))
+    words = f"the fastest changes in {record.source}"
+    found += [(rough_noise_um(values), words) for values in (reading, residual_um)]
+    digit = quantum_um(reading) / 12**0.5
+    least = max(digit, 1e-7 * float(np.ptp(reading)))
+    noise, shown_by = min(found, key=lambda one: one[0])
+    return (noise, shown_by) if noise >= least else (least, f"the last digit in {record.source}")

@@ -1,0 +1,308 @@
+"""Whether the parts of what was fitted as one hysteresis belong to one, and whether readings come late in it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from fits.io._errors import DataError
+from fits.io._record import Record
+from fits.loop._design import Grid
+from fits.loop._evidence import posterior
+from fits.loop._fit_checks import remarks_on
+from fits.loop._grid import non_negative, solve_grid
+from fits.loop._misfit import Misfit, misfits, worst
+from fits.loop._moments import gather
+from fits.loop._prior import Hyper, roughness
+from fits.loop._result import FitError
+from fits.loop._run import Run, simulate_run
+from fits.stats._noise import correlation_samples
+from microid import Preisach
+
+# Levels on which parts are fitted alone: enough to see whether they agree.
+_LEVELS = 16
+# Parts disagree where both together leave so many times what each leaves alone.
+_TIMES = 2.0
+# Gains that differ by more than this are not those of one rig.
+_REFUSED = 0.1
+# Places, in parts of a run, at which it may have changed, samples that a part needs, and rounds of moving the place.
+_PLACES, _FEWEST, _ROUNDS = 5, 200, 4
+# Shifts, in samples, at which a delay is looked for first, and how far.
+_FARTHEST = 64
+# Twice the logarithm of how much likelier a delay makes a run, and the part of the residual that it must take away
+# where more than so many times the noise stays.
+_WORTH, _MUCH, _NEAR = 30.0, 0.4, 2.0
+# What is so near the noise, and as white, holds no delay.
+_QUIET, _WHITE = 1.3, 1.2
+# A hysteresis takes part of a delay for width: it is known to half a sample at best.
+_ROUGHLY = 0.5
+
+
+def check_loops(
+    runs: Sequence[Run],
+    prepare: Callable[[Record], Run],
+    model: Preisach,
+    stroke_um: float,
+    hyper: Hyper,
+    robust: bool,
+) -> tuple[Misfit, list[str]]:
+    """Say how far from noise a fitted hysteresis is, and what is wrong with the runs that it was fitted to.
+
+    Parameters
+    ----------
+    runs
+        What was fitted together.
+    prepare
+        Makes a record ready again.
+    model
+        The result.
+    stroke_um, hyper
+        Unit of the columns, and smoothness and noise to start from.
+    robust
+        Whether outliers counted less.
+
+    Raises
+    ------
+    DataError
+        As `disagreements`.
+    """
+    records = [run.record for run in runs]
+    known = [left_of(model, run) for run in runs], [run.fitted for run in runs]
+    left = misfits(records, *known)
+    remarks = remarks_on(records, *known, robust)
+    alone = Alone(stroke_um, hyper)
+    try:
+        told = disagreements(runs, model, alone, left)
+    except FitError:
+        # Fits of parts are only asked for an opinion.
+        told = []
+    quiet = all(
+        one.times_noise < _QUIET and correlation_samples([residual[used]]) < _WHITE
+        for one, residual, used in zip(left, *known, strict=True)
+    )
+    if not told and not quiet:
+        told = delays(runs, prepare, alone, left)
+    return worst(left), [*told, *remarks]
+
+
+class Alone:
+    """Fits of single runs, or parts of them, on a coarse grid.
+
+    Parameters
+    ----------
+    stroke_um
+        Unit of the columns.
+    hyper
+        Smoothness and noise to start from.
+    """
+
+    def __init__(self, stroke_um: float, hyper: Hyper):
+        self.stroke_um, self.hyper = stroke_um, hyper
+
+    def fit(self, runs: Sequence[Run]) -> Preisach:
+        """Fit a hysteresis to some runs; a `FitError` where that fails."""
+        grid = Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), _LEVELS)
+        solution = solve_grid(gather(grid, runs), self.stroke_um, 1.0, self.hyper)
+        return grid.model(np.asarray(solution.columns) * self.stroke_um, np.zeros(()))
+
+    def left(self, run: Run) -> np.ndarray:
+        """What a run leaves that is fitted alone as smoothly as all are, at its fitted samples, in um."""
+        grid = Grid(jnp.asarray(run.lower_V), jnp.asarray(run.upper_V), _LEVELS)
+        moments = gather(grid, [run]).total.scaled(1.0, self.stroke_um)
+        columns, _ = non_negative(posterior(moments, roughness(_LEVELS), self.hyper))
+        return left_of(grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
+
+
+def left_of(model: Preisach, run: Run) -> np.ndarray:
+    """Measurement less prediction, the offset taken off over the fitted samples, in um, shape `(n,)`."""
+    left = run.displacement_um - simulate_run(model, run)
+    weight = None if run.weight is None else run.weight[run.fitted]
+    return np.asarray(left - np.average(left[run.fitted], weights=weight))
+
+
+def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequence[Misfit]) -> list[str]:
+    """Look for runs, and parts of runs, that a hysteresis explains one by one but not together.
+
+    Parameters
+    ----------
+    runs
+        What was fitted together.
+    model
+        The result.
+    alone
+        Fits them alone.
+    left
+        What the joint fit leaves of each run.
+
+    Returns
+    -------
+    list of str
+        A sentence for each disagreement.
+
+    Raises
+    ------
+    DataError
+        If the gains of two runs, or parts, differ by so much that they are not of one rig in one setting.
+    """
+    if not any(one.far for one in left):
+        return []
+    remarks = []
+    models = [alone.fit([run]) for run in runs]
+    own = [_rms(left_of(one, run)[run.fitted]) for one, run in zip(models, runs, strict=True)]
+    together = [_rms(left_of(model, run)[run.fitted]) for run in runs]
+    if len(runs) > 1 and _pooled(together, runs) > _TIMES * _pooled(own, runs):
+        gains = [_gain(left_of(model, run), run) for run in runs]
+        low, high = int(np.argmin(gains)), int(np.argmax(gains))
+        ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
+        names = ", ".join(run.record.source for run in runs)
+        strokes = [float(np.ptp(run.displacement_um[run.fitted])) for run in runs]
+        apart = ", ".join(f"{100 * rms / stroke:.2g}" for rms, stroke in zip(own, strokes, strict=True))
+        joint = ", ".join(f"{100 * rms / stroke:.2g}" for rms, stroke in zip(together, strokes, strict=True))
+        sentence = (
+            f"{names}: these runs do not show one hysteresis: fitted together they leave {joint} % of their strokes, "
+            f"each alone {apart} %; under the same voltage {runs[high].record.source} moves {ratio:.3g} "
+            f"times as far as {runs[low].record.source}: they are of different rigs or settings, or differ in rate, "
+            "drift, load or temperature; fit them apart"
+        )
+        if ratio > 1 + _REFUSED:
+            raise DataError(sentence)
+        remarks.append(sentence)
+    for run, rms in zip(runs, own, strict=True):
+        remarks += _changed(run, alone, rms)
+    return remarks
+
+
+def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
+    """Find the place from where on a run shows another hysteresis."""
+    order = np.cumsum(run.fitted)
+    total = int(order[-1])
+    best: tuple[float, int, Preisach, Preisach] | None = None
+
+    def parts(place: int) -> tuple[Run, Run]:
+        before = np.arange(len(order)) < place
+        return replace(run, fitted=run.fitted & before), replace(run, fitted=run.fitted & ~before)
+
+    for k in range(1, _PLACES):
+        place = int(np.searchsorted(order, total * k / _PLACES))
+        if min(order[place], total - order[place]) < _FEWEST:
+            continue
+        for _ in range(_ROUNDS):
+            first, second = parts(place)
+            if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST:
+                break
+            models = alone.fit([first]), alone.fit([second])
+            squares = [
+                np.where(run.fitted, left_of(m, p) ** 2, 0.0) for m, p in zip(models, parts(place), strict=True)
+            ]
+            split = float(np.sqrt((squares[0][:place].sum() + squares[1][place:].sum()) / total))
+            if best is None or split < best[0]:
+                best = split, place, *models
+            moved = int(np.argmin(np.cumsum(squares[0]) + squares[1].sum() - np.cumsum(squares[1]))) + 1
+            if moved == place:
+                break
+            place = moved
+    if best is None or best[0] * _TIMES > rms_um:
+        return []
+    split, place, one, other = best
+    gains = [simulate_run(model, run)[run.fitted] for model in (one, other)]
+    ratio = float(np.std(gains[1]) / max(np.std(gains[0]), 1e-300))
+    stroke = float(np.ptp(run.displacement_um[run.fitted]))
+    sentence = (
+        f"{run.record.source}: something changed near sample {place + 1} ({run.record.time_s[place]:.6g} s): fitted "
+        f"as one hysteresis the run leaves {100 * rms_um / stroke:.2g} % of its stroke, its parts before and after "
+        f"{100 * split / stroke:.2g} %; after it the stage moves {ratio:.3g} times as far as before: two rigs or "
+        "settings, a sensor that jumped or stuck, creep over a hold, or a part that came loose; split the file "
+        "there, and fit the parts apart"
+    )
+    return [sentence]
+
+
+def delays(runs: Sequence[Run], prepare: Callable[[Record], Run], alone: Alone, left: Sequence[Misfit]) -> list[str]:
+    """Look for readings that come late, or before their command, by fitting each run again with its voltage shifted.
+
+    Parameters
+    ----------
+    runs
+        What was fitted together.
+    prepare
+        Makes a record ready again.
+    alone
+        Fits them alone.
+    left
+        What the joint fit leaves of each run.
+    """
+    remarks = []
+    for run, miss in zip(runs, left, strict=True):
+        interval = float(np.median(np.diff(run.record.time_s)))
+
+        def residual(samples: float, run: Run = run, interval: float = interval) -> np.ndarray:
+            record = run.record
+            voltage = np.interp(record.time_s - samples * interval, record.time_s, record.voltage_V)
+            return alone.left(prepare(replace(record, voltage_V=voltage, extra=dict(record.extra))))
+
+        try:
+            found = _profile(residual)
+        except (DataError, FitError):
+            continue
+        if found is None:
+            continue
+        samples, sd, before, after, gained = found
+        if (
+            gained < _WORTH
+            or abs(samples) < 5 * sd
+            or after > (_MUCH if after > _NEAR * miss.noise_um else 1.0) * before
+        ):
+            continue
+        sd = max(sd, _ROUGHLY)
+        size = f"{abs(samples):.1f} +- {sd:.1f} samples ({abs(samples) * interval:.3g} s)"
+        where = "AFTER the voltage" if samples > 0 else "BEFORE the voltage that causes it"
+        remarks.append(
+            f"{run.record.source}: the displacement comes {size} {where}: taken out, the residual falls from "
+            f"{before:.3g} to {after:.3g} um; check columns and time stamps, or the lag of amplifier and sensor"
+        )
+    return remarks
+
+
+def _profile(residual: Callable[[float], np.ndarray]) -> tuple[float, float, float, float, float] | None:
+    """Delay in samples, its sd, the residual's rms without and with it, and the evidence; None if it has no end."""
+    known = {0.0: residual(0.0)}
+
+    def cost(samples: float) -> float:
+        if samples not in known:
+            known[samples] = residual(samples)
+        return float(np.mean(known[samples] ** 2))
+
+    # Down from none, by steps that double, and back by halves.
+    best, step = 0.0, 1.0 if cost(1.0) < cost(-1.0) else -1.0
+    while abs(best + step) <= _FARTHEST and cost(best + step) < cost(best):
+        best, step = best + step, 2 * step
+    while abs(step) > 1:
+        step /= 2
+        best = min((best - step, best, best + step), key=cost)
+    low, middle, high = (cost(best + one) for one in (-1.0, 0.0, 1.0))
+    bend = (low + high) / 2 - middle
+    if not bend > 0:
+        return None
+    at = best + float(np.clip((low - high) / (4 * bend), -1, 1))
+    after = cost(at)
+    count = len(known[at]) / correlation_samples([known[at]])
+    sd = float(np.sqrt(after / bend / count))
+    before = cost(0.0)
+    return at, sd, before**0.5, after**0.5, count * float(np.log(before / after)) if after > 0 else np.inf
+
+
+def _gain(left_um: np.ndarray, run: Run) -> float:
+    """How much further a run moves than the model says."""
+    left, said = left_um[run.fitted], (run.displacement_um - left_um)[run.fitted]
+    said = said - said.mean()
+    return 1 + float(said @ left / max(said @ said, 1e-300))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _pooled(rms: Sequence[float], runs: Sequence[Run]) -> float:
+    counts = [int(run.fitted.sum()) for run in runs]
+    return float(np.sqrt(np.average(np.square(rms), weights=counts)))

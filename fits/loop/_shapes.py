@@ -1,0 +1,215 @@
+"""Fitting densities with few or tangled parameters: Powell's dogleg from several starts."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from fits.loop._design import columns_of
+from fits.loop._moments import Data, Moments
+from fits.loop._prior import Hyper, roughness
+from fits.loop._result import FitError, FitStatus
+from fits.loop._run import Run, simulate_run
+from fits.stats._estimate import Estimate
+from fits.stats._noise import correlation_samples, shared_square
+from microid import FAMILIES, Coordinates, Preisach, Reversible
+
+# Steps at a time; every start gets these, the leading ones are followed while their cost falls.
+_STEPS = 60
+_TIMES = 12
+_FOLLOWED = 2
+# A cost that fell by less than this has settled: a tenth of what noise does to it.
+_SETTLED = 0.05
+_ROUNDS = 4
+# Noise, in strokes, at which starts are compared.
+_COARSE = 3e-3
+# Starts whose cost comes this close to the best one's agree with it, in units of the noise.
+_AGREE = 2.0
+# A fit ends where the optimum is closer than this, in standard deviations per parameter that the data determine.
+_STATIONARY = 0.2
+# Directions of the data that hold less than this fraction of its largest are rounding.
+_DUST = 1e-13
+
+
+class _Problem(eqx.Module):
+    """The data as a short regression: `scale (root @ columns - target)`, in noise standard deviations."""
+
+    root: Float[Array, "D D"]
+    target: Float[Array, " D"]
+    scale: Float[Array, ""]
+    slopes: Float[Array, "s N"]
+    precision: Float[Array, ""]
+    coordinates: Coordinates[Preisach]
+    stroke_um: Float[Array, ""]
+
+
+def _residual(z: Float[Array, " k"], problem: _Problem) -> Float[Array, " m"]:
+    model = problem.coordinates(z)
+    columns = columns_of(model) / problem.stroke_um
+    slopes = columns[-model.reversible.levels :]
+    misfit = problem.scale * (problem.root @ columns - problem.target)
+    return jnp.concatenate([misfit, problem.slopes @ slopes, jnp.sqrt(problem.precision) * z])
+
+
+@eqx.filter_jit
+def _descend(problem: _Problem, start: Float[Array, " k"]) -> tuple[Float[Array, " k"], Float[Array, ""]]:
+    """Go some steps down from a start; returns where that leads and the cost there."""
+    solver: Any = optx.Dogleg(rtol=1e-8, atol=1e-8)
+    solution: Any = optx.least_squares(_residual, solver, start, args=problem, max_steps=_STEPS, throw=False)
+    return solution.value, jnp.sum(_residual(solution.value, problem) ** 2) / 2
+
+
+def _follow(problem: _Problem, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
+    cost = float("inf")
+    for _ in range(_TIMES):
+        z, lower = _descend(problem, z)
+        settled = not float(lower) < cost - _SETTLED
+        cost = float(lower)
+        if settled:
+            break
+    return z, cost
+
+
+@eqx.filter_jit
+def _laplace(
+    problem: _Problem, z: Float[Array, " k"]
+) -> tuple[Float[Array, "D k"], Float[Array, ""], Float[Array, ""]]:
+    """Factor of the covariance of the columns, number of coordinates the data determine, Newton decrement."""
+    jacobian = jax.jacfwd(_residual)(z, problem)
+    root = jnp.linalg.cholesky(jacobian.T @ jacobian)
+    inverse = jax.scipy.linalg.solve_triangular(root, jnp.eye(z.shape[0]), lower=True)
+    determined = z.shape[0] - problem.precision * jnp.sum(inverse**2)
+    columns = jax.jacfwd(lambda z: columns_of(problem.coordinates(z)))(z)
+    slope = jacobian.T @ _residual(z, problem)
+    return columns @ inverse.T, determined, jnp.linalg.norm(inverse @ slope)
+
+
+def solve_shape(
+    family: str,
+    data: Data,
+    runs: Sequence[Run],
+    stroke_um: float,
+    hyper: Hyper,
+    starts: int,
+    key: PRNGKeyArray,
+    progress: Callable[[str], None],
+) -> tuple[Estimate, bool]:
+    """Fit a family that is not linear in its parameters.
+
+    The record enters through its moments only, so that a start costs milliseconds whatever the record's length.
+    The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise
+    is what this family leaves, which may be more than the grid's.
+
+    Parameters
+    ----------
+    family
+        Name in `microid.FAMILIES`.
+    data
+        Moments of the runs.
+    runs
+        The runs themselves.
+    stroke_um
+        Displacement that the relays account for, roughly.
+    hyper
+        Noise, and smoothness of the reversible part, as the grid found them.
+    starts
+        Number of starts.
+    key
+        Draws the starts.
+    progress
+        Told what is being done.
+
+    Returns
+    -------
+    Estimate
+        The best of all starts.
+    agree
+        Whether the two best starts ended at the same cost.
+
+    Raises
+    ------
+    FitError
+        If no start gives a finite cost, or the best one does not become stationary.
+    """
+    grid = data.grid
+    moments = data.total.scaled(1.0, stroke_um)
+    variance = float(jnp.exp(hyper.log_variance))
+
+    def draw(key: PRNGKeyArray) -> Preisach:
+        half = jnp.asarray(stroke_um / 2)
+        density = FAMILIES[family].start(grid.lower_V, grid.upper_V, grid.levels, half, key)
+        slope = jnp.full(grid.levels, half / grid.range_V)
+        return Preisach(density, Reversible(slope, grid.lower_V, grid.upper_V), jnp.asarray(0.0))
+
+    keys = jax.random.split(key, starts)
+    coordinates = Coordinates(draw(keys[0]), free=lambda info: info.path != "offset_um")
+    root, target = _square_root(moments)
+    rough = roughness(grid.levels).reversible[grid.weights :, grid.weights :]
+    values, vectors = jnp.linalg.eigh(rough * jnp.exp(hyper.log_reversible))
+    slopes = jnp.sqrt(jnp.maximum(values, 0))[:, None] * vectors.T
+    unit = jnp.asarray(1.0)
+    # Starts race on a coarse scale: at the grid's own noise, most would crawl along narrow valleys.
+    scale = jnp.asarray(1 / max(variance, _COARSE**2) ** 0.5)
+    problem = _Problem(root, target, scale, slopes, unit, coordinates, jnp.asarray(stroke_um))
+
+    ends = []
+    for number, one in enumerate(keys):
+        progress(f"{family}: start {number + 1} of {starts}")
+        end, cost = _descend(problem, coordinates.of(draw(one)))
+        ends.append((end, float(cost)))
+    # Narrow valleys cost many steps: only those that lead the race go through them.
+    ends = sorted((end for end in ends if np.isfinite(end[1])), key=lambda end: end[1])[:_FOLLOWED]
+    if not ends:
+        raise FitError(FitStatus.NONFINITE)
+    for number, (end, _) in enumerate(ends):
+        progress(f"{family}: following start {number + 1} of {len(ends)}")
+        ends[number] = _follow(problem, end)
+    costs = [cost for _, cost in ends]
+    best = int(np.argmin(costs))
+    agree = max(costs) < costs[best] + _AGREE
+
+    z, count = ends[best][0], float(moments.count)
+    precision, determined = 1.0, 0.0
+    for number in range(_ROUNDS):
+        progress(f"{family}: weighing the prior, round {number + 1} of {_ROUNDS}")
+        model = coordinates(z)
+        off = [run.weighed(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
+        off = [o - o.mean() for o in off]
+        variance = sum(float(np.sum(o**2)) for o in off) / stroke_um**2 / max(count - determined, 1)
+        correlation = correlation_samples(off)
+        problem = eqx.tree_at(
+            lambda p: (p.scale, p.precision),
+            problem,
+            (jnp.asarray((variance * correlation) ** -0.5), jnp.asarray(precision)),
+        )
+        z, _ = _follow(problem, z)
+        factor, known, distance = _laplace(problem, z)
+        determined = float(known)
+        precision = max(determined, 1e-3) / float(jnp.sum(z**2))
+    if not float(distance) < _STATIONARY * max(determined, 1) ** 0.5:
+        raise FitError(FitStatus.NOT_STATIONARY)
+    shared = sum(shared_square(o) * len(o) for o in off) / sum(len(o) for o in off)
+    estimate = Estimate(
+        model=coordinates(z),
+        levels=grid.levels,
+        factor_um=factor,
+        noise_um=variance**0.5 * stroke_um,
+        correlation=correlation,
+        discrepancy_um=max(0.0, shared) ** 0.5,
+    )
+    return estimate, agree
+
+
+@eqx.filter_jit
+def _square_root(moments: Moments) -> tuple[Float[Array, "D D"], Float[Array, " D"]]:
+    """Factor the moments: `root' root` is the Gram matrix, `root' target` the cross products."""
+    value, vector = jnp.linalg.eigh(moments.gram)
+    kept = value > _DUST * value[-1]
+    scale = jnp.sqrt(jnp.where(kept, value, 0))
+    seen = vector.T @ moments.cross_um
+    return scale[:, None] * vector.T, jnp.where(kept, seen / jnp.where(kept, scale, 1), 0)

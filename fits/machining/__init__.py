@@ -1,0 +1,1 @@
+"""What the dimensions of a stage and their tolerances do to its motion."""

@@ -1,0 +1,256 @@
+"""Which tolerances to tighten, and which to give up, so that the pose keeps to its budget at the least cost."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import NonlinearConstraint, minimize, nnls
+
+from fits.io._errors import DataError
+from fits.machining._design import Design
+from fits.machining._second_order import check, first_order, inputs_of, nominal, second_order, setting, twin
+from microid import DIMENSIONS, Axis
+
+Limit = Literal["three_sigma", "worst_case"]
+_POWERS: dict[Limit, int] = {"three_sigma": 2, "worst_case": 1}
+_LENGTHS_MM = (0.001, 0.1)
+# Of the logarithms of errors over budgets, and of the optimality conditions, whose terms are parts of the cost.
+_SLACK, _STATIONARY = 1e-7, 1e-5
+_STEPS = 500
+_Vector = NDArray[np.float64]
+
+
+class AllocationError(RuntimeError):
+    """The cheapest tolerances were not found; there is no answer to give."""
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """The cheapest tolerances that keep to a budget.
+
+    Attributes
+    ----------
+    design
+        With the new tolerances. Dimensions that no axis of the budget depends on keep theirs.
+    names
+        Dimensions whose tolerances were chosen.
+    cost, cost_before
+        Sum over these, with the new tolerances and the old ones.
+    error_pct
+        First-order error of each axis of the budget, in percent of its output.
+    active
+        Axes whose budget is used up. Of two axes that are one function of the same dimensions, the one with the
+        lower budget stands for both.
+    multipliers
+        Of the active axes: by how many percent the cost falls when the budget grows by one percent.
+    limit
+        As asked for.
+    """
+
+    design: Design
+    names: tuple[str, ...]
+    cost: float
+    cost_before: float
+    error_pct: dict[Axis, float]
+    active: tuple[Axis, ...]
+    multipliers: dict[Axis, float]
+    limit: Limit
+
+
+def allocate(
+    design: Design,
+    budget_pct: Mapping[Axis, float],
+    cost: Mapping[str, float] | None = None,
+    *,
+    limit: Limit = "three_sigma",
+    bounds_mm: tuple[float, float] = _LENGTHS_MM,
+    voltage: bool = False,
+    curvature_share: float = 0.05,
+) -> Allocation:
+    r"""Choose the tolerances that cost least and keep the error of each axis within its budget.
+
+    The cost of a dimension is in inverse proportion to its tolerance. In the logarithms of the tolerances both the
+    cost :math:`\sum c_i T_{0i} / T_i` and the errors, :math:`\sum |s_i| T_i` or :math:`\sqrt{\sum s_i^2 T_i^2}` with
+    relative derivatives s, are convex, so that the minimum is the only one. Where a slope nearly vanishes the first
+    order would let a tolerance grow without a price; `curvature_share` stops it.
+
+    Parameters
+    ----------
+    design
+        Dimensions and present tolerances.
+    budget_pct
+        Largest error of the output by axis, in percent of the output.
+    cost
+        By dimension, at the present tolerance; one for those not named.
+    limit
+        What keeps to the budget: `three_sigma` of independent normal errors, whose tolerances are three standard
+        deviations, or the `worst_case`, all errors at their tolerances with the worst signs.
+    bounds_mm
+        Smallest and largest tolerance of a length; of an angle, at the end of its leg.
+    voltage
+        Impose the voltage of the piezos instead of their elongation.
+    curvature_share
+        No tolerance goes beyond where the second order of its dimension alone takes this share of a budget; infinite
+        for the first order however far.
+
+    Raises
+    ------
+    DataError
+        If a budget, cost or bound makes no sense, dimensions go together and three standard deviations are asked
+        for, or a budget is out of reach; the sentence gives the smallest error within reach.
+    AllocationError
+        If the solver fails.
+    """
+    _check(design, budget_pct, cost or {}, limit, bounds_mm)
+    axes = _tightest(budget_pct)
+    names = tuple(dict.fromkeys(name for axis in axes for name in inputs_of(axis, voltage)))
+    tolerance = np.array([design.tolerance[name] for name in names])
+    if not np.all(tolerance > 0):
+        name = names[int(np.argmin(tolerance))]
+        raise DataError(f"the cost of {name} at its present tolerance of zero is infinite: give it a positive one")
+    price = np.array([(cost or {}).get(name, 1.0) for name in names])
+    leg = np.array([float(design.geometry[DIMENSIONS[n].leg or ""]) if DIMENSIONS[n].leg else 1.0 for n in names])
+    lower, upper = (np.log(bound / leg / tolerance) for bound in bounds_mm)
+    for axis in axes:
+        straight = np.log(_straight(design, axis, names, voltage, curvature_share * budget_pct[axis]) / tolerance)
+        upper = np.maximum(lower, np.minimum(upper, straight))
+    effect = np.array([_effect_pct(design, axis, names, voltage) for axis in axes]) * tolerance
+    wanted = np.array([budget_pct[axis] for axis in axes])
+    problem = _Problem(price, effect / wanted[:, None], lower, upper, _POWERS[limit])
+    for axis, excess in zip(axes, problem.excess(lower), strict=True):
+        if excess > 0:
+            raise DataError(
+                f"{axis}: an error of {budget_pct[axis]:g} % is out of reach, the smallest is "
+                f"{budget_pct[axis] * np.exp(excess):.3g} % with tolerances of {bounds_mm[0]:g} mm: raise the budget "
+                "or allow smaller tolerances"
+            )
+    logarithm, weights = problem.solve()
+    found = dict(zip(names, (tolerance * np.exp(logarithm)).tolist(), strict=True))
+    share = dict(zip(axes, np.exp(problem.excess(logarithm)).tolist(), strict=True))
+    reached = {twin(axis): share[axis] * budget_pct[axis] for axis in axes}
+    return Allocation(
+        replace(design, tolerance={**design.tolerance, **found}),
+        names,
+        float(price @ np.exp(-logarithm)),
+        float(price.sum()),
+        {axis: reached[twin(axis)] for axis in budget_pct},
+        tuple(axes[i] for i in weights),
+        {axes[i]: weight for i, weight in weights.items()},
+        limit,
+    )
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """In the logarithms of tolerances over the present ones; errors are in budgets."""
+
+    price: _Vector
+    effect: _Vector
+    lower: _Vector
+    upper: _Vector
+    power: int
+
+    def terms(self, logarithm: _Vector) -> _Vector:
+        return (np.abs(self.effect) * np.exp(logarithm)) ** self.power
+
+    def excess(self, logarithm: _Vector) -> _Vector:
+        """Logarithm of each error over its budget."""
+        return np.asarray(np.log(self.terms(logarithm).sum(axis=1)) / self.power)
+
+    def shares(self, logarithm: _Vector) -> _Vector:
+        """Derivative of `excess`."""
+        terms = self.terms(logarithm)
+        return np.asarray(terms / terms.sum(axis=1, keepdims=True))
+
+    def log_cost(self, logarithm: _Vector) -> tuple[float, _Vector]:
+        each = self.price * np.exp(-logarithm)
+        return float(np.log(each.sum())), -each / each.sum()
+
+    def solve(self) -> tuple[_Vector, dict[int, float]]:
+        """The minimum, and the multipliers of the constraints that hold it."""
+        # All tolerances alike, as large as the worst error lets them be.
+        start = np.clip(
+            np.zeros_like(self.lower) - max(self.excess(np.zeros_like(self.lower))), self.lower, self.upper
+        )
+        solved = minimize(
+            self.log_cost,
+            start,
+            jac=True,
+            method="SLSQP",
+            bounds=list(zip(self.lower, self.upper, strict=True)),
+            constraints=NonlinearConstraint(self.excess, -np.inf, 0.0, jac=self.shares),
+            options={"ftol": 1e-15, "maxiter": _STEPS},
+        )
+        found = np.clip(solved.x, self.lower, self.upper)
+        excess = self.excess(found)
+        if not np.all(np.isfinite(found)) or np.max(excess) > _SLACK:
+            raise AllocationError("the solver did not find tolerances within the budget")
+        # Not the solver's word, but the optimality conditions: budgets and bounds balance the slope of the cost.
+        tight = np.flatnonzero(excess > -_SLACK)
+        low, high = (np.flatnonzero(np.abs(found - bound) < _SLACK) for bound in (self.lower, self.upper))
+        sides = np.eye(len(found))
+        columns = np.vstack([self.shares(found)[tight], -sides[low], sides[high]])
+        weights, residual = nnls(columns.T, -self.log_cost(found)[1])
+        if not residual < _STATIONARY:
+            raise AllocationError(
+                f"the solver stopped before the cheapest tolerances: {residual:.1g} of the cost is not balanced"
+            )
+        return found, dict(zip(tight.tolist(), weights[: len(tight)].tolist(), strict=True))
+
+
+def _effect_pct(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool) -> _Vector:
+    """Relative derivatives of a gain with respect to all names, in percent per mm or rad."""
+    own = inputs_of(axis, voltage)
+    value, slopes = first_order(nominal(design, own), twin(axis), own, *setting(design, voltage))
+    by_name = dict(zip(own, np.asarray(slopes).tolist(), strict=True))
+    return np.array([100 * by_name.get(name, 0.0) / float(value) for name in names])
+
+
+def _straight(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool, share_pct: float) -> _Vector:
+    """Tolerances at which the second order of each dimension alone comes to so much."""
+    if not np.isfinite(share_pct):
+        return np.full(len(names), np.inf)
+    expanded = second_order(design, twin(axis), voltage=voltage)
+    bend = np.abs(np.diagonal(expanded.hessian)) / abs(expanded.gain) / 2
+    allowed = dict(zip(expanded.names, np.sqrt(share_pct / 100 / np.maximum(bend, 1e-300)), strict=True))
+    return np.array([allowed.get(name, np.inf) for name in names])
+
+
+def _tightest(budget_pct: Mapping[Axis, float]) -> tuple[Axis, ...]:
+    """Of axes that are one function of the same dimensions, the one with the lower budget."""
+    found: dict[Axis, Axis] = {}
+    for axis, budget in budget_pct.items():
+        if twin(axis) not in found or budget < budget_pct[found[twin(axis)]]:
+            found[twin(axis)] = axis
+    return tuple(found.values())
+
+
+def _check(
+    design: Design,
+    budget_pct: Mapping[Axis, float],
+    cost: Mapping[str, float],
+    limit: str,
+    bounds_mm: tuple[float, float],
+) -> None:
+    check(design, tuple(budget_pct), "normal")
+    if limit not in _POWERS:
+        raise DataError(f"there is no limit {limit!r}: choose one of {', '.join(_POWERS)}")
+    if limit == "three_sigma" and design.together:
+        names = ", ".join(design.together[0].dimensions)
+        raise DataError(
+            f"{names} go together, and three standard deviations are allocated to independent dimensions only: "
+            "choose the worst_case, or a design without `together`"
+        )
+    for what, given in (("budget", budget_pct), ("cost", cost)):
+        for name, value in given.items():
+            if not (np.isfinite(value) and value > 0):
+                raise DataError(f"the {what} of {name} is a positive number, got {value}")
+    unknown = [name for name in cost if name not in DIMENSIONS]
+    if unknown:
+        raise DataError(f"there is no dimension {unknown[0]!r}: choose some of {', '.join(DIMENSIONS)}")
+    if not 0 < bounds_mm[0] < bounds_mm[1] < np.inf:
+        raise DataError(
+            f"the bounds of tolerances are positive and in order, got {bounds_mm[0]:g} and {bounds_mm[1]:g} mm"
+        )

@@ -1,0 +1,333 @@
+"""The error budget: driving, machining and measuring error of each axis, and their total (Eq. 1)."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+import microid as m
+from fits.control._compensate_stage import static_equivalent
+from fits.io._errors import DataError
+from fits.machining._design import Design
+from fits.machining._idle import IdleNoise
+from fits.machining._sensitivity import _ALIKE, _derive, quick_jit
+
+Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
+MEASURES: tuple[Measures, ...] = ("pzt", *m.AXES)
+# The largest error is a maximum, where a step this small changes it by a millionth of the loop.
+_STEPS = 1000
+
+
+@dataclass(frozen=True)
+class Driving:
+    """What hysteresis adds to a piezo that is taken for proportional, over one loop of its whole range (Eq. 7).
+
+    Attributes
+    ----------
+    stroke_um
+        Elongation between the lowest and the highest voltage.
+    slope_um_per_V
+        The proportional elongation: the line from the lowest voltage that leaves the smallest squares over the loop.
+    highest_um, lowest_um
+        Largest elongation above that line and below it, with their signs.
+    """
+
+    stroke_um: float
+    slope_um_per_V: float
+    highest_um: float
+    lowest_um: float
+
+    @property
+    def absolute_um(self) -> float:
+        """The larger of the two by size."""
+        return max(abs(self.highest_um), abs(self.lowest_um))
+
+
+@dataclass(frozen=True)
+class AxisBudget:
+    """The errors of one axis at the full elongation of its piezo, in um or urad.
+
+    Attributes
+    ----------
+    axis
+        Its name.
+    output_unit
+        `um` or `urad`, of all that follows but the sensitivity.
+    stroke
+        Output at full elongation.
+    piezo_sensitivity
+        Output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
+    driving_highest, driving_lowest
+        Largest driving errors to either side, with their signs.
+    machining_signed
+        Sum over all dimensions, each at plus one tolerance, the elongation being imposed (Eq. 4).
+    machining_worst_case
+        Sum of the sizes.
+    machining_root_sum_square
+        For errors that are independent, or correlated as the design says; for normal ones of three standard
+        deviations.
+    machining_voltage_worst_case, machining_voltage_root_sum_square
+        The same with the voltage being imposed, which the paper leaves out: the input stiffness then acts too.
+    measuring
+        Of the sensor; None where it is not known.
+    """
+
+    axis: m.Axis
+    output_unit: str
+    stroke: float
+    piezo_sensitivity: float
+    driving_highest: float
+    driving_lowest: float
+    machining_signed: float
+    machining_worst_case: float
+    machining_root_sum_square: float
+    machining_voltage_worst_case: float
+    machining_voltage_root_sum_square: float
+    measuring: float | None
+
+    @property
+    def driving(self) -> float:
+        """The larger driving error by size, with its sign."""
+        return max(self.driving_highest, self.driving_lowest, key=abs)
+
+    @property
+    def signed(self) -> float:
+        """Sum with signs (Eq. 1): `driving`, all dimensions at plus one tolerance, and a reading that is too high."""
+        return float(m.total_error(self.driving, self.machining_signed, self.measuring or 0.0).signed)
+
+    @property
+    def worst_case(self) -> float:
+        """Sum of sizes: no signs within the tolerances are worse."""
+        return float(m.total_error(self.driving, self.machining_worst_case, self.measuring or 0.0).worst_case)
+
+    @property
+    def root_sum_square(self) -> float:
+        """For parts, and dimensions, that are independent."""
+        parts = self.driving, self.machining_root_sum_square, self.measuring or 0.0
+        return float(m.total_error(*parts).root_sum_square)
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """What part of the squares in `root_sum_square` is from driving, machining and measuring."""
+        parts = {
+            "driving": self.driving,
+            "machining": self.machining_root_sum_square,
+            "measuring": self.measuring or 0.0,
+        }
+        total = sum(part**2 for part in parts.values())
+        return {name: part**2 / total if total > 0 else 0.0 for name, part in parts.items()}
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The error budgets of some axes by name, and what they rest on.
+
+    Attributes
+    ----------
+    axes
+        By name.
+    driving
+        Of the piezo.
+    measures
+        What the displacement of the model was: the piezo's elongation (`pzt`), or the output of an axis.
+    noise_um
+        Measuring error of the sensor.
+    zeroed
+        Whether its offset is left out of that.
+    arm_mm
+        Distance from the axis of rotation at which the sensor reads, or None.
+    level
+        Of the motion functions.
+    remarks
+        What a reader must know, one sentence each.
+    """
+
+    axes: dict[m.Axis, AxisBudget]
+    driving: Driving
+    measures: Measures
+    noise_um: float
+    zeroed: bool
+    arm_mm: float | None
+    level: int
+    remarks: tuple[str, ...]
+
+    def __getitem__(self, axis: m.Axis) -> AxisBudget:
+        """Budget of an axis by its name."""
+        return self.axes[axis]
+
+
+def budget(
+    design: Design,
+    model: m.Preisach | m.Stage,
+    idle: IdleNoise,
+    axes: Sequence[m.Axis] = m.AXES,
+    *,
+    measures: Measures = "pzt",
+    arm_mm: float | None = None,
+    zeroed: bool = True,
+) -> Budget:
+    """Put driving, machining and measuring errors together (Eq. 1), each axis being driven over its whole range.
+
+    Parameters
+    ----------
+    design
+        Dimensions, tolerances and constants.
+    model
+        The fitted hysteresis of a piezo; of a stage, what slow commands see. All piezos are taken to be like it.
+    idle
+        From `idle_noise`.
+    axes
+        Which; all by default.
+    measures
+        What the displacement of the model is: the piezo's elongation, or the output of an axis, which is then divided
+        by its gain.
+    arm_mm
+        Distance from the axis of rotation at which a displacement sensor reads a rotation. Without it rotations have
+        no measuring error, and none can be what the model measures.
+    zeroed
+        Whether the sensor is zeroed at rest, which removes its offset.
+
+    Raises
+    ------
+    DataError
+        If the model does not move, is a stage without hysteresis, or measures a rotation at no arm.
+    RuntimeError
+        If JAX is not in double precision.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError('budgets need float64: jax.config.update("jax_enable_x64", True)')
+    if arm_mm is not None and not (math.isfinite(arm_mm) and arm_mm > 0):
+        raise DataError(f"expected an arm above 0 mm, found {arm_mm:g}; give the distance from the axis of rotation.")
+    driving = _driving(design, model, measures, arm_mm)
+    noise_um = idle.error_um(zeroed)
+    found: dict[m.Axis, AxisBudget] = {}
+    for axis in axes:
+        known = next((each for name, each in found.items() if _alike(name) == _alike(axis)), None)
+        measuring = _reading(axis, noise_um, arm_mm)
+        found[axis] = dataclasses.replace(known or _of_axis(design, _alike(axis), driving, measuring), axis=axis)
+    remarks = (*_remarks(design, found, driving, arm_mm), *(f"Idle record: {remark}" for remark in idle.remarks))
+    return Budget(found, driving, measures, noise_um, zeroed, arm_mm, design.level, remarks)
+
+
+def _alike(axis: m.Axis) -> m.Axis:
+    """The axis itself, or the one with the same motion function."""
+    return _ALIKE.get(axis, axis)
+
+
+def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, arm_mm: float | None) -> Driving:
+    """Driving error in um of the piezo."""
+    law = static_equivalent(model) if isinstance(model, m.Stage) else model
+    lower_V, upper_V = float(law.density.lower_V), float(law.density.upper_V)
+    rise = np.linspace(lower_V, upper_V, _STEPS + 1)
+    error, highest_um = _loop(law, jnp.asarray(np.concatenate([rise, rise[-2::-1]])))
+    # What the model calls a um is this many of the piezo.
+    scale = 1.0
+    if measures != "pzt":
+        # A rotation in um at its arm.
+        per_rad = 1.0
+        if m.MOTIONS[measures].unit == "rad":
+            if arm_mm is None:
+                raise DataError(
+                    f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
+                )
+            per_rad = 1e3 * arm_mm
+        found = _derive(_alike(measures), design.geometry, design.constants, design.actuation)
+        scale = 1 / (per_rad * float(found.gain))
+    stroke_um = scale * float(highest_um)
+    if not stroke_um > 0:
+        raise DataError(
+            f"expected a model that moves between {lower_V:g} and {upper_V:g} V, found one that does not; fit it "
+            "again."
+        )
+    return Driving(
+        stroke_um,
+        scale * float(error.slope_um_per_V),
+        scale * float(error.signed_um.max()),
+        scale * float(error.signed_um.min()),
+    )
+
+
+@quick_jit
+def _loop(law: m.Preisach, voltage_V: Float[Array, " n"]) -> tuple[m.DrivingError, Float[Array, ""]]:
+    """Driving error over a loop, and what the model moves up to its middle, which is the turn."""
+    error = m.driving_error(law, voltage_V)
+    turn = len(voltage_V) // 2
+    return error, error.signed_um[turn] + error.slope_um_per_V * (voltage_V[turn] - voltage_V[0])
+
+
+def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | None) -> AxisBudget:
+    scale, unit = (1e6, "urad") if m.MOTIONS[axis].unit == "rad" else (1.0, "um")
+    # The load takes a fixed part of any free elongation.
+    usual = _derive(axis, design.geometry, design.constants, design.actuation)
+    free_um = driving.stroke_um * float(design.actuation.free_stroke_um / usual.loaded_stroke_um)
+    actuation = dataclasses.replace(design.actuation, free_stroke_um=jnp.asarray(free_um))
+    derived = _derive(axis, design.geometry, design.constants, actuation)
+    stroke = scale * float(derived.stroke)
+    slope = scale * float(derived.by_voltage.piezo) * free_um / driving.stroke_um
+    signed, worst, squares = _sums(design, derived.slopes_at_full_stroke, scale)
+    _, voltage_worst, voltage_squares = _sums(design, derived.by_voltage.dimensions, scale)
+    if not np.all(np.isfinite([stroke, slope, worst, voltage_worst])):
+        raise DataError(
+            f"{axis}: expected dimensions of a stage that moves, found some that are so small or so large that no "
+            "finite number comes out; correct them."
+        )
+    return AxisBudget(
+        axis=axis,
+        output_unit=unit,
+        stroke=stroke,
+        piezo_sensitivity=slope,
+        driving_highest=slope * driving.highest_um,
+        driving_lowest=slope * driving.lowest_um,
+        machining_signed=signed,
+        machining_worst_case=worst,
+        machining_root_sum_square=squares,
+        machining_voltage_worst_case=voltage_worst,
+        machining_voltage_root_sum_square=voltage_squares,
+        measuring=measuring,
+    )
+
+
+def _sums(design: Design, slopes: Mapping[str, Array], scale: float) -> tuple[float, float, float]:
+    """Sum of the errors at plus one tolerance, of their sizes, and the root of their squares with correlations."""
+    changes: NDArray[np.float64] = scale * np.array([float(slopes[name]) * design.tolerance[name] for name in slopes])
+    variance = float(changes @ design.correlation([*slopes]) @ changes)
+    return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
+
+
+def _reading(axis: m.Axis, noise_um: float, arm_mm: float | None) -> float | None:
+    """Measuring error in um, or in urad where the arm is known."""
+    if m.MOTIONS[axis].unit == "um":
+        return noise_um
+    return None if arm_mm is None else 1e3 * noise_um / arm_mm
+
+
+def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, arm_mm: float | None) -> list[str]:
+    remarks = []
+    turning = [axis for axis in axes if m.MOTIONS[axis].unit == "rad"]
+    if turning and arm_mm is None:
+        remarks.append(
+            f"The measuring error of {', '.join(turning)} is left out: a displacement sensor reads a rotation at an "
+            "arm; give it."
+        )
+    loaded_um = max(
+        float(_derive(_alike(axis), design.geometry, design.constants, design.actuation).loaded_stroke_um)
+        for axis in axes
+    )
+    if driving.stroke_um > 1.05 * loaded_um:
+        remarks.append(
+            f"The model elongates its piezo by {driving.stroke_um:.4g} um, but against the stage the piezos of this "
+            f"design reach {loaded_um:.4g} um: if it was measured without the stage, scale its displacement or say "
+            "what it measures."
+        )
+    remarks.append(
+        "The totals take machining at a fixed elongation of the piezo (Eq. 4); open loop the voltage is fixed, and "
+        "the column beside it counts."
+    )
+    return remarks

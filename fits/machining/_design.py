@@ -1,0 +1,212 @@
+"""A stage as it is designed: dimensions with their tolerances, material, piezos and moving masses."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+import numpy as np
+from numpy.typing import NDArray
+
+import microid as m
+from fits.io._errors import DataError
+
+TOLERANCE_MM = 0.02
+LARGEST_ANGLE_RAD = 1.5
+# Hinges and the distance between the centres of the two of a leg, which they cannot exceed.
+_HINGES = (("l1", "la1", "alpha1"), ("l2", "l3", ""), ("l4", "la2", "alpha2"), ("l6", "la3", "alpha3"))
+# The paper's middle platform has hinges that are longer than their leg's run by 0.2 %.
+_OVERLAP = 0.01
+_MOST_GUIDES = 1000
+# What rounding may take from the smallest eigenvalue of a correlation matrix.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Together:
+    """Dimensions whose errors go together, as one offset of a wire cut shifts several thicknesses.
+
+    Attributes
+    ----------
+    dimensions
+        Names in `microid.DIMENSIONS`.
+    correlation
+        Of the errors of any two of them, -1 to 1.
+    """
+
+    dimensions: tuple[str, ...]
+    correlation: float
+
+
+@dataclass(frozen=True)
+class Design:
+    """What a machining error is counted from.
+
+    Attributes
+    ----------
+    geometry
+        The dimensions.
+    tolerance
+        Largest error to either side of every dimension by name, in the dimension's unit. It stands for three standard
+        deviations of a normal distribution, or for the half-width of a uniform or a triangular one.
+    level
+        0 for Euler-Bernoulli leaves between rigid blocks, 1 with elastic roots, shear and links.
+    guides
+        Guiding legs of a translation in x or y.
+    youngs_modulus_GPa
+        Of all flexures.
+    actuation
+        Piezos and moving masses.
+    together
+        Dimensions with correlated errors; all others are independent.
+
+    Raises
+    ------
+    DataError
+        If anything in it is impossible; the sentence begins with its place, such as `geometry.t2`.
+    """
+
+    geometry: m.Geometry
+    tolerance: dict[str, float]
+    level: int = 1
+    guides: float = 4.0
+    youngs_modulus_GPa: float = 206.0
+    actuation: m.Actuation = dataclasses.field(default_factory=m.Actuation)
+    together: tuple[Together, ...] = ()
+
+    def __post_init__(self) -> None:
+        for fault in _faults(self):
+            raise DataError(fault)
+
+    @property
+    def constants(self) -> m.Constants:
+        """What enters the motion functions beside their arguments."""
+        return m.constants_of(self.geometry, self.level, 1e3 * self.youngs_modulus_GPa, self.guides)
+
+    def with_tolerance(self, length_mm: float) -> "Design":
+        """Give every length this tolerance, and every angle what an error of that size makes of it at its leg."""
+        return dataclasses.replace(self, tolerance=uniform_tolerance(self.geometry, length_mm))
+
+    def correlation(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Correlation of the errors of some dimensions, shape `(n, n)`."""
+        matrix = np.eye(len(names))
+        place = {name: i for i, name in enumerate(names)}
+        for group in self.together:
+            for one, other in itertools.permutations((name for name in group.dimensions if name in place), 2):
+                matrix[place[one], place[other]] = group.correlation
+        return matrix
+
+
+def paper_design(tolerance_mm: float = TOLERANCE_MM) -> Design:
+    """Return the paper's stage (Table 1).
+
+    The paper gives no tolerance for angles (erratum 9), here that of a length over its leg, and no value for `l`
+    (erratum 7), here 40 mm.
+
+    Parameters
+    ----------
+    tolerance_mm
+        Of every length.
+    """
+    geometry = m.Geometry()
+    return Design(geometry, uniform_tolerance(geometry, tolerance_mm))
+
+
+def uniform_tolerance(geometry: m.Geometry, length_mm: float) -> dict[str, float]:
+    """Tolerance of every dimension in its unit, the same for all lengths; angles as `default_tolerance`."""
+    sizes = {name: float(geometry[name]) for name in m.DIMENSIONS}
+    return {name: default_tolerance(name, sizes, length_mm) for name in m.DIMENSIONS}
+
+
+def default_tolerance(name: str, sizes: Mapping[str, float], length_mm: float = TOLERANCE_MM) -> float:
+    """Tolerance of a dimension that goes with one of lengths: for an angle, over the leg it is measured along."""
+    leg = m.DIMENSIONS[name].leg
+    return length_mm if leg is None else length_mm / sizes[leg]
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """Say what a name may have been meant for."""
+    close = get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"did you mean {close[0]}?" if close else f"use one of {', '.join(known)}."
+
+
+def _faults(design: Design) -> Iterator[str]:
+    """Sentences on what is impossible, each beginning with its place."""
+    yield from _faults_of_sizes(design)
+    if isinstance(design.level, bool) or not isinstance(design.level, int) or design.level not in (0, 1):
+        yield f"level: expected 0 or 1, found {design.level!r}; give one of them."
+    if not 0 <= design.guides <= _MOST_GUIDES:
+        yield f"material.guides: expected 0 to {_MOST_GUIDES} legs, found {design.guides:g}; correct it."
+    if not (math.isfinite(design.youngs_modulus_GPa) and design.youngs_modulus_GPa > 0):
+        yield (
+            f"material.youngs_modulus: expected more than 0 GPa, found {design.youngs_modulus_GPa:g}; give the "
+            "modulus of the flexures."
+        )
+    for name, value in vars(design.actuation).items():
+        if not (math.isfinite(value) and value > 0):
+            yield f"actuation.{name}: expected a number above 0, found {float(value):g}; correct it."
+    yield from _faults_of_groups(design)
+
+
+def _faults_of_sizes(design: Design) -> Iterator[str]:
+    for name in design.tolerance:
+        if name not in m.DIMENSIONS:
+            yield f"geometry.{name}: a tolerance is given for an unknown dimension; {nearest(name, [*m.DIMENSIONS])}"
+    sizes = {name: float(design.geometry[name]) for name in m.DIMENSIONS}
+    for name, dimension in m.DIMENSIONS.items():
+        place, size, unit = f"geometry.{name}", sizes[name], dimension.unit
+        if not (math.isfinite(size) and size > 0):
+            yield f"{place}: expected more than 0 {unit}, found {size:g}; give the {dimension.meaning}."
+        if unit == "rad" and not size < LARGEST_ANGLE_RAD:
+            yield (
+                f"{place}: expected an angle between 0 and {LARGEST_ANGLE_RAD} rad, found {size:g}; a bridge needs "
+                "a slight inclination."
+            )
+        if name not in design.tolerance:
+            yield f"{place}: expected a tolerance in {unit}, found none; give one."
+        tolerance = design.tolerance[name]
+        if not (math.isfinite(tolerance) and tolerance >= 0):
+            yield f"{place}: expected a tolerance of at least 0 {unit}, found {tolerance:g}; give its size alone."
+        if not tolerance < size:
+            yield (
+                f"{place}: expected a tolerance below the dimension, {size:g} {unit}, found {tolerance:g} {unit}; "
+                "give a smaller one."
+            )
+    for hinge, leg, angle in _HINGES:
+        run = sizes[leg] * math.cos(sizes[angle]) if angle else sizes[leg]
+        if sizes[hinge] > (1 + _OVERLAP) * run:
+            yield (
+                f"geometry.{hinge}: expected a hinge no longer than its leg, which runs {run:.4g} mm along it "
+                f"({leg} = {sizes[leg]:g} mm), found {sizes[hinge]:g} mm; shorten the hinge or lengthen the leg."
+            )
+
+
+def _faults_of_groups(design: Design) -> Iterator[str]:
+    pairs: dict[frozenset[str], int] = {}
+    for k, group in enumerate(design.together):
+        place = f"together[{k}]"
+        for name in group.dimensions:
+            if name not in m.DIMENSIONS:
+                yield f"{place}.dimensions: '{name}' is no dimension; {nearest(name, [*m.DIMENSIONS])}"
+        if len(set(group.dimensions)) < 2 or len(set(group.dimensions)) < len(group.dimensions):
+            yield f"{place}.dimensions: expected at least two different dimensions, found {list(group.dimensions)}."
+        if not -1 <= group.correlation <= 1:
+            yield (
+                f"{place}.correlation: expected a number between -1 and 1, found {group.correlation:g}; correct it."
+            )
+        for pair in map(frozenset, itertools.combinations(group.dimensions, 2)):
+            if pair in pairs:
+                yield (
+                    f"{place}.dimensions: the correlation of {' and '.join(sorted(pair))} is given by together"
+                    f"[{pairs[pair]}] already; keep one of the two."
+                )
+            pairs[pair] = k
+    names = sorted({name for group in design.together for name in group.dimensions})
+    if names and np.linalg.eigvalsh(design.correlation(names))[0] < -_ROUNDING:
+        yield (
+            f"together[{len(design.together) - 1}].correlation: expected correlations that errors can have, found a "
+            "matrix that is not positive semidefinite; n dimensions can all have -1 / (n - 1) at least, and two "
+            "that go with a third go with each other."
+        )

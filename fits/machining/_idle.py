@@ -1,0 +1,326 @@
+"""The measuring error (Eq. 6): what a sensor reads while the stage is at rest."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from fits.io._errors import DataError
+from fits.io._read_csv import _check_time, _converted
+from fits.io._record import Reference
+from fits.io._table import data_error, open_table
+from fits.io._units import find_sources
+from fits.stats._noise import correlation_samples
+from fits.stats._noise_spectrum import NoiseBand, NoiseLine, allan_deviation, find_lines, noise_bands
+
+FloatArray = NDArray[np.float64]
+
+MIN_IDLE_SAMPLES = 100
+# Share of a step by which steps may differ: spectra do not see less.
+_UNEVEN = 0.05
+_SEGMENTS = 8
+_MIN_SEGMENT = 64
+# Fewer stretches that know nothing of each other than this, and the error of the mean is itself a guess.
+_MIN_STRETCHES = 50
+_BATCHES = 32
+
+
+@dataclass(frozen=True, eq=False)
+class IdleNoise:
+    """Noise of a position sensor, with its constant and its random part kept apart.
+
+    The paper (section 4.2, Fig. 8) takes the *average* of an idle record, 0.103 um, for the measuring error. An
+    average is an offset: zeroing the sensor removes it, and Eq. 1 is about displacements, where it cancels (errata
+    11). What is left is the random part, of which the paper says "3.18 %" without saying of what; of its own
+    figures only a standard deviation of 0.0318 um is consistent with its band of 0.05 to 0.15 um (errata 41). Here
+    both are in um, and `error_um` says what enters Eq. 1.
+
+    Attributes
+    ----------
+    samples, rate_Hz, duration_s
+        Length of the record; `samples` times the interval between them.
+    mean_um, mean_sd_um
+        The offset, and its standard error with the noise's own correlation: neighbouring samples are no independent
+        evidence.
+    sd_um, sd_detrended_um
+        Standard deviation about the mean, and about a straight line in time.
+    drift_um_per_s, drift_sd_um_per_s
+        Slope of that line, and its standard error with the noise's own correlation.
+    peak_to_peak_um
+        Highest reading less the lowest.
+    resolution_um
+        Quantum of the readings, be it the converter's or the last digit of the file; None where none shows.
+    correlation_s
+        Time after which a sample counts as a new one; the sampling interval for white noise.
+    frequency_Hz, asd_um_per_rtHz
+        Amplitude spectral density, one-sided, shape `(f,)`, by Welch's method without the drift.
+    bands
+        The noise by decades of frequency; the squares add up to the variance about the line.
+    lines
+        Sines above the floor, such as mains hum.
+    averaging_s, adev_um, adev_sd_um
+        Overlapping Allan deviation of the readings, shape `(a,)`, and its approximate standard error.
+    bias_instability_um, bias_instability_s
+        Its minimum, and the averaging time at which it is reached: averaging any longer does not help.
+    remarks
+        What a reader must know, one sentence each.
+    source
+        Name of the file.
+    """
+
+    samples: int
+    rate_Hz: float
+    duration_s: float
+    mean_um: float
+    mean_sd_um: float
+    sd_um: float
+    sd_detrended_um: float
+    drift_um_per_s: float
+    drift_sd_um_per_s: float
+    peak_to_peak_um: float
+    resolution_um: float | None
+    correlation_s: float
+    frequency_Hz: FloatArray
+    asd_um_per_rtHz: FloatArray
+    bands: tuple[NoiseBand, ...]
+    lines: tuple[NoiseLine, ...]
+    averaging_s: FloatArray
+    adev_um: FloatArray
+    adev_sd_um: FloatArray
+    bias_instability_um: float
+    bias_instability_s: float
+    remarks: tuple[str, ...] = ()
+    source: str = ""
+
+    def error_um(self, zeroed: bool = True, coverage: float = 2.0) -> float:
+        """Measuring error that enters Eq. 1, of a single reading within a time as long as the record.
+
+        Parameters
+        ----------
+        zeroed
+            Whether the sensor is zeroed at rest, which removes the mean. Otherwise its size is added.
+        coverage
+            Coverage factor: how many standard deviations the random part counts; 2 covers 95 % of normal noise.
+
+        Returns
+        -------
+        float
+            In um. The random part is at least that of an even spread over one quantum of the readings.
+
+        Raises
+        ------
+        ValueError
+            If the coverage factor is not positive.
+        """
+        if not coverage > 0:
+            raise ValueError(f"expected a positive coverage factor, got {coverage}")
+        random = coverage * max(self.sd_um, (self.resolution_um or 0.0) / np.sqrt(12))
+        return float(random if zeroed else abs(self.mean_um) + random)
+
+
+def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> Reference:
+    """Read what a sensor shows while the stage is at rest: `time_s`, `displacement_um` and perhaps `voltage_V`.
+
+    Units, separators and `columns` are as in `read_csv`.
+
+    Raises
+    ------
+    DataError
+        One sentence with file, line and column: a voltage that changes, fewer than 100 samples, uneven time steps, a
+        reading that never changes, or what `read_csv` refuses.
+    """
+    table = open_table(path)
+    place = f"{table.path}, line {table.header_line}"
+    sources = find_sources(table.names, columns or {}, ("time_s", "displacement_um"), place)
+    wanted = [name for name in ("time_s", "displacement_um", "voltage_V") if name in sources]
+    values, _ = table.read({sources[name].column for name in wanted})
+    arrays = {name: _converted(table, name, sources[name], values) for name in wanted}
+    if "voltage_V" in arrays:
+        voltage_V = arrays["voltage_V"]
+        changes = np.flatnonzero(voltage_V != voltage_V[0])
+        if len(changes):
+            what = (
+                f"not idle: expected a constant voltage, found {voltage_V.min():.6g} to {voltage_V.max():.6g} V; cut "
+                "out the part at rest, or drop the column if it is a noisy monitor of a constant voltage"
+            )
+            raise data_error(table.path, what, table.line(int(changes[0])), sources["voltage_V"].column)
+    _check_time(table, sources["time_s"].column, arrays["time_s"])
+    fault = _find_fault(arrays["time_s"], arrays["displacement_um"])
+    if fault:
+        what, row, name = fault
+        raise data_error(table.path, what, table.line(row), sources[name].column)
+    return Reference(arrays["time_s"], arrays["displacement_um"], os.path.basename(table.path))
+
+
+def idle_noise(reference: Reference) -> IdleNoise:
+    """Describe the noise of an idle record (Eq. 6 and Fig. 8).
+
+    Parameters
+    ----------
+    reference
+        From `read_idle`: readings at rest, evenly sampled.
+
+    Returns
+    -------
+    IdleNoise
+        Offset and random part apart, spectrum, lines and Allan deviation.
+
+    Raises
+    ------
+    DataError
+        Fewer than 100 samples, uneven time steps, or readings that are not finite or never change.
+
+    Notes
+    -----
+    Standard errors: A. Sokal, "Monte Carlo Methods in Statistical Mechanics" (1997), section 3. Allan deviation: IEEE
+    Std 952-1997, annex C.
+    """
+    fault = _find_fault(reference.time_s, reference.displacement_um)
+    if fault:
+        raise DataError(f"{reference.source or 'idle record'}, row {fault[1]}, column '{fault[2]}': {fault[0]}.")
+    readings = reference.displacement_um
+    n = len(readings)
+    interval_s = float(reference.time_s[-1] - reference.time_s[0]) / (n - 1)
+    rate_Hz, duration_s = 1 / interval_s, n * interval_s
+
+    mean = float(readings.mean())
+    centred = readings - mean
+    time_s = interval_s * (np.arange(n) - (n - 1) / 2)
+    moment = float(time_s @ time_s)
+    drift = float(time_s @ centred) / moment
+    residual = centred - drift * time_s
+    # A record without noise but for a straight line has a residual of rounding alone.
+    residual = residual if np.ptp(residual) > 1e-9 * np.ptp(readings) else np.zeros(n)
+    sd_detrended = float(np.sqrt(residual @ residual / (n - 2)))
+    correlation = _correlation_samples(residual)
+    error = sd_detrended * np.sqrt(correlation)
+
+    segment = min(n, max(_MIN_SEGMENT, n // _SEGMENTS))
+    # The drift is gone already; taking more out of each segment would take slow noise with it.
+    frequency_Hz, density = signal.welch(residual, rate_Hz, nperseg=segment, detrend=False)
+    averaging_s, adev, adev_sd = allan_deviation(readings, interval_s)
+    lowest = int(np.argmin(adev))
+
+    figures = {
+        "samples": n,
+        "rate_Hz": rate_Hz,
+        "duration_s": duration_s,
+        "mean_um": mean,
+        "mean_sd_um": float(error / np.sqrt(n)),
+        "sd_um": float(readings.std(ddof=1)),
+        "sd_detrended_um": sd_detrended,
+        "drift_um_per_s": drift,
+        "drift_sd_um_per_s": float(error / np.sqrt(moment)),
+        "peak_to_peak_um": float(np.ptp(readings)),
+        "resolution_um": _quantum(readings),
+        "correlation_s": correlation * interval_s,
+        "frequency_Hz": frequency_Hz[1:],
+        "asd_um_per_rtHz": np.sqrt(density[1:]),
+        "bands": noise_bands(residual, rate_Hz),
+        "lines": find_lines(residual, rate_Hz),
+        "averaging_s": averaging_s,
+        "adev_um": adev,
+        "adev_sd_um": adev_sd,
+        "bias_instability_um": float(adev[lowest]),
+        "bias_instability_s": float(averaging_s[lowest]),
+        "source": reference.source,
+    }
+    return IdleNoise(**figures, remarks=_remarks(IdleNoise(**figures)))
+
+
+def _find_fault(time_s: FloatArray, displacement_um: FloatArray) -> tuple[str, int, str] | None:
+    """Why a record says nothing of noise, with the row and column to look at; None where it does."""
+    n = len(time_s)
+    if n < MIN_IDLE_SAMPLES:
+        what = f"expected at least {MIN_IDLE_SAMPLES} samples, found {n}; record the stage at rest for longer"
+        return what, max(n - 1, 0), "time_s"
+    for name, values in (("time_s", time_s), ("displacement_um", displacement_um)):
+        if not np.isfinite(values).all():
+            row = int(np.argmin(np.isfinite(values)))
+            return f"expected finite numbers, found {values[row]}; remove the rows before or after it", row, name
+    steps_s = np.diff(time_s)
+    step_s = float(np.median(steps_s))
+    uneven = np.abs(steps_s - step_s) > _UNEVEN * abs(step_s)
+    if step_s <= 0 or uneven.any():
+        row = int(np.argmax(np.abs(steps_s - step_s)))
+        what = (
+            f"expected even time steps, found one of {steps_s[row]:.6g} s among steps of {step_s:.6g} s; cut the "
+            "file at a gap, export the time with more digits, or sample by a clock"
+        )
+        return what, row + 1, "time_s"
+    if displacement_um.min() == displacement_um.max():
+        what = (
+            f"expected readings that scatter, found {displacement_um[0]:.9g} um throughout; check that the sensor is "
+            "on and in range, or export more digits"
+        )
+        return what, 0, "displacement_um"
+    return None
+
+
+def _correlation_samples(residual_um: FloatArray) -> float:
+    """Samples that are worth one independent one, from autocorrelation or from batch means, whichever is more.
+
+    Slow noise that hides below white noise shows in the means of 32 batches, and not in the first autocorrelations.
+    """
+    length = len(residual_um) // _BATCHES
+    means = residual_um[: _BATCHES * length].reshape(_BATCHES, length).mean(axis=1)
+    square = float(residual_um @ residual_um) / len(residual_um)
+    batch = length * float(means @ means) / (_BATCHES - 2) / square if square > 0 else 1.0
+    return max(correlation_samples([residual_um]), batch)
+
+
+def _quantum(readings_um: FloatArray) -> float | None:
+    """Step that all distances between readings are multiples of, if there is one."""
+    levels = np.unique(readings_um)
+    steps = np.diff(levels)
+    steps = steps[steps > 64 * np.finfo(float).eps * np.abs(levels).max()]  # what rounding tells apart is one level
+    if not len(steps) or len(levels) == len(readings_um):
+        return None
+    quantum = float(steps.min())
+    multiples = np.round(steps / quantum)
+    quantum = float(steps.sum() / multiples.sum())
+    return quantum if np.all(np.abs(steps / quantum - multiples) < 0.1) else None
+
+
+def _remarks(noise: IdleNoise) -> tuple[str, ...]:
+    remarks = [
+        f"The mean of {noise.mean_um:.4g} um is an offset that zeroing the sensor removes; what enters Eq. 1 as the "
+        f"measuring error is {noise.error_um():.3g} um, twice the random part. The paper takes the average, "
+        "0.103 um, instead.",
+        f"The standard deviation is {noise.sd_um:.3g} um and no percentage: the paper's 3.18 % has no reference, and "
+        "0.0318 um would fit its band of 0.05 to 0.15 um.",
+    ]
+    if abs(noise.drift_um_per_s) > 3 * noise.drift_sd_um_per_s:
+        remarks.append(
+            f"The readings drift by {noise.drift_um_per_s:.3g} um/s, {noise.drift_um_per_s * noise.duration_s:.3g} "
+            "um over the record, so the standard deviation depends on how long one waits; "
+            "zero again from time to time."
+        )
+    if noise.duration_s < _MIN_STRETCHES * noise.correlation_s:
+        remarks.append(
+            f"The noise is correlated over {noise.correlation_s:.3g} s, which is long for a record of "
+            f"{noise.duration_s:.3g} s: the errors of mean and drift are rough; record for longer."
+        )
+    if noise.resolution_um is not None and noise.sd_um < noise.resolution_um / 2:
+        remarks.append(
+            f"The readings scatter by less than half their quantum of {noise.resolution_um:.3g} um, so their "
+            "standard deviation is not that of the noise; no less is counted than an even spread over the quantum."
+        )
+    if noise.bias_instability_s == noise.averaging_s[-1]:
+        remarks.append(
+            "The Allan deviation still falls at the longest averaging time, so the bias instability is an upper "
+            "bound; record for longer."
+        )
+    elif noise.adev_um[-1] - noise.adev_sd_um[-1] > noise.bias_instability_um:
+        remarks.append(
+            f"The Allan deviation rises beyond {noise.bias_instability_s:.3g} s: the readings wander, averaging for "
+            "longer does not help, and the mean of another record may differ by more than its error says."
+        )
+    if noise.lines:
+        named = ", ".join(f"{line.amplitude_um:.2g} um at {line.frequency_Hz:.4g} Hz" for line in noise.lines[:3])
+        more = f" and {len(noise.lines) - 3} more" if len(noise.lines) > 3 else ""
+        remarks.append(f"Narrow lines stand above the floor: {named}{more}; they do not average out as noise does.")
+    return tuple(remarks)

@@ -1,0 +1,278 @@
+"""What machining errors do to each axis: derivatives, ranking, and shares of the variance (Eq. 4 and 5)."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+import microid as m
+from fits.io._errors import DataError
+from fits.machining._design import Design
+
+# By symmetry: the motion functions of the second are those of the first (Eq. 2).
+_ALIKE: dict[m.Axis, m.Axis] = {"y": "x", "beta": "alpha"}
+_TEN_UM_MM = 0.01
+# So short a stroke that all motions are in proportion to it, to the last digit.
+_SHORT_UM = 1e-6
+_Result = TypeVar("_Result")
+
+
+def quick_jit(function: Callable[..., _Result]) -> Callable[..., _Result]:
+    """Compile fast: a call takes microseconds however it is compiled, and compiling with optimisation seconds."""
+    quick = {"xla_backend_optimization_level": 0, "xla_disable_hlo_passes": "fusion"}
+    compiled: Callable[..., _Result] = eqx.filter_jit(function, compiler_options=quick)  # type: ignore[call-overload]
+    return compiled
+
+
+@dataclass(frozen=True)
+class DimensionEffect:
+    """What an error of one dimension does to one axis, the piezo's elongation being imposed.
+
+    Attributes
+    ----------
+    name, unit, value, tolerance
+        The dimension, in mm or rad.
+    derivative
+        Of the gain, in its unit per mm or rad.
+    relative_change_pct
+        Of the output at an error of plus one tolerance, to first order.
+    relative_change_exact_pct
+        The same without linearising.
+    share_of_variance
+        Of the output, to first order; with correlated dimensions it can be negative. Zero where no tolerance has any
+        effect, otherwise the shares of an axis add up to 1.
+    output_change_per_10um
+        At the full stroke of the loaded piezo, to first order, in um or urad per 10 um of a length, or of 10 um
+        across the leg of an angle.
+    """
+
+    name: str
+    unit: str
+    value: float
+    tolerance: float
+    derivative: float
+    relative_change_pct: float
+    relative_change_exact_pct: float
+    share_of_variance: float
+    output_change_per_10um: float
+
+
+@dataclass(frozen=True)
+class AxisSensitivity:
+    """The sensitivities of one axis.
+
+    Attributes
+    ----------
+    axis
+        Its name.
+    output_unit
+        `um` or `urad`.
+    gain
+        Output per elongation of the piezo for small strokes, in `output_unit` per um.
+    loaded_stroke_um
+        Elongation of the loaded piezo at the highest voltage (Eq. 14).
+    stroke
+        Output there, in `output_unit`.
+    dimensions
+        The arguments of Eq. 5, largest relative change first.
+    rss_pct
+        Root sum of squares of the relative changes, with their correlations.
+    worst_case_pct
+        Sum of their sizes.
+    voltage_change_pct
+        Relative change of the output at plus one tolerance, to first order, the voltage being imposed instead of the
+        elongation: for every dimension that has an effect, also by the input stiffness, largest first.
+    """
+
+    axis: m.Axis
+    output_unit: str
+    gain: float
+    loaded_stroke_um: float
+    stroke: float
+    dimensions: tuple[DimensionEffect, ...]
+    rss_pct: float
+    worst_case_pct: float
+    voltage_change_pct: dict[str, float]
+
+    @property
+    def gain_unit(self) -> str:
+        """Unit of the gain: `um/um` or `urad/um`."""
+        return f"{self.output_unit}/um"
+
+    def __getitem__(self, name: str) -> DimensionEffect:
+        """Effect of a dimension by its name."""
+        for effect in self.dimensions:
+            if effect.name == name:
+                return effect
+        raise KeyError(
+            f"{self.axis} does not depend on {name!r}: choose one of "
+            f"{', '.join(effect.name for effect in self.dimensions)}"
+        )
+
+
+@dataclass(frozen=True)
+class SensitivityReport:
+    """The sensitivities of some axes by name, and the level they hold at."""
+
+    level: int
+    axes: dict[m.Axis, AxisSensitivity]
+
+    def __getitem__(self, axis: m.Axis) -> AxisSensitivity:
+        """Sensitivities of an axis by its name."""
+        return self.axes[axis]
+
+
+def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> SensitivityReport:
+    """Differentiate the motion of a stage with respect to its dimensions.
+
+    The derivatives are those of the implicit motion functions (Eq. 4, with the inverse that the paper leaves out,
+    erratum 6).
+
+    Parameters
+    ----------
+    design
+        Dimensions, tolerances and constants.
+    axes
+        Which; all by default.
+
+    Raises
+    ------
+    DataError
+        If the dimensions are such that no finite number comes out.
+    RuntimeError
+        If JAX is not in double precision.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError('sensitivities need float64: jax.config.update("jax_enable_x64", True)')
+    found: dict[m.Axis, AxisSensitivity] = {}
+    for axis in (axes,) if isinstance(axes, str) else axes:
+        if axis not in m.AXES:
+            raise DataError(f"there is no axis {axis!r}: choose some of {', '.join(m.AXES)}.")
+        alike = _ALIKE.get(axis, axis)
+        known = next((each for name, each in found.items() if _ALIKE.get(name, name) == alike), None)
+        found[axis] = _of_axis(design, alike, axis) if known is None else dataclasses.replace(known, axis=axis)
+    return SensitivityReport(design.level, found)
+
+
+class _Derived(eqx.Module):
+    """Numbers of one axis in um, mm and rad, dimensions in the order of Eq. 5."""
+
+    gain: Float[Array, ""]
+    slopes: dict[str, Float[Array, ""]]
+    loaded_stroke_um: Float[Array, ""]
+    stroke: Float[Array, ""]
+    slopes_at_full_stroke: dict[str, Float[Array, ""]]
+    by_voltage: m.Sensitivity
+
+
+@quick_jit
+def _derive(axis: m.Axis, geometry: m.Geometry, constants: m.Constants, actuation: m.Actuation) -> _Derived:
+    piezo = (actuation.free_stroke_um, constants, actuation.piezo_N_per_um)
+    full_um = m.loaded_um(axis, geometry, *piezo)
+    strokes_um = jnp.stack([jnp.full_like(full_um, _SHORT_UM), full_um])
+    found = jax.vmap(lambda stroke_um: m.sensitivity(axis, geometry, stroke_um, constants))(strokes_um)
+    return _Derived(
+        gain=found.piezo[0],
+        slopes={name: slope[0] / _SHORT_UM for name, slope in found.dimensions.items()},
+        loaded_stroke_um=full_um,
+        stroke=found.output[1],
+        slopes_at_full_stroke={name: slope[1] for name, slope in found.dimensions.items()},
+        by_voltage=m.voltage_sensitivity(axis, geometry, *piezo),
+    )
+
+
+def gains_at(design: Design, axis: m.Axis, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gain of an axis with errors of its dimensions, in um/um or rad/um, shape `(n,)`.
+
+    Parameters
+    ----------
+    design, axis
+        See `sensitivities`.
+    errors
+        In mm and rad, shape `(n, k)`; the columns are the arguments of Eq. 5 as in `microid.MOTIONS`.
+    """
+    return np.asarray(_gains(_ALIKE.get(axis, axis), design.geometry, design.constants, jnp.asarray(errors)))
+
+
+@quick_jit
+def _gains(
+    axis: m.Axis, geometry: m.Geometry, constants: m.Constants, errors: Float[Array, "n k"]
+) -> Float[Array, " n"]:
+    names = m.MOTIONS[axis].dimensions
+
+    def gain(error: Float[Array, " k"]) -> Float[Array, ""]:
+        sizes = [geometry[name] + error[i] for i, name in enumerate(names)]
+        fields = [m.DIMENSIONS[name].field for name in names]
+        changed = eqx.tree_at(lambda g: [getattr(g, field) for field in fields], geometry, sizes)
+        return m.gain(axis, changed, constants)
+
+    return jax.vmap(gain)(errors)
+
+
+def _of_axis(design: Design, alike: m.Axis, axis: m.Axis) -> AxisSensitivity:
+    """Sensitivities of an axis, computed as those of one alike."""
+    names = m.MOTIONS[axis].dimensions
+    derived = _derive(alike, design.geometry, design.constants, design.actuation)
+    tolerance = np.array([design.tolerance[name] for name in names])
+    slopes = np.array([float(derived.slopes[name]) for name in names])
+    changes = slopes * tolerance / float(derived.gain)
+    exact = gains_at(design, axis, np.diag(tolerance)) / float(derived.gain) - 1
+    by_voltage = _by_voltage(design, derived.by_voltage)
+    numbers = [*changes, *exact, *slopes, *by_voltage.values(), float(derived.stroke)]
+    if not np.all(np.isfinite(numbers)) or not derived.gain > 0:
+        raise DataError(
+            f"{axis}: expected dimensions of a stage that moves, found some that are so small or so large that no "
+            "finite number comes out; correct them."
+        )
+    scale, unit = (1e6, "urad") if m.MOTIONS[axis].unit == "rad" else (1.0, "um")
+    parts = changes * (design.correlation(names) @ changes)
+    variance = float(parts.sum())
+    effects = [
+        DimensionEffect(
+            name=name,
+            unit=m.DIMENSIONS[name].unit,
+            value=float(design.geometry[name]),
+            tolerance=float(tolerance[i]),
+            derivative=scale * float(slopes[i]),
+            relative_change_pct=100 * float(changes[i]),
+            relative_change_exact_pct=100 * float(exact[i]),
+            share_of_variance=float(parts[i]) / variance if variance > 0 else 0.0,
+            output_change_per_10um=scale * float(derived.slopes_at_full_stroke[name]) * _ten_um(design, name),
+        )
+        for i, name in enumerate(names)
+    ]
+    return AxisSensitivity(
+        axis=axis,
+        output_unit=unit,
+        gain=scale * float(derived.gain),
+        loaded_stroke_um=float(derived.loaded_stroke_um),
+        stroke=scale * float(derived.stroke),
+        dimensions=tuple(sorted(effects, key=lambda effect: -abs(effect.relative_change_pct))),
+        rss_pct=100 * math.sqrt(max(variance, 0.0)),
+        worst_case_pct=100 * float(np.abs(changes).sum()),
+        voltage_change_pct=by_voltage,
+    )
+
+
+def _ten_um(design: Design, name: str) -> float:
+    """Ten um in the unit of a dimension."""
+    leg = m.DIMENSIONS[name].leg
+    return _TEN_UM_MM if leg is None else _TEN_UM_MM / float(design.geometry[leg])
+
+
+def _by_voltage(design: Design, found: m.Sensitivity) -> dict[str, float]:
+    """Relative changes in percent of all dimensions that have any, largest first."""
+    changes = {
+        name: 100 * float(slope) * design.tolerance[name] / float(found.output)
+        for name, slope in found.dimensions.items()
+        if slope != 0
+    }
+    return dict(sorted(changes.items(), key=lambda item: -abs(item[1])))

@@ -1,0 +1,180 @@
+"""What `microid paper` does on the bench of `data_synth`: identification, feedforward, and all runs of its tables."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import data_synth
+from fits.control._compensate import compensate
+from fits.control._compensate_stage import simulate_model
+from fits.io._atomic import write_csv
+from fits.io._read_csv import read_csv
+from fits.io._record import Record, Reference
+from fits.loop._fit import fit
+from fits.loop._result import FitResult
+from fits.paper._gains import INTERVAL_s, PaperMode, paper_controller, shown_reference
+from fits.paper._loop import PaperRun, run_feedback, stacked
+from fits.stage._frequency import estimate_response, read_multisine
+from fits.stage._modal_fit import fit_response
+from microid import Preisach, positive_saturation
+
+FEEDBACK = ("HC+PID", "HC+BP-PID", "HC+CMAC-PID")
+LEVELS = 23
+# Loops are closed this long before a run begins, so that the noise they carry has found its level.
+LEAD_s = 1.0
+# What a table learns from before a tracking run: two periods and a rest each.
+TRAINING_RUNS = 6
+_STEP_s = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """What one noisy set of CSVs taught.
+
+    Attributes
+    ----------
+    fit, record
+        The piezo's hysteresis, and what it was fitted to.
+    rest_um
+        What the piezo's sensor would read at the bias, by the fit.
+    slope_um_per_V
+        The straight line of the open loop: stroke over range.
+    """
+
+    fit: FitResult
+    record: Record
+    rest_um: float
+    slope_um_per_V: float
+
+    def model_um(self) -> np.ndarray:
+        """What the fit says of the record, shape `(n,)`."""
+        return simulate_model(self.fit.model, self.record, "negative")
+
+    def feedforward_V(self, axis: data_synth.PaperAxis, reference_um: np.ndarray) -> np.ndarray:
+        """Voltage of the inverse hysteresis for a reference at the sensor, shape `(n,)` as the reference has.
+
+        The amplification is the nominal one: of its error, nothing is known ahead.
+        """
+        wanted_um = self.rest_um + np.append(0.0, reference_um) / axis.amplification
+        time_s = np.arange(len(wanted_um), dtype=float) * INTERVAL_s
+        found = compensate(self.fit.model, Reference(time_s, wanted_um, source="reference"), "positive", clip=True)
+        return found.voltage_V[1:]
+
+
+def identify(piezo: data_synth.PaperPiezo, seeds: list[np.random.Generator], folder: Path) -> list[Identified]:
+    """Measure the piezo once per generator, through a CSV, and fit its hysteresis."""
+    found = []
+    for rng in seeds:
+        path = folder / "loops.csv"
+        write_csv(path, data_synth.paper_loops(piezo, data_synth.PaperSensor(), rng))
+        record = read_csv(path)
+        result = fit([record], levels=LEVELS, holdout=0.0, initial="negative")
+        assert record.displacement_um is not None
+        slope = float(np.ptp(record.displacement_um) / np.ptp(record.voltage_V))
+        rest = _at_bias(result.model, jnp.asarray([data_synth.PAPER_BIAS_V]))
+        found.append(Identified(result, record, float(rest[0]), slope))
+    return found
+
+
+@eqx.filter_jit
+def _at_bias(model: Preisach, voltage_V: Float[Array, " n"]) -> Float[Array, " n"]:
+    return model(voltage_V, positive_saturation(model.density.lower_V, model.density.upper_V))
+
+
+def identify_modes(
+    axis: data_synth.PaperAxis, piezo: data_synth.PaperPiezo, count: int, rng: np.random.Generator, folder: Path
+) -> list[PaperMode]:
+    """Measure the response of an axis `count` times, through a CSV, and fit its mode."""
+    found = []
+    for columns in data_synth.paper_responses(axis, piezo, data_synth.PaperSensor(), count, rng):
+        path = folder / "response.csv"
+        write_csv(path, columns)
+        modes = fit_response(estimate_response(read_multisine(path)), modes=1).model
+        omega = 2 * np.pi * float(modes.natural_frequency_Hz[0])
+        gain = float(modes.static_gain_um_per_V[0, 0])
+        found.append(PaperMode(omega, float(modes.damping_ratio[0]), gain))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class PaperStand:
+    """One axis with everything that was identified for it.
+
+    Attributes
+    ----------
+    axis, piezo
+        What is on the bench.
+    identified, modes
+        By seed.
+    """
+
+    axis: data_synth.PaperAxis
+    piezo: data_synth.PaperPiezo
+    identified: list[Identified]
+    modes: list[PaperMode]
+
+    def bench(self, rng: np.random.Generator | None) -> data_synth.PaperBench:
+        """A bench per seed; without a generator, with a sensor that sees everything."""
+        return data_synth.PaperBench(
+            self.axis, self.piezo, rng=rng, benches=len(self.identified), interval_s=INTERVAL_s
+        )
+
+    def track(self, scheme: str, rng: np.random.Generator) -> PaperRun:
+        """The tracking run of Tables 3 and 4."""
+        reference_um = data_synth.paper_reference_um(self.axis, INTERVAL_s)
+        bench = self.bench(rng)
+        if scheme == "OPEN":
+            lines = [
+                data_synth.PAPER_BIAS_V + reference_um / self.axis.amplification / one.slope_um_per_V
+                for one in self.identified
+            ]
+            return PaperRun(reference_um, *bench.run(np.stack(lines)), np.stack(lines))
+        lead_V = np.stack([one.feedforward_V(self.axis, reference_um) for one in self.identified])
+        if scheme == "HC":
+            return PaperRun(reference_um, *bench.run(lead_V), lead_V)
+        # At the bias loops close where they begin, so that every period asks for the same voltages.
+        begin = round(self.axis.rest_s / INTERVAL_s)
+        period = np.arange(begin, begin + round(data_synth.PAPER_PERIOD_s / INTERVAL_s))
+        rest = np.zeros(round(LEAD_s / INTERVAL_s), dtype=int)
+        training = [period, period, rest] * TRAINING_RUNS if scheme == "HC+CMAC-PID" else []
+        order = np.concatenate([rest, *training, np.arange(len(reference_um))])
+        controllers = stacked(
+            lambda k: paper_controller(scheme, self.modes[k], k, data_synth.PAPER_SWING_um, False), len(self.modes)
+        )
+        run = run_feedback(controllers, bench, reference_um[order], lead_V[:, order])
+        return run.last(len(reference_um))
+
+    def step(self, scheme: str, rng: np.random.Generator | None) -> PaperRun:
+        """The step of Table 2, which begins with the first sample."""
+        target_um = data_synth.PAPER_STEP_um
+        samples, rest = round(_STEP_s / INTERVAL_s), round(LEAD_s / INTERVAL_s)
+        reference_um = np.concatenate([np.zeros(rest), np.full(samples, target_um)])
+        lead_V = np.stack([one.feedforward_V(self.axis, reference_um) for one in self.identified])
+        bench = self.bench(rng)
+        if scheme == "HC":
+            return PaperRun(reference_um, *bench.run(lead_V), lead_V).last(samples)
+        controllers = stacked(lambda k: paper_controller(scheme, self.modes[k], k, target_um, True), len(self.modes))
+        shown = np.stack([shown_reference(scheme, mode, reference_um) for mode in self.modes])
+        return run_feedback(controllers, bench, reference_um, lead_V, shown).last(samples)
+
+
+def compensated(one: Identified, piezo: data_synth.PaperPiezo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A full slow loop of the piezo under its inverse, for Fig. 9: what was wanted, the voltage, and what came of it.
+
+    All of shape `(n,)`, in um, V and um.
+    """
+    model = one.fit.model
+    lowest_um = float(model.offset_um)
+    ramp_um = np.linspace(lowest_um, lowest_um + piezo.stroke_um, 1501)
+    wanted_um = np.concatenate([ramp_um, ramp_um[-2::-1]])
+    reference = Reference(np.arange(len(wanted_um), dtype=float) * 0.02, wanted_um, source="reference")
+    voltage_V = compensate(model, reference, "negative", clip=True).voltage_V
+    reached, states = [], piezo.radii_V
+    for value in voltage_V.tolist():
+        elongation_um, states = piezo.glide(np.array([value]), states)
+        reached.append(float(elongation_um[0]))
+    return wanted_um - lowest_um, voltage_V, np.array(reached)

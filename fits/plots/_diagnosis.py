@@ -1,0 +1,193 @@
+"""The pictures of a diagnosis, as SVG that stands in a page.
+
+Each is drawn twice, for a wide column and for a phone, so that its text is never scaled away; the page shows one.
+"""
+
+import html
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from io import StringIO
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from fits.diagnosis._result import Diagnosis, Experiment, RunView
+from fits.diagnosis._views import VIEWS
+from fits.diagnosis._words import Lengths
+from fits.plots._style import figure, label, verbatim
+
+# Colours of Okabe and Ito, which colour-blind readers can tell apart.
+BEFORE, AFTER = "#d55e00", "#0072b2"
+NOISE, ASIDE, INK = "#d9dde2", "#f4f1e4", "#22272e"
+# Width of the column and of a phone, in CSS pixels over 96.
+_WIDE_in, _NARROW_in = 7.3, 3.4
+_FONT_pt = 8.5
+# Points of all curves of one picture together.
+_POINTS = 5000
+# More runs than this make a page that nobody scrolls through.
+_MOST_RUNS = 6
+# Half-width of the band of the noise, in standard deviations.
+_BAND = 2.0
+_HEAD = re.compile(r"^.*?(?=<svg)", re.DOTALL)
+_IDS = re.compile(r'( id="|href="#|url\(#)')
+_DIGITS = re.compile(r"(\d\.\d)\d+")
+_PATHS = re.compile(r' d="[^"]*"')
+_SIZE = re.compile(r'(<svg[^>]*?) width="[^"]*"')
+_HEIGHT = re.compile(r'(<svg[^>]*?) height="[^"]*"')
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture in both widths, and what it is about, in words, for those who cannot see it."""
+
+    wide: str
+    narrow: str
+
+
+def _drawn(name: str, words: str, draw: Callable[[float], Figure]) -> Picture:
+    return Picture(*(_svg(draw(width), f"{name}-{width:.0f}-", words) for width in (_WIDE_in, _NARROW_in)))
+
+
+def _svg(picture: Figure, prefix: str, words: str) -> str:
+    """Write a figure as one `svg` element whose names do not meet those of other figures."""
+    for axes in picture.axes:
+        axes.tick_params(width=0.6, length=2.5, color=INK)
+        for spine in axes.spines.values():
+            spine.set_linewidth(0.6)
+            spine.set_color(INK)
+    for each in picture.findobj(Text):
+        each.set_fontsize(_FONT_pt)
+        if each.get_color() in ("black", "k"):
+            each.set_color(INK)
+    out = StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": prefix}):
+        nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
+        picture.savefig(out, format="svg", metadata=nothing, transparent=True)
+    text = _HEAD.sub("", out.getvalue(), count=1)
+    text = _IDS.sub(lambda found: found[1] + prefix, text)
+    # A tenth of a point is finer than any screen.
+    text = _PATHS.sub(lambda found: _DIGITS.sub(r"\1", found[0]).replace("\n", ""), text)
+    text = _HEIGHT.sub(r"\1", _SIZE.sub(r"\1", text, count=1), count=1)
+    return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(words)}"', 1).strip()
+
+
+def _envelope(values: np.ndarray, points: int) -> np.ndarray:
+    """Choose samples that look like all of them: the extremes of even stretches, and the ends; increasing indices."""
+    n = len(values)
+    if n <= points:
+        return np.arange(n)
+    chosen = [0, n - 1]
+    for stretch in np.array_split(np.arange(n), max(points // 2, 1)):
+        known = stretch[np.isfinite(values[stretch])]
+        if known.size:
+            chosen += [known[np.argmin(values[known])], known[np.argmax(values[known])]]
+    return np.unique(chosen)
+
+
+def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
+    """Choose the runs with the largest residuals, in their order."""
+    runs = [run for run in runs if run.time_s.size > 1]
+    sizes = [np.nanmean(run.before_um**2) if np.isfinite(run.before_um).any() else 0.0 for run in runs]
+    keep = sorted(np.argsort(sizes)[::-1][:_MOST_RUNS])
+    return [runs[k] for k in keep]
+
+
+def residuals(diagnosis: Diagnosis, length: Lengths) -> Picture | None:
+    """Residual of the plain and the extended stage over time; None where there are no runs."""
+    runs = shown_runs(diagnosis.runs)
+    if not runs:
+        return None
+    points = max(_POINTS // (2 * len(runs)), 200)
+    extended = bool(diagnosis.causes)
+
+    def draw(width_in: float) -> Figure:
+        picture = figure(width_in, 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0))
+        panels = picture.subplots(len(runs), 1, sharey=True, squeeze=False)[:, 0]
+        for axes, run in zip(panels, runs, strict=True):
+            _set_aside(axes, run)
+            band = _BAND * diagnosis.noise_um * length.per_um
+            if np.isfinite(band):
+                axes.axhspan(-band, band, color=NOISE, linewidth=0)
+            curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if extended else [])
+            for values, colour, line in curves:
+                keep = _envelope(values, points)
+                axes.plot(run.time_s[keep], length.per_um * values[keep], color=colour, linewidth=line)
+            if np.isfinite(band):
+                # Over the curves, which else hide the band.
+                for edge in (-band, band):
+                    axes.axhline(edge, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=3)
+            axes.set_xlim(run.time_s[0], run.time_s[-1])
+            axes.set_title(verbatim(run.source, int(12 * width_in)), loc="left")
+            label(axes, y=f"residual ({length.unit})" if len(runs) < 3 or width_in == _WIDE_in else length.unit)
+        label(panels[-1], "time (s)")
+        return picture
+
+    return _drawn("residuals", "Residual over time before and after the extension, with the band of the noise", draw)
+
+
+def _set_aside(axes: Axes, run: RunView) -> None:
+    """Shade what was not used for the fit."""
+    aside = np.concatenate([[False], ~np.asarray(run.fitted, bool), [False]])
+    begins, ends = (np.flatnonzero(np.diff(aside.astype(int)) == sign) for sign in (1, -1))
+    # Single samples without a value are not what was held out.
+    for begin, end in zip(begins, ends, strict=True):
+        if end - begin > 0.01 * run.time_s.size:
+            axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
+
+
+def fingerprint(diagnosis: Diagnosis, name: str, length: Lengths, number: int) -> tuple[Picture, str] | None:
+    """The residual against the variable that shows an effect, and what is drawn in words; None without runs."""
+    found = next((view for view in VIEWS if name in view.effects), VIEWS[-1])
+    try:
+        seen = found.look(diagnosis.runs, length.per_um)
+    except ValueError:
+        found = VIEWS[-1]
+        try:
+            seen = found.look(diagnosis.runs, length.per_um)
+        except ValueError:
+            return None
+    view, extended = found, bool(diagnosis.causes)
+
+    def draw(width_in: float) -> Figure:
+        picture = figure(width_in, 2.7 if width_in == _WIDE_in else 2.5)
+        axes = picture.subplots()
+        if not view.spectrum:
+            axes.axhline(0.0, color=INK, linewidth=0.5)
+        for curve in seen:
+            if curve.after and not extended:
+                continue
+            colour = AFTER if curve.after else BEFORE
+            if curve.low is not None and curve.high is not None:
+                axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.14, linewidth=0)
+            style = "--" if curve.downwards else "-"
+            axes.plot(curve.x, curve.y, color=colour, linewidth=1.3, linestyle=style)
+        if view.logarithmic:
+            axes.set_xscale("log")
+        if view.spectrum:
+            axes.set_yscale("log")
+        label(axes, view.x_label, f"{view.y_label} ({length.unit}{view.per})")
+        return picture
+
+    words = f"{view.y_label.capitalize()} against {view.x_label}, before and after the extension"
+    return _drawn(f"fingerprint{number}", words, draw), view.caption
+
+
+def program(ahead: Experiment) -> Picture | None:
+    """The voltage of the next experiment; None where it has no samples."""
+    if ahead.time_s.size < 2:
+        return None
+
+    def draw(width_in: float) -> Figure:
+        picture = figure(width_in, 2.0)
+        axes = picture.subplots()
+        keep = _envelope(ahead.voltage_V, _POINTS // 2)
+        axes.plot(ahead.time_s[keep], ahead.voltage_V[keep], color=INK, linewidth=0.9)
+        axes.set_xlim(ahead.time_s[0], ahead.time_s[-1])
+        label(axes, "time (s)", "voltage (V)")
+        return picture
+
+    return _drawn("program", "Voltage of the next experiment over time", draw)

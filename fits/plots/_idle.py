@@ -1,0 +1,102 @@
+"""A picture of the measuring error, as the paper's Fig. 8 with what it leaves out."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from fits.io._record import Reference
+from fits.machining._idle import IdleNoise
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned, verbatim
+
+_MOST_LINES = 5
+
+
+def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[str]) -> list[Path]:
+    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
+
+    Parameters
+    ----------
+    reference
+        What `idle_noise` was given.
+    noise
+        From `idle_noise`.
+    folder
+        Existing folder for `idle.png`; 200 dots per inch.
+
+    Returns
+    -------
+    list of Path
+        The file written.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be written.
+    """
+    picture = figure(WIDE_in, 4.8, gap=0.08)
+    grid = picture.add_gridspec(2, 8)
+    readings = picture.add_subplot(grid[0, :7])
+    histogram = picture.add_subplot(grid[0, 7], sharey=readings)
+    spectrum, allan = picture.add_subplot(grid[1, :4]), picture.add_subplot(grid[1, 4:])
+    _draw_readings(readings, histogram, reference, noise)
+    _draw_spectrum(spectrum, noise)
+    _draw_allan(allan, noise)
+    titles = {readings: verbatim(reference.source) or "readings", spectrum: "spectrum", allan: "Allan deviation"}
+    for axes, title in titles.items():
+        axes.set_title(title, loc="left", fontsize=7)
+    legend(picture, (readings,))
+    return [save(picture, Path(folder) / "idle.png")]
+
+
+def _draw_readings(axes: Axes, margin: Axes, reference: Reference, noise: IdleNoise) -> None:
+    values = reference.displacement_um
+    keep = thinned(values)
+    axes.plot(reference.time_s[keep], values[keep], label="readings", **MEASURED | {"linewidth": 0.4})
+    half = noise.error_um()
+    for level in (noise.mean_um - half, noise.mean_um, noise.mean_um + half):
+        style = "-" if level == noise.mean_um else ":"
+        name = {noise.mean_um: "offset", noise.mean_um + half: "offset ± measuring error"}.get(level, "")
+        for each in (axes, margin):
+            each.axhline(level, color=DARK, linestyle=style, linewidth=0.8, label=name)
+    label(axes, "time (s)", "displacement (µm)")
+    margin.hist(values, _edges(noise, values), orientation="horizontal", color=LIGHT)
+    margin.tick_params(labelleft=False)
+    margin.set_xticks([])
+    label(margin, "count")
+
+
+def _edges(noise: IdleNoise, values: np.ndarray) -> list[float]:
+    """Bins of the histogram: of whole quanta where readings have one, so that no bin is empty by construction."""
+    low, high = float(values.min()), float(values.max())
+    width = (high - low) / min(40.0, np.sqrt(len(values)))
+    if noise.resolution_um is None:
+        return np.arange(low, high + width, width).tolist()
+    width = noise.resolution_um * np.ceil(width / noise.resolution_um)
+    return np.arange(low - noise.resolution_um / 2, high + width, width).tolist()
+
+
+def _draw_spectrum(axes: Axes, noise: IdleNoise) -> None:
+    density = noise.asd_um_per_rtHz
+    keep = thinned(density)
+    axes.loglog(noise.frequency_Hz[keep], density[keep], **MODEL)
+    at_Hz = [line.frequency_Hz for line in noise.lines[:_MOST_LINES]]
+    if at_Hz:
+        tops = [float(density[np.argmin(np.abs(noise.frequency_Hz - each))]) for each in at_Hz]
+        axes.plot(at_Hz, tops, "v", color=DARK, markersize=3.5)
+        for x, y in zip(at_Hz, tops, strict=True):
+            axes.annotate(f"{x:.4g} Hz", (x, y), (3, 1), textcoords="offset points", fontsize=6)
+    label(axes, "frequency (Hz)", "amplitude density (µm/√Hz)")
+
+
+def _draw_allan(axes: Axes, noise: IdleNoise) -> None:
+    time_s, deviation, sd = noise.averaging_s, noise.adev_um, noise.adev_sd_um
+    axes.loglog(time_s, deviation, **MODEL | {"linewidth": 1.0})
+    seen = deviation > 0
+    low = np.maximum(deviation - sd, 0.1 * deviation)
+    axes.fill_between(time_s[seen], low[seen], (deviation + sd)[seen], color=LIGHT, linewidth=0)
+    axes.plot(time_s, deviation[0] * np.sqrt(time_s[0] / time_s), ":", color=DARK, linewidth=0.8, label="white noise")
+    axes.plot(noise.bias_instability_s, noise.bias_instability_um, "o", color=DARK, markersize=3, label="minimum")
+    axes.legend(frameon=False)
+    label(axes, "averaging time (s)", "Allan deviation (µm)")

@@ -1,0 +1,297 @@
+"""Pictures of what machining errors do: tornado plots, and the curves of the paper's Fig. 7."""
+
+import dataclasses
+import os
+import re
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+
+import microid as m
+from fits.machining._claims import Claim, paper_claims
+from fits.machining._design import Design, paper_design
+from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at
+from fits.plots._style import DARK, LIGHT, WIDE_in, figure, label, legend, save
+
+AXIS_SIGNS: dict[m.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamma": r"$\gamma$"}
+UNIT_SIGNS = {"um": "µm", "urad": "µrad"}
+# Odd, so that the nominal dimensions are among the steps.
+_STEPS = 41
+_COLUMNS = 2
+# Of the height of a panel: the least distance of two labels.
+_LABEL_GAP = 0.085
+_PANEL_in, _LINE_in = 2.3, 0.125
+_SMALL_pt = 6
+_CHARACTERS = 64
+_DIMENSION = re.compile(rf"\b(?:{'|'.join({name for motion in m.MOTIONS.values() for name in motion.dimensions})})\b")
+
+
+_LEADER: dict[str, Any] = {
+    "arrowstyle": "-",
+    "color": "0.5",
+    "linewidth": 0.4,
+    "shrinkA": 1.5,
+    "shrinkB": 0,
+    "relpos": (0, 0.5),
+    "patchA": None,
+}
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """One motion, or two that are alike.
+
+    Attributes
+    ----------
+    axis
+        Sensitivities of the first.
+    title
+        Names of all.
+    curves
+        Relative change of the output by dimension over the steps of its error, from minus to plus one tolerance,
+        each of shape `(s,)`.
+    """
+
+    axis: AxisSensitivity
+    title: str
+    curves: dict[str, NDArray[np.float64]]
+
+
+def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os.PathLike[str]) -> list[Path]:
+    """Draw which dimensions matter, and the output error over the machining error of each (Fig. 7).
+
+    Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel.
+
+    Parameters
+    ----------
+    design, report
+        What `sensitivities` was given, and what it found.
+    folder
+        Existing folder for `tornado.png` and `machining_error.png`; 200 dots per inch.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be written.
+    """
+    panels = _panels(design, report)
+    claims = paper_claims(design) if _is_the_papers(design) else ()
+    return [
+        save(_tornado(panels), Path(folder) / "tornado.png"),
+        save(_machining_error(design, panels, claims), Path(folder) / "machining_error.png"),
+    ]
+
+
+def _panels(design: Design, report: SensitivityReport) -> list[_Panel]:
+    panels: list[_Panel] = []
+    left = list(report.axes.values())
+    while left:
+        first = left[0]
+        names = [each.axis for each in left if dataclasses.replace(each, axis=first.axis) == first]
+        left = [each for each in left if each.axis not in names]
+        title = ", ".join(AXIS_SIGNS.get(name, name) for name in names)
+        panels.append(_Panel(first, title, _curves(design, first.axis)))
+    return panels
+
+
+def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
+    names = m.MOTIONS[axis].dimensions
+    shares = np.linspace(-1, 1, _STEPS)
+    errors = np.concatenate([np.outer(shares, row) for row in np.diag([design.tolerance[name] for name in names])])
+    gains = gains_at(design, axis, errors).reshape(len(names), _STEPS)
+    nominal = gains[0, _STEPS // 2]
+    return {name: gains[i] / nominal - 1 for i, name in enumerate(names)}
+
+
+def _is_the_papers(design: Design) -> bool:
+    paper = paper_design()
+    same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
+    return same and design.guides == paper.guides and design.tolerance == paper.tolerance
+
+
+def _tornado(panels: Sequence[_Panel]) -> Figure:
+    rows = [len(panel.axis.dimensions) for panel in panels]
+    picture = figure(WIDE_in, 0.75 + 0.17 * sum(rows) + 0.3 * len(rows))
+    column = np.atleast_1d(picture.subplots(len(panels), 1, sharex=True, height_ratios=[n + 0.6 for n in rows]))
+    for axes, panel in zip(column, panels, strict=True):
+        _draw_bars(axes, panel)
+        axes.tick_params(axis="x", labelbottom=axes is column[-1])
+    reach = 1.06 * max(np.abs(panel.axis.dimensions[0].relative_change_pct) for panel in panels) or 1.0
+    column[-1].set_xlim(-reach, reach)
+    label(column[-1], x="change of the output at a fixed elongation of the piezo (%)")
+    legend(picture, column[:1])
+    return picture
+
+
+def _draw_bars(axes: Axes, panel: _Panel) -> None:
+    effects = panel.axis.dimensions
+    places = range(len(effects))
+    changes = np.array([effect.relative_change_pct for effect in effects])
+    exact = 100 * np.array([panel.curves[effect.name][[0, -1]] for effect in effects])
+    plain: dict[str, Any] = {"height": 0.72, "linewidth": 0.4, "edgecolor": DARK}
+    axes.barh(places, changes, color="0.45", label="plus one tolerance, first order", **plain)
+    axes.barh(places, -changes, color="0.9", label="minus one tolerance, first order", **plain)
+    marks: dict[str, Any] = {"linestyle": "none", "markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
+    axes.plot(exact[:, 1], places, marker="D", label="plus, exact", markerfacecolor="0.0", **marks)
+    axes.plot(exact[:, 0], places, marker="D", label="minus, exact", markerfacecolor="1.0", **marks)
+    axes.axvline(0, color=DARK, linewidth=0.6)
+    axes.set_ylim(len(effects) - 0.4, -0.6)
+    axes.set_yticks(places, [f"{symbol(effect.name)} ± {_tolerance(effect)}" for effect in effects])
+    for place, effect in zip(places, effects, strict=True):
+        words = _signed(f"{effect.relative_change_pct:+.3f} %")
+        axes.text(1.10, place, words, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
+        share = _signed(f"{100 * effect.share_of_variance:.1f} %")
+        axes.text(1.20, place, share, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
+    for x, words in ((1.10, "change"), (1.20, "share of\nvariance")):
+        axes.text(x, 1.0, words, transform=axes.transAxes, ha="right", va="bottom", fontsize=_SMALL_pt)
+    axis = panel.axis
+    title = f"{panel.title}: root sum of squares {axis.rss_pct:.2f} %, worst case {axis.worst_case_pct:.2f} %"
+    axes.set_title(title, loc="left", fontsize=8)
+    label(axes)
+    axes.tick_params(axis="y", length=0)
+
+
+def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[Claim]) -> Figure:
+    """Fig. 7: panels in two columns, each with its claims below."""
+    columns = min(_COLUMNS, len(panels))
+    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    words = {panel.title: _claim_lines(panel, claims) for panel in panels}
+    heights = [
+        height
+        for row in rows
+        for height in (_PANEL_in, _LINE_in * max(1, *(len(words[panel.title]) for panel in row)))
+    ]
+    picture = figure(WIDE_in * (1 if columns > 1 else 0.55), sum(heights) + 0.55 * len(rows) + 0.25, gap=0.06)
+    grid = picture.add_gridspec(2 * len(rows), columns, height_ratios=heights)
+    for k, panel in enumerate(panels):
+        row, column = divmod(k, columns)
+        axes = picture.add_subplot(grid[2 * row, column])
+        _draw_curves(axes, design, panel)
+        unit = UNIT_SIGNS[panel.axis.output_unit]
+        axes.set_title(f"({'abcdef'[k]}) {panel.title}: full stroke {plain(panel.axis.stroke)} {unit}", loc="left")
+        axes.title.set_fontsize(8)
+        below = picture.add_subplot(grid[2 * row + 1, column])
+        below.set_axis_off()
+        _write(below, words[panel.title])
+    kinds = [picture.axes[0].plot([], [], style, color="0.0", linewidth=0.8)[0] for style in ("-", "--")]
+    names = ["length", "angle, by the error across its leg"]
+    picture.legend(kinds, names, loc="outside upper center", ncols=2, frameon=False)
+    return picture
+
+
+def _draw_curves(axes: Axes, design: Design, panel: _Panel) -> None:
+    unit = UNIT_SIGNS[panel.axis.output_unit]
+    effects = sorted(panel.axis.dimensions, key=lambda effect: panel.curves[effect.name][-1])
+    curves = {effect.name: panel.axis.stroke * panel.curves[effect.name] for effect in effects}
+    ends_mm = {effect.name: _length_mm(design, effect) for effect in effects}
+    widest_mm = max(ends_mm.values()) or 1.0
+    reach = 1.08 * max(float(np.abs(curve).max()) for curve in curves.values()) or 1.0
+    axes.set_xlim(-widest_mm, widest_mm)
+    axes.set_ylim(-reach, reach)
+    axes.axhline(0, color=LIGHT, linewidth=0.6)
+    axes.axvline(0, color=LIGHT, linewidth=0.6)
+    gap = _LABEL_GAP * 2 * reach
+    heights = _apart(np.array([curve[-1] for curve in curves.values()]), gap)
+    for effect, height in zip(effects, heights, strict=True):
+        curve, end_mm = curves[effect.name], ends_mm[effect.name]
+        style = "-" if effect.unit == "mm" else "--"
+        leads = effect.name == panel.axis.dimensions[0].name
+        axes.plot(end_mm * np.linspace(-1, 1, _STEPS), curve, style, color="0.0", linewidth=1.4 if leads else 0.8)
+        axes.annotate(
+            f"{symbol(effect.name)}  {_signed(f'{curve[-1]:+#.3g}'.rstrip('.'))}",
+            (end_mm, curve[-1]),
+            (1.07, height),
+            textcoords=axes.get_yaxis_transform(),
+            va="center",
+            fontsize=7,
+            arrowprops=_LEADER,
+        )
+    label(axes, "machining error (mm)", f"output error ({unit})")
+
+
+def _apart(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
+    """Places nearest to increasing ones, at least a gap from each other."""
+    steps = gap * np.arange(len(wanted))
+    return np.asarray(isotonic_regression(wanted - steps).x) + steps
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line of words in a colour, with a verdict in bold before them where there is one."""
+
+    words: str
+    color: str = DARK
+    verdict: str = ""
+
+
+def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[_Line]:
+    """What the paper says of a motion, each with our verdict and the figures for it."""
+    lines: list[_Line] = []
+    for claim in claims:
+        # One on several motions stands below the last of them.
+        if panel.axis.axis in claim.axes and (panel.axis.axis == claim.axes[0]) == (len(claim.axes) < 3):
+            reason = claim.reason.partition(". ")[0].rstrip(".")
+            room = " " * len(f"{claim.verdict}: ")
+            first, *more = textwrap.wrap(claim.statement, _CHARACTERS, initial_indent=room, subsequent_indent="   ")
+            lines.append(_Line(first[len(room) :], verdict=claim.verdict))
+            lines += [_Line(line) for line in more]
+            lines += [_Line(f"   {line}", "0.4") for line in textwrap.wrap(reason, _CHARACTERS - 3)]
+    return [_Line("The paper's reading of its Fig. 7, and this stage:"), *lines] if lines else []
+
+
+def _write(axes: Axes, lines: Sequence[_Line]) -> None:
+    for k, line in enumerate(lines):
+        words = _with_symbols(line.words)
+        if line.verdict:
+            words = rf"$\bf{{{line.verdict}}}$: {words}"
+        place: dict[str, Any] = {"xy": (0, 1), "xytext": (0, -72 * _LINE_in * k), "textcoords": "offset points"}
+        axes.annotate(words, **place, xycoords="axes fraction", va="top", fontsize=_SMALL_pt, color=line.color)
+
+
+def _with_symbols(words: str) -> str:
+    """Words with the symbols of dimensions and axes."""
+    found = _DIMENSION.sub(lambda name: symbol(name[0]), _signed(words))
+    return re.sub(r"\balpha\b", r"$\\alpha$", found)
+
+
+def _signed(words: str) -> str:
+    """Words with minus signs before numbers, where there were hyphens."""
+    return re.sub(r"-(?=\d)", "\N{MINUS SIGN}", words)
+
+
+def symbol(name: str) -> str:
+    """Symbol of a dimension as the paper prints it."""
+    stem = name.rstrip("0123456789")
+    index = name[len(stem) :]
+    stem, index = ("l", f"a{index}") if stem == "la" else (stem, index)
+    stem = rf"\{stem}" if stem == "alpha" else stem
+    return f"${stem}_{{{index}}}$" if index else f"${stem}$"
+
+
+def plain(number: float, digits: int = 4) -> str:
+    """Significant digits, or whole numbers where these are more, without an exponent for large ones."""
+    return f"{number:.{digits}g}" if abs(number) < 10**digits else f"{number:.0f}"
+
+
+def _tolerance(effect: DimensionEffect) -> str:
+    unit, scale = ("mrad", 1e3) if effect.unit == "rad" else ("µm", 1e3)
+    return f"{scale * effect.tolerance:.3g} {unit}"
+
+
+def _length_mm(design: Design, effect: DimensionEffect) -> float:
+    """Tolerance as a length: of an angle, that of the end of its leg."""
+    leg = m.DIMENSIONS[effect.name].leg
+    return effect.tolerance * (1.0 if leg is None else float(design.geometry[leg]))

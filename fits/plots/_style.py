@@ -1,0 +1,89 @@
+"""The look of all pictures, set on the figures themselves: Matplotlib's own settings stay as the user has them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.text import Text
+
+from fits.io._atomic import atomic_path
+from fits.io._printable import printable
+
+# One and two columns of a journal, 90 mm and 180 mm.
+NARROW_in, WIDE_in = 3.54, 7.09
+DARK, LIGHT = "0.1", "0.75"
+MEASURED: dict[str, Any] = {"color": "0.65", "linewidth": 1.5}
+MODEL: dict[str, Any] = {"color": "0.0", "linewidth": 0.5}
+_FONT_pt = 8
+_DPI = 200
+# More points than this do not show at this size.
+_POINTS = 6000
+
+
+def figure(width_in: float, height_in: float, gap: float = 0.02) -> Figure:
+    """Make an empty figure with a canvas of its own, and a gap between columns as a fraction of their width."""
+    made = Figure(figsize=(width_in, height_in), layout=ConstrainedLayoutEngine(wspace=gap, compress=True))
+    FigureCanvasAgg(made)
+    return made
+
+
+def label(axes: Axes, x: str = "", y: str = "") -> None:
+    """Name the axes, where there is a name; the frame is open at the top and right."""
+    axes.set_xlabel(x or axes.get_xlabel())
+    axes.set_ylabel(y or axes.get_ylabel())
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def verbatim(text: str, most: int = 60) -> str:
+    """Let a text from outside, such as a file's name, be drawn as it is: `$` starts no formula, and it fits."""
+    cut = text if len(text) <= most else f"…{text[1 - most :]}"
+    return printable(cut).replace("$", r"\$")
+
+
+def legend(picture: Figure, axes: Iterable[Axes]) -> None:
+    """Explain the curves of some axes in one line above the picture."""
+    curves, names = [], []
+    for each in axes:
+        found = each.get_legend_handles_labels()
+        curves += found[0]
+        names += found[1]
+    picture.legend(curves, names, loc="outside upper center", ncols=len(names), frameon=False, handlelength=1.8)
+
+
+def thinned(values: np.ndarray) -> np.ndarray:
+    """Choose samples that look like all of them: the extremes of even stretches, and the ends.
+
+    Parameters
+    ----------
+    values
+        Shape `(n,)`.
+
+    Returns
+    -------
+    ndarray
+        Increasing indices, at most some thousands.
+    """
+    n = len(values)
+    if n <= _POINTS:
+        return np.arange(n)
+    stretches = np.array_split(np.arange(n), _POINTS // 2)
+    extremes = [(s[np.argmin(values[s])], s[np.argmax(values[s])]) for s in stretches]
+    return np.unique(np.concatenate([np.ravel(extremes), [0, n - 1]]))
+
+
+def save(picture: Figure, path: Path) -> Path:
+    """Write a figure, whole or not at all."""
+    for axes in picture.axes:
+        axes.tick_params(labelsize=_FONT_pt, width=0.6, length=2.5)
+        for spine in axes.spines.values():
+            spine.set_linewidth(0.6)
+    for text in picture.findobj(Text):
+        text.set_fontsize(min(_FONT_pt, text.get_fontsize()))
+    with atomic_path(path) as unfinished:
+        picture.savefig(unfinished, dpi=_DPI)
+    return path

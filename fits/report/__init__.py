@@ -1,0 +1,1 @@
+"""Texts, JSON and HTML of what the other rooms computed."""

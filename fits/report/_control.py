@@ -1,0 +1,203 @@
+"""What is told of a closed loop: figures of a run, of its tuning and of its margins."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.control._gains import printed_gains
+from fits.control._make import Loop, Made
+from fits.control._tune_result import Tuning
+from microid import (
+    ControlledRun,
+    Margins,
+    Stage,
+    Start,
+    step_metrics,
+    tracking_errors,
+)
+
+SCHEMA = "microid.control/1"
+
+
+def control_json(
+    loop: Loop,
+    made: Made,
+    run: ControlledRun,
+    about: Mapping[str, Any],
+    remarks: Sequence[str],
+) -> dict[str, Any]:
+    """Gather all that is told, as JSON values; what is infinite is None.
+
+    Parameters
+    ----------
+    loop, made, run
+        What was closed, by which controller, and what came of it.
+    about
+        More to put in front.
+    remarks
+        What is known already; more may follow.
+    """
+    kept = slice(loop.skip, None)
+    wanted, moved, command = (np.asarray(x) for x in (run.reference_um, run.displacement_um, run.command_V))
+    error = np.asarray(run.error_um)[kept]
+    rms = _rms(error)
+    sensor = {"noise": loop.noise_um, "resolution": loop.resolution_um or 0.0}
+    said = list(remarks)
+    below = [f"{name}, {size:.3g} um" for name, size in sensor.items() if 0 < rms < size]
+    if below:
+        said.append(
+            f"the error, {rms:.3g} um rms, is that of the model's own displacement and below the sensor's "
+            f"{' and its '.join(below)}: a bench cannot show it in single readings"
+        )
+    every = loop.margins(made.controller)
+    return {
+        "schema": SCHEMA,
+        **about,
+        "samples": len(wanted),
+        "interval_s": loop.ready.interval_s,
+        "gains": _gains(made),
+        "tuning": None if made.tuning is None else _tuning(made.tuning),
+        "margins": _margins(every[0]),
+        "margins_worst": _worst(every),
+        "tracking": _tracking(wanted[kept], moved[kept]),
+        "without_feedback": _without(loop, wanted, kept),
+        "step": _step(np.asarray(run.time_s), wanted, moved),
+        "command_min_V": _finite(command.min()),
+        "command_max_V": _finite(command.max()),
+        "noise_um": loop.noise_um,
+        "resolution_um": loop.resolution_um,
+        "remarks": said,
+    }
+
+
+def _gains(made: Made) -> dict[str, Any]:
+    values = printed_gains(made.controller, made.pid)
+    return {path: jax.tree.map(_finite, value.tolist()) for path, value in values.items()}
+
+
+def _finite(value: Any) -> float | None:
+    return float(value) if math.isfinite(float(value)) else None
+
+
+def _rms(values: np.ndarray) -> float:
+    """Root mean square, of numbers whose squares overflow, too."""
+    largest = float(np.abs(values).max())
+    return largest * float(np.sqrt(np.mean((values / largest) ** 2))) if 0 < largest < math.inf else largest
+
+
+def _margins(found: Margins) -> dict[str, Any]:
+    numbers = {name: _finite(value) for name, value in vars(found).items() if name != "stable"}
+    return {"stable": bool(found.stable), **numbers}
+
+
+def _worst(every: Sequence[Margins]) -> dict[str, Any]:
+    return {
+        "plants": len(every),
+        "stable": all(bool(one.stable) for one in every),
+        "gain_margin": _finite(min(float(one.gain_margin) for one in every)),
+        "phase_margin_deg": _finite(min(float(one.phase_margin_deg) for one in every)),
+        "sensitivity_peak": _finite(max(float(one.sensitivity_peak) for one in every)),
+    }
+
+
+def _tuning(found: Tuning[Any]) -> dict[str, Any]:
+    return {
+        "converged": found.converged,
+        "cost_before_um": _finite(found.cost_before_um),
+        "cost_after_um": _finite(found.cost_after_um),
+        "plants": len(found.plants),
+        "error_rms_um": [_finite(one.error_rms_um) for one in found.plants],
+        "overshoot_pct": [_finite(one.overshoot_pct) for one in found.plants],
+    }
+
+
+def _tracking(wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any]:
+    error = wanted_um - moved_um
+    shares = tracking_errors(jnp.asarray(wanted_um), jnp.asarray(moved_um))
+    return {
+        "error_rms_um": _finite(_rms(error)),
+        "error_max_um": _finite(np.abs(error).max()),
+        "e_rms_pct": _finite(shares.e_rms_pct),
+        "e_max_pct": _finite(shares.e_max_pct),
+    }
+
+
+def _without(loop: Loop, wanted_um: np.ndarray, kept: slice) -> dict[str, Any] | None:
+    """What the feedforward does alone, by the model."""
+    ready = loop.ready
+    if ready.feedforward_V is None:
+        return None
+    stage = loop.plants[0]
+    command = jnp.asarray(np.clip(ready.feedforward_V, *ready.limits_V))
+    moved = np.asarray(_respond(stage, jnp.asarray(ready.interval_s), command, ready.start))
+    return _tracking(wanted_um[kept], moved[kept])
+
+
+@eqx.filter_jit
+def _respond(
+    stage: Stage, interval_s: Float[Array, ""], voltage_V: Float[Array, " t"], start: Start
+) -> Float[Array, " t"]:
+    return stage(interval_s, voltage_V, start)
+
+
+def _step(time_s: np.ndarray, wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any] | None:
+    """Figures of Table 2, where the reference is one step."""
+    turns = np.flatnonzero(np.diff(wanted_um))
+    if len(turns) != 1:
+        return None
+    first = int(turns[0]) + 1
+    found = step_metrics(
+        jnp.asarray(time_s[first:]), jnp.asarray(moved_um[first:]), float(wanted_um[-1]), float(moved_um[first])
+    )
+    return {name: _finite(value) for name, value in vars(found).items()}
+
+
+def describe_control(summary: Mapping[str, Any]) -> str:
+    """The same in words, from `control_json`."""
+    tracking, worst = summary["tracking"], summary["margins_worst"]
+    lines = [f"{summary['controller']}, {summary['samples']} samples of {summary['interval_s']:.6g} s"]
+    for path, value in summary["gains"].items():
+        if "network" not in path:
+            lines.append(f"{path.removeprefix('pid.'):24} {' '.join(f'{x:.5g}' for x in np.ravel(value))}")
+    if summary["tuning"] is not None:
+        tuning = summary["tuning"]
+        how = "converged" if tuning["converged"] else "not converged"
+        lines.append(
+            f"tuning      cost {_said(tuning['cost_before_um'])} to {_said(tuning['cost_after_um'])} um over "
+            f"{tuning['plants']} plants, {how}"
+        )
+    lines.append(
+        f"margins     {worst['plants']} plants, at worst: gain {_said(worst['gain_margin'])}, phase "
+        f"{_said(worst['phase_margin_deg'])} degrees, peak of the sensitivity {_said(worst['sensitivity_peak'])}"
+    )
+    lines.append(f"tracking    {_tracked(tracking)}")
+    if summary["without_feedback"] is not None:
+        lines.append(f"  without   {_tracked(summary['without_feedback'])}")
+    if summary["step"] is not None:
+        step = summary["step"]
+        time_s = step["settling_time_s"]
+        settled = "not settled within the record" if time_s is None else f"settled in {time_s:.4g} s"
+        lines.append(
+            f"step        {settled}, overshoot {_said(step['overshoot_pct'])} %, "
+            f"positioning error {_said(step['positioning_error_pct'])} %"
+        )
+    lines.append(f"command     {_said(summary['command_min_V'])} to {_said(summary['command_max_V'])} V")
+    lines += [f"Note: {remark}" for remark in summary["remarks"]]
+    lines += [f"run         {summary['out']}", *(f"plot        {place}" for place in summary["plots"])]
+    return "\n".join(lines)
+
+
+def _tracked(found: Mapping[str, Any]) -> str:
+    # A reference that stands still has no range to count in.
+    shares = ["" if found[name] is None else f" ({found[name]:.4g} %)" for name in ("e_rms_pct", "e_max_pct")]
+    return f"rms {_said(found['error_rms_um'])} um{shares[0]}, at most {_said(found['error_max_um'])} um{shares[1]}"
+
+
+def _said(value: float | None) -> str:
+    return "unlimited" if value is None else f"{value:.5g}"

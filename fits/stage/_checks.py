@@ -1,0 +1,300 @@
+"""Runs that cannot be fitted as one stage: what is wrong with them, in words."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fits.io._errors import DataError
+from fits.io._record import Record
+from fits.loop._misfit import Misfit
+from fits.stage._run import StageRun, residual_of, simulate_stage
+from fits.stage._solve import Solved, marginal_information
+from fits.stats._noise import correlation_samples
+from microid import Coordinates, Driver, Mechanics, Stage
+
+# Gains that differ by more than this are not those of one rig, and by more than that are worth a remark.
+_REFUSED, _REMARKED = 0.1, 0.05
+# A resonance above this fraction of the sampling rate is hardly told from its mirror image.
+_HIGHEST = 0.45
+# Coordinates are of the order of 1; one that is known no better than this is not seen.
+UNSEEN, _LOST = 0.5, 5.0
+# Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
+WORTH = 40.0
+# A run that leaves so many times what the quietest leaves moves in ways that its samples do not show.
+_LOUD = 3.0
+# Ranges of voltage that differ by less than this, as a fraction, are alike.
+_ALIKE = 0.05
+# And speeds that differ by less than this factor.
+_SAME_SPEED = 1.5
+# Rates beyond so many times the resonance show it well.
+_FINELY = 5.0
+# Share of a command's speed in the upper half of the band from which on it is not sampled finely.
+_UPPER = 0.1
+# Poles that piezo stages have, from slow macro stages and weak amplifiers to small ones with strong ones.
+_USUAL = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
+_POLES = ("time_constant_s", "natural_frequency_Hz")
+
+
+def refuse_slopes(records: Sequence[Record]) -> None:
+    """Refuse slow runs over one range of voltage that move differently far.
+
+    Raises
+    ------
+    DataError
+        If they cannot be of one rig.
+    """
+    spans = [
+        (float(np.ptp(record.voltage_V)), float(np.ptp(record.displacement_um)), speed_Hz(record), record.source)
+        for record in records
+        if record.displacement_um is not None
+    ]
+    widest = max(span for span, _, _, _ in spans)
+    full = [(moved / span, speed, source) for span, moved, speed, source in spans if span > (1 - _ALIKE) * widest]
+    for high, fast, one in full:
+        for low, slow, other in full:
+            # What is faster may move less far because of the dynamics, which are not known yet.
+            if high > (1 + _REFUSED) * low and max(fast, slow) < _SAME_SPEED * min(fast, slow):
+                raise DataError(_not_one_rig(one, other, high / low))
+
+
+def speed_Hz(record: Record) -> float:
+    """Frequency of a sine that moves as fast as a voltage does, for its size; a `DataError` if it does not move."""
+    rate = np.diff(record.voltage_V) / np.diff(record.time_s)
+    size = float(np.std(record.voltage_V))
+    if size == 0:
+        raise DataError(f"{record.source}: the voltage does not move; there is nothing to fit")
+    return float(np.sqrt(np.mean(rate**2))) / (2 * np.pi * size)
+
+
+def _not_one_rig(one: str, other: str, ratio: float) -> str:
+    return (
+        f"{one} and {other}: under the same voltage the first moves {ratio:.3g} times as far as the second, so "
+        "they are not of one rig in one setting; check the units, the amplifier's gain and the sensor's range, "
+        "or fit them apart"
+    )
+
+
+def refuse_unseen(
+    stage: Stage,
+    coordinates: Coordinates[Stage],
+    solved: Solved,
+    drives: Sequence[np.ndarray],
+    fast: bool,
+    spare: bool = False,
+) -> str | None:
+    """Refuse runs that do not show the dynamics they are fitted with.
+
+    Parameters
+    ----------
+    stage
+        With the poles that explain the runs best.
+    coordinates, solved
+        Of these poles, the hysteresis being given.
+    drives
+        What the hysteresis alone would give, for each run, shape `(n,)`.
+    fast
+        Whether a run is faster than the others.
+    spare
+        Whether a mechanics may be left out where a driver alone may do.
+
+    Returns
+    -------
+    str or None
+        Name of a mechanics that the runs do not show, though they are sampled finely enough: leave it out.
+
+    Raises
+    ------
+    DataError
+        If no run moves fast enough, or none is sampled fast enough.
+    """
+    information = marginal_information(
+        solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
+    )
+    slope = np.abs(_relative(coordinates, solved.z))
+    names = _names(stage, coordinates)
+    poles = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _POLES]
+    if not poles:
+        return None
+    spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    # At a bound the slope vanishes, however far the coordinate may run.
+    blurred = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > _LOST]
+    sources = ", ".join(run.record.source for run in solved.runs)
+    fastest = max(solved.runs, key=lambda run: run.rate_Hz)
+    mechanics = [
+        (name, float(part.natural_frequency_Hz))
+        for name, part in zip(stage.names, stage.parts, strict=True)
+        if isinstance(part, Mechanics)
+    ]
+    beyond = [(name, value) for name, value in mechanics if value > _HIGHEST * fastest.rate_Hz]
+    seen = gained(solved, drives) >= WORTH
+    some = bool(blurred) and (len(blurred) == len(poles) or not fast)
+    driven = any(isinstance(part, Driver) for part in stage.parts)
+    if spare and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
+        return (beyond or mechanics)[0][0]
+    if blurred and not fast and len(blurred) < len(poles):
+        raise DataError(
+            f"{sources}: these runs are all about as slow, and do not show {', '.join(blurred)}; add a run with "
+            "steps, a chirp or a multisine that goes beyond the resonance"
+        )
+    if len(blurred) == len(poles) or not seen:
+        noise = solved.weighing.noise_um
+        loudest = int(np.argmax(noise))
+        if noise[loudest] > _LOUD * min(noise):
+            compare_gains(stage, solved.runs, refuse=True)
+            loud = solved.runs[loudest]
+            what = (
+                f"{noise[loudest]:.3g} um of it stay unexplained, {noise[loudest] / min(noise):.3g} times as much as "
+                "of the quietest run"
+            )
+            if _resolved(loud):
+                raise DataError(
+                    f"{loud.record.source}: no lag and no resonance was found that explains what moves in it: "
+                    f"{what}; record it for longer, with a slower chirp or a longer period, or fit the hysteresis "
+                    "alone with --model loop"
+                )
+            raise DataError(
+                f"{loud.record.source}: sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it: "
+                f"{what}; sample at 5 times the resonance or more, or fit the hysteresis alone with --model loop"
+            )
+        raise DataError(
+            f"{sources}: the displacement follows the voltage without delay or ringing, so these runs hold nothing "
+            "of the driver and the mechanics; add a run with steps, a chirp or a multisine that goes beyond the "
+            "resonance, check that voltage and displacement are not exchanged, or fit the hysteresis alone with "
+            "--model loop"
+        )
+    if beyond:
+        raise DataError(
+            f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, and what moves there is explained best "
+            "by a resonance beyond half of that, so these runs do not show where it is: sample at 5 times the "
+            "resonance or more, or fit the hysteresis alone with --model loop"
+        )
+    return None
+
+
+def refuse_coarse(stage: Stage, runs: Sequence[StageRun], left: Sequence[Misfit]) -> None:
+    """Refuse a fitted resonance that the runs cannot show: they are sampled too slowly for it, and leave much.
+
+    Raises
+    ------
+    DataError
+        If they are.
+    """
+    finest = max(run.rate_Hz for run in runs)
+    for part in stage.parts:
+        if not isinstance(part, Mechanics):
+            continue
+        resonance = float(part.natural_frequency_Hz)
+        for run, one in zip(runs, left, strict=True):
+            blind = _HIGHEST * finest < resonance
+            where = "far beyond" if resonance > 2 * run.rate_Hz else f"near {resonance:.3g} Hz"
+            if one.far and (blind or (run.rate_Hz < _FINELY * resonance and not _resolved(run))):
+                raise DataError(
+                    f"{one.source}: sampled at {run.rate_Hz:.4g} Hz, which is too slow for what moves in it: "
+                    f"{one.share_pct:.3g} % of its stroke stay unexplained, {one.times_noise:.3g} times the sensor's "
+                    f"noise, and the resonance would lie {where}; sample at 5 times the resonance or more, or fit "
+                    "the hysteresis alone with --model loop"
+                )
+
+
+def _resolved(run: StageRun) -> bool:
+    """Whether the command is sampled so finely that little of it lies in the upper half of the band."""
+    voltage = run.record.voltage_V
+    # By differences, so that a slow motion of large amplitude does not hide what is fast.
+    change = np.diff(voltage)
+    power = np.abs(np.fft.rfft((change - change.mean()) * np.hanning(len(change)))) ** 2
+    return float(power[len(power) // 2 :].sum()) < _UPPER * float(power.sum())
+
+
+def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> list[str]:
+    """Remark on poles that no piezo stage has: the time is probably in another unit."""
+    for name, value in zip(names, values, strict=True):
+        field = name.rpartition(".")[2]
+        low, high = _USUAL.get(field, (-np.inf, np.inf))
+        if low <= value <= high:
+            continue
+        unit = "Hz" if field.endswith("_Hz") else "s"
+        return [
+            f"{', '.join(sources)}: {name} comes out as {value:.3g} {unit}, where piezo stages have {low:g} to "
+            f"{high:g} {unit}: the time is probably in another unit than its column says, for example in ms instead "
+            "of s; name the right one as in --columns time_s=time_ms"
+        ]
+    return []
+
+
+def gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:
+    """Twice the logarithm of how much likelier poles make the run that shows them best.
+
+    Slow runs may become less likely: the hysteresis read off them has taken in the driver's lag, which now counts
+    twice.
+    """
+    gained = []
+    for run, drive, noise in zip(solved.runs, drives, solved.weighing.noise_um, strict=True):
+        x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
+        left = y - y.mean() - x * (x @ y / (x @ x))
+        gained.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
+    return max(gained)
+
+
+def _names(stage: Stage, coordinates: Coordinates[Stage]) -> list[str]:
+    return [stage.named(info.path) for info in coordinates.table for _ in range(int(np.prod(info.shape)))]
+
+
+def _relative(coordinates: Coordinates[Stage], z: np.ndarray) -> np.ndarray:
+    """Change of each parameter's logarithm per coordinate, shape `(p,)`."""
+    value, slope = coordinates_slope(coordinates, z)
+    return slope / np.maximum(np.abs(value), 1e-300)
+
+
+def coordinates_slope(coordinates: Coordinates[Stage], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters and their derivatives, each by its own coordinate, shapes `(p,)`."""
+    point = jnp.asarray(z)
+    value, slope = jax.jvp(coordinates.values, (point,), (jnp.ones_like(point),))
+    return np.asarray(value), np.asarray(slope)
+
+
+def _gains(stage: Stage, runs: Sequence[StageRun]) -> np.ndarray:
+    """How much each run moves for what the stage says it moves."""
+    gains = []
+    for run in runs:
+        predicted, left = simulate_stage(stage, run)[run.fitted], residual_of(stage, run)[run.fitted]
+        predicted = predicted - predicted.mean()
+        gains.append(1 + float(predicted @ left / (predicted @ predicted)))
+    return np.asarray(gains)
+
+
+def compare_gains(stage: Stage, runs: Sequence[StageRun], refuse: bool = False) -> list[str]:
+    """Find runs that move further, or less far, than the others under the same voltage.
+
+    Parameters
+    ----------
+    stage
+        Fitted to all of them.
+    runs
+        The runs.
+    refuse
+        Whether too large a difference is an error.
+
+    Returns
+    -------
+    list of str
+        A remark, if there is anything to say.
+
+    Raises
+    ------
+    DataError
+        If they cannot be of one rig.
+    """
+    gains = _gains(stage, runs)
+    low, high = int(np.argmin(gains)), int(np.argmax(gains))
+    ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
+    one, other = runs[high].record.source, runs[low].record.source
+    if refuse and ratio > 1 + _REFUSED:
+        raise DataError(_not_one_rig(one, other, ratio))
+    if ratio > 1 + _REMARKED:
+        return [
+            f"under the same voltage {one} moves {ratio:.3g} times as far as {other}: "
+            "if both are of one rig, its gain depends on amplitude or rate more than the hysteresis explains"
+        ]
+    return []

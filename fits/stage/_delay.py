@@ -1,0 +1,294 @@
+"""Readings that come late, or before their command: seen in what a fitted stage leaves of each run."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from fits.io._errors import DataError
+from fits.io._record import Record
+from fits.loop._design import columns_of
+from fits.loop._misfit import Misfit, misfits
+from fits.loop._result import FitError
+from fits.stage._moments import Chain, along, linearise, pieces
+from fits.stage._reach import Reach
+from fits.stage._result import StageFit
+from fits.stage._run import StageRun, lead_ins, simulate_stage, without
+from fits.stage._solve import Solved, solve_chain
+from fits.stage._start import best_shifts, measure_response, start_stages
+from fits.stage._steps import Plan, Problem, hysteresis_alone
+from fits.stage._uncertainty import Precision, sandwich
+from microid import Preisach, Stage
+
+# A delay counts from so many standard deviations on, if it is as many samples long, and moves a parameter by so many
+# of its own; from there on it is followed until it changes by less than a part of its standard deviation.
+_SURE, _LEAST, _MOVED = 5.0, 0.02, 0.5
+_ROUNDS, _SETTLED = 10, 0.3
+# A step is halved so often where it leaves more of its run.
+_HALVED, _NO_WORSE = 4, 1.01
+# Part of a sample by which a command is shifted to see what a delay does.
+_STEP = 0.25
+# Runs that leave so many times the noise are searched for delays up to so many samples either way, and so many of
+# these are tried.
+_LOUD, _FARTHEST, _TRIED = 1.5, 64, 3
+# What is as much likelier as leaving this part of a run's residual is a better answer.
+_BETTER = 0.7
+# Where more than so many times the noise is left, a delay counts if it takes all but this part away.
+_NEAR, _MUCH = 2.0, 0.4
+# Precision, in scaled coordinates, that stands in for none.
+_FAINT = 1e-8
+# What a stage leaves, in % of the stroke, that is more than creep and its like would be.
+GROSS_PCT = 2.0
+_REMEDY = (
+    "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
+)
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A run's delay: how much later than the stage the readings come, and its standard deviation, in s."""
+
+    run: StageRun
+    delay_s: float
+    sd_s: float
+
+    @property
+    def samples(self) -> float:
+        """The same in samples."""
+        return self.delay_s * self.run.rate_Hz
+
+    @property
+    def seen(self) -> bool:
+        """Whether it is no chance."""
+        return abs(self.delay_s) > _SURE * self.sd_s and abs(self.samples) > _LEAST
+
+    def words(self) -> str:
+        """Say what the columns look like."""
+        sd = self.sd_s * self.run.rate_Hz
+        digits = max(1, min(4, 1 - int(np.floor(np.log10(max(sd, 1e-9))))))
+        size = f"{abs(self.samples):.{digits}f} +- {sd:.{digits}f} samples ({abs(self.delay_s):.3g} s)"
+        if self.delay_s > 0:
+            return f"the displacement comes {size} AFTER what the voltage asks for"
+        return f"the displacement comes {size} BEFORE the voltage that causes it"
+
+
+@dataclass(frozen=True)
+class Undelayed:
+    """A fit of the same runs with their delays taken out.
+
+    Attributes
+    ----------
+    delays
+        Of the runs that have one.
+    solved, precision
+        The fit without them.
+    """
+
+    delays: tuple[Delay, ...]
+    solved: Solved
+    precision: Precision
+
+    def left(self, records: Sequence[Record]) -> list[Misfit]:
+        """What stays of each run without its delay."""
+        known = [one.residual_um for one in self.solved.sums], [run.fitted for run in self.solved.runs]
+        return misfits(records, *known)
+
+    def words(self) -> str:
+        """Say what the columns of the runs look like."""
+        return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
+
+
+def take_out_delays(
+    plan: Plan, problem: Problem, solved: Solved, precision: Precision | None, left: Sequence[Misfit]
+) -> Undelayed | None:
+    """Look for delays in what a fit leaves, and fit again without them.
+
+    A small one shows as the derivative of the residual with respect to a delay, whatever the parameters may do
+    beside it (the score test of Rao 1948). In runs that are far from noise the measured frequency response is
+    searched for larger ones.
+
+    Parameters
+    ----------
+    plan, problem
+        What was asked for.
+    solved, precision
+        The fit; without a precision, only large delays are looked for.
+    left
+        What it leaves of each run.
+
+    Returns
+    -------
+    Undelayed or None
+        None where no run has a delay, or taking it out does not help.
+    """
+    # Between two samples a command in steps has no place where it could be shifted to, and without a resonance to
+    # measure it by a delay is part of the lag.
+    if plan.hold == "zero":
+        return None
+    if problem.even:
+        # Unless much is left, which may hide the resonance that was not found.
+        gross = problem.full is not None and max(one.share_pct for one in left) > GROSS_PCT
+        return take_out_delays(plan, *problem.full, None, left) if gross and problem.full is not None else None
+    shifts = np.zeros(len(plan.records))
+    start = problem.z, solved.columns_um
+    far = [k for k, one in enumerate(left) if one.times_noise > _LOUD]
+    searched = _search(plan, problem, solved, far)
+    if searched is not None:
+        shifts, start = searched
+    elif precision is None or not any(one.seen for one in _scores(plan, solved, precision, shifts)):
+        return None
+    found, sure = solved, precision
+    if np.any(shifts):
+        again = _solved_with(plan, problem, solved, start, shifts)
+        if again is None:
+            return None
+        found, sure = again
+    assert sure is not None
+    known: list[Delay] = []
+    for _ in range(_ROUNDS):
+        more = _scores(plan, found, sure, shifts)
+        known = [replace(one, delay_s=one.delay_s + shift) for one, shift in zip(more, shifts, strict=True)]
+        # One at a time, the surest first: the parameters bend to a delay, which makes other runs look late, too.
+        steps = [one.delay_s / one.sd_s if total.seen else 0.0 for one, total in zip(more, known, strict=True)]
+        first = int(np.argmax(np.abs(steps)))
+        if abs(steps[first]) <= _SETTLED:
+            break
+        step = np.zeros(len(shifts))
+        step[first] = more[first].delay_s
+        # Where a parameter is at its bound, a line goes too far.
+        for _ in range(_HALVED):
+            plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts + step)} ms")
+            again = _solved_with(plan, problem, solved, (found.z, found.columns_um), shifts + step)
+            if again is not None and again[0].weighing.noise_um[first] <= _NO_WORSE * found.weighing.noise_um[first]:
+                break
+            step /= 2
+        else:
+            break
+        assert again is not None
+        shifts, (found, sure) = shifts + step, again
+    seen = tuple(
+        one
+        for one, shift, miss, before, after in zip(
+            known, shifts, left, solved.weighing.noise_um, found.weighing.noise_um, strict=True
+        )
+        # Where much is left with it as without it, it is something else.
+        if one.seen and shift and after < (_MUCH if after > miss.noise_um * _NEAR else 1.0) * before
+    )
+    if not seen:
+        return None
+    if searched is None and precision is not None:
+        moved = np.abs(found.z - solved.z) / np.sqrt(np.diagonal(precision.covariance(precision.influence())))
+        if np.max(moved) < _MOVED:
+            return None
+    return Undelayed(seen, found, sure)
+
+
+def _solved_with(
+    plan: Plan, problem: Problem, solved: Solved, start: tuple[np.ndarray, np.ndarray], shifts_s: np.ndarray
+) -> tuple[Solved, Precision] | None:
+    """Fit again with the command of each run that much later, as well as can be; None where that fails."""
+    runs = plan.shifted(shifts_s).runs(solved.runs[0].samples.stride)
+    given = problem.chain, *start, runs, problem.hyper, problem.stroke_um, plan.loss, plan.progress
+    try:
+        found = solve_chain(*given, anyway=True, even=problem.even)
+    except (FitError, np.linalg.LinAlgError):
+        return None
+    return found, Precision(problem.chain, found, problem.stroke_um)
+
+
+def refuse_delays(undelayed: Undelayed | None) -> None:
+    """Refuse runs whose delays kept a fit from an answer, in a `DataError`; nothing where there are none."""
+    if undelayed is not None:
+        raise DataError(f"{undelayed.words()}, and no fit was found with that: {_REMEDY}")
+
+
+def own_up(fit: StageFit, chain: Chain, undelayed: Undelayed) -> StageFit:
+    """Name the delays of a fit, and widen the intervals by what they did to its parameters.
+
+    Raises
+    ------
+    DataError
+        If a parameter moves so much that the fit says nothing.
+    """
+    reach, said = Reach.of(chain, undelayed.solved, undelayed.precision), undelayed.words()
+    if ruined := reach.ruined(fit):
+        raise DataError(f"{said}, and {ruined[0]}: {_REMEDY}")
+    return reach.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
+
+
+def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray) -> list[Delay]:
+    """Delays to first order beside all parameters, each run's alone; of the noise, that of the run itself counts."""
+    chain, size = precision.chain, precision.chain.size
+    here = jnp.asarray(solved.z), jnp.asarray(solved.columns_um)
+    stage = chain.stage(*here)
+    whole = precision.gram + precision.prior
+    # What nothing is known of must not spoil the rest.
+    whole = whole + _FAINT * np.eye(len(whole))
+    out = []
+    for k, (run, one) in enumerate(zip(solved.runs, solved.sums, strict=True)):
+        n, step = len(run.record), _STEP / run.rate_Hz
+        late, early = (
+            simulate_stage(stage, plan.run(k, run.samples.stride, shifts[k] + sign * step)) for sign in (1, -1)
+        )
+        full = np.zeros(run.samples.weight.shape[0])
+        full[:n] = (late - early) / (2 * step)
+        weight = np.asarray(run.samples.weight)[:n]
+        own = jnp.asarray(lead_ins(stage, run.samples))
+        late_um_per_s = np.asarray(without(own, run.samples.weight, jnp.asarray(full)))[:n]
+        worth = solved.weighing.shares[k] / precision.variance
+        weighed = worth * weight * late_um_per_s
+        _, slope, _ = linearise(chain, *here, run)
+        border = np.concatenate([np.zeros(size), slope[:n].T @ weighed])
+        for first, columns in pieces(chain, here[0], run, True):
+            border[:size] += columns.T @ weighed[first : first + len(columns)]
+        follow = np.linalg.solve(whole, border)
+        known = float(weighed @ late_um_per_s - border @ follow)
+        if not known > 1e-9 * float(weighed @ late_um_per_s):
+            out.append(Delay(run, 0.0, np.inf))
+            continue
+        along_it = late_um_per_s - along(chain, *here, run, (follow[:size, None], follow[size:, None]))[:n, 0]
+        influence = worth / known * np.sqrt(weight) * (along_it - np.average(along_it, weights=weight))
+        noise = np.sqrt(weight) * one.residual_um
+        sd = float(sandwich(influence[None], noise, run.fitted)[0, 0]) ** 0.5
+        out.append(Delay(run, float(weighed @ one.residual_um) / known, sd))
+    return out
+
+
+def _search(plan: Plan, problem: Problem, solved: Solved, far: Sequence[int]) -> tuple | None:
+    """Large delays of the runs that are far from noise: shifts, and what to go on from; None where none helps."""
+    # As it began: a delay bends the hysteresis of a joint fit, and the slow runs hardly feel it.
+    stage = problem.stage
+    columns_um = _columns(problem, stage)
+    drives = hysteresis_alone(stage, plan)
+    shifts, best = np.zeros(len(plan.records)), solved
+    for k in far:
+        run = solved.runs[k]
+        response = measure_response(run, drives[k])
+        if not len(response.frequency_Hz):
+            continue
+        step = min(1.0 / run.rate_Hz, 0.1 / response.frequency_Hz.max())
+        tried = best_shifts(stage, response, step * np.arange(-_FARTHEST, _FARTHEST + 1))[:_TRIED]
+        for shift in (shift for shift in tried if shift):
+            there = shifts.copy()
+            there[k] = shift
+            plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
+            moved = replace(response, response=response.response * np.exp(2j * np.pi * response.frequency_Hz * shift))
+            runs = plan.shifted(there).runs(run.samples.stride)
+            for candidate in start_stages(stage, [moved])[:1]:
+                z = np.asarray(problem.chain.coordinates.of(candidate))
+                given = problem.chain, z, columns_um, runs, None, problem.stroke_um, plan.loss, plan.progress
+                try:
+                    found = solve_chain(*given, rough=True)
+                except (FitError, np.linalg.LinAlgError):
+                    continue
+                if found.cost < best.cost + float(run.fitted.sum()) * np.log(_BETTER):
+                    best, shifts = found, there
+    return (shifts, (best.z, columns_um)) if np.any(shifts) else None
+
+
+def _columns(problem: Problem, stage: Stage) -> np.ndarray:
+    """Columns of a stage's grid, in um, shape `(D,)`; none where none is fitted."""
+    place = problem.chain.place
+    law = None if place is None else stage.parts[place]
+    return np.asarray(columns_of(law)) if isinstance(law, Preisach) else np.zeros(0)

@@ -1,0 +1,235 @@
+"""From slow and fast records to a whole fitted stage."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+
+from fits.io._errors import DataError
+from fits.io._record import Record, refuse_repeats
+from fits.loop._choose_grid import LADDER
+from fits.loop._fit_checks import remarks_on
+from fits.loop._misfit import misfits, worst
+from fits.loop._result import FitError
+from fits.stage._checks import implausible, refuse_coarse
+from fits.stage._delay import GROSS_PCT, own_up, refuse_delays, take_out_delays
+from fits.stage._moments import Chain
+from fits.stage._reach import leave_outliers
+from fits.stage._result import StageFit
+from fits.stage._run import gain_ahead, place_of_hysteresis, prepare_stage_run
+from fits.stage._solve import Solved
+from fits.stage._steps import Plan, Problem, refine_problem, start_problem
+from fits.stage._summary import summarise
+from fits.stage._uncertainty import Precision
+from fits.stats._noise import LOSSES
+from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
+
+
+def default_stage(hold: Hold = "first") -> Stage:
+    """The stage of Section 3.1: driver, Preisach operator and mechanics, with all gain in the operator.
+
+    A gain anywhere else would only be seen together with it.
+
+    Parameters
+    ----------
+    hold
+        How the command runs between samples: `first` for lines, `smooth` for curves, `zero` for steps that each begin
+        at a sample and are not seen by it yet.
+    """
+    flat = Preisach(
+        GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
+        Reversible(jnp.ones(4), jnp.asarray(0.0), jnp.asarray(1.0)),
+        jnp.asarray(0.0),
+    )
+    stage = Stage.of(
+        hold=hold,
+        driver=Driver(jnp.asarray(1e-3)),
+        hysteresis=flat,
+        mechanics=Mechanics(jnp.asarray(100.0), jnp.asarray(0.1)),
+    )
+    return stage.freeze("driver.gain", "mechanics.gain")
+
+
+def fit_stage(
+    records: Sequence[Record],
+    *,
+    stage: Stage | None = None,
+    levels: int | None = None,
+    holdout: float | Sequence[Record] = 0.2,
+    initial: str | Sequence[str] = "unknown",
+    loss: str = "squares",
+    progress: Callable[[str], None] = lambda _: None,
+) -> StageFit:
+    """Fit driver, hysteresis and mechanics jointly to slow and fast runs of one rig.
+
+    The slow runs give a first hysteresis, what the fast ones make of it a frequency response, and that the poles to
+    start from. Then all runs are fitted together: the hysteresis is a smooth non-negative regression as in `fit`,
+    solved for exactly while the other parameters follow damped Gauss-Newton steps.
+
+    Parameters
+    ----------
+    records
+        Runs of one rig, at whatever rates. Each has its own sensor offset.
+    stage
+        What is fitted: all its parameters that are not frozen. A `Preisach` operator on a grid is fitted as `fit`
+        does, whatever its present values; drivers and mechanics start from the data; other parts start from their
+        present values. By default the stage of `default_stage`.
+    levels
+        Number of switching voltages; chosen from the slow runs by default.
+    holdout
+        Fraction at the end of every run that is only predicted, or records that are.
+    initial
+        Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. One for all holds for records
+        that are held out, too; theirs is unknown where each fitted run has its own.
+    loss
+        `squares`, or `huber`, to which outliers count less.
+    progress
+        Told what is being done, a sentence at a time.
+
+    Returns
+    -------
+    StageFit
+        Never the start: a fit that fails raises.
+
+    Raises
+    ------
+    DataError
+        If the records cannot be fitted, do not show the dynamics, or are not of one rig.
+    FitError
+        If a solver fails.
+    RuntimeError
+        If JAX computes in single precision.
+    """
+    asked = stage, levels, holdout, initial, loss, progress
+    found = solve_stage(records, *asked)
+    runs, sources = found.solved.runs, [record.source for record in records]
+    known = [one.residual_um for one in found.solved.sums], [run.fitted for run in runs]
+    left = misfits(records, *known)
+    progress("looking for delays")
+    undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
+    # What is sampled too slowly may look late; a delay is believed that leaves little else.
+    if undelayed is None or any(one.far for one in undelayed.left(records)):
+        refuse_coarse(found.stage, runs, left)
+    if found.failure is not None or found.problem.even:
+        refuse_delays(undelayed)
+    if found.failure is not None:
+        raise found.failure
+    gross = worst(left)
+    if found.problem.even and gross.share_pct > GROSS_PCT:
+        raise DataError(
+            f"{gross.source}: neither a lag nor a resonance explains what moves in it: {gross.share_pct:.3g} % of "
+            f"its stroke stay unexplained, {gross.times_noise:.3g} times the sensor's noise; check columns, time "
+            "stamps and sampling rate, or fit the hysteresis alone with --model loop"
+        )
+    progress("comparing with the measurement")
+    aside = () if isinstance(holdout, int | float) else tuple(holdout)
+    before = initial if isinstance(initial, str) else "unknown"
+    chain = found.chain
+    settings = before, 1.0, found.solved.runs[-1].samples.stride, gain_ahead(found.stage), found.stage.hold
+    held = [prepare_stage_run(record, found.range_V, *settings) for record in aside]
+    summary = summarise(found.stage, chain.coordinates, found.solved, found.precision, held)
+    if undelayed is not None:
+        summary = own_up(summary, chain, undelayed)
+    outliers = leave_outliers(found.plan, found.problem, found.solved)
+    if outliers is not None:
+        said = f"{', '.join(outliers[0])}: outliers pull this fit"
+        summary = outliers[1].widen(summary, said, "fit again with --loss huber, or leave them out")
+    odd = remarks_on(records, *known, robust=loss == "huber")
+    odd += implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
+    notes = [warning for record in (*records, *aside) for warning in record.warnings]
+    told = tuple(dict.fromkeys((*odd, *notes, *found.remarks, *summary.remarks)))
+    return replace(summary, misfit=worst(left), remarks=told)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the fit of a stage found, before it is compared with anything.
+
+    Attributes
+    ----------
+    stage
+        The fitted stage, without an offset.
+    chain
+        The same in the coordinates of its fit.
+    solved
+        Where the fit ended.
+    precision
+        How sure it is.
+    stroke_um
+        Unit of the columns of the grid.
+    range_V
+        Range of the commands.
+    remarks
+        What the user should know, one sentence each.
+    plan, problem
+        What was asked for, and where the fit began.
+    failure
+        Why this is only the best place that was found; None where the fit converged.
+    """
+
+    stage: Stage
+    chain: Chain
+    solved: Solved
+    precision: Precision
+    stroke_um: float
+    range_V: tuple[float, float]
+    remarks: tuple[str, ...]
+    plan: Plan
+    problem: Problem
+    failure: FitError | None
+
+
+def solve_stage(
+    records: Sequence[Record],
+    stage: Stage | None,
+    levels: int | None,
+    holdout: float | Sequence[Record],
+    initial: str | Sequence[str],
+    loss: str,
+    progress: Callable[[str], None],
+    finest: int = LADDER[-1],
+    anyway: bool = False,
+) -> Solution:
+    """Fit a stage, on a grid of at most the finest levels; other arguments and errors are those of `fit_stage`.
+
+    `anyway` takes the best place for an answer where the fit does not become stationary.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
+    if loss not in LOSSES:
+        raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
+    if not records:
+        raise DataError("there is no record to fit")
+    aside = () if isinstance(holdout, int | float) else tuple(holdout)
+    refuse_repeats([*records, *aside])
+    states = [initial] * len(records) if isinstance(initial, str) else list(initial)
+    if len(states) != len(records):
+        raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
+    fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
+    if not 0 <= fraction <= 0.9:
+        raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
+    voltages = [record.voltage_V for record in (*records, *aside)]
+    range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
+    stage = default_stage() if stage is None else stage
+    ahead = stage.parts[: place_of_hysteresis(stage)]
+    if stage.hold == "zero" and not any(isinstance(part, Driver) for part in ahead):
+        raise DataError(
+            "the stage holds its command in steps, which is fitted only with a driver ahead of the hysteresis: "
+            "insert one, or use hold='first'"
+        )
+    plan = Plan(
+        tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, anyway
+    )
+    problem = start_problem(plan, stage, levels, finest)
+    failure = None
+    try:
+        problem, solved, precision = refine_problem(plan, problem)
+    except FitError as error:
+        if anyway:
+            raise
+        # What the best place leaves may show why.
+        failure = error
+        problem, solved, precision = refine_problem(replace(plan, anyway=True), problem)
+    place = problem.at(solved), problem.chain, solved, precision, problem.stroke_um, range_V
+    return Solution(*place, problem.remarks, plan, problem, failure)

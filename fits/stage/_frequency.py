@@ -1,0 +1,204 @@
+"""Measured frequency responses: from periodic multisines to the best linear approximation and its variance."""
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.io._errors import DataError
+from fits.io._plausible import SHORTEST_STEP_s, check_size
+from fits.io._table import data_error, open_table
+
+# A line is excited if the input reaches this share of its largest.
+_EXCITED = 0.01
+# Variances are averaged over this many neighbouring lines: few realizations alone make poor weights.
+_SMOOTH = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Multisine:
+    """Steady-state response to periodic inputs: `r` realizations of `q` periods, `n` samples each.
+
+    Attributes
+    ----------
+    interval_s
+        Between samples.
+    voltage_V, displacement_um
+        Shapes `(r, q, n, m)` and `(r, q, n, p)`.
+    source
+        Name of the file.
+    """
+
+    interval_s: float
+    voltage_V: NDArray[np.float64]
+    displacement_um: NDArray[np.float64]
+    source: str = "record"
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not belong together."""
+        u, y = self.voltage_V, self.displacement_um
+        if u.ndim != 4 or y.ndim != 4 or u.shape[:3] != y.shape[:3] or not self.interval_s > 0:
+            raise DataError(
+                f"{self.source}: expected voltages and displacements of shapes (realizations, periods, samples, "
+                f"channels) and a positive interval, got {u.shape}, {y.shape} and {self.interval_s:g} s; "
+                "arrange them so."
+            )
+
+    def take(self, realizations: slice) -> "Multisine":
+        """Some of the realizations, so that the others can be held out."""
+        return Multisine(
+            self.interval_s, self.voltage_V[realizations], self.displacement_um[realizations], self.source
+        )
+
+    def spectra(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+        """Excited lines in Hz, shape `(f,)`, and spectra of all periods, `(f, r, q, m)` and `(f, r, q, p)`."""
+        samples = self.voltage_V.shape[2]
+        u, y = (np.moveaxis(np.fft.rfft(x, axis=2), 2, 0) / samples for x in (self.voltage_V, self.displacement_um))
+        size = np.sqrt(np.mean(np.abs(u) ** 2, axis=(1, 2, 3)))
+        size[0] = 0
+        lines = np.flatnonzero(size > _EXCITED * np.max(size))
+        if not len(lines):
+            raise DataError(
+                f"{self.source}: expected periodic voltages, found none that change; choose other columns."
+            )
+        return np.fft.rfftfreq(samples, self.interval_s)[lines], u[lines], y[lines]
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseData:
+    """A measured frequency response.
+
+    Attributes
+    ----------
+    frequency_Hz
+        Shape `(f,)`, increasing.
+    response_um_per_V
+        Shape `(f, p, m)`, complex.
+    variance_um2_per_V2
+        Of the complex response, from noise and distortion together, shape `(f, p, m)`; None where it is not known,
+        and then all lines weigh the same.
+    noise_variance_um2_per_V2
+        The part of it that differs between periods; None for a single period.
+    """
+
+    frequency_Hz: NDArray[np.float64]
+    response_um_per_V: NDArray[np.complex128]
+    variance_um2_per_V2: NDArray[np.float64] | None = None
+    noise_variance_um2_per_V2: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no frequency response."""
+        lines, response = np.asarray(self.frequency_Hz), np.asarray(self.response_um_per_V)
+        if lines.ndim != 1 or response.ndim != 3 or len(response) != len(lines) or not np.all(np.isfinite(response)):
+            raise DataError(
+                "frequency response: expected finite values of shape (f, p, m) at f frequencies, got "
+                f"{response.shape} at {lines.shape}; give (f, 1, 1) for one input and one output."
+            )
+        if len(lines) < 2 or lines[0] < 0 or np.any(np.diff(lines) <= 0):
+            raise DataError("frequency response: expected frequencies that increase from 0 Hz on; sort the lines.")
+        for variance in (self.variance_um2_per_V2, self.noise_variance_um2_per_V2):
+            if variance is not None and (variance.shape != response.shape or not np.all(variance > 0)):
+                raise DataError(
+                    f"frequency response: expected positive variances of shape {response.shape}; "
+                    "leave them out where they are not known."
+                )
+
+
+def read_multisine(path: str | os.PathLike[str]) -> Multisine:
+    """Read `time_s, realization, period, u1_V, u2_V, ..., y1_um, y2_um, ...` from a CSV file.
+
+    Rows are ordered by realization, then period, then time. Time may start anew with each realization.
+
+    Raises
+    ------
+    DataError
+        One sentence with file and column, what was expected and what to do.
+    """
+    table = open_table(path)
+    inputs = [f"u{i}_V" for i in range(1, len(table.names) + 1) if f"u{i}_V" in table.names]
+    outputs = [f"y{i}_um" for i in range(1, len(table.names) + 1) if f"y{i}_um" in table.names]
+    needed = ("time_s", "realization", "period", *(inputs or ["u1_V"]), *(outputs or ["y1_um"]))
+    for name in needed:
+        if name not in table.names:
+            raise data_error(
+                table.path, f"expected a column '{name}', found none; rename or add it", table.header_line
+            )
+    values, _ = table.read(needed)
+    for name in needed:
+        check_size(table, name, values[name], {"V": "V", "um": "um", "s": "s"}.get(name.rpartition("_")[2], "1"))
+    group = np.stack([values["realization"], values["period"]])
+    starts = np.flatnonzero(np.append(True, np.any(np.diff(group) != 0, axis=0)))
+    lengths, periods = np.diff(np.append(starts, group.shape[1])), len(np.unique(group[1]))
+    order = np.lexsort(group[::-1, starts])
+    if (
+        len(set(lengths)) != 1
+        or np.any(order != np.arange(len(starts)))
+        or len(starts) != periods * len(np.unique(group[0]))
+    ):
+        raise data_error(
+            table.path,
+            "expected every realization with the same periods of the same length, in order; cut or sort the rows",
+            table.header_line,
+            "period",
+        )
+    if periods * lengths[0] < 2:
+        raise data_error(table.path, "expected two samples or more per realization, found one", table.header_line)
+    steps = np.diff(values["time_s"].reshape(-1, periods * lengths[0]), axis=1)
+    interval_s = float(np.mean(steps))
+    if not interval_s >= SHORTEST_STEP_s or np.max(np.abs(steps - interval_s)) > 0.01 * interval_s:
+        raise data_error(
+            table.path, "expected even time steps of 1e-12 s or more; sample evenly", table.header_line, "time_s"
+        )
+    shape = (-1, periods, lengths[0])
+    u, y = (np.stack([values[name].reshape(shape) for name in names], axis=-1) for names in (inputs, outputs))
+    return Multisine(interval_s, u, y, os.path.basename(table.path))
+
+
+def estimate_response(record: Multisine) -> ResponseData:
+    """Estimate the best linear approximation and its variance, line by line.
+
+    Least squares over the realizations of what periods have averaged; see Pintelon and Schoukens, *System
+    Identification: A Frequency Domain Approach* (2012), chapter 4. What differs between periods is noise; what
+    differs between realizations is noise and nonlinear distortion together. Voltages count as exact.
+
+    Raises
+    ------
+    DataError
+        If there are no more realizations than inputs, or the inputs are not independent.
+    """
+    frequency_Hz, u, y = record.spectra()
+    gain, total = approximate(record, u, y)
+    mean = np.mean(u, axis=2)
+    spread = np.real(np.diagonal(np.linalg.inv(np.swapaxes(mean, 1, 2).conj() @ mean), axis1=1, axis2=2))
+    noise = None
+    if y.shape[2] > 1:
+        between = np.mean(np.var(y, axis=2, ddof=1), axis=1) / y.shape[2]
+        noise = smooth(between)[:, :, None] * spread[:, None, :]
+    return ResponseData(frequency_Hz, gain, smooth(total)[:, :, None] * spread[:, None, :], noise)
+
+
+def approximate(record: Multisine, u: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Best linear approximation, shape `(f, p, m)`, and variance of the averaged outputs about it, `(f, p)`."""
+    drive, moved = np.mean(u, axis=2), np.mean(y, axis=2)
+    realizations, inputs = drive.shape[1:]
+    if realizations <= inputs:
+        raise DataError(
+            f"{record.source}: expected more realizations than its {inputs} inputs, found {realizations}; "
+            "record more, or the distortion cannot be told from the response."
+        )
+    if np.max(np.linalg.cond(drive)) > 1e6:
+        raise DataError(
+            f"{record.source}: expected inputs that are independent over the realizations, found some that are not; "
+            "draw the phases of each input and realization anew."
+        )
+    gain = np.linalg.pinv(drive) @ moved
+    total = np.sum(np.abs(moved - drive @ gain) ** 2, axis=1) / (realizations - inputs)
+    return np.swapaxes(gain, 1, 2), total
+
+
+def smooth(variance: NDArray[Any]) -> NDArray[Any]:
+    half = min(_SMOOTH, len(variance) - 1 | 1) // 2
+    padded = np.pad(variance, ((half, half), (0, 0)), mode="reflect")
+    return np.mean(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0), axis=-1)

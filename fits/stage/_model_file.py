@@ -1,0 +1,239 @@
+"""Fitted models as files: JSON that explains itself.
+
+A model file is one JSON object (UTF-8; no NaN or infinity) with six keys:
+
+`schema`
+    `"microid.model/1"`. Another number means another format.
+`sha256`
+    Of the object without this key, as `json.dumps(rest, sort_keys=True, separators=(",", ":"))` in ASCII.
+`written_by`
+    Name and version of the program.
+`model`
+    The model. Every part is an object whose `type` is the name of a class in `microid`, with one key per field.
+`uncertainty`
+    `fits.Uncertainty`, or for a whole stage `fits.StageUncertainty`, in the same form.
+`fit`
+    The report of the fit, as `microid fit --json` prints it.
+
+A field that holds numbers is `{"unit": "um", "value": 1.5}`, where the value is one number or nested lists of them
+(float64, written with as many digits as reading it back exactly takes; another type is named by the key `dtype`). The
+perturbations of the uncertainty, which are many, are `{"unit": "um", "shape": [k, D], "float64_base64": "..."}`: row
+by row, little-endian float64. A tuple is a list; other fields are plain JSON. A network has `type` `MLP`, the sizes
+of its input and output, the name of its activation, and layers with `weight`, shape `(out, in)`, and `bias`. A stage
+has its `parts` in the order of the signal, and as many `names`; perturbations of its other parameters, in scaled and
+unbounded coordinates, are `coordinates`.
+
+Without microid, the weights of Eq. 9 of a grid and the perturbations are read by
+
+    import base64, json, pathlib
+    import numpy as np
+
+    content = json.loads(pathlib.Path("model.json").read_text(encoding="utf-8"))
+    packed_um = np.array(content["model"]["density"]["packed_um"]["value"])
+    n = (round((8 * len(packed_um) + 1) ** 0.5) - 1) // 2
+    weights_um = np.zeros((n, n))
+    weights_um[np.tril_indices(n)] = packed_um
+    columns = content["uncertainty"]["columns_um"]
+    columns_um = np.frombuffer(base64.b64decode(columns["float64_base64"]), "<f8").reshape(columns["shape"])
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+
+from fits.io._atomic import atomic_write_text
+from fits.io._errors import DataError, shown
+from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
+from fits.io._version import written_by
+from fits.loop._design import Grid
+from fits.loop._uncertainty import Uncertainty
+from fits.stage._encode import decode, encode
+from fits.stage._uncertainty import StageUncertainty, offsets_out
+from microid import Preisach, Stage
+
+_FAMILY = "microid.model/"
+SCHEMA = f"{_FAMILY}1"
+_PARTS = ("schema", "sha256", "written_by", "model", "uncertainty", "fit")
+# One number per weight is worth reading; one per weight and perturbation is not.
+_PACKED = ("columns_um", "coordinates", "mean_um")
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """What a model file holds.
+
+    Attributes
+    ----------
+    model
+        A module of `microid`, usually a `Preisach` or a `Stage`.
+    uncertainty
+        Of its predictions.
+    report
+        What is known of the fit, as `fit_report` or `stage_report` makes it.
+    written_by
+        Program and version.
+    """
+
+    model: eqx.Module
+    uncertainty: Uncertainty | StageUncertainty | None
+    report: dict[str, Any]
+    written_by: str
+
+
+def save_model(
+    path: str | os.PathLike[str],
+    model: eqx.Module,
+    uncertainty: Uncertainty | StageUncertainty | None,
+    report: Mapping[str, Any],
+) -> None:
+    """Write a model file, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        File to write; the same model gives the same bytes.
+    model
+        Any module made of public classes of `microid`.
+    uncertainty
+        Of its predictions.
+    report
+        JSON values under string keys, such as `fit_report` or `stage_report` makes.
+
+    Raises
+    ------
+    DataError
+        If the model or the report cannot be written, or the file cannot be.
+    """
+    try:
+        text = model_text(model, uncertainty, report)
+    except DataError as error:
+        raise DataError(f"{os.fspath(path)}: the model cannot be written: {error}.") from error
+    atomic_write_text(path, text)
+
+
+def model_text(
+    model: eqx.Module, uncertainty: Uncertainty | StageUncertainty | None, report: Mapping[str, Any]
+) -> str:
+    """Compose the text of a model file; a `DataError` says why it cannot be."""
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "sha256": "",
+        "written_by": written_by(),
+        "model": encode(model),
+        "uncertainty": encode(uncertainty, packed=_PACKED),
+        "fit": dict(report),
+    }
+    try:
+        content["sha256"] = _hash(content)
+        same_report = json.loads(json.dumps(content["fit"])) == content["fit"]
+    except (TypeError, ValueError) as error:
+        raise DataError(f"its report is not made of finite JSON values ({error})") from error
+    if not same_report:
+        raise DataError("its report holds something that JSON gives back differently, such as a tuple")
+    for value, part in ((model, "model"), (uncertainty, "uncertainty")):
+        # What a file would not give back must not be lost silently.
+        if not eqx.tree_equal(value, decode(content[part], part)):
+            raise DataError(f"the {part} holds something that the file would not give back")
+    return _pretty(content) + "\n"
+
+
+def load_model(path: str | os.PathLike[str]) -> ModelFile:
+    """Read a model file.
+
+    Parameters
+    ----------
+    path
+        Written by `save_model`.
+
+    Returns
+    -------
+    ModelFile
+        Every number is bit by bit what was written.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, is of another version, was changed after it was written, or makes no sense.
+    RuntimeError
+        If JAX computes in single precision.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError('model files hold float64: jax.config.update("jax_enable_x64", True)')
+    name = os.fspath(path)
+    content = _read(name)
+    try:
+        model = decode(content["model"], "model")
+        uncertainty = decode(content["uncertainty"], "uncertainty")
+    except DataError as error:
+        raise DataError(f"{name}: {error}; write the file again with 'microid fit'.") from error
+    if not isinstance(model, eqx.Module) or not isinstance(uncertainty, Uncertainty | StageUncertainty | None):
+        raise DataError(f"{name}: expected a model and its uncertainty; write the file again with 'microid fit'.")
+    if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
+        raise DataError(f"{name}: the uncertainty does not fit the stage; write the file again with 'microid fit'.")
+    if uncertainty is not None and uncertainty.columns_um.shape[1] != (
+        0 if uncertainty.grid is None else uncertainty.grid.columns
+    ):
+        raise DataError(f"{name}: the uncertainty does not fit its grid; write the file again with 'microid fit'.")
+    return ModelFile(model, uncertainty, content["fit"], content["written_by"])
+
+
+def _moves(model: eqx.Module, uncertainty: StageUncertainty) -> bool:
+    """Whether perturbations are those of the parameters of a stage, and of its grid if they have one."""
+    if not isinstance(model, Stage) or not isinstance(uncertainty.grid, Grid | None):
+        return False
+    on_grid = uncertainty.grid is not None
+    if on_grid and not any(isinstance(part, Preisach) for part in model.parts):
+        return False
+    try:
+        return uncertainty.coordinates.shape[1] == offsets_out(model, on_grid).size
+    except ValueError:
+        return False
+
+
+def _read(name: str) -> dict[str, Any]:
+    what = "a model file"
+    content = parse_json(read_text(name, what, MOST_JSON_BYTES), name, what)
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if not isinstance(schema, str) or not schema.startswith(_FAMILY):
+        raise DataError(f"{name}: expected a model written by 'microid fit', found other JSON; name such a file.")
+    if schema != SCHEMA:
+        raise DataError(
+            f"{name}: expected the format {SCHEMA}, found {shown(schema)}; "
+            "read it with the version of microid that wrote it, or fit again."
+        )
+    typed = isinstance(content.get("written_by"), str) and isinstance(content.get("fit"), dict)
+    if set(content) != set(_PARTS) or not typed:
+        raise DataError(f"{name}: expected the keys {', '.join(_PARTS)}; write the file again with 'microid fit'.")
+    if content["sha256"] != _hash(content):
+        raise DataError(
+            f"{name}: the content does not match its sha256, so it was changed after it was written; "
+            "restore the file, or write it again with 'microid fit'."
+        )
+    return content
+
+
+def _hash(content: Mapping[str, Any]) -> str:
+    rest = {key: value for key, value in content.items() if key != "sha256"}
+    text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
+
+
+def _pretty(value: Any, indent: str = "") -> str:
+    """Write objects that hold objects over several lines, and arrays of numbers on one."""
+    inner = indent + " "
+    if (
+        isinstance(value, dict)
+        and any(isinstance(item, dict | list) for item in value.values())
+        and "unit" not in value
+    ):
+        items = [f"{inner}{json.dumps(key)}: {_pretty(item, inner)}" for key, item in value.items()]
+        return "{\n" + ",\n".join(items) + f"\n{indent}}}"
+    if isinstance(value, list) and any(isinstance(item, dict | str) for item in value):
+        return "[\n" + ",\n".join(inner + _pretty(item, inner) for item in value) + f"\n{indent}]"
+    return json.dumps(value, allow_nan=False)

@@ -1,0 +1,289 @@
+"""A whole stage as a regression: linear in the columns of its hysteresis, linearised in its other parameters."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from fits.loop._design import Grid, branch_table, design
+from fits.loop._moments import Moments
+from fits.stage._run import Samples, StageRun, ahead, joined, lead_ins, respond, without
+from microid import Coordinates, LinearSystem, Stage, Staircase
+
+# Samples that go through the compiled regression at a time.
+_PIECE = 2048
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A stage in the coordinates of its fit.
+
+    Attributes
+    ----------
+    coordinates
+        Of all parameters but those of the grid and the offsets.
+    place
+        Where the hysteresis stands in the chain; None where no grid is fitted.
+    grid
+        Its columns; None where no grid is fitted.
+    """
+
+    coordinates: Coordinates[Stage]
+    place: int | None
+    grid: Grid | None
+
+    @property
+    def size(self) -> int:
+        """Number of columns, `D`."""
+        return 0 if self.grid is None else self.grid.columns
+
+    @property
+    def levels(self) -> int:
+        """Levels of the grid."""
+        return 0 if self.grid is None else self.grid.levels
+
+    def stage(self, z: Float[Array, " p"], columns_um: Float[Array, " D"]) -> Stage:
+        """The stage with these coordinates and columns, and no offset."""
+        return _stage(self.coordinates, self.place, self.grid, z, columns_um)
+
+
+def _stage(
+    coordinates: Coordinates[Stage],
+    place: int | None,
+    grid: Grid | None,
+    z: Float[Array, " p"],
+    columns_um: Float[Array, " D"] | None,
+) -> Stage:
+    stage = coordinates(z)
+    if grid is None or place is None or columns_um is None:
+        return stage
+    return stage.swap(stage.names[place], grid.model(columns_um, jnp.zeros(())))
+
+
+@eqx.filter_jit
+def _linearised(
+    coordinates: Coordinates[Stage],
+    place: int | None,
+    grid: Grid | None,
+    z: Float[Array, " p"],
+    columns_um: Float[Array, " D"] | None,
+    samples: Samples,
+) -> tuple[Float[Array, " n"], Float[Array, "n p"], Float[Array, "n k"]]:
+    """Response of a run, its derivatives along the coordinates, and the run's own unknowns."""
+
+    def response(z: Float[Array, " p"]) -> tuple[Array, Array]:
+        out = respond(_stage(coordinates, place, grid, z, columns_um), samples)
+        return out, out
+
+    slope, out = jax.jacfwd(response, has_aux=True)(z)
+    return out, slope, lead_ins(_stage(coordinates, place, grid, z, columns_um), samples)
+
+
+@eqx.filter_jit
+def _before_and_after(
+    coordinates: Coordinates[Stage], place: int, z: Float[Array, " p"], samples: Samples
+) -> tuple[Float[Array, " n"], LinearSystem | None]:
+    """Voltage that the hysteresis sees, at the samples, and the linear system that follows it."""
+    stage = coordinates(z)
+    return ahead(stage, place, samples)[:: samples.stride], joined(stage.parts[place + 1 :])
+
+
+@eqx.filter_jit
+def _rows(
+    grid: Grid,
+    table: Float[Array, "4 k D"],
+    system: LinearSystem | None,
+    interval_s: Float[Array, " k"],
+    voltage_V: Float[Array, " k"],
+    memory: Staircase,
+    carried: tuple[Float[Array, "s D"], Float[Array, " D"]] | None,
+) -> tuple[Float[Array, "k D"], Staircase, tuple[Float[Array, "s D"], Float[Array, " D"]]]:
+    """Response to every column alone, passed on through what follows the hysteresis."""
+    response, memory = design(grid, table, voltage_V, memory)
+    if system is None:
+        return response, memory, (jnp.zeros((0, grid.columns)), response[-1])
+    if carried is None:
+        # At rest before the first sample.
+        carried = jnp.zeros((system.order, grid.columns)), response[0]
+    state, last = carried
+    step, taken = system.advance(interval_s, "first")
+    change = jnp.diff(response, axis=0, prepend=last[None])
+
+    def visit(state: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        matrix, loss, rise = now
+        state = matrix @ state - loss[:, None] * rise[None, :]
+        return state, system.read @ state
+
+    state, more = lax.scan(visit, state, (jnp.moveaxis(step, 2, 0), taken.T, change))
+    return system.gain * response + more, memory, (state, response[-1])
+
+
+_without = eqx.filter_jit(without)
+
+
+@dataclass(frozen=True)
+class RunSums:
+    """What one run adds to the regression.
+
+    Attributes
+    ----------
+    moments
+        Of columns and coordinates, the run's own unknowns eliminated.
+    mean
+        Mean of the rows over the fitted samples, shape `(D + p,)`.
+    residual_um
+        Measurement less prediction at all samples, the run's own unknowns taken off, shape `(n,)`.
+    """
+
+    moments: Moments
+    mean: np.ndarray
+    residual_um: np.ndarray
+
+
+def run_sums(
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"], run: StageRun, free: bool = True
+) -> RunSums:
+    """Pass one run through the regression.
+
+    Parameters
+    ----------
+    chain
+        The stage.
+    z, columns_um
+        Where it is linearised.
+    run
+        Prepared, with its samples weighed.
+    free
+        Whether the columns are part of the regression, or left as they are.
+    """
+    samples, size = run.samples, chain.size if free else 0
+    out, slope, own = linearise(chain, z, columns_um, run)
+    weight = np.asarray(samples.weight)
+    residual = np.asarray(samples.displacement_um) - out
+    root = np.sqrt(weight)
+    known = size + slope.shape[1]
+    rows = np.empty((min(len(weight), _PIECE), known + own.shape[1]))
+    sums = Moments(np.zeros((rows.shape[1],) * 2), np.zeros(rows.shape[1]), np.zeros(()), np.zeros(()))
+    for first, columns in pieces(chain, z, run, free):
+        piece = slice(first, first + columns.shape[0])
+        used = rows[: columns.shape[0]]
+        used[:, :size], used[:, size:known], used[:, known:] = columns, slope[piece], own[piece]
+        target = root[piece] * (residual[piece] + columns @ np.asarray(columns_um)[:size])
+        used *= root[piece, None]
+        sums = sums + Moments(
+            used.T @ used, used.T @ target, np.asarray(target @ target), np.asarray(weight[piece].sum())
+        )
+    reduced, _, _ = split_moments(sums, known, 0.0)
+    off = np.asarray(_without(jnp.asarray(own), samples.weight, jnp.asarray(residual)))
+    return RunSums(reduced, np.asarray(sums.gram)[:known, known] / weight.sum(), off[: len(run.record)])
+
+
+def linearise(
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, run: StageRun
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Response of a padded run, its slopes along the coordinates, and its own unknowns; see `_linearised`."""
+    here = chain.coordinates, chain.place, chain.grid
+    out, slope, own = _linearised(*here, z, columns_um, run.samples)
+    return np.asarray(out), np.asarray(slope), np.asarray(own)
+
+
+def along(
+    chain: Chain,
+    z: Float[Array, " p"],
+    columns_um: Float[Array, " D"] | None,
+    run: StageRun,
+    directions: tuple[np.ndarray, np.ndarray],
+    reduce: Callable[[np.ndarray], np.ndarray] = lambda moved: moved,
+) -> np.ndarray:
+    """Move coordinates and columns along directions, to first order.
+
+    Parameters
+    ----------
+    chain, z, columns_um, run
+        The run, and where it is linearised: without columns, at those that the stage has, whose grid may then differ
+        from the chain's.
+    directions
+        Of the columns, shape `(D, k)`, and of the coordinates, shape `(p, k)`.
+    reduce
+        What is kept of the changes of each piece, shape `(samples, k)`.
+
+    Returns
+    -------
+    Array
+        Changes of the displacement, or what is kept of them, for all samples, shape `(n, ...)`.
+    """
+    _, slope, _ = linearise(chain, z, columns_um, run)
+    moved = [
+        reduce(columns @ directions[0] + slope[first : first + len(columns)] @ directions[1])
+        for first, columns in pieces(chain, z, run, True)
+    ]
+    return np.concatenate(moved)
+
+
+def pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the rows of the columns, piece by piece, with the sample that each piece begins at.
+
+    They are not refined: as directions to move in they are good enough, and only the residual decides where the fit
+    ends.
+    """
+    samples, grid, n = run.samples, chain.grid, len(run.record)
+    if grid is None or chain.place is None or not free:
+        yield from ((first, np.zeros((min(_PIECE, n - first), 0))) for first in range(0, n, _PIECE))
+        return
+    voltage, system = _before_and_after(chain.coordinates, chain.place, z, samples)
+    table = jnp.asarray(branch_table(grid.levels))
+    memory, carried = samples.start.memory, None
+    interval = np.diff(run.record.time_s, prepend=2 * run.record.time_s[0] - run.record.time_s[1])
+    path = np.asarray(voltage)[:n]
+    for first in range(0, n, _PIECE):
+        pad = (0, max(0, first + _PIECE - n))
+        piece = slice(first, first + _PIECE)
+        rows, memory, carried = _rows(
+            grid,
+            table,
+            system,
+            jnp.asarray(np.pad(interval[piece], pad, mode="edge")),
+            jnp.asarray(np.pad(path[piece], pad, mode="edge")),
+            memory,
+            carried,
+        )
+        yield first, np.asarray(rows)[: _PIECE - pad[1]]
+
+
+def split_moments(total: Moments, size: int, damping: float) -> tuple[Moments, np.ndarray, np.ndarray]:
+    """Eliminate the last unknowns of a regression.
+
+    Parameters
+    ----------
+    total
+        Of all unknowns.
+    size
+        Number of those that stay, `D`.
+    damping
+        Share of the diagonal that is added to the eliminated ones' own block (Marquardt).
+
+    Returns
+    -------
+    reduced
+        Moments of those that stay, with the best of the others for each.
+    answer
+        Best of the others without those that stay, shape `(p,)`.
+    follow
+        What it loses for each of those, shape `(p, D)`.
+    """
+    gram, cross = np.asarray(total.gram), np.asarray(total.cross_um)
+    own = gram[size:, size:]
+    own = own + damping * np.diag(np.diagonal(own)) + 1e-14 * np.trace(own) * np.eye(len(own))
+    answer, follow = np.linalg.solve(own, cross[size:]), np.linalg.solve(own, gram[size:, :size])
+    reduced = Moments(
+        gram[:size, :size] - gram[:size, size:] @ follow,
+        cross[:size] - gram[:size, size:] @ answer,
+        np.asarray(total.energy_um2) - cross[size:] @ answer,
+        total.count,
+    )
+    return reduced, answer, follow

@@ -1,0 +1,207 @@
+"""What a command makes a stage do, between its samples as well: voltage at the piezo, displacement, derivatives."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from fits.io._limits import Ranges, joined, measured_ranges
+from fits.io._record import Record
+from fits.stage._run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run
+from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
+
+# Steps in a period of the resonance: a sampled sine misses less than 2 % of its peak.
+_PER_PERIOD = 16
+# Samples of a run in all steps, at most: what rings between samples that are this far apart has died away.
+_MOST = 1 << 18
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run, and what a stage makes of it."""
+
+    run: StageRun
+    time_s: Any
+    scene: Scene
+
+
+def prepare(stage: Stage, run: StageRun) -> Prepared:
+    """Build the scene of a run."""
+    samples = run.samples
+    command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
+    return Prepared(run, samples.time_s, Scene(command, samples.beside, samples.start.memory))
+
+
+class _Programs:
+    """Compiled functions that send a signal through one part; one for each kind of part, and length of signal."""
+
+    def __init__(self) -> None:
+        self.drop()
+
+    def drop(self) -> None:
+        """Give back the memory of all of them: they go with the function that they were compiled for."""
+
+        @eqx.filter_jit
+        def run(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
+            return part.run(time_s, signal, scene)
+
+        self.run = run
+
+
+programs = _Programs()
+
+
+def pass_signal(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
+    """Send a signal through one part."""
+    passed: Signal = programs.run(part, time_s, signal, scene)
+    return passed
+
+
+def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
+    """What goes into each part of a stage, and at the end what comes out."""
+    signal = prepared.scene.command
+    found = [signal]
+    for part in stage.parts:
+        signal = pass_signal(part, prepared.time_s, signal, prepared.scene)
+        found.append(signal)
+    return found
+
+
+def fine_steps(stage: Stage, interval_s: float, count: int) -> int:
+    """Steps between samples that show how a stage rings."""
+    resonances = [float(p.natural_frequency_Hz) for p in map(innermost, stage.parts) if isinstance(p, Mechanics)]
+    wanted = max((interval_s * _PER_PERIOD * f for f in resonances), default=1.0)
+    # In powers of two, so that few programs are compiled.
+    return int(2 ** math.ceil(math.log2(min(max(wanted, 1.0), max(_MOST / count, 1.0)))))
+
+
+def motion(
+    stage: Stage, record: Record, range_V: tuple[float, float], initial: str = "unknown"
+) -> tuple[Ranges, np.ndarray]:
+    """Extremes of what a command makes a stage do, between its samples as well.
+
+    Parameters
+    ----------
+    stage
+        With or without effects.
+    record
+        The command, and further columns that effects need; the displacement is not looked at.
+    range_V
+        Range of the switching voltages of the hysteresis, as commands.
+    initial
+        Memory before the first sample, one of `INITIAL_STATES`.
+
+    Returns
+    -------
+    tuple
+        Ranges of voltage, slew, displacement (without the sensor's offset, which is the stage's own), velocity,
+        acceleration and driver current; and the displacement at the samples in um, shape `(n,)`.
+    """
+    n = len(record)
+    stride = fine_steps(stage, float(np.median(np.diff(record.time_s))), n)
+    blank = replace(record, displacement_um=np.zeros(n))
+    # Held out as a whole, so that short commands are no error: nothing is fitted.
+    run = prepare_stage_run(blank, range_V, initial, 1.0, stride, hold=stage.hold)
+    found = signals(stage.with_substeps(1), prepare(stage, run))
+    last = (n - 1) * stride + 1
+    time_s = np.asarray(run.samples.time_s)
+    step_s: Any = float(time_s) if time_s.ndim == 0 else time_s[:last]
+    displacement = np.asarray(found[-1].values)[:last]
+    velocity = np.gradient(displacement, step_s)
+    piezo = np.asarray(found[_driven(stage)].values)[:last]
+    steps_s = np.diff(record.time_s)
+    ranges = {
+        "voltage": record.voltage_V,
+        "slew": np.diff(record.voltage_V) / steps_s,
+        "displacement": displacement,
+        "velocity": velocity,
+        "acceleration": np.gradient(velocity, step_s),
+        "current": np.diff(piezo) / (step_s if np.ndim(step_s) == 0 else np.diff(step_s)),
+    }
+    return {name: _range(values) for name, values in ranges.items()}, displacement[::stride]
+
+
+def predicted_ranges(
+    model: Preisach | Stage, program: Record, displacement_um: np.ndarray, initial: str, every: bool = False
+) -> Ranges:
+    """What a command is, and makes a model do, between its samples too where the model rings.
+
+    Parameters
+    ----------
+    model
+        From a fit or a model file.
+    program
+        The command.
+    displacement_um
+        What the model does at the samples, shape `(n,)`.
+    initial
+        Memory before the first sample.
+    every
+        Whether velocity, acceleration and current are asked for as well.
+    """
+    ranges = measured_ranges(replace(program, displacement_um=displacement_um))
+    stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
+    law = next((law for law in map(innermost, stage.parts) if isinstance(law, Preisach)), None)
+    if law is None or len(program) < 2:
+        return ranges
+    rings = fine_steps(stage, float(np.median(np.diff(program.time_s))), len(program)) > 1
+    if not (rings or every):
+        return ranges
+    gain = gain_ahead(stage) or 1.0
+    ends = float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
+    between, _ = motion(stage, program, ends, initial)
+    return joined([between, ranges]) if every else joined([ranges, {"displacement": between["displacement"]}])
+
+
+def _driven(stage: Stage) -> int:
+    """Which of the signals is the voltage at the piezo."""
+    place = place_of_hysteresis(stage)
+    if place is not None:
+        return place
+    drivers = [k for k, part in enumerate(stage.parts) if isinstance(innermost(part), Driver)]
+    return drivers[-1] + 1 if drivers else 0
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    return float(np.min(values)), float(np.max(values))
+
+
+def reached_by(
+    stage: Stage,
+    records: Sequence[Record],
+    range_V: tuple[float, float],
+    states: Sequence[str],
+    known: Sequence[np.ndarray],
+) -> tuple[Ranges, list[float]]:
+    """What records have shown of a rig: the displacement as measured, its derivatives as a fitted stage has them.
+
+    Noise would make derivatives of the measurement larger than anything the rig did.
+
+    Parameters
+    ----------
+    stage
+        Fitted to the records.
+    records
+        With displacements.
+    range_V, states
+        See `motion`; a state for each record.
+    known
+        Samples whose response does not depend on an unknown past, one array of shape `(n,)` for each record.
+
+    Returns
+    -------
+    tuple
+        The ranges, with displacements as the sensor reads them in the first record; and for each record what the
+        sensor reads, in um, where the stage's own displacement is zero.
+    """
+    found, offsets_um = [], []
+    for record, state, sure in zip(records, states, known, strict=True):
+        assert record.displacement_um is not None
+        ranges, predicted = motion(stage, record, range_V, state)
+        offsets_um.append(float(np.mean((record.displacement_um - predicted)[sure])))
+        measured_um = record.displacement_um - offsets_um[-1] + offsets_um[0]
+        found.append({**ranges, "displacement": _range(measured_um)})
+    return joined(found), offsets_um

@@ -1,0 +1,97 @@
+"""Intervals that own up to what pulls a fit: they reach to where it comes out without that."""
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from fits.loop._fit_checks import outlying
+from fits.loop._result import FitError
+from fits.stage._moments import Chain
+from fits.stage._result import StageFit
+from fits.stage._solve import Solved, solve_chain
+from fits.stage._steps import Plan, Problem
+from fits.stage._uncertainty import Precision
+
+# Half the width of a 95 % interval, in standard deviations.
+_NORMAL = 1.959964
+# What pulls a fit ruins it where it moves a parameter by more than this part of it.
+_RUINED = 0.5
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Where the parameters of a stage come out without something.
+
+    Attributes
+    ----------
+    values, low, high
+        The parameters and the ends of their 95 % intervals, shape `(p,)`.
+    """
+
+    values: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, chain: Chain, solved: Solved, precision: Precision) -> "Reach":
+        """Read it off a solution."""
+        sd = np.sqrt(np.diagonal(precision.covariance(precision.influence())))
+        ends = (np.asarray(chain.coordinates.values(jnp.asarray(solved.z + k * _NORMAL * sd))) for k in (0, -1, 1))
+        return cls(*ends)
+
+    def ruined(self, fit: StageFit) -> list[str]:
+        """Say which parameters of a fit are far from these, one sentence each."""
+        return [
+            f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
+            for p, v in zip(fit.parameters, self.values, strict=True)
+            if abs(v - p.value) > _RUINED * min(abs(v), abs(p.value))
+        ]
+
+    def widen(self, fit: StageFit, said: str, remedy: str) -> StageFit:
+        """Let a fit's intervals reach these, and say so first.
+
+        Parameters
+        ----------
+        fit
+            With all that pulls it.
+        said, remedy
+            What pulls it, and what to do about that.
+        """
+        parameters = tuple(
+            replace(
+                p,
+                sd=float(np.hypot(p.sd, v - p.value)),
+                lower=min(p.lower, float(a)),
+                upper=max(p.upper, float(b)),
+            )
+            for p, v, a, b in zip(fit.parameters, self.values, self.low, self.high, strict=True)
+        )
+        listed = ", ".join(f"{p.name} {v:.5g} {p.unit}" for p, v in zip(fit.parameters, self.values, strict=True))
+        remark = f"{said}; without that the parameters would be {listed}, and the intervals reach there: {remedy}"
+        return replace(fit, parameters=parameters, remarks=(remark, *fit.remarks))
+
+
+def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[str], Reach] | None:
+    """Fit again without readings that jump out; the files that have such, and where the parameters come out.
+
+    Returns
+    -------
+    tuple or None
+        None where there are none, or where a robust loss weighs them less already, or where that fit fails.
+    """
+    bad = [outlying(one.residual_um, run.fitted) for one, run in zip(solved.sums, solved.runs, strict=True)]
+    sources = [run.record.source for one, run in zip(bad, solved.runs, strict=True) if one.any()]
+    if plan.loss != "squares" or not sources:
+        return None
+    runs = []
+    for run, one in zip(solved.runs, bad, strict=True):
+        kept = replace(run, fitted=run.fitted & ~one)
+        runs.append(kept.weighted(np.ones(len(one))))
+    plan.progress(f"fitting without the outliers of {', '.join(sources)}")
+    start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
+    try:
+        found = solve_chain(problem.chain, *start, plan.loss, plan.progress, anyway=True, even=problem.even)
+    except (FitError, np.linalg.LinAlgError):
+        return None
+    return sources, Reach.of(problem.chain, found, Precision(problem.chain, found, problem.stroke_um))

@@ -1,0 +1,259 @@
+"""Fitting a whole stage: damped Gauss-Newton steps, the columns of the hysteresis solved for exactly in each."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from fits.loop._grid import solve_grid
+from fits.loop._moments import Data, Moments
+from fits.loop._prior import Hyper, roughness
+from fits.loop._result import FitError, FitStatus
+from fits.stage._moments import Chain, RunSums, run_sums, split_moments
+from fits.stage._run import StageRun, residual_of
+from fits.stage._weighing import Weighing
+from fits.stats._noise import huber_weight
+
+_ROUNDS, _ROUGH = 40, 12
+# Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
+_DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
+# A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
+_STATIONARY = 0.02
+# Variance of the noise below which, in squares of the stroke, all is rounding.
+_ROUNDING = 1e-20
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Where a fit ended.
+
+    Attributes
+    ----------
+    z
+        Coordinates, shape `(p,)`.
+    columns_um
+        Columns of the grid, shape `(D,)`.
+    hyper
+        Smoothness and noise of the grid; None without one.
+    runs
+        With the weights of their samples.
+    sums
+        Regression at the end, per run.
+    weighing
+        Noise of each run.
+    distance
+        How far the optimum may still be, in standard deviations of the coordinates.
+    """
+
+    z: np.ndarray
+    columns_um: np.ndarray
+    hyper: Hyper | None
+    runs: list[StageRun]
+    sums: list[RunSums]
+    weighing: Weighing
+    distance: float
+
+    @property
+    def cost(self) -> float:
+        """Logarithm of the noise that is left, times the samples that count: smaller is better."""
+        terms = zip(self.runs, self.weighing.noise_um, strict=True)
+        return sum(float(run.fitted.sum()) * float(np.log(noise)) for run, noise in terms)
+
+
+def solve_chain(
+    chain: Chain,
+    z: np.ndarray,
+    columns_um: np.ndarray,
+    runs: Sequence[StageRun],
+    hyper: Hyper | None,
+    stroke_um: float,
+    loss: str,
+    progress: Callable[[str], None],
+    rough: bool = False,
+    anyway: bool = False,
+    even: float = 0.0,
+) -> Solved:
+    """Find the most probable coordinates of a stage, and the columns of its grid.
+
+    Each round linearises the stage, eliminates the coordinates from the regression, solves it for non-negative smooth
+    columns with the smoothness that maximises the evidence, and damps the step until the true cost falls (variable
+    projection; Golub & Pereyra 2003). Without columns these are Levenberg and Marquardt's steps.
+
+    Parameters
+    ----------
+    chain
+        The stage.
+    z, columns_um
+        Start.
+    runs
+        Prepared.
+    hyper
+        Smoothness and noise of the columns to start from; None to leave the columns as they are.
+    stroke_um
+        Unit of the columns.
+    loss
+        One of `LOSSES`.
+    progress
+        Told what is being done.
+    rough
+        Whether the place found is only a start for another fit, so that it need not be stationary.
+    anyway
+        Whether the best place is an answer, too, if it does not become stationary: for those who go on from there.
+    even
+        No run counts as quieter than this part of the loudest. Where more than noise is left, one run would otherwise
+        be fitted ever better, and so count for ever more, at the cost of the others.
+
+    Raises
+    ------
+    FitError
+        If it does not become stationary and must.
+    """
+    damping = _DAMPING
+    counted: tuple[float, ...] = ()
+    for number in range(_ROUGH if rough else _ROUNDS):
+        runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
+        progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
+        if not np.all(np.isfinite(weighing.noise_um)):
+            raise FitError(FitStatus.NONFINITE)
+        # Far from the answer, what a run leaves says nothing of its noise: weighed by it, one run would be given up.
+        weights = weighing.alike() if rough else weighing
+        total = weights.total(sums)
+        here = weights.cost_um2(runs, [one.residual_um for one in sums])
+        while True:
+            try:
+                step, columns, better, variance, distance = _step(
+                    chain, total, columns_um, hyper, weights, stroke_um, damping
+                )
+            except FitError:
+                # The columns of a step too far may be out of their solver's reach.
+                damping *= _FACTOR
+                if damping > _HIGHEST and not (anyway and number):
+                    raise
+                if damping > _HIGHEST:
+                    return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+                continue
+            hyper = better
+            prior = prior_precision(chain, hyper, stroke_um)
+            there = weights.cost_um2(runs, _residuals(chain, z + step, columns, runs))
+            old = here / variance + columns_um @ prior @ columns_um
+            new = there / variance + columns @ prior @ columns
+            if new <= old:
+                z, columns_um, damping = z + step, columns, damping / _FACTOR
+                break
+            # Within rounding of the optimum nothing falls any more.
+            if distance < _STATIONARY:
+                break
+            damping *= _FACTOR
+            if damping > _HIGHEST:
+                break
+        if damping > _HIGHEST and anyway:
+            break
+        if damping > _HIGHEST and not rough:
+            raise FitError(FitStatus.NOT_STATIONARY)
+        if distance < _STATIONARY and not rough and not counted and len(runs) > 1:
+            # What is fitted worse is correlated more: run after run would be given up if this were asked again.
+            counted = weighing.correlation
+            continue
+        if distance < _STATIONARY:
+            runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
+            return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+    if rough or anyway:
+        return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+    raise FitError(FitStatus.MAX_STEPS)
+
+
+def prior_precision(chain: Chain, hyper: Hyper | None, stroke_um: float) -> np.ndarray:
+    """Precision of the columns before the data, in 1/um^2, shape `(D, D)`; zero where they are given."""
+    if hyper is None:
+        return np.zeros((chain.size, chain.size))
+    return np.asarray(roughness(chain.levels).precision(hyper)) / stroke_um**2
+
+
+def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
+    """Take off what a prior says of the scale of all columns together, shape `(D, D)`.
+
+    That is for the data alone to say: a gain beside the grid is not seen, however smooth the grid is.
+    """
+    pull = prior @ columns_um
+    return prior - np.outer(pull, pull) / max(float(columns_um @ pull), 1e-300)
+
+
+def _gather(
+    chain: Chain,
+    z: np.ndarray,
+    columns_um: np.ndarray,
+    runs: Sequence[StageRun],
+    loss: str,
+    free: bool,
+    counted: tuple[float, ...],
+    even: float,
+) -> tuple[Sequence[StageRun], list[RunSums], Weighing]:
+    if loss != "squares":
+        left = _residuals(chain, z, columns_um, runs)
+        runs = [robust(run, residual) for run, residual in zip(runs, left, strict=True)]
+    sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
+    return runs, sums, replace(Weighing.of(runs, [one.residual_um for one in sums], *counted), even=even)
+
+
+def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun]) -> list[np.ndarray]:
+    stage = chain.stage(jnp.asarray(z), jnp.asarray(columns_um))
+    return [residual_of(stage, run) for run in runs]
+
+
+def robust(run: StageRun, residual_um: np.ndarray) -> StageRun:
+    """Weigh a run's samples by what they leave: outliers count linearly (Huber)."""
+    return run.weighted(huber_weight(residual_um, run.fitted))
+
+
+def _step(
+    chain: Chain,
+    total: Moments,
+    columns_um: np.ndarray,
+    hyper: Hyper | None,
+    weighing: Weighing,
+    stroke_um: float,
+    damping: float,
+) -> tuple[np.ndarray, np.ndarray, Hyper | None, float, float]:
+    """Change of coordinates, columns, their smoothness, noise variance in um^2, and standard deviations moved."""
+    if hyper is None or chain.grid is None:
+        _, step, _ = split_moments(total, 0, damping)
+        variance = weighing.least_um**2
+        information = marginal_information(total, 0, np.zeros((0, 0)), variance)
+        return step, columns_um, hyper, variance, float(step @ information @ step / len(step)) ** 0.5
+    reduced, answer, follow = split_moments(total, chain.size, damping)
+    solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, 1.0, hyper)
+    if solution.result != optx.RESULTS.successful:
+        raise FitError(FitStatus.MAX_STEPS)
+    columns = np.asarray(solution.columns) * stroke_um
+    step = answer - follow @ columns
+    variance = float(jnp.exp(solution.hyper.log_variance)) * stroke_um**2
+    if not variance > _ROUNDING * stroke_um**2:
+        # The search for the noise went astray.
+        raise FitError(FitStatus.NONFINITE)
+    prior = scale_free(prior_precision(chain, solution.hyper, stroke_um), columns)
+    information = marginal_information(total, chain.size, prior, variance)
+    return step, columns, solution.hyper, variance, float(step @ information @ step / len(step)) ** 0.5
+
+
+def marginal_information(total: Moments, size: int, prior: np.ndarray, variance: float) -> np.ndarray:
+    """Precision of the coordinates, whatever the columns may be, shape `(p, p)`.
+
+    Parameters
+    ----------
+    total
+        Of columns and coordinates.
+    size
+        Number of columns, `D`.
+    prior
+        Precision of the columns before the data, shape `(D, D)`.
+    variance
+        Of the noise.
+    """
+    gram = np.asarray(total.gram) / variance
+    if size == 0:
+        return gram
+    root = np.linalg.cholesky(gram[:size, :size] + prior)
+    half = np.linalg.solve(root, gram[:size, size:])
+    return gram[size:, size:] - half.T @ half

@@ -1,0 +1,269 @@
+"""Where the fit of a stage begins: poles read off a measured frequency response, so that nobody has to guess them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import signal
+from scipy.optimize import least_squares
+
+from fits.stage._run import StageRun
+from microid import AbstractLinear, Driver, Mechanics, Stage
+
+# Segments whose spectra are averaged.
+_SEGMENTS = 8
+_LEAST = 64
+# Lines at which less than this of the displacement's power follows the input say nothing; noise alone seems to follow
+# by a third at many of them, so that less than the first counts only where there is nothing better.
+_COHERENT, _HARDLY = 0.7, 0.3
+_LINES = 6
+# However coherent a line is, the estimate leaks from its neighbours.
+_SHARPEST = 30.0
+_DAMPING_RATIOS = (0.005, 0.03, 0.15, 0.7)
+_FREQUENCIES, _TIMES, _PEAKS = 24, 8, 3
+# Lines of a response that are kept, spread evenly over the logarithm of the frequency and around the largest.
+_MOST = 240
+# Candidates, in logarithms of the poles, that are too alike to refine both, or to keep both.
+_COARSE, _SAME = 0.5, 0.05
+_LEADING, _REFINED, _KEPT = 200, 4, 3
+
+
+@dataclass(frozen=True)
+class MeasuredResponse:
+    """Frequency response of the linear part of a stage, as the runs show it.
+
+    Attributes
+    ----------
+    frequency_Hz
+        Shape `(f,)`.
+    response
+        Displacement per displacement that the hysteresis alone would give, complex, shape `(f,)`.
+    coherence
+        Share of the power that follows the input, shape `(f,)`.
+    """
+
+    frequency_Hz: np.ndarray
+    response: np.ndarray
+    coherence: np.ndarray
+
+
+def measure_response(run: StageRun, drive: np.ndarray) -> MeasuredResponse:
+    """Estimate the frequency response from a drive to the displacement of a run (Welch).
+
+    Parameters
+    ----------
+    run
+        Its fitted samples are used, from the first to the last.
+    drive
+        What goes in, shape `(n,)`.
+    """
+    which = np.flatnonzero(run.fitted)
+    piece = slice(which[0], which[-1] + 1)
+    time = run.record.time_s[piece]
+    even = np.linspace(time[0], time[-1], len(time))
+    x, y = (np.interp(even, time, values[piece]) for values in (drive, run.displacement_um))
+    rate, length = (len(time) - 1) / (time[-1] - time[0]), max(_LEAST, 2 * len(time) // (_SEGMENTS + 1))
+    settings: dict[str, Any] = {"fs": rate, "nperseg": min(length, len(time)), "detrend": "linear"}
+    frequency, cross = signal.csd(x, y, **settings)
+    power, out = signal.welch(x, **settings)[1], signal.welch(y, **settings)[1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        response, coherence = cross / power, np.abs(cross) ** 2 / (power * out)
+    # The lines next to zero hold what the trend leaves.
+    usable = (np.arange(len(frequency)) >= 2) & np.isfinite(coherence) & (response != 0)
+    seen = usable & (coherence > _COHERENT)
+    if seen.sum() < _LINES:
+        seen = usable & (coherence > _HARDLY)
+    kept = _thinned(frequency, np.abs(response), np.flatnonzero(seen))
+    return MeasuredResponse(frequency[kept], response[kept], np.minimum(coherence[kept], 1 - 1e-9))
+
+
+def _thinned(frequency: np.ndarray, size: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Keep some lines of many: spread over the logarithm of the frequency, and the largest, where poles show."""
+    if len(seen) <= _MOST:
+        return seen
+    spread = np.searchsorted(frequency[seen], np.geomspace(frequency[seen[0]], frequency[seen[-1]], _MOST // 2))
+    largest = np.argsort(-size[seen])[: _MOST // 2]
+    return seen[np.unique(np.concatenate([np.minimum(spread, len(seen) - 1), largest]))]
+
+
+def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[Stage]:
+    """Find poles that explain measured frequency responses.
+
+    Parameters
+    ----------
+    stage
+        Its drivers and mechanics, where they are not frozen, are replaced; other linear parts are taken as they are.
+    responses
+        One per run; each has a gain of its own.
+
+    Returns
+    -------
+    list of Stage
+        Distinct candidates, the best first; the stage itself where the responses say nothing.
+    """
+    free = [
+        (name, part)
+        for name, part in zip(stage.names, stage.parts, strict=True)
+        if isinstance(part, Driver | Mechanics) and name not in stage.frozen
+    ]
+    responses = [one for one in responses if len(one.frequency_Hz) >= _LINES]
+    if not free or not responses:
+        return [stage]
+    moved = [name for name, _ in free]
+    fixed = [
+        part
+        for name, part in zip(stage.names, stage.parts, strict=True)
+        if isinstance(part, AbstractLinear) and name not in moved
+    ]
+    problem = _LogResponse.of(responses, [isinstance(part, Driver) for _, part in free], fixed)
+    candidates = problem.candidates()
+    found: list[tuple[float, np.ndarray]] = []
+    for x in _distinct(candidates[:_LEADING], _COARSE)[:_REFINED]:
+        low, high = problem.bounds()
+        end: Any = least_squares(problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200)
+        found.append((float(end.cost), end.x))
+    found.sort(key=lambda item: item[0])
+    ends = _distinct([x for _, x in found], _SAME)[:_KEPT]
+    best = [other for x in ends[:1] for other in problem.exchanged(x)]
+    return [problem.applied(stage, moved, x) for x in [*ends, *best]]
+
+
+def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) -> list[float]:
+    """Order delays by how well some poles of a stage and the delay explain a measured response, the best first.
+
+    Of neighbours only the best is kept.
+    """
+    parts = [part for part in stage.parts if isinstance(part, Driver | Mechanics)]
+    if not parts or len(response.frequency_Hz) < _LINES:
+        return []
+    problem = _LogResponse.of([response], [isinstance(part, Driver) for part in parts], [])
+    costs = []
+    for shift in shifts_s:
+        turned = problem.measured * np.exp(2j * np.pi * problem.frequency_Hz * shift)
+        costs.append(replace(problem, measured=turned).least())
+    cost = np.asarray(costs)
+    low = np.flatnonzero((cost <= np.r_[np.inf, cost[:-1]]) & (cost <= np.r_[cost[1:], np.inf]))
+    return [float(shifts_s[k]) for k in low[np.argsort(cost[low])]]
+
+
+def _distinct(points: Sequence[np.ndarray], apart: float) -> list[np.ndarray]:
+    kept: list[np.ndarray] = []
+    for point in points:
+        if all(np.max(np.abs(point - other)) > apart for other in kept):
+            kept.append(point)
+    return kept
+
+
+@dataclass(frozen=True)
+class _LogResponse:
+    """Measured and modelled responses compared by their logarithms, in which poles far away still pull.
+
+    A driver is one coordinate, the logarithm of its time constant; a mechanics two, those of its natural frequency
+    and its damping ratio.
+    """
+
+    frequency_Hz: np.ndarray
+    measured: np.ndarray
+    weight: np.ndarray
+    run: np.ndarray
+    drivers: list[bool]
+
+    @classmethod
+    def of(
+        cls, responses: Sequence[MeasuredResponse], drivers: list[bool], fixed: Sequence[AbstractLinear]
+    ) -> "_LogResponse":
+        frequency = np.concatenate([one.frequency_Hz for one in responses])
+        measured = np.concatenate([one.response for one in responses])
+        coherence = np.concatenate([one.coherence for one in responses])
+        for part in fixed:
+            response = np.asarray(part.frequency_response(jnp.asarray(frequency)))
+            measured = measured * float(part.static_gain) / response
+        # The variance of the logarithm of a response is proportional to (1 - coherence) / coherence.
+        weight = np.minimum(np.sqrt(coherence / (1 - coherence)), _SHARPEST)
+        run = np.repeat(np.arange(len(responses)), [len(one.frequency_Hz) for one in responses])
+        return cls(frequency, measured, weight, run, drivers)
+
+    def misfit(self, x: np.ndarray) -> np.ndarray:
+        """Weighted real and imaginary parts of the logarithm of measured over modelled, shape `(2 f,)`."""
+        off = self._off(np.prod([self._inverse(part) for part in self._split(x)], axis=0))
+        return np.concatenate([off.real, off.imag])
+
+    def _split(self, x: np.ndarray) -> list[np.ndarray]:
+        return np.split(x, np.cumsum([1 if driver else 2 for driver in self.drivers])[:-1])
+
+    def _inverse(self, x: np.ndarray) -> np.ndarray:
+        """One over the response of one part, whose coordinates are along the last axis, shape `(..., f)`."""
+        turns = 2j * np.pi * self.frequency_Hz
+        if x.shape[-1] == 1:
+            return 1 + turns * np.exp(x)
+        s = turns / (2 * np.pi * np.exp(x[..., :1]))
+        return 1 + s * (s + 2 * np.exp(x[..., 1:]))
+
+    def _off(self, inverse: np.ndarray) -> np.ndarray:
+        # The logarithm of a product of ratios wraps; that of each ratio's deviation from one gain rarely does.
+        ratio = self.measured * inverse
+        off = np.log(np.abs(ratio)) + 1j * np.angle(ratio)
+        for number in range(self.run.max() + 1):
+            which = self.run == number
+            share = self.weight[which] ** 2
+            # Gains are positive: only their size is free.
+            off[..., which] -= (off[..., which].real @ share / np.sum(share))[..., None]
+        return off * self.weight
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Poles beyond these leave nothing in the band, and those within their ends something."""
+        low, high = np.log(self.frequency_Hz.min() / 30), np.log(self.frequency_Hz.max() * 30)
+        radian = np.log(2 * np.pi)
+        driver, mechanics = [(-radian - high, -radian - low)], [(low, high), (np.log(1e-4), np.log(1e2))]
+        pairs = [pair for one in self.drivers for pair in (driver if one else mechanics)]
+        return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
+
+    def least(self) -> float:
+        """Misfit of the best candidate."""
+        return float(self._ranked()[0][0])
+
+    def candidates(self) -> list[np.ndarray]:
+        """All combinations of some poles for each part, the best first."""
+        return list(self._ranked()[1])
+
+    def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
+        low, high = float(self.frequency_Hz.min()), float(self.frequency_Hz.max())
+        size = np.abs(self.measured) * np.minimum(self.weight, 1)
+        peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] > size[2:])) + 1
+        highest = self.frequency_Hz[peaks[np.argsort(-size[peaks])][:_PEAKS]]
+        natural = np.concatenate([highest, np.geomspace(max(low, high / 100), 2 * high, _FREQUENCIES)])
+        constants = np.log(np.geomspace(0.02, 50, _TIMES) / (2 * np.pi * high))[:, None]
+        poles = np.log(list(product(natural, _DAMPING_RATIOS)))
+        points, inverse = np.zeros((1, 0)), np.ones((1, len(self.frequency_Hz)), dtype=complex)
+        for driver in self.drivers:
+            more = constants if driver else poles
+            inverse = (inverse[:, None] * self._inverse(more)[None]).reshape(-1, inverse.shape[1])
+            points = np.concatenate([np.repeat(points, len(more), axis=0), np.tile(more, (len(points), 1))], axis=1)
+        cost = np.sum(np.abs(self._off(inverse)) ** 2, axis=1)
+        order = np.argsort(cost)
+        return cost[order], points[order]
+
+    def exchanged(self, x: np.ndarray) -> list[np.ndarray]:
+        """The same poles in other places: a response does not tell which real pole lies ahead of the hysteresis."""
+        parts = self._split(x)
+        if self.drivers != [True, False] or parts[1][1] <= 0:
+            return []
+        rate, damping = 2 * np.pi * np.exp(parts[1][0]), np.exp(parts[1][1])
+        spread = rate * np.sqrt(damping**2 - 1)
+        poles = [np.exp(-parts[0][0]), rate * damping - spread, rate * damping + spread]
+        others = []
+        for k in (1, 2):
+            one, two = poles[:k] + poles[k + 1 :]
+            natural = np.log(np.sqrt(one * two) / (2 * np.pi)), np.log((one + two) / (2 * np.sqrt(one * two)))
+            others.append(np.array([-np.log(poles[k]), *natural]))
+        return others
+
+    def applied(self, stage: Stage, names: Sequence[str], x: np.ndarray) -> Stage:
+        for name, pole in zip(names, self._split(np.exp(x)), strict=True):
+            part: Any = stage[name]
+            made: Any = Driver if isinstance(part, Driver) else Mechanics
+            stage = stage.swap(name, made(*(jnp.asarray(value) for value in pole), part.gain))
+        return stage

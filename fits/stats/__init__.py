@@ -1,0 +1,1 @@
+"""Figures of residuals: noise, its correlation and spectrum, errors, and what data leave open."""

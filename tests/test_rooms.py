@@ -1,0 +1,52 @@
+"""The rooms of `fits`: what each may import."""
+
+import ast
+
+import pytest
+from test_architecture import ROOT, imports, relative
+
+# The rooms of `fits`; each may import from those before it.
+ROOMS = (
+    "io",
+    "stats",
+    "loop",
+    "stage",
+    "control",
+    "machining",
+    "diagnosis",
+    "sweeps",
+    "plots",
+    "report",
+    "paper",
+    "cli",
+)
+
+
+def rooms_of(path):
+    """Rooms of `fits` that a file imports from."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        for name in names:
+            package, _, rest = name.partition(".")
+            if package == "fits":
+                assert rest, f"{relative(path)} imports the public names of fits, and so all of it"
+                yield rest.partition(".")[0]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "fits").glob("*/**/*.py")), ids=relative)
+def test_rooms_of_fits_import_only_those_below(path):
+    room = path.relative_to(ROOT).parts[1]
+    above = ROOMS[ROOMS.index(room) + 1 :]
+    found = set(rooms_of(path))
+    assert not found & set(above), f"{relative(path)} imports from {', '.join(sorted(found & set(above)))}"
+    assert found <= set(ROOMS)
+    # Pictures are drawn in one room alone.
+    drawn = "matplotlib" in {name for name, _ in imports(ast.parse(path.read_text(encoding="utf-8")))}
+    assert room == "plots" or not drawn, f"{relative(path)} imports matplotlib"
+
+
+def test_rooms_are_what_the_folder_shows():
+    here = {path.name for path in (ROOT / "fits").iterdir() if path.name != "__pycache__"}
+    assert here == {*ROOMS, "__init__.py", "__main__.py"}
