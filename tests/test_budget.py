@@ -15,7 +15,6 @@ from _models import densities_of, limits_V, random_model
 from matplotlib.image import imread
 
 import fits
-import fits.cli._budget
 import microid as m
 from fits.cli._main import cli
 from fits.loop._design import Grid
@@ -239,7 +238,7 @@ def test_a_rotation_needs_an_arm_for_its_sensor(folder):
 )
 def test_bad_input_ends_in_one_sentence(folder, monkeypatch, arguments, words):
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(fits.cli._budget, "budget", lambda *_, **__: pytest.fail("worked before refusing"))
+    monkeypatch.setattr("fits.machining._budget.budget", lambda *_, **__: pytest.fail("worked before refusing"))
     Path("short.csv").write_text("\n".join(Path("idle.csv").read_text().splitlines()[:50]))
     linear = m.Stage.of(piezo=m.Piezo(jnp.asarray(0.3)))
     unsure = fits.load_model("model.json").uncertainty

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from _command import OFF, files, refused, run
 
-import fits.cli._fit
 from fits.cli._main import cli
 from fits.io._jax_setup import _cache_folder
 from fits.loop._run import INITIAL_STATES
@@ -131,7 +130,7 @@ def test_json_and_info_agree(bench, tmp_path):
     assert fit.stdout.split("\n\nmodel ")[0] in words.stdout
 
 
-@pytest.mark.parametrize("step", ["fit", "plot_fit", "model_text"])
+@pytest.mark.parametrize("step", ["loop._fit.fit", "plots._loop.plot_fit", "stage._model_file.model_text"])
 def test_an_interruption_leaves_nothing(bench, tmp_path, monkeypatch, step):
     folder, _, _ = bench
     old = tmp_path / "m.json"
@@ -143,7 +142,7 @@ def test_an_interruption_leaves_nothing(bench, tmp_path, monkeypatch, step):
                 (argument / "loops.png").write_bytes(b"half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fits.cli._fit, step, interrupt)
+    monkeypatch.setattr(f"fits.{step}", interrupt)
     csv = folder / "csv" / "train.csv"
     result = run("fit", csv, "--out", old, "--plots", tmp_path / "plots", "--levels", 8)
     assert result.exit_code == 130
@@ -315,7 +314,7 @@ def test_places_that_cannot_be_are_refused_before_the_work(bench, tmp_path, monk
     shutil.copy(folder / "csv" / "train.csv", "train.csv")
     shutil.copy(folder / "model.json", "model.json")
     os.mkfifo("pipe")
-    monkeypatch.setattr(fits.cli._fit, "read_runs", lambda *_: pytest.fail("the work has begun"))
+    monkeypatch.setattr("fits.io._read_csv.read_runs", lambda *_: pytest.fail("the work has begun"))
     for place in ("", "n" * 300, "pipe"):
         refused(run(*arguments, place))
     assert files(tmp_path) == ["model.json", "pipe", "train.csv"]

@@ -111,7 +111,7 @@ def test_what_cannot_be_written_whole_is_not_written(bench, monkeypatch):
     def full(*_):
         raise DataError("the disk is full")
 
-    monkeypatch.setattr("fits.cli._diagnose.write_csv", full)
+    monkeypatch.setattr("fits.io._atomic.write_csv", full)
     refused(run("diagnose", "run.csv", "--out", "d"), "full")
     assert files(bench.folder / "d") == []
 

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from _command import files, refused, run
 
-import fits.cli._fit
 from fits import FitError, FitStatus
 from microid import FAMILIES
 
@@ -91,12 +90,12 @@ def test_a_failed_fit_ends_in_its_sentence(good_csv, monkeypatch, status):
     def fail(*_, **__):
         raise FitError(status)
 
-    monkeypatch.setattr(fits.cli._fit, "fit", fail)
+    monkeypatch.setattr("fits.loop._fit.fit", fail)
     refused(run("fit", good_csv, "--out", good_csv.parent / "m.json", "--plots", good_csv.parent / "p"), status.value)
     assert files(good_csv.parent) == ["good.csv"]
 
 
 def test_other_mistakes_are_not_hidden(good_csv, monkeypatch):
-    monkeypatch.setattr(fits.cli._fit, "fit", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("fits.loop._fit.fit", lambda *_, **__: 1 / 0)
     assert isinstance(run("fit", good_csv, "--out", good_csv.parent / "m.json").exception, ZeroDivisionError)
     assert files(good_csv.parent) == ["good.csv"]

@@ -8,7 +8,6 @@ import pytest
 from _command import files, refused, run
 
 import fits
-import fits.cli._sensitivity
 import microid as m
 from fits.cli._main import cli
 
@@ -154,7 +153,7 @@ def test_an_interruption_leaves_nothing(stage, tmp_path, drawing):
 )
 def test_bad_input_ends_in_one_sentence(stage, monkeypatch, options, words):
     monkeypatch.chdir(stage.parent)
-    monkeypatch.setattr(fits.cli._sensitivity, "sensitivities", lambda *_: pytest.fail("worked before refusing"))
+    monkeypatch.setattr("fits.machining._sensitivity.sensitivities", lambda *_: pytest.fail("worked before refusing"))
     Path("broken.toml").write_text(stage.read_text().replace("t1 = { value = 0.8", "t1 = { value = -0.8"))
     before = stage.read_bytes()
     refused(run("sensitivity", *options), *words)

@@ -9,7 +9,6 @@ from _command import files, refused, run
 from matplotlib.image import imread
 from test_cli_refusals import bad_csv, write_csv
 
-import fits.cli._fit
 from fits import FitError, FitStatus, StageUncertainty, describe_stage, load_model
 from microid import Stage
 
@@ -253,7 +252,7 @@ def test_a_failed_fit_ends_in_its_sentence(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise FitError(FitStatus.MAX_STEPS)
 
-    monkeypatch.setattr(fits.cli._fit, "fit_stage", fail)
+    monkeypatch.setattr("fits.stage._fit.fit_stage", fail)
     options = ["--model", "stage", "--out", tmp_path / "m.json", "--plots", tmp_path / "p"]
     refused(run("fit", tmp_path / "good.csv", *options), FitStatus.MAX_STEPS.value)
     assert files(tmp_path) == ["good.csv"]
@@ -268,7 +267,7 @@ def test_each_run_may_have_a_memory_of_its_own(tmp_path, monkeypatch):
         given.append((initial, loss))
         raise FitError(FitStatus.NONFINITE)
 
-    monkeypatch.setattr(fits.cli._fit, "fit_stage", fail)
+    monkeypatch.setattr("fits.stage._fit.fit_stage", fail)
     runs = ["fit", tmp_path / "a.csv", tmp_path / "b.csv", "--model", "stage", "--out", tmp_path / "m.json"]
     run(*runs)
     run(*runs, "--initial", "negative", "--loss", "huber")

@@ -147,12 +147,10 @@ def test_the_driver_alone_can_be_what_asks_for_too_much(rng):
 
 def test_the_command_takes_stages(rng, model_file, tmp_path, monkeypatch):
     """Reading them from a file is tested elsewhere: here the model in the file is put into a stage."""
-    from fits.cli import _compensate as _cli_compensate
-
     law, path = model_file
     stage = stage_of(rng, law)
     loaded = load_model(path)
-    monkeypatch.setattr(_cli_compensate, "load_model", lambda _: dataclasses.replace(loaded, model=stage))
+    monkeypatch.setattr("fits.stage._model_file.load_model", lambda _: dataclasses.replace(loaded, model=stage))
     wanted, stroke = smooth_reference(stage)
     csv, out = tmp_path / "r.csv", tmp_path / "v.csv"
     rows = zip(wanted.time_s.tolist(), wanted.displacement_um.tolist(), strict=True)

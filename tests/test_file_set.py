@@ -283,7 +283,7 @@ class Noisy:
             time.sleep(0.01)
 
 @in_sentences
-def work():
+def work(_given):
     print("begin", flush=True)
     Noisy()
     time.sleep(1000)

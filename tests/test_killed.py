@@ -33,7 +33,8 @@ from fits.cli._common import heed_signals, in_sentences
 from fits.io._file_set import file_set
 
 @in_sentences
-def write(folder, first, rounds):
+def write(given):
+    folder, first, rounds = given.folder, given.first, given.rounds
     for number in range(first, first + rounds):
         with file_set() as files:
             model = files.file(folder / "model.json")
@@ -45,7 +46,7 @@ def write(folder, first, rounds):
 
 heed_signals()
 folder, first, rounds = sys.argv[1:]
-write(Path(folder), int(first), int(rounds))
+write(folder=Path(folder), first=int(first), rounds=int(rounds))
 """
 
 

@@ -11,7 +11,7 @@ from _command import files, refused, run
 from _seed import seed_of
 
 import data_synth as ds
-import fits.cli._paper as paper
+import fits.paper._regenerate as paper
 import fits.paper._runs as runs
 from fits.paper._gains import PaperMode, paper_controller, placed_pid, shown_reference
 from fits.paper._loop import run_feedback, stacked

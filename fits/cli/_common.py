@@ -1,7 +1,7 @@
 """What the commands share: options, and bad input in sentences.
 
-Of other packages only click is imported here and in the `_commands_...` modules; the work, and what it imports,
-is in the modules those call.
+Each command is one file of this folder, named after it, and declares its options once. Of other packages only click
+is imported before a command runs, so that help does not wait for JAX.
 """
 
 import errno
@@ -11,7 +11,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from typing import Any, NoReturn, TypeVar
+from types import SimpleNamespace
+from typing import Any, NoReturn
 
 import click
 
@@ -22,7 +23,6 @@ from fits.io._printable import printable
 # Signals that ask the command to end.
 _SIGNALS = ("SIGTERM", "SIGHUP")
 _AGAIN_s = 0.05
-_Command = TypeVar("_Command", bound=Callable[..., None])
 
 
 class Terminated(KeyboardInterrupt):
@@ -86,13 +86,20 @@ class Stopped(SystemExit):
     """The end of a command that was stopped."""
 
 
-def in_sentences(command: _Command) -> _Command:
-    """Turn bad input and interruption into one line on stderr and an exit status."""
+class Given(SimpleNamespace):
+    """What a command was given, by the names of its options."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"the command declares no option {name!r}")
+
+
+def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
+    """Hand a command its options in one piece; bad input and interruption end in one line on stderr and a status."""
 
     @functools.wraps(command)
-    def run(*args: Any, **kwargs: Any) -> None:
+    def run(**options: Any) -> None:
         try:
-            command(*args, **kwargs)
+            command(Given(**options))
         except KeyboardInterrupt as stop:
             stopped(stop, "no unfinished file was left")
         except DataError as error:
@@ -102,7 +109,7 @@ def in_sentences(command: _Command) -> _Command:
         except OSError as error:
             system_refuses(error)
 
-    return run  # type: ignore[return-value]
+    return run
 
 
 columns = click.option(

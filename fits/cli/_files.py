@@ -72,3 +72,15 @@ def keep_inputs(out: str, inputs: Iterable[str]) -> None:
     for path in inputs:
         if os.path.realpath(path) == os.path.realpath(out):
             raise DataError(f"--out: {out} would overwrite what is read; choose another name.")
+
+
+def keep_apart(places: dict[str, str | None]) -> None:
+    """Refuse to write where is read, or twice to one place."""
+    seen: dict[str, str] = {}
+    for option, place in places.items():
+        if place is None:
+            continue
+        real = os.path.realpath(place)
+        if real in seen:
+            raise DataError(f"{option}: {place} would overwrite the file of {seen[real]}; choose another name.")
+        seen[real] = option

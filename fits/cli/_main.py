@@ -4,18 +4,15 @@ Only the standard library and click are imported before a command runs.
 """
 
 import contextlib
+import importlib
 import io
 import os
+import pkgutil
 import sys
 
 import click
 
-from fits.cli._commands_control import control
-from fits.cli._commands_diagnosis import diagnose
-from fits.cli._commands_model import compensate, export, fit, info, simulate, synth
-from fits.cli._commands_paper import paper
-from fits.cli._commands_stage import budget, sensitivity
-from fits.cli._commands_sweep import sweep
+import fits.cli
 from fits.cli._common import Stopped, heed_signals, stopped, system_refuses
 
 
@@ -44,21 +41,10 @@ def cli() -> None:
     """
 
 
-for _command in (
-    fit,
-    simulate,
-    compensate,
-    export,
-    synth,
-    info,
-    sensitivity,
-    budget,
-    diagnose,
-    control,
-    paper,
-    sweep,
-):
-    cli.add_command(_command)
+for _found in pkgutil.iter_modules(fits.cli.__path__):
+    # A file whose name has no underscore holds the command of its name.
+    if not _found.name.startswith("_"):
+        cli.add_command(getattr(importlib.import_module(f"fits.cli.{_found.name}"), _found.name))
 
 
 def main() -> None:

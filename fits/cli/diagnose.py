@@ -1,28 +1,21 @@
-"""The command `microid diagnose`: the work."""
+"""The command `microid diagnose`: its options, and the work."""
+
+from __future__ import annotations
 
 import json
 import math
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fits.cli._files import bar_to_stderr, fraction_or_files, keep_inputs
-from fits.diagnosis._steps import Step
-from fits.io._atomic import write_csv
-from fits.io._errors import DataError
-from fits.io._file_set import file_set
-from fits.io._jax_setup import start_jax
-from fits.io._limits import parse_limits, ranges_json
-from fits.io._places import usable_folder
-from fits.io._read_csv import read_csv, read_runs
-from fits.io._units import parse_columns
-from fits.loop._result import FitError
-
 if TYPE_CHECKING:
     from fits.diagnosis._result import Diagnosis, EffectParameter
+from fits.cli._common import Given, columns, in_sentences, json_output, limit, margin, quiet
+from fits.cli._files import bar_to_stderr, fraction_or_files, keep_inputs
+from fits.io._errors import DataError
+from fits.io._file_set import file_set
 
 _REPORT, _JSON, _BASELINE, _EXTENDED = "report.html", "diagnosis.json", "baseline.json", "extended.json"
 _PROGRAM = "next_experiment.csv"
@@ -31,37 +24,62 @@ _WIDEST = 10.0
 _FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
 
 
-def run_diagnose(
-    *,
-    runs: Sequence[str],
-    out: str,
-    holdout: Sequence[str],
-    false_alarm: float,
-    duration: float | None,
-    initial: str,
-    limit: Sequence[str],
-    margin: float,
-    columns: str,
-    as_json: bool,
-    quiet: bool,
-) -> None:
-    """Do `microid diagnose`; the options are the command's."""
-    if not 0 < false_alarm <= 0.5:
-        raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {false_alarm:g}.")
-    if duration is not None and not 0 < duration <= _LONGEST_s:
-        raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {duration:g}.")
-    if not 0 <= margin <= _WIDEST:
-        raise DataError(f"--margin: expected a share of the ranges reached, 0 to {_WIDEST:g}, found {margin:g}.")
-    limits = parse_limits(limit)
-    mapping = parse_columns(columns)
-    fraction, files = fraction_or_files(holdout)
+@click.command()
+@click.argument("runs", metavar="RUN.csv [MORE.csv ...]", nargs=-1, required=True)
+@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+@click.option(
+    "--holdout", multiple=True, metavar="FRACTION|FILE", help="What is only predicted, as for fit (default 0.2)."
+)
+@click.option(
+    "--false-alarm", type=float, default=0.01, show_default=True, help="Chance of a cause where there is none."
+)
+@click.option("--duration", type=float, metavar="SECONDS", help="Of the next experiment, at most.")
+@click.option(
+    "--initial",
+    type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
+    default="unknown",
+    show_default=True,
+    help="Memory before all runs.",
+)
+@limit
+@margin
+@columns
+@json_output
+@quiet
+@in_sentences
+def diagnose(given: Given) -> None:
+    """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.
+
+    Writes report.html, diagnosis.json, the plain and the extended stage, and the voltages of the next experiment.
+    Name the runs in the order in which they were taken. A column that begins with temp, and one of a second axis in
+    um, nm, mm or m, are used. The end of every run is kept aside to check what is found.
+    """
+    from fits.diagnosis._steps import Step
+    from fits.io._jax_setup import start_jax
+    from fits.io._limits import parse_limits
+    from fits.io._places import usable_folder
+    from fits.io._read_csv import read_csv, read_runs
+    from fits.io._units import parse_columns
+    from fits.loop._result import FitError
+
+    if not 0 < given.false_alarm <= 0.5:
+        raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {given.false_alarm:g}.")
+    if given.duration is not None and not 0 < given.duration <= _LONGEST_s:
+        raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {given.duration:g}.")
+    if not 0 <= given.margin <= _WIDEST:
+        raise DataError(
+            f"--margin: expected a share of the ranges reached, 0 to {_WIDEST:g}, found {given.margin:g}."
+        )
+    limits = parse_limits(given.limit)
+    mapping = parse_columns(given.columns)
+    fraction, files = fraction_or_files(given.holdout)
     for name in _FILES:
-        keep_inputs(os.path.join(out, name), [*runs, *files])
+        keep_inputs(os.path.join(given.out, name), [*given.runs, *files])
     # Before the work, so that a place that cannot be written to is refused before the wait.
-    usable_folder(out, "--out")
+    usable_folder(given.out, "--out")
     start_jax()
-    progress = bar_to_stderr(quiet, tuple(Step))
-    records = read_runs(runs, mapping)
+    progress = bar_to_stderr(given.quiet, tuple(Step))
+    records = read_runs(given.runs, mapping)
     aside = [read_csv(file, mapping) for file in files]
     # Not before the files are read: this takes as long as all that.
     from fits.diagnosis._diagnose import diagnose
@@ -70,11 +88,11 @@ def run_diagnose(
         diagnosis: Diagnosis = diagnose(
             records,
             holdout=aside or fraction,
-            false_alarm=false_alarm,
-            duration_s=duration,
-            initial=initial,
+            false_alarm=given.false_alarm,
+            duration_s=given.duration,
+            initial=given.initial,
             limits=limits,
-            margin=margin,
+            margin=given.margin,
             progress=progress,
         )
     except FitError as error:
@@ -83,15 +101,17 @@ def run_diagnose(
     from fits.report._diagnosis_json import diagnosis_json
 
     content = diagnosis_json(diagnosis)
-    places = _write(diagnosis, content, out)
-    if as_json:
-        click.echo(json.dumps({"out": out, "files": places, **content}, indent=1, allow_nan=False))
+    places = _write(diagnosis, content, given.out)
+    if given.as_json:
+        click.echo(json.dumps({"out": given.out, "files": places, **content}, indent=1, allow_nan=False))
     else:
         click.echo("\n".join([*_lines(diagnosis), "", *places]))
 
 
 def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[str]:
     """Write all files, or none; their names come back."""
+    from fits.io._atomic import write_csv
+    from fits.io._limits import ranges_json
     from fits.report._diagnosis import report_html
     from fits.stage._model_file import model_text
 

@@ -1,19 +1,15 @@
-"""The command `microid paper`: the work."""
+"""All of the paper's compensation again, on the virtual bench: figures, pictures and a page."""
 
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-import click
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 import data_synth
-from fits.cli._files import progress_to_stderr
 from fits.io._atomic import finite_json
-from fits.io._file_set import file_set
-from fits.io._jax_setup import start_jax
 from fits.io._record import Reference
 from fits.machining._design import paper_design
 from fits.machining._idle import idle_noise
@@ -39,17 +35,6 @@ from microid.control import step_metrics, tracking_errors
 
 Tell = Callable[[str], None]
 _IDLE_SAMPLES, _IDLE_RATE_Hz = 20_000, 1000.0
-
-
-def run_paper(*, out: str, seeds: int, seed: int, quiet: bool) -> None:
-    """Do `microid paper`; the options are the command's."""
-    start_jax()
-    tell = progress_to_stderr(quiet)
-    with file_set() as files:
-        result = paper_result(seeds, seed, files.folder(out, "--out"), tell)
-    click.echo(f"page   {Path(out) / 'paper.md'}\njson   {Path(out) / 'paper.json'}")
-    worse = result.worse()
-    click.echo("worse than the paper: " + ("; ".join(worse) if worse else "no row"))
 
 
 def paper_result(seeds: int, seed: int, folder: Path, tell: Tell) -> PaperResult:

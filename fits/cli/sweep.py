@@ -1,10 +1,14 @@
-"""The command that runs many rows at once: its options."""
+"""The command `microid sweep`: its options, and the work."""
 
-from typing import Any
+from __future__ import annotations
+
+from pathlib import Path
 
 import click
 
-from fits.cli._common import in_sentences, json_output, quiet
+from fits.cli._common import Given, in_sentences, json_output, quiet, stopped
+from fits.cli._files import progress_to_stderr
+from fits.io._file_set import file_set
 
 
 class _Sweep(click.Group):
@@ -49,15 +53,42 @@ def sweep(context: click.Context, example: str | None) -> None:
 @json_output
 @quiet
 @in_sentences
-def run(**options: Any) -> None:
+def run(given: Given) -> None:
     """Run SWEEP.toml.
 
     DIR will hold results.zarr, which xarray opens, results.parquet, and what is needed to go on. A row that fails is
     kept with its reason and stops nothing else. Without --cluster all is computed in this process.
     """
-    from fits.cli._sweep import run_sweep
+    from fits.io._atomic import finite_json
+    from fits.io._jax_setup import start_jax
 
-    run_sweep(**options)
+    start_jax()
+    from fits.sweeps._run import run_sweep as run_all
+    from fits.sweeps._spec import read_sweep
+    from fits.sweeps._store import RESULTS, TABLE
+
+    progress = progress_to_stderr(given.quiet)
+    sweep = read_sweep(given.file)
+    try:
+        outcome = run_all(sweep, given.out, resume=given.resume, cluster=given.cluster, progress=progress)
+    except KeyboardInterrupt as stop:
+        stopped(stop, "what was computed is kept; go on with --resume")
+    files = [str(Path(given.out) / name) for name in (RESULTS, TABLE)]
+    if given.as_json:
+        content = {
+            "out": given.out,
+            "rows": outcome.rows,
+            "failed": outcome.failed,
+            "computed": outcome.computed,
+            "chunks_computed_again": outcome.again,
+            "seconds": outcome.seconds,
+            "files": files,
+        }
+        click.echo(finite_json(content))
+        return
+    failed = f", {outcome.failed:,} of them failed" if outcome.failed else ""
+    click.echo(f"{outcome.rows:,} rows{failed}; {outcome.computed:,} computed in {outcome.seconds:.1f} s")
+    click.echo("\n".join(f"results  {name}" for name in files))
 
 
 @sweep.command()
@@ -67,8 +98,20 @@ def run(**options: Any) -> None:
 @click.option("--plots", metavar="DIR", help="Folder for heat maps and parallel coordinates; it is made if need be.")
 @json_output
 @in_sentences
-def show(**options: Any) -> None:
+def show(given: Given) -> None:
     """Say how far the sweep in DIR is, and what came out."""
-    from fits.cli._sweep import show_sweep
+    from fits.io._atomic import finite_json
+    from fits.sweeps._show import describe, summarise
 
-    show_sweep(**options)
+    summary = summarise(given.folder, given.best, given.largest)
+    drawn: list[Path] = []
+    with file_set() as files:
+        drawings = files.folder(given.plots)
+        if drawings is not None:
+            from fits.plots._sweep import plot_sweep
+
+            drawn = plot_sweep(given.folder, drawings, given.best)
+    if given.as_json:
+        click.echo(finite_json(summary))
+        return
+    click.echo("\n".join([describe(summary), *(f"plot  {Path(given.plots or '') / path.name}" for path in drawn)]))

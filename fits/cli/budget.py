@@ -1,0 +1,131 @@
+"""The command `microid budget`: its options, and the work."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fits.cli._common import Given, columns, in_sentences
+from fits.cli._files import keep_apart
+from fits.io._errors import DataError
+from fits.io._file_set import file_set
+
+if TYPE_CHECKING:
+    import microid as m
+
+# What stands for the paper's stage instead of a file.
+_PAPER = "paper"
+_ARM = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|m)\s*")
+
+
+@click.command()
+@click.argument("stage", metavar="STAGE.toml|paper")
+@click.argument("model", metavar="MODEL.json")
+@click.argument("idle", metavar="IDLE.csv")
+@click.option(
+    "--axis",
+    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
+    default="all",
+    show_default=True,
+    help="Which motion.",
+)
+@click.option(
+    "--model-measures",
+    type=click.Choice(["pzt", "x", "y", "z", "alpha", "beta", "gamma"]),
+    default="pzt",
+    show_default=True,
+    help="What the displacement of MODEL.json is: the piezo's elongation, or the output of a motion.",
+)
+@click.option(
+    "--arm", metavar="LENGTH", help="Where the sensor reads a rotation: its distance from the axis, as 50mm."
+)
+@click.option("--not-zeroed", "zeroed", flag_value=False, default=True, help="Count the offset of IDLE.csv too.")
+@columns
+@click.option("--json", "json_file", metavar="FILE", help="JSON file to write; - prints it instead of the table.")
+@click.option("--plots", metavar="DIR", help="Folder for a plot; it is made if need be.")
+@in_sentences
+def budget(given: Given) -> None:
+    """Add up what driving, machining and measuring do to each motion of a stage.
+
+    The driving error is the hysteresis of MODEL.json, from `microid fit`, over its whole range; the machining error
+    is that of the tolerances in STAGE.toml, or of the paper's stage; the measuring error is what the sensor shows at
+    rest in IDLE.csv, with the columns time_s and displacement_um.
+    """
+    import microid as m
+    from fits.io._atomic import finite_json
+    from fits.io._jax_setup import start_jax
+    from fits.io._units import parse_columns
+    from fits.machining._budget import budget
+    from fits.machining._design import paper_design
+    from fits.machining._design_file import read_design
+    from fits.machining._idle import idle_noise, read_idle
+    from fits.report._budget import budget_json, describe_budget
+
+    start_jax()
+    printed = given.json_file == "-"
+    out = None if printed else given.json_file
+    for what, path in {"STAGE.toml": given.stage, "MODEL.json": given.model, "IDLE.csv": given.idle}.items():
+        keep_apart({what: None if path == _PAPER else path, "--json": out})
+    arm_mm = None if given.arm is None else _arm_mm(given.arm)
+    if arm_mm is None and given.model_measures in m.AXES and m.MOTIONS[given.model_measures].unit == "rad":
+        raise DataError(
+            f"--model-measures {given.model_measures}: expected the arm at which a displacement is a rotation, found "
+            "none; add --arm, such as --arm 50mm."
+        )
+    with file_set() as files:
+        # Entered before the work, so that a place that cannot be written to is refused before the wait.
+        unfinished = None if out is None else files.file(out)
+        drawings = files.folder(given.plots)
+        design = paper_design() if given.stage == _PAPER else read_design(given.stage)
+        noise = idle_noise(read_idle(given.idle, parse_columns(given.columns)))
+        law = _law(given.model)
+        axes = tuple(name for name in m.AXES if given.axis in (name, "all"))
+        found = budget(design, law, noise, axes, measures=given.model_measures, arm_mm=arm_mm, zeroed=given.zeroed)
+        text = finite_json(budget_json(found))
+        drawn: list[Path] = []
+        if drawings is not None:
+            from fits.plots._budget import plot_budget
+
+            drawn = plot_budget(found, drawings)
+        if unfinished is not None:
+            unfinished.write_text(f"{text}\n", encoding="utf-8")
+    if printed:
+        click.echo(text)
+        return
+    places = [("json", out), *(("plot", str(Path(given.plots or "") / path.name)) for path in drawn)]
+    written = [f"{what:5}  {place}" for what, place in places if place is not None]
+    click.echo("\n".join([describe_budget(found), *([""] if written else []), *written]))
+
+
+def _law(path: str) -> m.Preisach:
+    """The hysteresis of a model file, as slow voltages see it."""
+    import microid as m
+    from fits.cli._models import preisach_of
+    from fits.control._compensate_stage import static_equivalent
+    from fits.stage._model_file import load_model
+
+    loaded = load_model(path)
+    if not isinstance(loaded.model, m.Stage):
+        return preisach_of(path, loaded)
+    try:
+        return static_equivalent(loaded.model)
+    except DataError as error:
+        if not error.of_model:
+            raise
+        raise DataError(f"{path}: {error}") from error
+
+
+def _arm_mm(text: str) -> float:
+    """Read an arm such as 50mm or 0.05m."""
+    found = _ARM.fullmatch(text)
+    try:
+        number = float(found[1]) if found else math.nan
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and number > 0):
+        raise DataError(f"--arm: expected a length above 0 with its unit, found '{text}'; write one such as 50mm.")
+    return number if found and found[2] == "mm" else 1e3 * number

@@ -1,0 +1,246 @@
+"""The command `microid control`: its options, and the work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fits.cli._common import Given, columns, in_sentences, json_output, limit, limits, margin, quiet
+from fits.cli._files import keep_inputs, progress_to_stderr
+from fits.io._errors import DataError
+from fits.io._file_set import file_set
+
+if TYPE_CHECKING:
+    from fits.control._setup import Setup
+    from fits.io._record import Reference
+    from microid import Stage
+
+_PLANTS = 4
+# Finer steps, of um or V, are none.
+_FINEST, _LARGEST = 1e-9, 1e9
+# In the order of the options that are looked at.
+_LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "overshoot_max_pct")
+
+
+@click.command()
+@click.argument("model", metavar="MODEL.json")
+@click.argument("reference", metavar="REFERENCE.csv")
+@click.option("--out", required=True, metavar="RUN.csv", help="CSV to write; .gz is compressed.")
+@click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
+@click.option(
+    "--controller",
+    type=click.Choice(["pid", "bp-pid", "cmac-pid", "resonant"]),
+    default="pid",
+    show_default=True,
+    help="Which controller; the last three are made around a PID controller.",
+)
+@click.option(
+    "--gains",
+    metavar="KP,KI,KD|FILE",
+    help="Gains in V/um, V/(um s) and V s/um, or what --json printed; tuned by default. Limits stated beside them "
+    "are checked, default ones remarked on.",
+)
+@click.option(
+    "--feedforward",
+    type=click.Choice(["none", "static", "dynamic"]),
+    default="static",
+    show_default=True,
+    help="What is added to the feedback: nothing, the inverse of the hysteresis, or of the whole stage.",
+)
+@click.option(
+    "--frequency", type=float, multiple=True, metavar="HZ", help="Of a resonator; the reference's own by default."
+)
+@click.option("--noise", type=float, default=0.0, metavar="UM", help="Standard deviation of sensor noise, in um.")
+@click.option("--delay", type=click.IntRange(0, 100), default=0, metavar="SAMPLES", help="Age of a reading.")
+@click.option("--resolution", type=float, metavar="UM", help="Steps of the sensor, in um.")
+@click.option("--resolution-voltage", type=float, metavar="V", help="Steps of the amplifier's command, in V.")
+@limits
+@limit
+@margin
+@click.option(
+    "--initial",
+    type=click.Choice(["negative", "positive", "demagnetised"]),
+    default="negative",
+    show_default=True,
+    help="Memory before the reference.",
+)
+@click.option(
+    "--plants",
+    type=click.IntRange(1, 100),
+    help="Models drawn from the uncertainty of the fit, all to be controlled (default 4, or 1 without one).",
+)
+@click.option("--overshoot", type=float, metavar="PCT", help="Largest overshoot, in percent of the range.")
+@click.option("--gain-margin", type=float, help="Least gain margin (default 2).")
+@click.option("--phase-margin", type=float, help="Least phase margin, in degrees (default 30).")
+@click.option("--peak", type=float, help="Largest peak of the sensitivity (default 2).")
+@click.option("--effort", type=float, default=0.0, metavar="UM/V", help="Weight of the feedback in the cost.")
+@click.option("--rate", type=float, default=0.0, metavar="UM/V", help="Weight of the command's steps in the cost.")
+@click.option("--skip", type=float, default=0.0, metavar="S", help="Time at the beginning that does not count, in s.")
+@click.option("--starts", type=click.IntRange(1, 100), default=2, show_default=True, help="Places to tune from.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Of noise, plants and starts (default 0).")
+@columns
+@json_output
+@quiet
+@in_sentences
+def control(given: Given) -> None:
+    """Tune a controller on a model, and run it along a reference.
+
+    REFERENCE.csv needs the columns time_s, in even steps, and displacement_um: what the sensor is to read, its offset
+    included. The run has time_s, reference_um, displacement_um, measured_um, command_V and error_um. The least error
+    is sought within all limits, for every plant; a loop that is unstable or beyond a limit is refused. What --json
+    prints makes the same controller again with --gains, for the same model, reference and seed.
+    """
+    import numpy as np
+
+    from fits.cli._models import parse_rig_limits, stage_or_preisach
+    from fits.control._gains import read_gains
+    from fits.control._limits import passed_limits
+    from fits.control._make import Loop, Maker
+    from fits.control._setup import setup
+    from fits.control._tune_problem import Goal
+    from fits.io._atomic import finite_json, write_csv
+    from fits.io._jax_setup import start_jax
+    from fits.io._limits import check_command, joined, measured_ranges, reached_in
+    from fits.io._read_csv import read_reference
+    from fits.io._record import Record
+    from fits.io._units import parse_columns
+    from fits.loop._result import FitError
+    from fits.report._control import control_json, describe_control
+    from fits.stage._draw_plants import draw_plants
+    from fits.stage._model_file import load_model
+    from microid import Stage
+
+    for option, value in {
+        "--noise": given.noise,
+        "--effort": given.effort,
+        "--rate": given.rate,
+        "--skip": given.skip,
+    }.items():
+        if not 0 <= value <= _LARGEST:
+            raise DataError(f"{option}: expected a number from 0 to {_LARGEST:g}, found {value:g}.")
+    for option, step in {"--resolution": given.resolution, "--resolution-voltage": given.resolution_voltage}.items():
+        if step is not None and not _FINEST <= step <= _LARGEST:
+            raise DataError(f"{option}: expected {_FINEST:g} to {_LARGEST:g}, found {step:g}; leave it out for none.")
+    stated = {
+        "--gain-margin": given.gain_margin,
+        "--phase-margin": given.phase_margin,
+        "--peak": given.peak,
+        "--overshoot": given.overshoot,
+    }
+    for option, bound in stated.items():
+        least = 0.0 if option == "--overshoot" else 1.0
+        if bound is not None and not least <= bound <= _LARGEST:
+            raise DataError(f"{option}: expected a number from {least:g} to {_LARGEST:g}, found {bound:g}.")
+    if given.frequency and given.controller != "resonant":
+        raise DataError(
+            f"--frequency: expected --controller resonant with it, found {given.controller}; leave it out."
+        )
+    volts, allowed_here = parse_rig_limits(given.limits, given.limit, given.margin)
+    start_jax()
+    keep_inputs(
+        given.out,
+        [given.model, given.reference] if given.gains is None else [given.model, given.reference, given.gains],
+    )
+    tell = progress_to_stderr(given.quiet)
+    known_gains = None if given.gains is None else read_gains(given.gains)
+    loaded = load_model(given.model)
+    known = loaded.uncertainty is not None
+    plant = stage_or_preisach(given.model, loaded)
+    wanted = read_reference(given.reference, parse_columns(given.columns))
+    # Entered before the work, so that a place that cannot be written to is refused before the wait.
+    with file_set() as files:
+        unfinished, drawings = files.file(given.out), files.folder(given.plots)
+        try:
+            ready = setup(plant, wanted, given.feedforward, initial=given.initial, limits_V=volts)
+        except DataError as error:
+            if not error.of_model:
+                raise
+            raise DataError(f"{given.model}: {error}") from error
+        skipped = _skipped(wanted, ready, given.skip)
+        count = given.plants or (_PLANTS if known else 1)
+        held = _held(plant) if isinstance(plant, Stage) else plant
+        stages = draw_plants(held, loaded.uncertainty, count, seed=given.seed)
+        limits_of = {name: x for name, x in zip(_LIMITS, stated.values(), strict=True) if x is not None}
+        goal = Goal(given.effort, given.rate, **limits_of)
+        rng = np.random.default_rng(given.seed)
+        loop = Loop(ready, [_held(one) for one in stages], given.noise, given.delay, given.resolution, skipped)
+        tune = Maker(
+            loop,
+            goal,
+            given.starts,
+            given.seed,
+            rng.normal(0, given.noise, len(wanted)) if given.noise else None,
+            tell,
+        )
+        try:
+            made = tune.make(given.controller, known_gains, given.frequency)
+        except FitError as error:
+            raise DataError(f"{given.model}: {error}.") from error
+        every = loop.margins(made.controller)
+        if not all(bool(one.stable) for one in every):
+            raise DataError(
+                f"{given.model}: the loop is unstable with these gains, its largest pole has modulus "
+                f"{max(float(one.radius) for one in every):.6g}; lower --gains, or leave them out to have them tuned."
+            )
+        tell("run")
+        heard = rng.normal(0, given.noise, len(wanted)) if given.noise else None
+        asked = 1 if given.overshoot is None else len(loop.plants)
+        played = [loop.run(made.controller, heard, given.resolution_voltage, k) for k in range(len(loop.plants))]
+        runs, run = played[:asked], played[0]
+        if not all(np.all(np.isfinite(one.error_um)) for one in played):
+            raise DataError(f"{given.model}: the loop is unstable, its displacement has no bounds; lower --gains.")
+        passed = passed_limits(goal, every, runs)
+        predicted = joined(
+            measured_ranges(Record(wanted.time_s, np.asarray(one.command_V), np.asarray(one.displacement_um)))
+            for one in played
+        )
+        # Sensor noise alone makes a loop's command jump from sample to sample.
+        said = check_command(
+            wanted.source, predicted, reached_in(loaded.report), allowed_here, given.margin, spared=("slew",)
+        )
+        more = [*made.remarks, *said, *_judged(passed, stated, given.controller, known_gains is not None)]
+        names = ("time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um")
+        table = {name: np.asarray(getattr(run, name)) for name in names}
+        write_csv(unfinished, table | {"time_s": wanted.time_s})
+        drawn: list[Path] = []
+        if drawings is not None:
+            from fits.plots._control import plot_control
+
+            drawn = plot_control(run, made.controller, loop.plants, drawings, delay=given.delay)
+        places = [str(Path(given.plots) / path.name) for path in drawn] if given.plots else []
+        about = {"controller": given.controller, "out": given.out, "plots": places}
+        # Before the file is in its place: what cannot be told is not left behind either.
+        summary = control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
+        told = finite_json(summary) if given.as_json else describe_control(summary)
+    click.echo(told)
+
+
+def _judged(passed: dict[str, str], stated: dict[str, float | None], kind: str, given: bool) -> list[str]:
+    """What is said of limits that are passed; those that were asked for are not."""
+    remarks = []
+    for option, words in passed.items():
+        if stated[option] is None:
+            remarks.append(f"a limit that tuning keeps by default is passed: {words} ({option})")
+        elif given:
+            raise DataError(f"{option}: {words}; choose other --gains, or leave them out to have them tuned.")
+        elif kind in ("bp-pid", "cmac-pid"):
+            raise DataError(f"{option}: {words} while {kind} learns; relax it, or choose pid.")
+        else:
+            # Tuning kept it under the noise it heard.
+            remarks.append(f"in this run, under fresh noise, a limit is passed: {words} ({option})")
+    return remarks
+
+
+def _held(stage: Stage) -> Stage:
+    from microid import Stage
+
+    return Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
+
+
+def _skipped(reference: Reference, ready: Setup, skip_s: float) -> int:
+    count = round(skip_s / ready.interval_s)
+    if count > len(reference) - 2:
+        raise DataError(f"--skip: expected less than the reference's {reference.time_s[-1]:g} s, found {skip_s:g} s.")
+    return count

@@ -1,0 +1,39 @@
+"""The command `microid paper`: its options, and the work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fits.cli._common import Given, in_sentences, quiet
+from fits.cli._files import progress_to_stderr
+from fits.io._file_set import file_set
+
+
+@click.command()
+@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+@click.option(
+    "--seeds", type=click.IntRange(1, 100), default=10, show_default=True, help="How many noises to go through."
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Where all randomness starts."
+)
+@quiet
+@in_sentences
+def paper(given: Given) -> None:
+    """Repeat the paper's compensation on a virtual stage: its tables and figures beside ours.
+
+    Writes paper.md with pictures, and paper.json. The stage is identified from noisy CSVs, then run open, under
+    feedforward, and with each of the paper's three controllers.
+    """
+    from fits.io._jax_setup import start_jax
+    from fits.paper._regenerate import paper_result
+
+    start_jax()
+    tell = progress_to_stderr(given.quiet)
+    with file_set() as files:
+        result = paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), tell)
+    click.echo(f"page   {Path(given.out) / 'paper.md'}\njson   {Path(given.out) / 'paper.json'}")
+    worse = result.worse()
+    click.echo("worse than the paper: " + ("; ".join(worse) if worse else "no row"))

@@ -1,0 +1,124 @@
+"""The command `microid sensitivity`: its options, and the work."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import keep_apart
+from fits.io._errors import DataError
+from fits.io._file_set import file_set
+
+if TYPE_CHECKING:
+    from fits.machining._design import Design
+
+_TOLERANCE = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|um|µm|μm)\s*")
+
+
+@click.command()
+@click.argument("stage", metavar="[STAGE.toml]", required=False)
+@click.option(
+    "--axis",
+    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
+    default="all",
+    show_default=True,
+    help="Which motion.",
+)
+@click.option(
+    "--tolerance", metavar="LENGTH", help="Of all lengths instead of the stage's own, such as 0.02mm or 20um."
+)
+@click.option(
+    "--level", type=click.IntRange(0, 1), help="0: slender leaves and rigid blocks; 1: the stage's default."
+)
+@click.option("--voltage", is_flag=True, help="Also at a fixed voltage, where a stiffer stage compresses its piezo.")
+@click.option("--json", "json_file", metavar="FILE", help="JSON file to write; - prints it instead of the tables.")
+@click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
+@click.option("--write-stage", metavar="FILE", help="TOML file of the stage to write, to change and come back with.")
+@in_sentences
+def sensitivity(given: Given) -> None:
+    """Rank what machining errors of the dimensions do to each motion of a stage.
+
+    STAGE.toml holds the dimensions with their tolerances; without it, the stage is the paper's, and the tables are
+    followed by what the paper reads in its Fig. 7. --write-stage writes one to begin with.
+    """
+    import microid as m
+    from fits.io._atomic import finite_json
+    from fits.io._jax_setup import start_jax
+    from fits.machining._claims import describe_claims, paper_claims
+    from fits.machining._design_file import design_text
+    from fits.machining._sensitivity import sensitivities
+    from fits.report._sensitivity import describe_sensitivity, sensitivity_json
+
+    start_jax()
+    printed = given.json_file == "-"
+    out = None if printed else given.json_file
+    keep_apart({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
+    design = _design(given.stage, given.tolerance, given.level)
+    axes = tuple(name for name in m.AXES if given.axis in (name, "all"))
+    with file_set() as files:
+        # Entered before the work, so that a place that cannot be written to is refused before the wait.
+        unfinished = None if out is None else files.file(out)
+        unfinished_stage = None if given.write_stage is None else files.file(given.write_stage)
+        drawings = files.folder(given.plots)
+        report = sensitivities(design, axes)
+        text = finite_json(sensitivity_json(report))
+        claims = (
+            [] if given.stage or printed else [claim for claim in paper_claims(design) if {*claim.axes} & {*axes}]
+        )
+        drawn: list[Path] = []
+        if drawings is not None:
+            from fits.plots._sensitivity import plot_sensitivity
+
+            drawn = plot_sensitivity(design, report, drawings)
+        if unfinished is not None:
+            unfinished.write_text(f"{text}\n", encoding="utf-8")
+        if unfinished_stage is not None:
+            unfinished_stage.write_text(design_text(design), encoding="utf-8")
+    if printed:
+        click.echo(text)
+        return
+    lines = [describe_sensitivity(report, given.voltage)]
+    if claims:
+        lines += ["", describe_claims(claims)]
+    places = [
+        ("json", out),
+        ("stage", given.write_stage),
+        *(("plot", str(Path(given.plots or "") / path.name)) for path in drawn),
+    ]
+    written = [f"{what:5}  {place}" for what, place in places if place is not None]
+    click.echo("\n".join([*lines, *([""] if written else []), *written]))
+
+
+def _design(stage: str | None, tolerance: str | None, level: int | None) -> Design:
+    """The stage that is asked about."""
+    from fits.machining._design import paper_design
+    from fits.machining._design_file import read_design
+
+    design = paper_design() if stage in (None, "paper") else read_design(stage)
+    if tolerance is not None:
+        length_mm = _length_mm(tolerance)
+        try:
+            design = design.with_tolerance(length_mm)
+        except DataError as error:
+            raise DataError(f"--tolerance {tolerance}: {error}") from None
+    return design if level is None else dataclasses.replace(design, level=level)
+
+
+def _length_mm(text: str) -> float:
+    """Read a tolerance such as 0.02mm or 20um."""
+    found = _TOLERANCE.fullmatch(text)
+    try:
+        number = float(found[1]) if found else math.nan
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and number > 0):
+        raise DataError(
+            f"--tolerance: expected a length above 0 with its unit, found '{text}'; write one such as 0.02mm or 20um."
+        )
+    return number if found and found[2] == "mm" else number / 1e3
