@@ -95,10 +95,10 @@ def _classes() -> dict[str, type[eqx.Module]]:
     modules = {
         name: value for name, value in public.items() if inspect.isclass(value) and issubclass(value, eqx.Module)
     }
-    effects = {effect.__name__: effect for effect in microid.EFFECTS}
+    plugins = (*microid.EFFECTS, *microid.FAMILIES.values(), *microid.hysteresis.LAWS.values())
     return (
         {name: cls for name, cls in modules.items() if not inspect.isabstract(cls)}
-        | effects
+        | {plugin.__name__: plugin for plugin in plugins}
         | {
             "Grid": Grid,
             "StageUncertainty": StageUncertainty,

@@ -3,9 +3,7 @@
 Importing the package imports every sibling whose name does not start with an underscore; each registers itself.
 """
 
-import importlib
-import pkgutil
-
+from microid._plugins import plugins as _plugins
 from microid.effects._base import EFFECTS as EFFECTS
 from microid.effects._base import PLACES as PLACES
 from microid.effects._base import AbstractEffect as AbstractEffect
@@ -15,6 +13,4 @@ from microid.effects._base import extend as extend
 from microid.effects._base import host as host
 from microid.effects._base import register as register
 
-for _module in pkgutil.iter_modules(__path__):
-    if not _module.name.startswith("_"):
-        importlib.import_module(f"{__name__}.{_module.name}")
+_plugins(__name__, __path__)

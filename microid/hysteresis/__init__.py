@@ -2,11 +2,17 @@
 
 Each gives the displacement in um under a voltage in V, whatever the speed: `law(voltage_V, start)`. In the literature
 most of them are friction forces that run ahead of a displacement; a piezo's displacement stays behind its voltage, so
-here they are subtracted from a proportional part.
+here they are subtracted from a proportional part. Importing the package imports every sibling whose name does not
+start with an underscore; each registers itself.
 """
 
+from microid._plugins import plugins as _plugins
+from microid.hysteresis._base import LAWS as LAWS
+from microid.hysteresis._base import register as register
 from microid.hysteresis.bouc_wen import BoucWen as BoucWen
 from microid.hysteresis.dahl import Dahl as Dahl
 from microid.hysteresis.duhem import Duhem as Duhem
 from microid.hysteresis.maxwell_slip import MaxwellSlip as MaxwellSlip
 from microid.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
+
+_plugins(__name__, __path__)

@@ -7,8 +7,10 @@ from jaxtyping import Array, Float
 
 from microid._param import param
 from microid._part import AbstractHysteresis
+from microid.hysteresis._base import register
 
 
+@register
 class BoucWen(AbstractHysteresis):
     r"""A proportional part less the state of Bouc and Wen.
 

@@ -5,9 +5,11 @@ from jaxtyping import Array, Float
 
 from microid._param import param
 from microid._part import AbstractHysteresis
+from microid.hysteresis._base import register
 from microid.hysteresis._rates import _direction, _mean_decay, _mean_ramp, _relax
 
 
+@register
 class Duhem(AbstractHysteresis):
     r"""Pursuit of an anhysteretic curve `f`.
 

@@ -5,9 +5,11 @@ from jaxtyping import Array, Float
 
 from microid._param import param
 from microid._part import AbstractHysteresis
+from microid.hysteresis._base import register
 from microid.hysteresis._play import _plays
 
 
+@register
 class MaxwellSlip(AbstractHysteresis):
     r"""A proportional part less a sum of elements that stick, then slip.
 

@@ -5,9 +5,11 @@ from jaxtyping import Array, Float
 
 from microid._param import param
 from microid._part import AbstractHysteresis
+from microid.hysteresis._base import register
 from microid.hysteresis._play import _plays
 
 
+@register
 class PrandtlIshlinskii(AbstractHysteresis):
     r"""A proportional part and a weighted sum of plays.
 

@@ -1,0 +1,127 @@
+"""A new density, hysteresis law, effect or command is one new file, and works from the command at once."""
+
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+DENSITY = '''
+    """A density that is the same everywhere."""
+    from typing import ClassVar, Self
+    import jax.numpy as jnp
+    from jaxtyping import Array, Float, PRNGKeyArray
+    from microid._param import array, param, static
+    from microid.densities._base import AbstractDensity, register
+
+    @register
+    class FlatDensity(AbstractDensity):
+        """One number."""
+        family: ClassVar[str] = "flat"
+        weight_um: Float[Array, ""] = param(unit="um", scale=10.0, lower=0.0)
+        lower_V: Float[Array, ""] = array()
+        upper_V: Float[Array, ""] = array()
+        levels: int = static()
+
+        def nodes_um_per_V2(self):
+            area = (self.upper_V - self.lower_V) ** 2 / 2
+            return self.weight_um / area * jnp.tril(jnp.ones((self.levels, self.levels)))
+
+        @classmethod
+        def start(cls, lower_V, upper_V, levels, stroke_um, key):
+            return cls(jnp.asarray(stroke_um), lower_V, upper_V, levels)
+'''
+LAW = '''
+    """A spring: no hysteresis at all."""
+    import jax.numpy as jnp
+    from jaxtyping import Array, Float
+    from microid._param import param
+    from microid._part import AbstractHysteresis
+    from microid.hysteresis._base import register
+
+    @register
+    class Spring(AbstractHysteresis):
+        """Proportional."""
+        slope_um_per_V: Float[Array, ""] = param(unit="um/V", scale=0.1, lower=0.0)
+        offset_um: Float[Array, ""] = param(unit="um", scale=10.0, default=0.0)
+
+        def __call__(self, voltage_V, start=None):
+            return self.slope_um_per_V * voltage_V + self.offset_um
+'''
+COMMAND = '''
+    """Say hello."""
+    import click
+    from fits.cli._common import Given, in_sentences
+
+    @click.command()
+    @click.argument("name")
+    @click.option("--loud", is_flag=True)
+    @in_sentences
+    def hello(given: Given) -> None:
+        """Greet."""
+        click.echo(f"hello {given.name.upper() if given.loud else given.name}")
+'''
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory):
+    """A copy of the packages with a new file of each kind in its place."""
+    folder = tmp_path_factory.mktemp("copy")
+    for package in ("microid", "fits", "data_synth"):
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for place, text in {
+        "microid/densities/flat.py": DENSITY,
+        "microid/hysteresis/spring.py": LAW,
+        "fits/cli/hello.py": COMMAND,
+    }.items():
+        (folder / place).write_text(textwrap.dedent(text).lstrip())
+    return folder
+
+
+def python(folder, *arguments, code=0):
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(folder), "MICROID_CACHE": os.environ["JAX_COMPILATION_CACHE_DIR"]},
+    )
+    assert done.returncode == code, done.stderr
+    return done.stdout
+
+
+def test_a_command_is_one_file(copy):
+    assert "hello" in python(copy, "-m", "fits", "--help")
+    assert python(copy, "-m", "fits", "hello", "you", "--loud") == "hello YOU\n"
+
+
+def test_a_density_is_one_file_and_is_saved_and_read(copy):
+    python(copy, "-m", "fits", "synth", "quickstart", "--out", "data")
+    fit = ["fit", "data/train.csv", "--family", "flat", "--starts", "1", "--levels", "8", "--out", "flat.json"]
+    python(copy, "-m", "fits", *fit)
+    assert "FlatDensity" in (copy / "flat.json").read_text()
+    python(copy, "-m", "fits", "simulate", "flat.json", "data/heldout.csv", "--out", "out.csv")
+    assert (copy / "out.csv").read_text().startswith("time_s,voltage_V,displacement_um")
+
+
+SAVE = """
+import jax; jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp, microid, fits
+from microid.hysteresis import LAWS
+stage = microid.Stage.of(hysteresis=LAWS["spring"](jnp.asarray(0.25), jnp.asarray(1.0)))
+fits.save_model("spring.json", stage, None, {})
+"""
+
+
+def test_a_hysteresis_law_is_one_file_and_is_saved_and_read(copy):
+    python(copy, "-c", SAVE)
+    (copy / "program.csv").write_text("time_s,voltage_V\n0,0\n1,8\n2,4\n")
+    python(copy, "-m", "fits", "simulate", "spring.json", "program.csv", "--out", "moved.csv")
+    rows = [line.split(",") for line in (copy / "moved.csv").read_text().splitlines()[1:]]
+    assert [float(row[2]) for row in rows] == pytest.approx([1.0, 3.0, 2.0])
