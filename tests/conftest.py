@@ -16,13 +16,8 @@ from hypothesis import settings
 
 # For notebooks and commands that tests start: threads of several processes wait for each other in a busy loop.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Tests compile much and compute little. Other versions of XLA may not know these options, and end the process.
-if jax.__version__.startswith("0.10."):
-    os.environ.setdefault(
-        "XLA_FLAGS",
-        "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 "
-        "--xla_cpu_parallel_codegen_split_count=1",
-    )
+# Tests compile much and compute little: what LLVM does to make code fast is not worth its time here.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
 # What one process has compiled the others, and the commands and notebooks they start, take from here.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="microid-tests-")

@@ -7,8 +7,8 @@ import pytest
 from _gain_formulas import ARGUMENTS, TABLE_1, TWINS, gains, slopes
 
 import fits
-from fits import _allocate
 from fits.io._errors import DataError
+from fits.machining import _allocate
 from fits.machining._allocate import AllocationError, allocate
 from fits.machining._design import Together, paper_design
 

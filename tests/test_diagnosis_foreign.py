@@ -10,10 +10,10 @@ from optimistix import RESULTS
 from scipy.signal import fftconvolve, lsim
 
 from fits import Record, diagnose
-from fits import _grid as grid
 from fits.diagnosis._floor import Floor, pooled
 from fits.diagnosis._regression import _alive
 from fits.diagnosis._regulated import held_creep
+from fits.loop import _grid as grid
 from fits.loop._evidence import Posterior
 from fits.loop._run import known_samples
 from fits.stats._whiten import Noise
@@ -71,6 +71,7 @@ def test_a_smooth_command_is_no_effect(rng):
     assert found.gain.heldout_rms_before_um < 1.3 * 0.01
 
 
+@pytest.mark.study
 def test_creep_that_was_under_way(rng):
     """The record begins after moves whose creep goes on: the gain is found all the same."""
     before = turns([50, 100, 30, 0], 600)

@@ -9,6 +9,7 @@ import fits
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
+@pytest.mark.study
 def test_the_cause_is_found_why_a_real_record_predicts_badly():
     # In-sample the plain hysteresis looks fine; the last third is predicted several times worse.
     path = DATA / "picma_p885_amplitude_modulated.csv"
@@ -22,6 +23,7 @@ def test_the_cause_is_found_why_a_real_record_predicts_badly():
     assert found.gain.heldout_rms_after_um < found.gain.heldout_rms_before_um / 2
 
 
+@pytest.mark.study
 def test_creep_is_read_off_what_a_controller_took_back():
     # At constant height the voltage falls by 1.5 % of the step with each decade of time.
     path = DATA / "afm_z_piezo_hold30s.csv"

@@ -6,17 +6,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from test_diagnosis_contest import NOISE_UM, stage_on
+from test_diagnosis_comparison import NOISE_UM, stage_on
 
 from fits import Record
 from fits.diagnosis._candidates import Bench
+from fits.diagnosis._findings import _parameters
+from fits.diagnosis._joint_fit import released
 from fits.diagnosis._law import Law
 from fits.diagnosis._profiled import profiled
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
-from fits.diagnosis._settle import released
-from fits.diagnosis._tell import _parameters
 from fits.stats._whiten import Noise
 from microid import EFFECTS, Driver
 
@@ -130,7 +130,7 @@ def test_what_ended_at_its_bound_is_tried_weaker_where_the_baseline_follows(way,
     # Beside the baseline as it is, the bound is best; beside one that has followed something weaker, that is.
     stuck = at_slope(way * (0.9 - 1e-9), way * 2.0)
     freed = at_slope(way * 0.7, way * 0.7)[:2]
-    monkeypatch.setattr("fits.diagnosis._settle._follow", lambda *_: freed)
+    monkeypatch.setattr("fits.diagnosis._joint_fit._follow", lambda *_: freed)
     assert stuck[-1].laws[0].pinned(stuck[-1].x[0])
     *at, model = released(*stuck, False)
     assert float(model.laws[0].effect(model.x[0], 0).slope) == pytest.approx(way * 0.7, abs=1e-3)
@@ -140,11 +140,11 @@ def test_what_ended_at_its_bound_is_tried_weaker_where_the_baseline_follows(way,
 def test_at_a_bound_where_weaker_is_worse_it_stays(monkeypatch):
     stuck = at_slope(0.9 - 1e-9, 1.0)
     worse = at_slope(0.9 - 1e-9, 5.0)[:2]
-    monkeypatch.setattr("fits.diagnosis._settle._follow", lambda *_: worse)
+    monkeypatch.setattr("fits.diagnosis._joint_fit._follow", lambda *_: worse)
     assert released(*stuck, False) == stuck
 
 
 def test_what_is_not_at_its_bound_stays(monkeypatch):
     inside = at_slope(0.7, 2.0)
-    monkeypatch.setattr("fits.diagnosis._settle._follow", lambda *_: at_slope(0.5, 0.5)[:2])
+    monkeypatch.setattr("fits.diagnosis._joint_fit._follow", lambda *_: at_slope(0.5, 0.5)[:2])
     assert released(*inside, False) == inside

@@ -12,13 +12,13 @@ from fits import Record
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import simulate, with_effects
+from fits.diagnosis._joint_fit import settled
 from fits.diagnosis._law import Law
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
-from fits.diagnosis._settle import settled
-from fits.diagnosis._through import passed
+from fits.diagnosis._tangent import passed
 from fits.loop._design import Grid
 from fits.stage._fit import default_stage
 from fits.stage._moments import Chain

@@ -57,6 +57,7 @@ def test_a_clean_rig_gets_no_such_remark(runs):
     holds_the_truth(result)
 
 
+@pytest.mark.study
 def test_a_delay_that_ruins_the_fit_is_refused_by_its_size(runs):
     slow, fast = runs
     with pytest.raises(fits.DataError, match=r"fast\.csv: the displacement comes .* AFTER") as refusal:
@@ -65,7 +66,10 @@ def test_a_delay_that_ruins_the_fit_is_refused_by_its_size(runs):
     assert abs(size - 20) < 0.1 + 5 * sd
 
 
-@pytest.mark.parametrize(("late", "where"), [(1, "AFTER"), (-3, "BEFORE")], ids=["late", "acausal"])
+@pytest.mark.parametrize(
+    ("late", "where"),
+    [pytest.param(1, "AFTER", id="late", marks=pytest.mark.study), pytest.param(-3, "BEFORE", id="acausal")],
+)
 def test_a_delay_is_named_and_the_intervals_own_up_to_it(runs, late, where):
     slow, fast = runs
     told, result = named(slow, delayed(fast, late), where)

@@ -31,7 +31,7 @@ from fits.control._gains import read_gains
 from fits.sweeps._chunks import chunk_rows, compute_chunk
 from fits.sweeps._spec import read_sweep
 
-SAMPLE, COMMANDS = 150, 6
+SAMPLE, COMMANDS = 80, 3
 STUDY = int(os.environ.get("MICROID_FUZZ", 0))
 # What takes longer than this is looked at: less is lost among what the machine does besides.
 SLOW_s, TIMES = 2.0, 3.0

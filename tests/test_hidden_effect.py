@@ -94,6 +94,7 @@ def test_the_extended_model_simulates_new_runs_better(case):
     assert squares["extended"] <= squares["baseline"], case.seed
 
 
+@pytest.mark.study
 def test_a_rig_without_an_effect_is_not_accused(tmp_path):
     case = diagnosed(tmp_path, [], "--false-alarm", FALSE_ALARM)
     assert "effects" not in case.truth

@@ -10,7 +10,7 @@ import data_synth
 from fits import Record
 from fits.diagnosis import _baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
-from fits.diagnosis._contest import Rival
+from fits.diagnosis._comparison import Rival
 from fits.diagnosis._experiment import Wish, _open, refine, suggest
 from fits.diagnosis._law import Law, law_of
 from fits.diagnosis._path import Limits, limits_of, paces

@@ -28,6 +28,7 @@ def test_notebook_is_clean(path):
             assert cell.execution_count is None, "clear all outputs before saving"
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_notebook_runs(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)

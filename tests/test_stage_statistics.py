@@ -54,6 +54,7 @@ def test_estimates_and_standard_deviations_are_those_of_curve_fit(rng):
     np.testing.assert_allclose(result.correlation, correlation[np.ix_(order, order)], atol=0.1)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("pole", [0.0, 0.8], ids=["white", "coloured"])
 def test_intervals_hold_the_truth_as_often_as_they_say(rng, pole):
     fits_made, z = 40, []

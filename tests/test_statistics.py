@@ -38,13 +38,16 @@ def study():
     return np.array(ratios), np.array(coverage), np.array(alarms)
 
 
+@pytest.mark.study
 def test_held_out_error_is_the_noise(study):
     assert np.median(study[0]) < 1.05
 
 
+@pytest.mark.study
 def test_band_covers_the_truth(study):
     assert 0.90 <= np.mean(study[1]) <= 0.99
 
 
+@pytest.mark.study
 def test_clean_data_raise_few_alarms(study):
     assert np.mean(study[2]) <= 0.2

@@ -115,7 +115,7 @@ assert place(np.zeros((3, 2))).devices() == {first}
 
 
 def on_devices(count, script, *arguments):
-    flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={count}"}
+    flags = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"}
     command = [sys.executable, "-c", script, *map(str, arguments)]
     root = Path(__file__).parents[1]
     done = subprocess.run(
@@ -141,7 +141,10 @@ def texts(seed):
 
 @pytest.mark.parametrize(
     ("devices", "told", "kinds"),
-    [(2, "512 512", ["simulate"]), (3, "768 256", ["simulate", "control", "sensitivity", "fit"])],
+    [
+        (2, "512 512", ["simulate"]),
+        pytest.param(3, "768 256", ["simulate", "control", "sensitivity", "fit"], marks=pytest.mark.study),
+    ],
 )
 def test_several_devices_give_the_same_bits(tmp_path, seed, devices, told, kinds):
     chosen = {kind: text for kind, text in texts(seed).items() if kind in kinds}

@@ -11,6 +11,7 @@ from fits.diagnosis._evaluate import simulate
 from fits.diagnosis._experiment import Wish, suggest
 from fits.diagnosis._extend import Compared, extended_stage, feedforward, gain_of, left_of, shared_effects
 from fits.diagnosis._faults import Faults, find_faults, name_faults
+from fits.diagnosis._findings import bounds, causes_of
 from fits.diagnosis._floor import SPIKE
 from fits.diagnosis._irregular import irregular
 from fits.diagnosis._prepare import ONE_WAY, Prepared
@@ -22,7 +23,6 @@ from fits.diagnosis._result import Diagnosis, RunView, Test
 from fits.diagnosis._select import Selection
 from fits.diagnosis._steps import Step
 from fits.diagnosis._structure import cycles, further_views, look, together, views
-from fits.diagnosis._tell import bounds, causes_of
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from microid import AbstractEffect, Stage

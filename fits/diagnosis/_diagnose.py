@@ -13,11 +13,11 @@ from fits.diagnosis._prepare import HOLDS, Prepared, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis
 from fits.diagnosis._select import Selection, select
 from fits.diagnosis._steps import Step
-from fits.diagnosis._unswept import FirstWaysError
+from fits.diagnosis._virgin import VirginCurveError
 from fits.io._errors import DataError
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import Record, refuse_repeats
-from fits.loop._run import UNSWEPT
+from fits.loop._run import VIRGIN
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
@@ -109,8 +109,8 @@ def diagnose(
 
     try:
         found = selected(ready, initial == "unknown")
-    except FirstWaysError:
-        initial = UNSWEPT
+    except VirginCurveError:
+        initial = VIRGIN
         ready = prepare_diagnosis(records, aside, fraction, initial, progress)
         found = selected(ready, False)
     if ready.doubted and not found.model.is_noise(found.projector):
@@ -119,7 +119,7 @@ def diagnose(
         try:
             beside = selected(lines, initial == "unknown")
             ready, found = (lines, beside) if beside.left_um < found.left_um else (ready, found)
-        except FirstWaysError:
+        except VirginCurveError:
             progress("a first way from an unknown state explains what is left then")
     if not found.causes and not aside and ready.projector.ahead(found.model.change_um) > _UNLIKE:
         progress("asking again with what was held out, which noise does not explain")

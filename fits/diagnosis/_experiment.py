@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.diagnosis._contest import best_of
+from fits.diagnosis._comparison import best_of
 from fits.diagnosis._inside import guard_of
 from fits.diagnosis._path import limits_of, repeated
 from fits.diagnosis._predict import Hypothesis, Predictor

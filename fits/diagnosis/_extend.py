@@ -53,7 +53,7 @@ def extended_stage(baseline: Baseline, effects: Sequence[AbstractEffect], subste
 
 
 def left_of(run: StageRun, own: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
-    """Measurement less response, the run's own unknowns fitted to some of the samples and taken off."""
+    """Measurement less response, the run's nuisance parameters fitted to some of the samples and taken off."""
     off = run.displacement_um - response_um
     weight = jnp.asarray(using.astype(float))
     return np.asarray(_without(jnp.asarray(own), weight, jnp.asarray(off)))

@@ -11,7 +11,7 @@ from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Kinds, Regression, regress
-from fits.diagnosis._through import passed
+from fits.diagnosis._tangent import passed
 from fits.io._record import Record
 from fits.stage._run import prepare_stage_run
 from fits.stats._whiten import Noise
@@ -144,7 +144,7 @@ class Predictor:
         return columns
 
     def _old_gram(self, projector: Projector, columns: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
-        """Gram matrix of what runs share and of the signals, each run's own unknowns eliminated."""
+        """Gram matrix of what runs share and of the signals, each run's nuisance parameters eliminated."""
         signals = np.stack([projector.join(column) for column in columns], axis=1)
         root, inside = projector.root, projector.orthonormal.T @ signals
         outside = projector.off(signals)

@@ -16,9 +16,9 @@ from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._regulated import held_creep
 from fits.diagnosis._score import rescore, score
 from fits.diagnosis._steps import Step
-from fits.diagnosis._unswept import first_ways, unswept
+from fits.diagnosis._virgin import is_virgin, virgin_columns
 from fits.io._record import Record
-from fits.loop._run import UNSWEPT
+from fits.loop._run import VIRGIN
 from microid import EFFECTS, Hold, Scales, Stage
 from microid.effects.transport_delay import TransportDelay
 
@@ -107,7 +107,7 @@ class _Fitted:
     @cached_property
     def beside(self) -> np.ndarray:
         """Orthonormal columns along which the first ways may differ from later ones."""
-        joined = self.projector.off(first_ways(self.projector))
+        joined = self.projector.off(virgin_columns(self.projector))
         if joined.shape[1] == 0:
             return joined
         q, r, _ = qr(joined / (np.linalg.norm(joined, axis=0) + 1e-300), mode="economic", pivoting=True)
@@ -167,7 +167,7 @@ def prepare_diagnosis(
 
     How the command runs between samples is chosen among `holds`, of which lines are the first.
     """
-    said: tuple[str, ...] = (_FIRST,) if initial == UNSWEPT else ()
+    said: tuple[str, ...] = (_FIRST,) if initial == VIRGIN else ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, ONE_WAY)
 
@@ -201,9 +201,9 @@ def prepare_diagnosis(
                 continue
             doubted = doubted or drop < here.highest() ** 2
             here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
-        if initial == "unknown" and unswept(here.projector, here.highest()):
+        if initial == "unknown" and is_virgin(here.projector, here.highest()):
             progress("fitting the plain stage again, without the first way of each run")
-            initial = UNSWEPT
+            initial = VIRGIN
             here, said = fitted(hold), (*said, _FIRST)
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()

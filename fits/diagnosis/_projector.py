@@ -109,7 +109,7 @@ class Projector:
 
     @property
     def own_rows(self) -> np.ndarray:
-        """The runs' own unknowns, whitened and joined, shape `(rows, k)`."""
+        """The runs' nuisance parameters, whitened and joined, shape `(rows, k)`."""
         own = self.regression.own
         out = np.zeros((self.count + self._priors, sum(o.shape[1] for o in own)))
         row = at = 0
@@ -157,7 +157,7 @@ class Projector:
     def ahead(self, change_um: Sequence[np.ndarray]) -> float:
         """Mean square of the errors in what is held out of the runs, in noise variances, under effects.
 
-        The baseline and the runs' own unknowns follow what was fitted. NaN where nothing is held out.
+        The baseline and the runs' nuisance parameters follow what was fitted. NaN where nothing is held out.
         """
         regression = self.regression
         step, columns = self.step(self.residual - self.join(change_um))

@@ -10,7 +10,7 @@ from scipy.linalg import cholesky
 
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import simulate, with_effects
-from fits.diagnosis._through import answering, behind, dressed, passed
+from fits.diagnosis._tangent import answering, behind, dressed, passed
 from fits.loop._design import Grid
 from fits.loop._prior import interpolation
 from fits.stage._moments import Chain, linearise, pieces
@@ -43,7 +43,7 @@ class Regression:
     rows
         Derivatives along columns and coordinates, shape `(n, D + p)` per run.
     own
-        Each run's own unknowns, shape `(n, k)`.
+        Each run's nuisance parameters, shape `(n, k)`.
     finer
         By kind, per run, what relative roughness of the density changes that the grid cannot follow, shape `(n, k)`:
         of loops of one width at all biases, as play operators are, and at single places of the half-plane.
@@ -133,7 +133,7 @@ def root_of(prior: np.ndarray) -> np.ndarray:
 
 
 def _alive(own: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """A run's own unknowns without those that have died away before the samples that count: nothing tells them.
+    """A run's nuisance parameters without those that have died away before the samples that count.
 
     They would be fitted to noise there, and reach far beyond it where they begin.
     """

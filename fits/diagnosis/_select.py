@@ -6,11 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._candidates import Bench, Probe
-from fits.diagnosis._contest import INEXACT, SAME, WORTH, Rival, best_of, contest, tolerance
-from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
-from fits.diagnosis._score import Family, Scored, rescore, score
-from fits.diagnosis._settle import (
+from fits.diagnosis._comparison import INEXACT, SAME, WORTH, Rival, best_of, compare_rivals, tolerance
+from fits.diagnosis._joint_fit import (
     Settled,
     bounded,
     confirmed,
@@ -22,12 +19,15 @@ from fits.diagnosis._settle import (
     smoother,
     stronger,
 )
-from fits.diagnosis._unswept import FirstWaysError, unswept
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import Refit, nothing, refit, refit_beside
+from fits.diagnosis._score import Family, Scored, rescore, score
+from fits.diagnosis._virgin import VirginCurveError, is_virgin
 from microid import EFFECTS
 
 # Causes that are sought, at most, and laws in all, as some causes come several times.
 _MOST, _LAWS = 4, 8
-# Effects that the command has no part in: what one of them leaves looks like none that it has.
+# Effects that the command has no part in: their residuals show no dependence on it.
 _ALONE = ("mains_hum",)
 # Effects that every piezo has.
 _USUAL = ("creep",)
@@ -128,7 +128,7 @@ def select(
 
     Raises
     ------
-    FirstWaysError
+    VirginCurveError
         If the state before the runs was `guessed`, and a wrong guess explains what is left.
     """
     plain = model = nothing(bench, projector)
@@ -154,10 +154,10 @@ def select(
         sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
         if family.p(top / sigma) >= false_alarm:
             break
-        if guessed and causes and unswept(projector, top, model):
-            raise FirstWaysError
+        if guessed and causes and is_virgin(projector, top, model):
+            raise VirginCurveError
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
-        fitted = contest(bench, projector, model, open_, explained, _LAWS - len(causes))
+        fitted = compare_rivals(bench, projector, model, open_, explained, _LAWS - len(causes))
         if not fitted:
             refused |= {one.name for one in open_ if one.z > WORTH * top}
             continue

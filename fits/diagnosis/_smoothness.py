@@ -20,7 +20,7 @@ def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector
     """The same beside a density as smooth as is most probable under what causes change in each run, shape `(n,)`.
 
     Maximises the evidence for the columns as `solve_grid` does, from the noise as it was found, the coordinates and
-    the runs' own unknowns free (MacKay, Neural Computation 4 (1992) 415).
+    the runs' nuisance parameters free (MacKay, Neural Computation 4 (1992) 415).
     """
     regression = projector.regression
     baseline, count = regression.baseline, projector.count

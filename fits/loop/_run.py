@@ -20,7 +20,7 @@ _STAIRCASES = (64, 512, 4096)
 _NEAR = (1e-3, 3e-3, 1e-2)
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
-UNSWEPT = "unswept"
+VIRGIN = "virgin"
 """As `unknown`, where relays that the range does not reach back may have any state, too."""
 
 
@@ -113,7 +113,7 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
     An unknown state is stood in for by negative saturation; the samples that would show the difference are not
     known ones.
     """
-    if name in ("negative", "unknown", UNSWEPT):
+    if name in ("negative", "unknown", VIRGIN):
         return negative_saturation(lower_V)
     if name == "positive":
         return positive_saturation(lower_V, upper_V)
@@ -123,14 +123,14 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
 
 
 def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:
-    """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES` or `UNSWEPT`.
+    """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES` or `VIRGIN`.
 
     At an end of the range every relay is in a known state, if none lies beyond: one that a voltage within the range
     switches on and none switches off is on after the first loop, and may have been off before. Short of that, relays
     outside the extremes that this run itself reaches either never switch or switch on the way to them; once both
     have been visited they are a constant, which the run's own offset takes up.
     """
-    if initial not in ("unknown", UNSWEPT):
+    if initial not in ("unknown", VIRGIN):
         return np.ones(len(voltage), dtype=bool)
     highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
     found: list[np.ndarray] = []
@@ -139,7 +139,7 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
         saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
         own = near if found else 0.0
         both = (highest >= voltage.max() - own) & (lowest <= voltage.min() + own)
-        found.append(both if initial == UNSWEPT else saturated | both)
+        found.append(both if initial == VIRGIN else saturated | both)
     return next(known for known in found if 2 * known.sum() >= found[-1].sum())
 
 

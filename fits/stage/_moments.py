@@ -74,7 +74,7 @@ def _linearised(
     columns_um: Float[Array, " D"] | None,
     samples: Samples,
 ) -> tuple[Float[Array, " n"], Float[Array, "n p"], Float[Array, "n k"]]:
-    """Response of a run, its derivatives along the coordinates, and the run's own unknowns."""
+    """Response of a run, its derivatives along the coordinates, and the run's nuisance parameters."""
 
     def response(z: Float[Array, " p"]) -> tuple[Array, Array]:
         out = respond(_stage(coordinates, place, grid, z, columns_um), samples)
@@ -133,11 +133,11 @@ class RunSums:
     Attributes
     ----------
     moments
-        Of columns and coordinates, the run's own unknowns eliminated.
+        Of columns and coordinates, the run's nuisance parameters eliminated.
     mean
         Mean of the rows over the fitted samples, shape `(D + p,)`.
     residual_um
-        Measurement less prediction at all samples, the run's own unknowns taken off, shape `(n,)`.
+        Measurement less prediction at all samples, the run's nuisance parameters taken off, shape `(n,)`.
     """
 
     moments: Moments

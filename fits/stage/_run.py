@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fits.io._columns import columns_beside
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._run import UNSWEPT, initial_state, known_samples
+from fits.loop._run import VIRGIN, initial_state, known_samples
 from microid import (
     AbstractHysteresis,
     AbstractLinear,
@@ -137,7 +137,7 @@ def prepare_stage_run(
     range_V
         Range of the command.
     initial
-        Memory before the first sample, one of `INITIAL_STATES`, or `UNSWEPT`.
+        Memory before the first sample, one of `INITIAL_STATES`, or `VIRGIN`.
     holdout
         Fraction at the end that is kept out of the fit.
     stride
@@ -163,7 +163,7 @@ def prepare_stage_run(
             "substeps each; split the record, or use a model of fewer substeps"
         )
     lower, upper = range_V
-    n, unknown = len(record), initial in ("unknown", UNSWEPT)
+    n, unknown = len(record), initial in ("unknown", VIRGIN)
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
     fitted = known.copy() if usable is None else known & usable
     if holdout > 0:
@@ -231,7 +231,7 @@ def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
 
 
 def lead_ins(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
-    """What a run's own unknowns add to its displacement, shape `(n, k)`: an offset, and how the stage moved before.
+    """What a run's nuisance parameters add, shape `(n, k)`: an offset in um, and how the stage moved before.
 
     The latter are the free motions of what follows the hysteresis, or of the whole chain without one. A voltage at
     the piezo that still settles when the record begins is not among them.
@@ -273,7 +273,7 @@ def simulate_stage(stage: Stage, run: StageRun) -> np.ndarray:
 
 
 def residual_of(stage: Stage, run: StageRun) -> np.ndarray:
-    """Measurement less prediction, the run's own unknowns taken off, in um, shape `(n,)`."""
+    """Measurement less prediction, the run's nuisance parameters taken off, in um, shape `(n,)`."""
     return np.asarray(_compare(stage, run.samples)[1])[: len(run.record)]
 
 

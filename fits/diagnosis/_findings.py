@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from fits.diagnosis._candidates import Bench
-from fits.diagnosis._contest import best_of
+from fits.diagnosis._comparison import best_of
 from fits.diagnosis._faults import Fault, Faults
 from fits.diagnosis._law import Law
 from fits.diagnosis._profiled import profiled

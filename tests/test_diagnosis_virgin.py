@@ -15,7 +15,7 @@ from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.loop._choose_grid import _resolve
 from fits.loop._result import FitStatus
-from fits.loop._run import UNSWEPT, known_samples
+from fits.loop._run import VIRGIN, known_samples
 from fits.stats._whiten import Noise
 from microid.effects.backlash import Backlash
 
@@ -43,7 +43,7 @@ def record(rng, start_V):
     return Record(np.arange(3000) / 50, voltage_V, reading_um, source="plays.csv")
 
 
-@pytest.mark.parametrize("start_V", [0.0, None])
+@pytest.mark.parametrize("start_V", [pytest.param(0.0, marks=pytest.mark.study), None])
 def test_a_first_way_of_its_own_is_no_effect(rng, start_V):
     run = record(rng, start_V)
     found = diagnose([run])
@@ -59,9 +59,9 @@ def test_a_first_way_of_its_own_is_no_effect(rng, start_V):
 def test_samples_known_whatever_was_before():
     voltage_V = np.array([0.0, 50.0, 100.0, 50.0, 0.0, 50.0])
     assert known_samples(voltage_V, 0.0, 100.0).tolist() == [True] * 6
-    assert known_samples(voltage_V, 0.0, 100.0, UNSWEPT).tolist() == [False, False, True, True, True, True]
+    assert known_samples(voltage_V, 0.0, 100.0, VIRGIN).tolist() == [False, False, True, True, True, True]
     # Within the range, the extremes of the run itself.
-    assert known_samples(voltage_V / 2, 0.0, 100.0, UNSWEPT).tolist() == [False, False, True, True, True, True]
+    assert known_samples(voltage_V / 2, 0.0, 100.0, VIRGIN).tolist() == [False, False, True, True, True, True]
     assert known_samples(voltage_V, 0.0, 100.0, "negative").all()
 
 

@@ -5,18 +5,18 @@ import numpy as np
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._score import evidence
-from fits.loop._run import UNSWEPT, known_samples
+from fits.loop._run import VIRGIN, known_samples
 
 # Waves over the first way, evidence from which it counts, the share of that for the best effect from which it is the
 # likelier reason, and the part of the range through which the voltage goes up, and down, beside it.
 _WAVES, _SURE, _NEARLY, _BOTH_WAYS = 12, 5.5, 0.8, 1.0
 
 
-class FirstWaysError(Exception):
+class VirginCurveError(Exception):
     """The first ways of the runs have to be left out."""
 
 
-def unswept(projector: Projector, highest: float, model: Refit | None = None) -> bool:
+def is_virgin(projector: Projector, highest: float, model: Refit | None = None) -> bool:
     """Whether the first ways of the runs explain about as much as anything else.
 
     A stage that was at rest since it was made, or demagnetised, begins on a curve of its own. What it lacks of a
@@ -32,7 +32,7 @@ def unswept(projector: Projector, highest: float, model: Refit | None = None) ->
     model
         Causes that are known already.
     """
-    columns = first_ways(projector)
+    columns = virgin_columns(projector)
     if columns.shape[1] == 0:
         return False
     columns = projector.off(columns)
@@ -45,7 +45,7 @@ def unswept(projector: Projector, highest: float, model: Refit | None = None) ->
     return z > max(_SURE, _NEARLY * highest)
 
 
-def first_ways(projector: Projector) -> np.ndarray:
+def virgin_columns(projector: Projector) -> np.ndarray:
     """Signals along which the first ways may differ from later ones, joined; none where too little is beside them."""
     runs, range_V = projector.regression.baseline.runs, projector.regression.baseline.range_V
     columns: list[np.ndarray] = []
@@ -53,7 +53,7 @@ def first_ways(projector: Projector) -> np.ndarray:
     up_V = down_V = 0.0
     for k, run in enumerate(runs):
         voltage = run.record.voltage_V
-        strict = known_samples(voltage, *range_V, UNSWEPT)
+        strict = known_samples(voltage, *range_V, VIRGIN)
         moves_V = np.diff(voltage)[(run.fitted & strict)[1:]]
         up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
         first = run.fitted & ~strict

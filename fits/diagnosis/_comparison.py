@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._candidates import Bench
+from fits.diagnosis._joint_fit import settled
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
 from fits.diagnosis._score import Scored, rescore
-from fits.diagnosis._settle import settled
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
 _LEADERS, _FORMS = 5, 2
@@ -50,7 +50,7 @@ def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
     return found
 
 
-def contest(
+def compare_rivals(
     bench: Bench, projector: Projector, model: Refit, scores: Sequence[Scored], explained: float, laws: int
 ) -> list[Rival]:
     """Fit the leaders beside what is there and explains so much, the best first; none as more than `laws`."""

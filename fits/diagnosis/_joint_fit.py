@@ -15,7 +15,7 @@ from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress
 from fits.diagnosis._smoothness import smoothed
-from fits.diagnosis._through import passed
+from fits.diagnosis._tangent import passed
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _OFF = 1.0

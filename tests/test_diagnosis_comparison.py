@@ -12,7 +12,7 @@ from fits import Record
 from fits.diagnosis import _contest, _select
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
-from fits.diagnosis._contest import INEXACT, Rival, best_of, contest
+from fits.diagnosis._comparison import INEXACT, Rival, best_of, compare_rivals
 from fits.diagnosis._law import Law
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
@@ -79,9 +79,10 @@ def asked(case, *names):
 def first_of(case, *names):
     model = nothing(case.bench, case.projector)
     scores = score(case.projector, asked(case, *names), model.residual)
-    return contest(case.bench, case.projector, model, scores, 0.0, 8)[0]
+    return compare_rivals(case.bench, case.projector, model, scores, 0.0, 8)[0]
 
 
+@pytest.mark.study
 def test_a_load_put_on_within_a_record_is_found_to_a_period_of_the_ringing(rng):
     # The sum of squares over the instant is jagged: from the nearest probe, a fit ends in another of its minima.
     at_s, mass = rng.uniform(0.15, 0.3), rng.uniform(1.02, 1.05)
@@ -104,6 +105,7 @@ def test_a_load_put_on_within_a_record_is_found_to_a_period_of_the_ringing(rng):
     assert 0.5 < float(effect.mass_ratio) / (mass - 1) < 2
 
 
+@pytest.mark.study
 def test_two_losses_are_no_drift_of_the_clock(rng):
     lost = np.sort(rng.choice(np.arange(600, 3400, 400), 2, replace=False))
 
@@ -161,6 +163,7 @@ def test_a_settling_mount_is_no_creep_from_before(rng, gain, before_um):
     assert found.possible(case.bench) == (gain > 0)
 
 
+@pytest.mark.study
 def test_hum_raises_no_bar_for_what_the_command_makes(rng):
     delay_s = float(rng.uniform(3e-4, 4e-4))
 
