@@ -9,7 +9,7 @@ from scipy.signal import lsim
 
 from data_synth._mechanics import Mechanics, Mode
 from fits import Record
-from fits.diagnosis import _contest, _select
+from fits.diagnosis import _comparison, _select
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._comparison import INEXACT, Rival, best_of, compare_rivals
@@ -132,12 +132,12 @@ def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(m
         cost = ends[model.laws[0].form.name][1]
         return bench, projector, SimpleNamespace(cost=cost, criterion=lambda _: cost, possible=lambda _: True)
 
-    monkeypatch.setattr(_contest, "settled", settled)
+    monkeypatch.setattr(_comparison, "settled", settled)
     fitted = [
         Rival(name, SimpleNamespace(laws=[SimpleNamespace(form=forms[name])]), cost, 0.0, cost)
         for name, (cost, _) in ends.items()
     ]
-    order = _contest._ranked(None, SimpleNamespace(count=10560), fitted, 17464.0)
+    order = _comparison._ranked(None, SimpleNamespace(count=10560), fitted, 17464.0)
     assert [(one.name, one.cost) for one in order] == [
         ("sensor_lowpass", 10713.0),
         ("transport_delay", 10793.0),
