@@ -92,6 +92,8 @@ def test_times_in_ms_are_told_by_the_resonance(runs):
     result = fit(*map(in_ms, runs))
     assert "in ms instead of s" in said(result, "another unit")
     assert result["mechanics.natural_frequency_Hz"].value < 1
+    for name, value in TRUTH.items():
+        assert 0.995 * result[name].lower < value < 1.005 * result[name].upper
 
 
 def test_outliers_and_a_stuck_sensor_are_named(runs, rng):

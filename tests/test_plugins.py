@@ -53,6 +53,37 @@ LAW = '''
         def __call__(self, voltage_V, start=None):
             return self.slope_um_per_V * voltage_V + self.offset_um
 '''
+EFFECT = '''
+    """A sensor that shows so many times the displacement."""
+    from typing import ClassVar
+    import jax.numpy as jnp
+    from jaxtyping import Array, Float
+    from microid._param import param
+    from microid._part import Signal
+    from microid.effects._base import AbstractEffect, Place, register
+
+    @register
+    class WrongGain(AbstractEffect):
+        """A factor."""
+        name: ClassVar[str] = "wrong_gain"
+        takes: ClassVar[str] = "um"
+        gives: ClassVar[str] = "um"
+        place: ClassVar[Place] = "sensor"
+        strength: ClassVar[tuple[str, ...]] = ("excess",)
+        fingerprint: ClassVar[str] = "The residual is proportional to the displacement."
+        confusions: ClassVar[tuple[str, ...]] = ()
+        experiment: ClassVar[str] = "A reference sensor."
+        source: ClassVar[str] = "a test"
+        excess: Float[Array, ""] = param(unit="1", scale=1e-2)
+
+        @classmethod
+        def probes(cls, scales, inner):
+            return ((cls(jnp.asarray(1e-3)),),)
+
+        def run(self, time_s, signal, start=None):
+            grow = 1 + self.excess
+            return Signal(grow * signal.values, grow * signal.before, signal.hold)
+'''
 COMMAND = '''
     """Say hello."""
     import click
@@ -77,6 +108,7 @@ def copy(tmp_path_factory):
     for place, text in {
         "microid/densities/flat.py": DENSITY,
         "microid/hysteresis/spring.py": LAW,
+        "microid/effects/wrong_gain.py": EFFECT,
         "fits/cli/hello.py": COMMAND,
     }.items():
         (folder / place).write_text(textwrap.dedent(text).lstrip())
@@ -114,14 +146,16 @@ SAVE = """
 import jax; jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp, microid, fits
 from microid.hysteresis import LAWS
-stage = microid.Stage.of(hysteresis=LAWS["spring"](jnp.asarray(0.25), jnp.asarray(1.0)))
+[effect] = [each for each in microid.EFFECTS if each.name == "wrong_gain"]
+law = LAWS["spring"](jnp.asarray(0.25), jnp.asarray(1.0))
+stage = microid.Stage.of(hysteresis=law, sensor=effect(jnp.asarray(0.5)))
 fits.save_model("spring.json", stage, None, {})
 """
 
 
-def test_a_hysteresis_law_is_one_file_and_is_saved_and_read(copy):
+def test_a_hysteresis_law_and_an_effect_are_one_file_each_and_are_saved_and_read(copy):
     python(copy, "-c", SAVE)
     (copy / "program.csv").write_text("time_s,voltage_V\n0,0\n1,8\n2,4\n")
     python(copy, "-m", "fits", "simulate", "spring.json", "program.csv", "--out", "moved.csv")
     rows = [line.split(",") for line in (copy / "moved.csv").read_text().splitlines()[1:]]
-    assert [float(row[2]) for row in rows] == pytest.approx([1.0, 3.0, 2.0])
+    assert [float(row[2]) for row in rows] == pytest.approx([1.5, 4.5, 3.0])

@@ -126,6 +126,13 @@ limit = click.option(
     help="What the rig may be asked for, such as displacement=0:40um or slew=2kV/s; again for more of voltage, slew, "
     "displacement, velocity, acceleration and current (per farad of the piezo). By default what the runs reached.",
 )
+axis = click.option(
+    "--axis",
+    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
+    default="all",
+    show_default=True,
+    help="Which motion.",
+)
 margin = click.option(
     "--margin",
     type=float,
@@ -133,5 +140,18 @@ margin = click.option(
     show_default=True,
     help="Share of its range by which what is predicted may go beyond what the runs reached.",
 )
+
+
+def initial(what: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make the option of the memory before a program or a reference."""
+    return click.option(
+        "--initial",
+        type=click.Choice(["negative", "positive", "demagnetised"]),
+        default="negative",
+        show_default=True,
+        help=f"Memory before the {what}.",
+    )
+
+
 json_output = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, columns, in_sentences
+from fits.cli._common import Given, axis, columns, in_sentences
 from fits.cli._files import keep_apart
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
@@ -26,13 +26,7 @@ _ARM = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|m)\s*")
 @click.argument("stage", metavar="STAGE.toml|paper")
 @click.argument("model", metavar="MODEL.json")
 @click.argument("idle", metavar="IDLE.csv")
-@click.option(
-    "--axis",
-    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
-    default="all",
-    show_default=True,
-    help="Which motion.",
-)
+@axis
 @click.option(
     "--model-measures",
     type=click.Choice(["pzt", "x", "y", "z", "alpha", "beta", "gamma"]),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, columns, in_sentences, json_output, limit, limits, margin
+from fits.cli._common import Given, columns, in_sentences, initial, json_output, limit, limits, margin
 from fits.cli._files import keep_inputs
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
@@ -31,13 +31,7 @@ if TYPE_CHECKING:
 @limits
 @limit
 @margin
-@click.option(
-    "--initial",
-    type=click.Choice(["negative", "positive", "demagnetised"]),
-    default="negative",
-    show_default=True,
-    help="Memory before the reference.",
-)
+@initial("reference")
 @click.option("--plots", metavar="DIR", help="Folder for a plot; it is made if need be.")
 @columns
 @json_output

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, columns, in_sentences, json_output, limit, limits, margin, quiet
+from fits.cli._common import Given, columns, in_sentences, initial, json_output, limit, limits, margin, quiet
 from fits.cli._files import keep_inputs, progress_to_stderr
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
@@ -59,13 +59,7 @@ _LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "o
 @limits
 @limit
 @margin
-@click.option(
-    "--initial",
-    type=click.Choice(["negative", "positive", "demagnetised"]),
-    default="negative",
-    show_default=True,
-    help="Memory before the reference.",
-)
+@initial("reference")
 @click.option(
     "--plants",
     type=click.IntRange(1, 100),

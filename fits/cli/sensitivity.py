@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, in_sentences
+from fits.cli._common import Given, axis, in_sentences
 from fits.cli._files import keep_apart
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
@@ -23,13 +23,7 @@ _TOLERANCE = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|um|µm|μm)\s*")
 
 @click.command()
 @click.argument("stage", metavar="[STAGE.toml]", required=False)
-@click.option(
-    "--axis",
-    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
-    default="all",
-    show_default=True,
-    help="Which motion.",
-)
+@axis
 @click.option(
     "--tolerance", metavar="LENGTH", help="Of all lengths instead of the stage's own, such as 0.02mm or 20um."
 )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, columns, in_sentences, json_output
+from fits.cli._common import Given, columns, in_sentences, initial, json_output
 from fits.cli._files import keep_inputs
 from fits.io._errors import DataError
 
@@ -20,13 +20,7 @@ if TYPE_CHECKING:
 @click.argument("model", metavar="MODEL.json")
 @click.argument("program", metavar="PROGRAM.csv")
 @click.option("--out", required=True, metavar="PREDICTION.csv", help="CSV to write; .gz is compressed.")
-@click.option(
-    "--initial",
-    type=click.Choice(["negative", "positive", "demagnetised"]),
-    default="negative",
-    show_default=True,
-    help="Memory before the program.",
-)
+@initial("program")
 @columns
 @json_output
 @in_sentences

@@ -82,7 +82,15 @@ def stuck(record: Record) -> list[str]:
 
 
 def outlying(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """Mark the readings that are far off their neighbours where there are enough to matter to a fit, shape `(n,)`."""
+    """Mark the readings that are far off their neighbours, where there are enough to matter to a fit, shape `(n,)`.
+
+    Parameters
+    ----------
+    residual_um
+        What the fit leaves, shape `(n,)`.
+    fitted
+        Which samples were fitted, shape `(n,)`.
+    """
     bad = impulsive(residual_um) & fitted
     height = _height(residual_um)
     if bad.any():

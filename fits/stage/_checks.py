@@ -207,20 +207,36 @@ def _resolved(run: StageRun) -> bool:
     return float(power[len(power) // 2 :].sum()) < _UPPER * float(power.sum())
 
 
-def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> list[str]:
-    """Remark on poles that no piezo stage has: the time is probably in another unit."""
+def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> tuple[str, float] | None:
+    """Find poles that no piezo stage has: the time is probably in another unit than its column says.
+
+    Parameters
+    ----------
+    names, values
+        Parameters of the fitted stage, in their units.
+    sources
+        The runs.
+
+    Returns
+    -------
+    tuple or None
+        A sentence, and what a time in the unit it suspects has to be multiplied by to be in s.
+    """
     for name, value in zip(names, values, strict=True):
         field = name.rpartition(".")[2]
         low, high = _USUAL.get(field, (-np.inf, np.inf))
         if low <= value <= high:
             continue
-        unit = "Hz" if field.endswith("_Hz") else "s"
-        return [
-            f"{', '.join(sources)}: {name} comes out as {value:.3g} {unit}, where piezo stages have {low:g} to "
-            f"{high:g} {unit}: the time is probably in another unit than its column says, for example in ms instead "
-            "of s; name the right one as in --columns time_s=time_ms"
-        ]
-    return []
+        hertz = field.endswith("_Hz")
+        # Slow poles and long times come of numbers that are too large.
+        units, factor = ("ms instead of s", 1e-3) if (value < low) == hertz else ("s instead of ms", 1e3)
+        return (
+            f"{', '.join(sources)}: {name} comes out as {value:.3g} {'Hz' if hertz else 's'}, where piezo stages "
+            f"have {low:g} to {high:g}: the time is probably in another unit than its column says, for example in "
+            f"{units}",
+            factor,
+        )
+    return None
 
 
 def gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:

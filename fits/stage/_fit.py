@@ -15,7 +15,7 @@ from fits.loop._result import FitError
 from fits.stage._checks import implausible, refuse_coarse
 from fits.stage._delay import GROSS_PCT, own_up, refuse_delays, take_out_delays
 from fits.stage._moments import Chain
-from fits.stage._reach import leave_outliers
+from fits.stage._reach import Reach, leave_outliers
 from fits.stage._result import StageFit
 from fits.stage._run import gain_ahead, place_of_hysteresis, prepare_stage_run
 from fits.stage._solve import Solved
@@ -133,10 +133,13 @@ def fit_stage(
         summary = own_up(summary, chain, undelayed)
     outliers = leave_outliers(found.plan, found.problem, found.solved)
     if outliers is not None:
-        said = f"{', '.join(outliers[0])}: outliers pull this fit"
-        summary = outliers[1].widen(summary, said, "fit again with --loss huber, or leave them out")
+        summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
     odd = remarks_on(records, *known, robust=loss == "huber")
-    odd += implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
+    unit = implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
+    if unit is not None:
+        summary = Reach.in_unit(summary, unit[1]).widen(
+            summary, unit[0], "name the right one as in --columns time_s=time_ms"
+        )
     notes = [warning for record in (*records, *aside) for warning in record.warnings]
     told = tuple(dict.fromkeys((*odd, *notes, *found.remarks, *summary.remarks)))
     return replace(summary, misfit=worst(left), remarks=told)

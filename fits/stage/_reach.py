@@ -40,6 +40,13 @@ class Reach:
         ends = (np.asarray(chain.coordinates.values(jnp.asarray(solved.z + k * _NORMAL * sd))) for k in (0, -1, 1))
         return cls(*ends)
 
+    @classmethod
+    def in_unit(cls, fit: StageFit, factor: float) -> "Reach":
+        """Where a fit comes out if a unit of its times is so many s."""
+        powers = np.asarray([{"s": 1.0, "Hz": -1.0}.get(p.unit, 0.0) for p in fit.parameters])
+        figures = [[getattr(p, name) for p in fit.parameters] for name in ("value", "lower", "upper")]
+        return cls(*(factor**powers * np.asarray(each) for each in figures))
+
     def ruined(self, fit: StageFit) -> list[str]:
         """Say which parameters of a fit are far from these, one sentence each."""
         return [
@@ -48,7 +55,7 @@ class Reach:
             if abs(v - p.value) > _RUINED * min(abs(v), abs(p.value))
         ]
 
-    def widen(self, fit: StageFit, said: str, remedy: str) -> StageFit:
+    def widen(self, fit: StageFit, said: str, remedy: str = "") -> StageFit:
         """Let a fit's intervals reach these, and say so first.
 
         Parameters
@@ -56,7 +63,7 @@ class Reach:
         fit
             With all that pulls it.
         said, remedy
-            What pulls it, and what to do about that.
+            What pulls it, and what to do about that where no other remark says so.
         """
         parameters = tuple(
             replace(
@@ -68,12 +75,20 @@ class Reach:
             for p, v, a, b in zip(fit.parameters, self.values, self.low, self.high, strict=True)
         )
         listed = ", ".join(f"{p.name} {v:.5g} {p.unit}" for p, v in zip(fit.parameters, self.values, strict=True))
-        remark = f"{said}; without that the parameters would be {listed}, and the intervals reach there: {remedy}"
+        remark = f"{said}; without that the parameters would be {listed}, and the intervals reach there"
+        remark += f": {remedy}" if remedy else ""
         return replace(fit, parameters=parameters, remarks=(remark, *fit.remarks))
 
 
 def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[str], Reach] | None:
     """Fit again without readings that jump out; the files that have such, and where the parameters come out.
+
+    Parameters
+    ----------
+    plan, problem
+        What was asked for.
+    solved
+        The fit with all readings.
 
     Returns
     -------
