@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import fits
-from fits.io._columns import columns_beside
+from fits.io.columns import columns_beside
 from microid import Dahl, Driver, Mechanics, Sensor, Stage
 from microid.effects import EFFECTS, extend
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.diagnosis._evaluate import simulate
-from fits.io._columns import PATH
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.io.columns.path import PATH
 from fits.loop._choose_grid import choose_grid
 from fits.loop._design import columns_of
 from fits.loop._prior import roughness

@@ -7,7 +7,7 @@ import numpy as np
 
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import respond_again, with_effects
-from fits.io._columns import columns_beside
+from fits.io.columns import columns_beside
 from fits.stage._motion import Prepared, prepare, signals
 from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host
 

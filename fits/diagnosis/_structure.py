@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._projector import Projector
-from fits.io._columns import columns_beside
+from fits.io.columns import COLUMNS, columns_beside
 from fits.stage._run import StageRun
 
 _WAVES, _POWERS = 12, 4
@@ -66,7 +66,11 @@ def _joined(runs: Sequence[StageRun], found: Sequence[dict[str, list[np.ndarray]
                 kinds.setdefault(name, []).append(
                     [column if i == k else np.zeros(size) for i, size in enumerate(sizes)]
                 )
-    return [View(name, tuple(tuple(c) for c in columns), _SENTENCES[name]) for name, columns in kinds.items()]
+    return [
+        # Further columns are called by their titles.
+        View(name, tuple(tuple(c) for c in columns), _SENTENCES.get(name, f"the residual goes with the {name}"))
+        for name, columns in kinds.items()
+    ]
 
 
 _SENTENCES = {
@@ -78,8 +82,6 @@ _SENTENCES = {
     "jumps": "the residual jumps",
     "voltage": "the residual depends on the command and its direction",
     "frequency": "the residual goes with the command, by another factor and phase at each frequency",
-    "temperature": "the residual goes with the temperature",
-    "other axis": "the residual goes with the second axis",
     "gain": "the residual is in proportion to the displacement, by a factor that changes along the run",
 }
 
@@ -129,11 +131,10 @@ def _beside(run: StageRun) -> dict[str, list[np.ndarray]]:
         "voltage": [np.cos(np.pi * k * share) * side for side in (up.astype(float), 1.0 - up) for k in range(8)],
         "frequency": _bands(voltage),
     }
-    beside = columns_beside(run.record)
-    for name, column in (("temperature", "temperature_degC"), ("other axis", "other_um")):
-        if column in beside:
-            values = beside[column] - np.mean(beside[column])
-            found[name] = [values, np.gradient(values), np.cumsum(values)]
+    for name, values in columns_beside(run.record).items():
+        if COLUMNS[name].title:
+            values = values - np.mean(values)
+            found[COLUMNS[name].title] = [values, np.gradient(values), np.cumsum(values)]
     return found
 
 

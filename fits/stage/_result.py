@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fits.io._columns import PATH, columns_beside
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._misfit import Misfit
 from fits.loop._result import FitStatus, Prediction, RunReport, pool, refuse_outside
 from fits.stage._run import (
@@ -164,7 +164,7 @@ def predict_stage(
     program = Record(record.time_s, record.voltage_V, np.zeros(len(record)), record.extra, source=record.source)
     missing = sorted(
         {name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs}
-        - {PATH}
+        - {name for name, column in COLUMNS.items() if column.optional}
         - set(columns_beside(program))
     )
     if missing:

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.io._columns import columns_beside
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.io.columns import columns_beside
 from fits.loop._run import VIRGIN, initial_state, known_samples
 from microid import (
     AbstractHysteresis,
