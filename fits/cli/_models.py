@@ -5,7 +5,11 @@ from collections.abc import Sequence
 
 from fits.io._errors import DataError
 from fits.io._limits import Ranges, allowed, parse_limits
+from fits.io._record import Record
+from fits.loop._result import Prediction, predict
+from fits.loop._uncertainty import Uncertainty
 from fits.stage._model_file import ModelFile
+from fits.stage._result import predict_stage
 from microid import Preisach, Stage
 
 
@@ -19,6 +23,16 @@ def preisach_of(path: str, loaded: ModelFile) -> Preisach:
 def stage_or_preisach(path: str, loaded: ModelFile) -> Preisach | Stage:
     """Return the stage or the hysteresis that a model file holds; a `DataError` where it holds neither."""
     return loaded.model if isinstance(loaded.model, Stage) else preisach_of(path, loaded)
+
+
+def predicted_by(path: str, loaded: ModelFile, program: Record, initial: str) -> Prediction:
+    """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
+    if isinstance(loaded.model, Stage):
+        assert not isinstance(loaded.uncertainty, Uncertainty)
+        return predict_stage(loaded.model, loaded.uncertainty, program, initial)
+    if not isinstance(loaded.uncertainty, Uncertainty):
+        raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
+    return predict(preisach_of(path, loaded), loaded.uncertainty, program, initial)
 
 
 def parse_rig_limits(

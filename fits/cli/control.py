@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, columns, in_sentences, initial, json_output, limit, limits, margin, quiet
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
 from fits.cli._files import keep_inputs, progress_to_stderr
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
@@ -25,10 +26,10 @@ _LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "o
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.json")
-@click.argument("reference", metavar="REFERENCE.csv")
-@click.option("--out", required=True, metavar="RUN.csv", help="CSV to write; .gz is compressed.")
-@click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
+@options.model
+@options.reference
+@options.out_csv("RUN.csv")
+@options.plots("plots")
 @click.option(
     "--controller",
     type=click.Choice(["pid", "bp-pid", "cmac-pid", "resonant"]),
@@ -56,10 +57,10 @@ _LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "o
 @click.option("--delay", type=click.IntRange(0, 100), default=0, metavar="SAMPLES", help="Age of a reading.")
 @click.option("--resolution", type=float, metavar="UM", help="Steps of the sensor, in um.")
 @click.option("--resolution-voltage", type=float, metavar="V", help="Steps of the amplifier's command, in V.")
-@limits
-@limit
-@margin
-@initial("reference")
+@options.limits
+@options.limit
+@options.margin
+@options.initial("the reference")
 @click.option(
     "--plants",
     type=click.IntRange(1, 100),
@@ -73,10 +74,10 @@ _LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "o
 @click.option("--rate", type=float, default=0.0, metavar="UM/V", help="Weight of the command's steps in the cost.")
 @click.option("--skip", type=float, default=0.0, metavar="S", help="Time at the beginning that does not count, in s.")
 @click.option("--starts", type=click.IntRange(1, 100), default=2, show_default=True, help="Places to tune from.")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Of noise, plants and starts (default 0).")
-@columns
-@json_output
-@quiet
+@click.option("--seed", type=options.SEEDS, default=0, help="Of noise, plants and starts (default 0).")
+@options.columns
+@options.json_output
+@options.quiet
 @in_sentences
 def control(given: Given) -> None:
     """Tune a controller on a model, and run it along a reference.

@@ -12,7 +12,8 @@ import click
 
 if TYPE_CHECKING:
     from fits.diagnosis._result import Diagnosis, EffectParameter
-from fits.cli._common import Given, columns, in_sentences, json_output, limit, margin, quiet
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
 from fits.cli._files import bar_to_stderr, fraction_or_files, keep_inputs
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
@@ -25,27 +26,19 @@ _FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
 
 
 @click.command()
-@click.argument("runs", metavar="RUN.csv [MORE.csv ...]", nargs=-1, required=True)
-@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
-@click.option(
-    "--holdout", multiple=True, metavar="FRACTION|FILE", help="What is only predicted, as for fit (default 0.2)."
-)
+@options.runs
+@options.out_folder
+@options.holdout("What is only predicted, as for fit (default 0.2).")
 @click.option(
     "--false-alarm", type=float, default=0.01, show_default=True, help="Chance of a cause where there is none."
 )
 @click.option("--duration", type=float, metavar="SECONDS", help="Of the next experiment, at most.")
-@click.option(
-    "--initial",
-    type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
-    default="unknown",
-    show_default=True,
-    help="Memory before all runs.",
-)
-@limit
-@margin
-@columns
-@json_output
-@quiet
+@options.initial("all runs", "unknown")
+@options.limit
+@options.margin
+@options.columns
+@options.json_output
+@options.quiet
 @in_sentences
 def diagnose(given: Given) -> None:
     """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +40,8 @@ class Quantity:
         """Canonical column name: stem and unit."""
         return f"{self.stem}_{self.unit}"
 
-    def convert(self, values: FloatArray, unit: str) -> FloatArray:
-        """Values, shape (n,), of a known unit in the canonical unit."""
+    def convert(self, values: Any, unit: str) -> Any:
+        """Values, or one, of a known unit in the canonical unit."""
         if unit == "K":
             return values - _KELVIN_AT_0_DEGC
         # Dividing by an exact power is rounded once; multiplying by 1e-3 would be rounded twice.

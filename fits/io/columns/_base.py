@@ -75,6 +75,7 @@ def columns_beside(record: Record) -> dict[str, FloatArray]:
         column = next((each for each in COLUMNS.values() if each.takes(header, values, record)), None)
         if column is not None and column.key not in found:
             unit = split_unit(header)[1]
-            converted = column.quantity.convert(values, unit) if unit in column.quantity.powers else values
-            found[column.key] = column.cleaned(converted, record)
+            if unit in column.quantity.powers:
+                values = column.quantity.convert(values, str(unit))
+            found[column.key] = column.cleaned(values, record)
     return found
