@@ -146,7 +146,7 @@ def python(folder, *arguments, code=0):
         env=os.environ | {"PYTHONPATH": str(folder), "MICROID_CACHE": os.environ["JAX_COMPILATION_CACHE_DIR"]},
     )
     assert done.returncode == code, done.stderr
-    return done.stdout
+    return done.stderr if code else done.stdout
 
 
 def test_a_command_is_one_file(copy):
@@ -203,5 +203,5 @@ def test_a_column_is_one_file_and_an_effect_uses_it(copy):
         assert found == pytest.approx(expected)
     arguments = ["simulate", "swelling.json", "program.csv", "--out", "not.csv"]
     (copy / "program.csv").write_text("time_s,voltage_V\n0,0\n1,8\n2,4\n")
-    done = python(copy, "-m", "fits", *arguments, code=2)
-    assert done == ""
+    sentence = "program.csv: the model depends on humidity_pct: add a column of that name that varies.\n"
+    assert python(copy, "-m", "fits", *arguments, code=2) == sentence
