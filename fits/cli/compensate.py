@@ -125,14 +125,9 @@ def compensate(given: Given) -> None:
 
 def _displacement_sd_um(loaded: ModelFile, program: Record, initial: str) -> np.ndarray | None:
     """Standard deviation of a model's displacement, where the file says enough for one."""
-    from fits.loop._result import predict
-    from fits.loop._uncertainty import Uncertainty
-    from fits.stage._result import predict_stage
-    from fits.stage._uncertainty import StageUncertainty
+    from fits.stage._predict import predict
     from microid import Preisach, Stage
 
-    if isinstance(loaded.model, Stage) and isinstance(loaded.uncertainty, StageUncertainty):
-        return predict_stage(loaded.model, loaded.uncertainty, program, initial).displacement_sd_um
-    if isinstance(loaded.model, Preisach) and isinstance(loaded.uncertainty, Uncertainty):
-        return predict(loaded.model, loaded.uncertainty, program, initial).displacement_sd_um
-    return None
+    if loaded.uncertainty is None or not isinstance(loaded.model, Preisach | Stage):
+        return None
+    return predict(loaded.model, loaded.uncertainty, program, initial).displacement_sd_um

@@ -78,8 +78,7 @@ def fit(given: Given) -> None:
     from fits.loop._result import FitError
     from fits.plots._loop import plot_fit
     from fits.plots._stage import plot_stage
-    from fits.report._loop import describe, fit_report
-    from fits.report._stage import describe_stage, stage_report
+    from fits.report._fit import describe, fit_report
     from fits.stage._fit import fit_stage
     from fits.stage._model_file import model_text
 
@@ -87,12 +86,12 @@ def fit(given: Given) -> None:
     states: str | list[str]
     options: dict[str, Any]
     if given.model == "stage":
-        kind = _Kind(fit_stage, stage_report, describe_stage, plot_stage)
+        kind = _Kind(fit_stage, plot_stage)
         states, options = _stage_options(
             given.family, given.starts, given.seed, given.loss, given.hold, given.initial, len(given.runs)
         )
     else:
-        kind = _Kind(fit, fit_report, describe, plot_fit)
+        kind = _Kind(fit, plot_fit)
         states, options = _loop_options(given.family, given.starts, given.seed, given.loss, given.hold, given.initial)
     progress = progress_to_stderr(given.quiet)
     mapping = parse_columns(given.columns)
@@ -110,7 +109,7 @@ def fit(given: Given) -> None:
             )
         except FitError as error:
             raise DataError(f"{error}.") from error
-        report = kind.report(result)
+        report = fit_report(result)
         drawn: Sequence[Path] = ()
         if drawings is not None:
             progress("drawing")
@@ -120,18 +119,14 @@ def fit(given: Given) -> None:
     if given.as_json:
         click.echo(finite_json({"out": given.out, "plots": places, **report}))
     else:
-        click.echo(
-            "\n".join([kind.describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)])
-        )
+        click.echo("\n".join([describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)]))
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """What can be fitted: how, and how to show it."""
+    """What can be fitted: how, and how to draw it."""
 
     fit: Callable[..., Any]
-    report: Callable[[Any], dict[str, Any]]
-    describe: Callable[[dict[str, Any]], str]
     plot: Callable[..., Sequence[Path]]
 
 

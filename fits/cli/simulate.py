@@ -12,7 +12,7 @@ from fits.io._errors import DataError
 
 if TYPE_CHECKING:
     from fits.io._record import Record
-    from fits.loop._result import Prediction
+    from fits.loop._uncertainty import Prediction
     from fits.stage._model_file import ModelFile
 
 
@@ -78,14 +78,10 @@ def simulate(given: Given) -> None:
 def _predict(path: str, loaded: ModelFile, record: Record, initial: str) -> Prediction:
     """Predict with whatever model a file holds."""
     from fits.cli._models import preisach_of
-    from fits.loop._result import predict
-    from fits.loop._uncertainty import Uncertainty
-    from fits.stage._result import predict_stage
+    from fits.stage._predict import predict
     from microid import Stage
 
-    if isinstance(loaded.model, Stage):
-        assert not isinstance(loaded.uncertainty, Uncertainty)
-        return predict_stage(loaded.model, loaded.uncertainty, record, initial)
-    if not isinstance(loaded.uncertainty, Uncertainty):
+    model = loaded.model if isinstance(loaded.model, Stage) else preisach_of(path, loaded)
+    if loaded.uncertainty is None and not isinstance(model, Stage):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
-    return predict(preisach_of(path, loaded), loaded.uncertainty, record, initial)
+    return predict(model, loaded.uncertainty, record, initial)

@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 
 from fits.io._record import Record
 from fits.loop._result import FitResult, RunReport
-from fits.loop._run import Run, prepare_run, simulate_run, split
-from fits.loop._uncertainty import sd_run
+from fits.loop._run import Run, prepare_run, simulate_run
 from fits.plots._style import (
     DARK,
     LIGHT,
@@ -31,7 +30,7 @@ from fits.plots._style import (
     verbatim,
 )
 from fits.stats._metrics import Errors
-from microid import Preisach, Reversible, Staircase, remember
+from microid import Preisach, Reversible
 
 # Half-width of a 95 % interval in standard deviations.
 _TWO_SIDED_95 = 1.959964
@@ -51,7 +50,7 @@ class _Drawn:
 
 
 def plot_fit(
-    result: FitResult,
+    result: FitResult[Preisach],
     records: Sequence[Record],
     folder: str | os.PathLike[str],
     *,
@@ -87,11 +86,9 @@ def plot_fit(
         raise ValueError(
             f"the result has {len(result.runs)} runs, and {len(records) + len(aside)} records were given"
         )
-    lower, upper = float(result.model.density.lower_V), float(result.model.density.upper_V)
-    runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]
-    for record in aside:
-        run = prepare_run(record, lower, upper, initial, holdout=1.0)
-        runs.append(replace(run, fitted=np.zeros_like(run.known)))
+    range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
+    runs = [prepare_run(record, range_V, initial, fraction) for record in records]
+    runs += [prepare_run(record, range_V, initial, holdout=1.0) for record in aside]
     drawn = [_simulated(result, run, report) for run, report in zip(runs, result.runs, strict=True)]
 
     voltage, (density, everett) = _over_half_plane(result.model)
@@ -106,27 +103,13 @@ def plot_fit(
     return [save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
 
 
-def _simulated(result: FitResult, run: Run, report: RunReport) -> _Drawn:
+def _simulated(result: FitResult[Preisach], run: Run, report: RunReport) -> _Drawn:
     model = eqx.tree_at(lambda m: m.offset_um, result.model, jnp.asarray(report.offset_um))
     predicted = simulate_run(model, run)
     if not run.known.all():
         # The reported errors are those of the known samples; the start was estimated from the others.
-        predicted = np.where(run.known, predicted, simulate_run(model, _started(run, report.start)))
+        predicted = np.where(run.known, predicted, simulate_run(model, replace(run, start=report.start)))
     return _Drawn(run, report, predicted)
-
-
-def _started(run: Run, start: Staircase) -> Run:
-    """Let a run begin with another memory."""
-    size = run.starts[0].extremes_V.shape[0]
-    starts = [Staircase(jnp.pad(start.extremes_V, (0, size - start.extremes_V.shape[0]), mode="edge"), start.count)]
-    for piece in split(run.record.voltage_V)[:-1]:
-        starts.append(_end(jnp.asarray(piece), starts[-1]))
-    return replace(run, starts=tuple(starts))
-
-
-@eqx.filter_jit
-def _end(voltage_V: Float[Array, " n"], start: Staircase) -> Staircase:
-    return remember(voltage_V, start).end()
 
 
 def _columns(runs: Sequence[_Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
@@ -163,13 +146,13 @@ def _loops(runs: Sequence[_Drawn]) -> Figure:
     return picture
 
 
-def _heldout(result: FitResult, runs: Sequence[_Drawn]) -> Figure:
+def _heldout(result: FitResult[Preisach], runs: Sequence[_Drawn]) -> Figure:
     picture, axes = _columns(runs, WIDE_in)
     for each, (above, below) in zip(runs, axes.T, strict=False):
         samples = each.run.held_out
         time_s, measured = each.run.record.time_s[samples], each.run.displacement_um[samples]
         predicted = each.predicted_um[samples]
-        half = _TWO_SIDED_95 * sd_run(result.uncertainty, each.run)[samples]
+        half = _TWO_SIDED_95 * result.uncertainty.sd_um(result.model, each.run)[samples]
         noisy = np.hypot(half, _TWO_SIDED_95 * result.noise_um)
         keep = thinned(measured)
         above.plot(time_s[keep], measured[keep], label="measured", **MEASURED)

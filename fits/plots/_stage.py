@@ -14,8 +14,8 @@ from matplotlib.ticker import LogFormatter
 
 from fits.control._compensate_stage import static_equivalent
 from fits.io._record import Record
-from fits.loop._result import RunReport
-from fits.loop._run import prepare_run, simulate_run
+from fits.loop._result import FitResult, RunReport
+from fits.loop._run import Run, prepare_run, simulate_run
 from fits.plots._loop import _MOST_RUNS, _TWO_SIDED_95, _caption
 from fits.plots._style import (
     DARK,
@@ -31,8 +31,7 @@ from fits.plots._style import (
     thinned,
     verbatim,
 )
-from fits.stage._result import StageFit
-from fits.stage._run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, residual_of
+from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of
 from fits.stage._start import MeasuredResponse, measure_response
 from microid import AbstractLinear, Preisach, Stage
 
@@ -46,7 +45,7 @@ _SURE, _FAINTEST = 0.8, 0.85
 class _Drawn:
     """A run with its prediction, as the report compares them."""
 
-    run: StageRun
+    run: Run
     report: RunReport
     predicted_um: np.ndarray
     sd_um: np.ndarray
@@ -58,7 +57,7 @@ class _Drawn:
 
 
 def plot_stage(
-    result: StageFit,
+    result: FitResult[Stage],
     records: Sequence[Record],
     folder: str | os.PathLike[str],
     *,
@@ -92,7 +91,8 @@ def plot_stage(
     fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
     aside: Sequence[Record] = () if isinstance(holdout, int | float) else holdout
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
-    if len(records) != len(result.substeps) or len(records) + len(aside) != len(result.runs):
+    known = result.fitted_runs
+    if len(records) != len(known) or len(records) + len(aside) != len(result.runs):
         raise ValueError(
             f"the result has {len(result.runs)} runs, and {len(records) + len(aside)} records were given"
         )
@@ -102,13 +102,14 @@ def plot_stage(
     gain = gain_ahead(stage)
     before_aside = initial if isinstance(initial, str) else "unknown"
     runs = [
-        prepare_stage_run(record, range_V, state, fraction, stride, gain, stage.hold)
-        for record, state, stride in zip(records, states, result.substeps, strict=True)
+        prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold)
+        for record, state, report in zip(records, states, known, strict=True)
     ]
     for record in aside:
-        run = prepare_stage_run(record, range_V, before_aside, 1.0, result.substeps[-1], gain, stage.hold)
-        runs.append(replace(run, fitted=run.known).weighted(run.known))
-    noises = [*result.noise_um, *([max(result.noise_um)] * len(aside))]
+        run = prepare_run(record, range_V, before_aside, 1.0, known[-1].substeps or 1, gain, stage.hold)
+        runs.append(replace(run, fitted=run.known))
+    noises = [report.noise_um or 0.0 for report in known]
+    noises += [max(noises)] * len(aside)
     drawn = [
         _simulated(result, stage, run, report, noise)
         for run, report, noise in zip(runs, result.runs, noises, strict=True)
@@ -138,13 +139,13 @@ def _speed_per_s(record: Record) -> float:
     return float(np.sqrt(np.mean(rate**2)) / np.ptp(record.voltage_V))
 
 
-def _simulated(result: StageFit, stage: Stage, run: StageRun, report: RunReport, noise_um: float) -> _Drawn:
+def _simulated(result: FitResult[Stage], stage: Stage, run: Run, report: RunReport, noise_um: float) -> _Drawn:
     predicted = run.displacement_um - residual_of(stage, run)
     return _Drawn(run, report, predicted, result.uncertainty.sd_um(stage, run), noise_um)
 
 
 def _measured(
-    stage: Stage, runs: Sequence[StageRun], states: Sequence[str], fraction: float
+    stage: Stage, runs: Sequence[Run], states: Sequence[str], fraction: float
 ) -> tuple[str, MeasuredResponse] | None:
     """Frequency response behind the hysteresis, from the run that shows the highest frequencies."""
     found = []
@@ -168,7 +169,7 @@ def _static_um(stage: Stage, record: Record, state: str, fraction: float) -> np.
     if isinstance(law, Preisach):
         static = static_equivalent(stage)
         lower, upper = float(static.density.lower_V), float(static.density.upper_V)
-        return simulate_run(static, prepare_run(record, lower, upper, state, fraction))
+        return simulate_run(static, prepare_run(record, (lower, upper), state, fraction))
     if law is None:
         return float(stage.static_gain) * record.voltage_V
     return float(stage.static_gain) * np.asarray(law(jnp.asarray(record.voltage_V)))
