@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from fits.io._errors import DataError
 from fits.io._limits import Ranges, allowed, parse_limits
 from fits.io._record import Record
-from fits.loop._result import Prediction, predict
-from fits.loop._uncertainty import Uncertainty
+from fits.loop._uncertainty import Prediction
 from fits.stage._model_file import ModelFile
-from fits.stage._result import predict_stage
+from fits.stage._predict import predict
 from microid import Preisach, Stage
 
 
@@ -27,12 +26,10 @@ def stage_or_preisach(path: str, loaded: ModelFile) -> Preisach | Stage:
 
 def predicted_by(path: str, loaded: ModelFile, program: Record, initial: str) -> Prediction:
     """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
-    if isinstance(loaded.model, Stage):
-        assert not isinstance(loaded.uncertainty, Uncertainty)
-        return predict_stage(loaded.model, loaded.uncertainty, program, initial)
-    if not isinstance(loaded.uncertainty, Uncertainty):
+    model = stage_or_preisach(path, loaded)
+    if loaded.uncertainty is None and isinstance(model, Preisach):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
-    return predict(preisach_of(path, loaded), loaded.uncertainty, program, initial)
+    return predict(model, loaded.uncertainty, program, initial)
 
 
 def parse_rig_limits(

@@ -66,28 +66,21 @@ def fit(given: Given) -> None:
     from fits.io._jax_setup import start_jax
     from fits.io._read_csv import read_csv, read_runs
     from fits.io._units import parse_columns
+    from fits.loop._fit import fit
     from fits.loop._result import FitError
+    from fits.plots._loop import plot_fit
+    from fits.plots._stage import plot_stage
+    from fits.report._fit import describe, fit_report
+    from fits.stage._fit import fit_stage
     from fits.stage._model_file import model_text
 
     start_jax()
     estimate: Any
-    report_of: Any
-    describe: Any
     draw: Any
     if given.model == "stage":
-        from fits.plots._stage import plot_stage as draw
-        from fits.report._stage import describe_stage as describe
-        from fits.report._stage import stage_report as report_of
-        from fits.stage._fit import fit_stage as estimate
-
-        asked = _for_stage(given)
+        estimate, draw, asked = fit_stage, plot_stage, _for_stage(given)
     else:
-        from fits.loop._fit import fit as estimate
-        from fits.plots._loop import plot_fit as draw
-        from fits.report._loop import describe
-        from fits.report._loop import fit_report as report_of
-
-        asked = _for_loop(given)
+        estimate, draw, asked = fit, plot_fit, _for_loop(given)
     initial = list(given.initial) if len(given.initial) > 1 else (given.initial or ("unknown",))[0]
     progress = progress_to_stderr(given.quiet)
     mapping = parse_columns(given.columns)
@@ -103,7 +96,7 @@ def fit(given: Given) -> None:
             result = estimate(records, **same, **asked)
         except FitError as error:
             raise DataError(f"{error}.") from error
-        report, drawn = report_of(result), []
+        report, drawn = fit_report(result), []
         if drawings is not None:
             progress("drawing")
             drawn = draw(result, records, drawings, **same)

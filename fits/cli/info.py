@@ -43,15 +43,12 @@ def info(given: Given) -> None:
 
 
 def _known_of_fit(path: str, loaded: ModelFile) -> str:
-    from fits.report._loop import describe
-    from fits.report._stage import describe_stage
-    from fits.stage._uncertainty import StageUncertainty
+    from fits.report._fit import describe
 
     if loaded.uncertainty is None:
         return "written by 'microid diagnose', whose report says how well it predicts"
-    words = describe_stage if isinstance(loaded.uncertainty, StageUncertainty) else describe
     try:
-        return words(loaded.report)
+        return describe(loaded.report)
     except (LookupError, TypeError, ValueError, AttributeError):
         # The format does not say what a report holds, and the words are made for that of a fit.
         raise DataError(f"{path}: its report is not that of a fit; fit again, or add --json to see it.") from None

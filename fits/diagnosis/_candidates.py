@@ -181,8 +181,8 @@ def _scaled(effect: AbstractEffect, share: float) -> AbstractEffect:
 
 def one_sided(form: type[AbstractEffect]) -> bool:
     """Whether the strength of an effect cannot be negative."""
-    from fits.stage._encode import _spec
+    from fits.stage._encode import spec_of
 
     fields = form.__dataclass_fields__
-    specs = [_spec(fields[name]) for name in form.strength]
+    specs = [spec_of(fields[name]) for name in form.strength]
     return not specs or all(spec is not None and spec.lower >= 0 for spec in specs)

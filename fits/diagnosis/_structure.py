@@ -9,7 +9,7 @@ from scipy import stats
 
 from fits.diagnosis._projector import Projector
 from fits.io.columns import COLUMNS, columns_beside
-from fits.stage._run import StageRun
+from fits.loop._run import Run
 
 _WAVES, _POWERS = 12, 4
 _CYCLES = 240
@@ -47,17 +47,17 @@ class Seen:
     p: float
 
 
-def views(runs: Sequence[StageRun], plain_um: Sequence[np.ndarray]) -> list[View]:
+def views(runs: Sequence[Run], plain_um: Sequence[np.ndarray]) -> list[View]:
     """The ways of looking in which structure counts as left over, each run by itself."""
     return _joined(runs, [_of_run(run, plain) for run, plain in zip(runs, plain_um, strict=True)])
 
 
-def further_views(runs: Sequence[StageRun]) -> list[View]:
+def further_views(runs: Sequence[Run]) -> list[View]:
     """Ways of looking that say more of the cause: along the command and along what was measured besides."""
     return _joined(runs, [_beside(run) for run in runs])
 
 
-def _joined(runs: Sequence[StageRun], found: Sequence[dict[str, list[np.ndarray]]]) -> list[View]:
+def _joined(runs: Sequence[Run], found: Sequence[dict[str, list[np.ndarray]]]) -> list[View]:
     kinds: dict[str, list[list[np.ndarray]]] = {}
     sizes = [len(run.record) for run in runs]
     for k, own in enumerate(found):
@@ -86,7 +86,7 @@ _SENTENCES = {
 }
 
 
-def _of_run(run: StageRun, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
+def _of_run(run: Run, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
     record = run.record
     n = len(record)
     time = (record.time_s - record.time_s[0]) / record.duration_s
@@ -123,7 +123,7 @@ def _of_run(run: StageRun, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
     return found
 
 
-def _beside(run: StageRun) -> dict[str, list[np.ndarray]]:
+def _beside(run: Run) -> dict[str, list[np.ndarray]]:
     voltage = run.record.voltage_V
     share = (voltage - voltage.min()) / (float(np.ptp(voltage)) or 1.0)
     up = np.gradient(voltage) >= 0

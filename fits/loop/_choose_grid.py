@@ -17,7 +17,7 @@ from fits.loop._prior import Hyper
 from fits.loop._result import FitError, FitStatus, LevelTrial
 from fits.loop._run import Run, simulate_run
 from fits.stats._at_rest import quantum_um
-from fits.stats._noise import correlation_samples, huber_weight
+from fits.stats._noise import WHITE, correlation_samples, huber_weight
 
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
@@ -29,8 +29,6 @@ _DEAR = 32
 _ROUNDED = 1.2
 # Rounds after which the weights of outliers have settled.
 _REWEIGHED = 8
-# A residual less correlated than this counts as white.
-_WHITE = 1.2
 # Correlation of displacement with voltage below which there is no loop.
 _FOLLOWS = 0.3
 # Coherence from which on it follows all the same, and segments whose spectra are averaged.
@@ -55,21 +53,8 @@ def choose_grid(
 ) -> tuple[float, GridTrial, list[LevelTrial]]:
     """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
 
-    Returns
-    -------
-    stroke_um
-        Unit of the columns.
-    kept
-        The finest grid that predicts no worse than the others, as it is least felt.
-    trials
-        All that were tried.
-
-    Raises
-    ------
-    DataError
-        If there is no loop to fit.
-    FitError
-        If a solver fails.
+    Returns the stroke in um, which is the unit of the columns, the grid that is kept, and all that were tried. A
+    `DataError` where there is no loop to fit, a `FitError` where a solver fails.
     """
     lower, upper = jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V)
     stroke = max(_stroke(run) for run in runs)
@@ -86,7 +71,7 @@ def choose_grid(
 def _resolve(
     trial: Callable[[int, Hyper], GridTrial], levels: int | None, finest: int, rounding_um: float
 ) -> tuple[GridTrial, list[LevelTrial]]:
-    """Refine until it no longer pays; the finest that predicts no worse is kept, as its grid is least felt.
+    """Refine until it no longer pays; of grids that predict alike the finest is kept.
 
     What a last digit rounds off repeats itself with every loop, and a fine grid follows it from digit to digit: an
     error that is no more than that is not worth refining.
@@ -119,7 +104,7 @@ def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compa
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
     left = [run.weighed(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
     found = correlation_samples(left)
-    if found > _WHITE:
+    if found > WHITE:
         correlation = found
         solution = solve_grid(data, stroke, correlation, hyper)
         _check(solution.result)
@@ -174,11 +159,7 @@ def _refuse_ringing(run: Run) -> None:
 
 
 def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:
-    """How the loops are run through: -1 where the displacement stays behind everywhere, 1 where it runs ahead.
-
-    That is the area of the loops about the smooth curve through them, over the same with all parts counted as
-    positive.
-    """
+    """Signed over absolute area of the loops: -1 where the displacement lags everywhere, 1 where it leads."""
     place = (voltage_V - voltage_V.mean()) / np.ptp(voltage_V)
     beside = displacement_um - np.polyval(np.polyfit(place, displacement_um, 3), place)
     parts = (beside[1:] + beside[:-1]) * np.diff(place)
@@ -194,13 +175,7 @@ def _check(result: RESULTS) -> None:
 
 
 def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list[Run]:
-    """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid.
-
-    Raises
-    ------
-    DataError, FitError
-        As `choose_grid`.
-    """
+    """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid."""
     progress("weighing outliers")
     stroke = max(_stroke(run) for run in runs)
     grid = Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), LADDER[0])

@@ -39,19 +39,7 @@ _FEW = 64
 
 @dataclass(frozen=True)
 class GridSolution:
-    """Weights and slopes of a grid, in strokes.
-
-    Attributes
-    ----------
-    columns
-        Non-negative solution, shape `(D,)`.
-    belief
-        Gaussian posterior it is the constrained mode of.
-    hyper
-        Smoothness and noise that the data chose.
-    result
-        Status of the regression.
-    """
+    """Non-negative weights and slopes of a grid, in strokes, and the Gaussian posterior they are the mode of."""
 
     columns: Float[Array, " D"]
     belief: Posterior
@@ -60,18 +48,9 @@ class GridSolution:
 
 
 def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -> GridSolution:
-    """Find the most probable non-negative columns, smoothness and noise.
+    """Find the most probable non-negative columns, smoothness and noise, all in strokes.
 
-    Parameters
-    ----------
-    data
-        Moments of the runs.
-    stroke_um
-        Unit of the columns and the noise.
-    correlation
-        Samples that are worth one independent one.
-    start
-        Smoothness and noise to start the search from.
+    So many samples as `correlation` are worth one independent one; the search begins at `start`.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
@@ -99,7 +78,8 @@ def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     """Find the mode of the belief among non-negative columns.
 
     Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
-    those ends up below zero, more are bounded. The answer is that of all bounds together.
+    those ends up below zero, more are bounded. The answer is that of all bounds together. Active-set solvers such as
+    `scipy.optimize.nnls` take one column at a time, and minutes for the thousands of a fine grid.
     """
     scale = np.sqrt(np.diagonal(belief.precision))
     lowest = np.asarray(belief.mean) * scale
@@ -216,24 +196,17 @@ def grid_estimate(
 def cross_validate(
     data: Data, runs: Sequence[Run], stroke_um: float, correlation: float, hyper: Hyper, levels: int
 ) -> tuple[float, float]:
-    """Predict each block of every run from the others, with the smoothness and noise given.
+    """Predict each block of every run from the others, with the smoothness and noise given, on few levels.
 
-    Done with at most `levels` levels: the grid's own to compare resolutions, fewer where only the discrepancy counts.
-
-    Returns
-    -------
-    error_um
-        Root mean square error, up to a constant in each block.
-    discrepancy_um
-        Standard deviation of what the posterior does not own up to: the part of the error that neighbouring samples
-        share, and that therefore is not noise, beyond the posterior's own. Zero where there is none.
+    Returns the root mean square error in um, up to a constant in each block, and the model discrepancy in um: the
+    part of the error that neighbouring samples share, which is no noise, beyond the posterior's own; zero if none.
     """
     rough, blocks, basis = roughness(data.grid.levels), data.blocks, None
     if levels < data.grid.levels:
         basis = interpolation(levels, data.grid.levels)
         rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
     whole = sum(blocks[1:], start=blocks[0])
-    pairs = [(run, blocks_of(run)) for run in runs]
+    labels = [blocks_of(run) for run in runs]
     squares = shared = expected = count = 0.0
     for number, block in enumerate(blocks):
         if not block.count > 0:
@@ -243,23 +216,16 @@ def cross_validate(
         columns = np.asarray(belief.mean if basis is None else basis @ belief.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
         # A short run may have no sample in a block.
-        off = [
-            _weighed_off(run, run.displacement_um - simulate_run(model, run), label == number)
-            for run, label in pairs
-            if np.any(label == number)
-        ]
+        off = []
+        for run, label in zip(runs, labels, strict=True):
+            if (inside := label == number).any():
+                left = run.displacement_um - simulate_run(model, run)
+                off.append(run.weighed(left - run.mean(left, inside))[inside])
         squares += sum(float(np.sum(o**2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)
         expected += float(_expected_square(belief, block)) * stroke_um**2
         count += float(block.count)
     return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
-
-
-def _weighed_off(run: Run, off_um: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Errors of some samples, without their mean, as large as they count."""
-    weight = None if run.weight is None else run.weight[samples]
-    centred = off_um - np.average(off_um[samples], weights=weight)
-    return np.asarray(run.weighed(centred)[samples])
 
 
 @eqx.filter_jit

@@ -117,8 +117,7 @@ class Alone:
 def left_of(model: Preisach, run: Run) -> np.ndarray:
     """Measurement less prediction, the offset taken off over the fitted samples, in um, shape `(n,)`."""
     left = run.displacement_um - simulate_run(model, run)
-    weight = None if run.weight is None else run.weight[run.fitted]
-    return np.asarray(left - np.average(left[run.fitted], weights=weight))
+    return np.asarray(left - run.mean(left, run.fitted))
 
 
 def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequence[Misfit]) -> list[str]:

@@ -99,42 +99,14 @@ def solve_shape(
     key: PRNGKeyArray,
     progress: Callable[[str], None],
 ) -> tuple[Estimate, bool]:
-    """Fit a family that is not linear in its parameters.
+    """Fit a family of `microid.FAMILIES` that is not linear in its parameters.
 
     The record enters through its moments only, so that a start costs milliseconds whatever the record's length.
     The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise
-    is what this family leaves, which may be more than the grid's.
+    is what this family leaves, which may be more than the grid's, in `hyper`.
 
-    Parameters
-    ----------
-    family
-        Name in `microid.FAMILIES`.
-    data
-        Moments of the runs.
-    runs
-        The runs themselves.
-    stroke_um
-        Displacement that the relays account for, roughly.
-    hyper
-        Noise, and smoothness of the reversible part, as the grid found them.
-    starts
-        Number of starts.
-    key
-        Draws the starts.
-    progress
-        Told what is being done.
-
-    Returns
-    -------
-    Estimate
-        The best of all starts.
-    agree
-        Whether the two best starts ended at the same cost.
-
-    Raises
-    ------
-    FitError
-        If no start gives a finite cost, or the best one does not become stationary.
+    Returns the best of all starts, and whether the two best ended at the same cost. A `FitError` if no start gives a
+    finite cost, or the best one does not become stationary.
     """
     grid = data.grid
     moments = data.total.scaled(1.0, stroke_um)

@@ -45,7 +45,7 @@ class Identified:
         The straight line of the open loop: stroke over range.
     """
 
-    fit: FitResult
+    fit: FitResult[Preisach]
     record: Record
     rest_um: float
     slope_um_per_V: float

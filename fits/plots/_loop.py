@@ -14,18 +14,17 @@ from matplotlib.figure import Figure
 
 from fits.io._record import Record
 from fits.loop._result import FitResult, RunReport
-from fits.loop._run import Run, prepare_run, simulate_run, split
-from fits.loop._uncertainty import sd_run
+from fits.loop._run import Run, prepare_run, simulate_run
 from fits.plots._runs import Drawn, held_out, loops, over_time
 from fits.plots._style import DARK, NARROW_in, WIDE_in, figure, label, save
-from microid import Preisach, Reversible, Staircase, remember
+from microid import Preisach, Reversible
 
 _MESH = 361
 _ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
 
 
 def plot_fit(
-    result: FitResult,
+    result: FitResult[Preisach],
     records: Sequence[Record],
     folder: str | os.PathLike[str],
     *,
@@ -56,11 +55,9 @@ def plot_fit(
         If the records are not those of the result.
     """
     fraction, aside = held_out(holdout, len(records), len(result.runs))
-    lower, upper = float(result.model.density.lower_V), float(result.model.density.upper_V)
-    runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]
-    for record in aside:
-        run = prepare_run(record, lower, upper, initial, holdout=1.0)
-        runs.append(replace(run, fitted=np.zeros_like(run.known)))
+    range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
+    runs = [prepare_run(record, range_V, initial, fraction) for record in records]
+    runs += [prepare_run(record, range_V, initial, holdout=1.0) for record in aside]
     drawn = [_simulated(result, run, report) for run, report in zip(runs, result.runs, strict=True)]
 
     voltage, (density, everett) = _over_half_plane(result.model)
@@ -74,28 +71,14 @@ def plot_fit(
     return [save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
 
 
-def _simulated(result: FitResult, run: Run, report: RunReport) -> Drawn:
+def _simulated(result: FitResult[Preisach], run: Run, report: RunReport) -> Drawn:
     model = eqx.tree_at(lambda m: m.offset_um, result.model, jnp.asarray(report.offset_um))
     predicted = simulate_run(model, run)
     if not run.known.all():
         # The reported errors are those of the known samples; the start was estimated from the others.
-        predicted = np.where(run.known, predicted, simulate_run(model, _started(run, report.start)))
-    sd_um = sd_run(result.uncertainty, run) if run.held_out.any() else np.zeros(len(predicted))
+        predicted = np.where(run.known, predicted, simulate_run(model, replace(run, start=report.start)))
+    sd_um = result.uncertainty.sd_um(result.model, run) if run.held_out.any() else np.zeros(len(predicted))
     return Drawn(run, report, predicted, sd_um, result.noise_um)
-
-
-def _started(run: Run, start: Staircase) -> Run:
-    """Let a run begin with another memory."""
-    size = run.starts[0].extremes_V.shape[0]
-    starts = [Staircase(jnp.pad(start.extremes_V, (0, size - start.extremes_V.shape[0]), mode="edge"), start.count)]
-    for piece in split(run.record.voltage_V)[:-1]:
-        starts.append(_end(jnp.asarray(piece), starts[-1]))
-    return replace(run, starts=tuple(starts))
-
-
-@eqx.filter_jit
-def _end(voltage_V: Float[Array, " n"], start: Staircase) -> Staircase:
-    return remember(voltage_V, start).end()
 
 
 @eqx.filter_jit

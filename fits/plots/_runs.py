@@ -25,7 +25,6 @@ from fits.plots._style import (
     thinned,
     verbatim,
 )
-from fits.stage._run import StageRun
 
 # Runs side by side in one picture.
 _MOST_RUNS = 3
@@ -35,7 +34,7 @@ _MOST_RUNS = 3
 class Drawn:
     """A run with its prediction and its standard deviation, as the report compares them, in um."""
 
-    run: Run | StageRun
+    run: Run
     report: RunReport
     predicted_um: np.ndarray
     sd_um: np.ndarray

@@ -13,11 +13,11 @@ from matplotlib.ticker import LogFormatter
 
 from fits.control._compensate_stage import static_equivalent
 from fits.io._record import Record
-from fits.loop._run import prepare_run, simulate_run
+from fits.loop._result import FitResult
+from fits.loop._run import Run, prepare_run, simulate_run
 from fits.plots._runs import Drawn, held_out, loops, over_time
 from fits.plots._style import WIDE_in, figure, label, legend, save, verbatim
-from fits.stage._result import StageFit
-from fits.stage._run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, residual_of
+from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of
 from fits.stage._start import MeasuredResponse, measure_response
 from microid import AbstractLinear, Preisach, Stage
 
@@ -28,7 +28,7 @@ _SURE, _FAINTEST = 0.8, 0.85
 
 
 def plot_stage(
-    result: StageFit,
+    result: FitResult[Stage],
     records: Sequence[Record],
     folder: str | os.PathLike[str],
     *,
@@ -61,21 +61,23 @@ def plot_stage(
     """
     fraction, aside = held_out(holdout, len(records), len(result.runs))
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
-    if len(records) != len(result.substeps):
-        raise ValueError(f"the result is of {len(result.substeps)} fitted runs, and {len(records)} were given")
+    known = result.fitted_runs
+    if len(records) != len(known):
+        raise ValueError(f"the result is of {len(known)} fitted runs, and {len(records)} were given")
     # The runs are refined already.
     stage, gain = result.model.with_substeps(1), gain_ahead(result.model)
     voltages = np.concatenate([record.voltage_V for record in (*records, *aside)])
     range_V = float(voltages.min()), float(voltages.max())
     runs = [
-        prepare_stage_run(record, range_V, state, fraction, stride, gain, stage.hold)
-        for record, state, stride in zip(records, states, result.substeps, strict=True)
+        prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold)
+        for record, state, report in zip(records, states, known, strict=True)
     ]
     before_aside = initial if isinstance(initial, str) else "unknown"
     for record in aside:
-        run = prepare_stage_run(record, range_V, before_aside, 1.0, result.substeps[-1], gain, stage.hold)
-        runs.append(replace(run, fitted=run.known).weighted(run.known))
-    noises = [*result.noise_um, *([max(result.noise_um)] * len(aside))]
+        run = prepare_run(record, range_V, before_aside, 1.0, known[-1].substeps or 1, gain, stage.hold)
+        runs.append(replace(run, fitted=run.known))
+    noises = [report.noise_um or 0.0 for report in known]
+    noises += [max(noises)] * len(aside)
     drawn = [
         Drawn(run, report, run.displacement_um - residual_of(stage, run), result.uncertainty.sd_um(stage, run), noise)
         for run, report, noise in zip(runs, result.runs, noises, strict=True)
@@ -99,7 +101,7 @@ def _speed_per_s(record: Record) -> float:
 
 
 def _measured(
-    stage: Stage, runs: Sequence[StageRun], states: Sequence[str], fraction: float
+    stage: Stage, runs: Sequence[Run], states: Sequence[str], fraction: float
 ) -> tuple[str, MeasuredResponse] | None:
     """Frequency response behind the hysteresis, from the run that shows the highest frequencies."""
     found = []
@@ -122,8 +124,8 @@ def _static_um(stage: Stage, record: Record, state: str, fraction: float) -> np.
     law: Any = None if place is None else stage.parts[place]
     if isinstance(law, Preisach):
         static = static_equivalent(stage)
-        lower, upper = float(static.density.lower_V), float(static.density.upper_V)
-        return simulate_run(static, prepare_run(record, lower, upper, state, fraction))
+        range_V = float(static.density.lower_V), float(static.density.upper_V)
+        return simulate_run(static, prepare_run(record, range_V, state, fraction))
     if law is None:
         return float(stage.static_gain) * record.voltage_V
     return float(stage.static_gain) * np.asarray(law(jnp.asarray(record.voltage_V)))

@@ -88,7 +88,7 @@ def _heat(path: Path, rows: _Rows, pair: tuple[str, str]) -> Path:
     drawn = axes.pcolormesh(*corners, mean.T, cmap="viridis")
     axes.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
     picture.colorbar(drawn, label=f"mean {verbatim(rows.by)}")
-    label(axes, *map(verbatim, pair))
+    label(axes, verbatim(pair[0]), verbatim(pair[1]))
     for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
         if name in rows.words:
             axis.set_ticks(range(len(rows.words[name])), [verbatim(word, 24) for word in rows.words[name]])

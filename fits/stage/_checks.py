@@ -9,7 +9,8 @@ import numpy as np
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._misfit import Misfit
-from fits.stage._run import StageRun, residual_of, simulate_stage
+from fits.loop._run import Run
+from fits.stage._run import residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
 from fits.stats._noise import correlation_samples
 from microid import Coordinates, Driver, Mechanics, Stage
@@ -173,7 +174,7 @@ def refuse_unseen(
     return None
 
 
-def refuse_coarse(stage: Stage, runs: Sequence[StageRun], left: Sequence[Misfit]) -> None:
+def refuse_coarse(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
     """Refuse a fitted resonance that the runs cannot show: they are sampled too slowly for it, and leave much.
 
     Raises
@@ -198,7 +199,7 @@ def refuse_coarse(stage: Stage, runs: Sequence[StageRun], left: Sequence[Misfit]
                 )
 
 
-def _resolved(run: StageRun) -> bool:
+def _resolved(run: Run) -> bool:
     """Whether the command is sampled so finely that little of it lies in the upper half of the band."""
     voltage = run.record.voltage_V
     # By differences, so that a slow motion of large amplitude does not hide what is fast.
@@ -270,7 +271,7 @@ def coordinates_slope(coordinates: Coordinates[Stage], z: np.ndarray) -> tuple[n
     return np.asarray(value), np.asarray(slope)
 
 
-def _gains(stage: Stage, runs: Sequence[StageRun]) -> np.ndarray:
+def _gains(stage: Stage, runs: Sequence[Run]) -> np.ndarray:
     """How much each run moves for what the stage says it moves."""
     gains = []
     for run in runs:
@@ -280,7 +281,7 @@ def _gains(stage: Stage, runs: Sequence[StageRun]) -> np.ndarray:
     return np.asarray(gains)
 
 
-def compare_gains(stage: Stage, runs: Sequence[StageRun], refuse: bool = False) -> list[str]:
+def compare_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
     """Find runs that move further, or less far, than the others under the same voltage.
 
     Parameters

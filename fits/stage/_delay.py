@@ -10,11 +10,11 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import columns_of
 from fits.loop._misfit import Misfit, misfits
-from fits.loop._result import FitError
-from fits.stage._moments import Chain, along, linearise, pieces
+from fits.loop._result import FitError, FitResult
+from fits.loop._run import Run
+from fits.stage._moments import along, linearise, pieces
 from fits.stage._reach import Reach
-from fits.stage._result import StageFit
-from fits.stage._run import StageRun, lead_ins, simulate_stage, without
+from fits.stage._run import lead_ins, simulate_stage, without
 from fits.stage._solve import Solved, solve_chain
 from fits.stage._start import best_shifts, measure_response, start_stages
 from fits.stage._steps import Plan, Problem, hysteresis_alone
@@ -49,7 +49,7 @@ _REMEDY = (
 class Delay:
     """A run's delay: how much later than the stage the readings come, and its standard deviation, in s."""
 
-    run: StageRun
+    run: Run
     delay_s: float
     sd_s: float
 
@@ -91,8 +91,7 @@ class Undelayed:
 
     def left(self, records: Sequence[Record]) -> list[Misfit]:
         """What stays of each run without its delay."""
-        known = [one.residual_um for one in self.solved.sums], [run.fitted for run in self.solved.runs]
-        return misfits(records, *known)
+        return misfits(records, self.solved.residuals_um, [run.fitted for run in self.solved.runs])
 
     def words(self) -> str:
         """Say what the columns of the runs look like."""
@@ -188,7 +187,7 @@ def _solved_with(
     plan: Plan, problem: Problem, solved: Solved, start: tuple[np.ndarray, np.ndarray], shifts_s: np.ndarray
 ) -> tuple[Solved, Precision] | None:
     """Fit again with the command of each run that much later, as well as can be; None where that fails."""
-    runs = plan.shifted(shifts_s).runs(solved.runs[0].samples.stride)
+    runs = plan.shifted(shifts_s).runs(solved.runs[0].stride)
     given = problem.chain, *start, runs, problem.hyper, problem.stroke_um, plan.loss, plan.progress
     try:
         found = solve_chain(*given, anyway=True, even=problem.even)
@@ -203,7 +202,7 @@ def refuse_delays(undelayed: Undelayed | None) -> None:
         raise DataError(f"{undelayed.words()}, and no fit was found with that: {_REMEDY}")
 
 
-def own_up(fit: StageFit, chain: Chain, undelayed: Undelayed) -> StageFit:
+def own_up(fit: FitResult[Stage], undelayed: Undelayed) -> FitResult[Stage]:
     """Name the delays of a fit, and widen the intervals by what they did to its parameters.
 
     Raises
@@ -211,7 +210,7 @@ def own_up(fit: StageFit, chain: Chain, undelayed: Undelayed) -> StageFit:
     DataError
         If a parameter moves so much that the fit says nothing.
     """
-    reach, said = Reach.of(chain, undelayed.solved, undelayed.precision), undelayed.words()
+    reach, said = Reach.of(undelayed.precision), undelayed.words()
     if ruined := reach.ruined(fit):
         raise DataError(f"{said}, and {ruined[0]}: {_REMEDY}")
     return reach.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
@@ -227,13 +226,10 @@ def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray
     whole = whole + _FAINT * np.eye(len(whole))
     out = []
     for k, (run, one) in enumerate(zip(solved.runs, solved.sums, strict=True)):
-        n, step = len(run.record), _STEP / run.rate_Hz
-        late, early = (
-            simulate_stage(stage, plan.run(k, run.samples.stride, shifts[k] + sign * step)) for sign in (1, -1)
-        )
+        n, step, weight = len(run.record), _STEP / run.rate_Hz, run.fit_weight
+        late, early = (simulate_stage(stage, plan.run(k, run.stride, shifts[k] + sign * step)) for sign in (1, -1))
         full = np.zeros(run.samples.weight.shape[0])
         full[:n] = (late - early) / (2 * step)
-        weight = np.asarray(run.samples.weight)[:n]
         own = jnp.asarray(lead_ins(stage, run.samples))
         late_um_per_s = np.asarray(without(own, run.samples.weight, jnp.asarray(full)))[:n]
         worth = solved.weighing.shares[k] / precision.variance
@@ -260,7 +256,7 @@ def _search(plan: Plan, problem: Problem, solved: Solved, far: Sequence[int]) ->
     # As it began: a delay bends the hysteresis of a joint fit, and the slow runs hardly feel it.
     stage = problem.stage
     columns_um = _columns(problem, stage)
-    drives = hysteresis_alone(stage, plan)
+    drives = hysteresis_alone(stage, solved.runs)
     shifts, best = np.zeros(len(plan.records)), solved
     for k in far:
         run = solved.runs[k]
@@ -274,7 +270,7 @@ def _search(plan: Plan, problem: Problem, solved: Solved, far: Sequence[int]) ->
             there[k] = shift
             plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
             moved = replace(response, response=response.response * np.exp(2j * np.pi * response.frequency_Hz * shift))
-            runs = plan.shifted(there).runs(run.samples.stride)
+            runs = plan.shifted(there).runs(run.stride)
             for candidate in start_stages(stage, [moved])[:1]:
                 z = np.asarray(problem.chain.coordinates.of(candidate))
                 given = problem.chain, z, columns_um, runs, None, problem.stroke_um, plan.loss, plan.progress

@@ -111,13 +111,13 @@ def _fields(cls: type[eqx.Module]) -> dict[str, dataclasses.Field[Any]]:
     return {field.name: field for field in dataclasses.fields(cls) if field.init}
 
 
-def _spec(field: dataclasses.Field[Any]) -> ParameterSpec | None:
+def spec_of(field: dataclasses.Field[Any]) -> ParameterSpec | None:
     return next((entry for entry in field.metadata.values() if isinstance(entry, ParameterSpec)), None)
 
 
 def _unit(field: dataclasses.Field[Any]) -> str:
     """Take the unit from the specification, or else from the end of the name, such as `um/V^2` from `x_um_per_V2`."""
-    spec = _spec(field)
+    spec = spec_of(field)
     if spec is not None:
         return spec.unit
     name = field.name.split("_")
@@ -146,7 +146,7 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
     fields = _fields(cls)
     if set(item) - {"type"} != set(fields):
         raise DataError(f"{where}: a {item['type']} has the fields {', '.join(fields)}, and no others")
-    values = {key: decode(item[key], f"{where}.{key}", _spec(field)) for key, field in fields.items()}
+    values = {key: decode(item[key], f"{where}.{key}", spec_of(field)) for key, field in fields.items()}
     # One context, so that an `N` means the same in all fields.
     with jaxtyping.jaxtyped("context"):
         for key, field in fields.items():

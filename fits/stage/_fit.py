@@ -3,26 +3,26 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import jax.numpy as jnp
 
 from fits.io._errors import DataError
-from fits.io._record import Record, refuse_repeats
+from fits.io._record import Record
 from fits.loop._choose_grid import LADDER
+from fits.loop._fit import check_fit
 from fits.loop._fit_checks import remarks_on
 from fits.loop._misfit import misfits, worst
-from fits.loop._result import FitError
+from fits.loop._result import FitError, FitResult
+from fits.loop._run import prepare_run
+from fits.loop._samples import refuse_many_steps
 from fits.stage._checks import implausible, refuse_coarse
 from fits.stage._delay import GROSS_PCT, own_up, refuse_delays, take_out_delays
 from fits.stage._moments import Chain
 from fits.stage._reach import Reach, leave_outliers
-from fits.stage._result import StageFit
-from fits.stage._run import gain_ahead, place_of_hysteresis, prepare_stage_run
+from fits.stage._run import gain_ahead, place_of_hysteresis
 from fits.stage._solve import Solved
 from fits.stage._steps import Plan, Problem, refine_problem, start_problem
 from fits.stage._summary import summarise
 from fits.stage._uncertainty import Precision
-from fits.stats._noise import LOSSES
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
 
 
@@ -60,7 +60,7 @@ def fit_stage(
     initial: str | Sequence[str] = "unknown",
     loss: str = "squares",
     progress: Callable[[str], None] = lambda _: None,
-) -> StageFit:
+) -> FitResult[Stage]:
     """Fit driver, hysteresis and mechanics jointly to slow and fast runs of one rig.
 
     The slow runs give a first hysteresis, what the fast ones make of it a frequency response, and that the poles to
@@ -89,7 +89,7 @@ def fit_stage(
 
     Returns
     -------
-    StageFit
+    FitResult
         Never the start: a fit that fails raises.
 
     Raises
@@ -104,7 +104,7 @@ def fit_stage(
     asked = stage, levels, holdout, initial, loss, progress
     found = solve_stage(records, *asked)
     runs, sources = found.solved.runs, [record.source for record in records]
-    known = [one.residual_um for one in found.solved.sums], [run.fitted for run in runs]
+    known = found.solved.residuals_um, [run.fitted for run in runs]
     left = misfits(records, *known)
     progress("looking for delays")
     undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
@@ -125,12 +125,11 @@ def fit_stage(
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
     before = initial if isinstance(initial, str) else "unknown"
-    chain = found.chain
-    settings = before, 1.0, found.solved.runs[-1].samples.stride, gain_ahead(found.stage), found.stage.hold
-    held = [prepare_stage_run(record, found.range_V, *settings) for record in aside]
-    summary = summarise(found.stage, chain.coordinates, found.solved, found.precision, held)
+    settings = before, 1.0, runs[-1].stride, gain_ahead(found.stage), found.stage.hold
+    held = [prepare_run(record, found.range_V, *settings) for record in aside]
+    summary = summarise(found.stage, found.precision, held)
     if undelayed is not None:
-        summary = own_up(summary, chain, undelayed)
+        summary = own_up(summary, undelayed)
     outliers = leave_outliers(found.plan, found.problem, found.solved)
     if outliers is not None:
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
@@ -198,22 +197,12 @@ def solve_stage(
 
     `anyway` takes the best place for an answer where the fit does not become stationary.
     """
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
-    if loss not in LOSSES:
-        raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
-    if not records:
-        raise DataError("there is no record to fit")
-    aside = () if isinstance(holdout, int | float) else tuple(holdout)
-    refuse_repeats([*records, *aside])
+    fraction, _, range_V = check_fit(records, holdout, loss)
+    for record in records:
+        refuse_many_steps(record, 1)
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
     if len(states) != len(records):
         raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
-    fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
-    if not 0 <= fraction <= 0.9:
-        raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
-    voltages = [record.voltage_V for record in (*records, *aside)]
-    range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     stage = default_stage() if stage is None else stage
     ahead = stage.parts[: place_of_hysteresis(stage)]
     if stage.hold == "zero" and not any(isinstance(part, Driver) for part in ahead):

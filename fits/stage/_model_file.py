@@ -75,7 +75,7 @@ class ModelFile:
     uncertainty
         Of its predictions.
     report
-        What is known of the fit, as `fit_report` or `stage_report` makes it.
+        What is known of the fit, as `fit_report` makes it.
     written_by
         Program and version.
     """
@@ -103,7 +103,7 @@ def save_model(
     uncertainty
         Of its predictions.
     report
-        JSON values under string keys, such as `fit_report` or `stage_report` makes.
+        JSON values under string keys, such as `fit_report` makes.
 
     Raises
     ------

@@ -12,7 +12,9 @@ from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
-from fits.stage._run import Samples, StageRun, ahead, joined, lead_ins, respond, without
+from fits.loop._run import Run
+from fits.loop._samples import Samples
+from fits.stage._run import ahead, joined, lead_ins, respond, without
 from microid import Coordinates, LinearSystem, Stage, Staircase
 
 # Samples that go through the compiled regression at a time.
@@ -146,7 +148,7 @@ class RunSums:
 
 
 def run_sums(
-    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"], run: StageRun, free: bool = True
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"], run: Run, free: bool = True
 ) -> RunSums:
     """Pass one run through the regression.
 
@@ -184,7 +186,7 @@ def run_sums(
 
 
 def linearise(
-    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, run: StageRun
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, run: Run
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Response of a padded run, its slopes along the coordinates, and its own unknowns; see `_linearised`."""
     here = chain.coordinates, chain.place, chain.grid
@@ -196,7 +198,7 @@ def along(
     chain: Chain,
     z: Float[Array, " p"],
     columns_um: Float[Array, " D"] | None,
-    run: StageRun,
+    run: Run,
     directions: tuple[np.ndarray, np.ndarray],
     reduce: Callable[[np.ndarray], np.ndarray] = lambda moved: moved,
 ) -> np.ndarray:
@@ -225,7 +227,7 @@ def along(
     return np.concatenate(moved)
 
 
-def pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> Iterator[tuple[int, np.ndarray]]:
+def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the rows of the columns, piece by piece, with the sample that each piece begins at.
 
     They are not refined: as directions to move in they are good enough, and only the residual decides where the fit

@@ -10,7 +10,8 @@ import numpy as np
 
 from fits.io._limits import Ranges, joined, measured_ranges
 from fits.io._record import Record
-from fits.stage._run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run
+from fits.loop._run import Run, prepare_run
+from fits.stage._run import gain_ahead, place_of_hysteresis
 from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
 
 # Steps in a period of the resonance: a sampled sine misses less than 2 % of its peak.
@@ -23,12 +24,12 @@ _MOST = 1 << 18
 class Prepared:
     """A run, and what a stage makes of it."""
 
-    run: StageRun
+    run: Run
     time_s: Any
     scene: Scene
 
 
-def prepare(stage: Stage, run: StageRun) -> Prepared:
+def prepare(stage: Stage, run: Run) -> Prepared:
     """Build the scene of a run."""
     samples = run.samples
     command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
@@ -102,9 +103,8 @@ def motion(
     """
     n = len(record)
     stride = fine_steps(stage, float(np.median(np.diff(record.time_s))), n)
-    blank = replace(record, displacement_um=np.zeros(n))
     # Held out as a whole, so that short commands are no error: nothing is fitted.
-    run = prepare_stage_run(blank, range_V, initial, 1.0, stride, hold=stage.hold)
+    run = prepare_run(record, range_V, initial, 1.0, stride, hold=stage.hold)
     found = signals(stage.with_substeps(1), prepare(stage, run))
     last = (n - 1) * stride + 1
     time_s = np.asarray(run.samples.time_s)

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.stage._result import StageFit, prepare_again
-from fits.stage._run import Samples, lead_ins, residual_of, respond, without
+from fits.loop._result import FitResult
+from fits.loop._samples import Samples
+from fits.stage._run import lead_ins, prepare_again, residual_of, respond, without
 from fits.stage._solve import Weighing
 from fits.stage._uncertainty import offsets_out
 from microid import Coordinates, Stage
@@ -48,7 +49,7 @@ def _potential(
 
 
 def sample_posterior(
-    result: StageFit,
+    result: FitResult[Stage],
     records: Sequence[Record],
     *,
     draws: int = 1000,

@@ -12,9 +12,10 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._prior import Hyper
+from fits.loop._result import FitResult
+from fits.loop._run import Run
 from fits.stage._moments import Chain
-from fits.stage._result import StageFit, prepare_again
-from fits.stage._run import StageRun, place_of_hysteresis, residual_of
+from fits.stage._run import place_of_hysteresis, prepare_again, residual_of
 from fits.stage._solve import Solved, prior_precision, solve_chain
 from fits.stage._uncertainty import offsets_out
 from microid import GridDensity, Preisach, Stage, parameter_table
@@ -48,7 +49,7 @@ class Profile:
 
 
 def profile_stage(
-    result: StageFit,
+    result: FitResult[Stage],
     records: Sequence[Record],
     name: str,
     *,
@@ -113,12 +114,12 @@ class _Held:
     """A fit that others are compared with."""
 
     stage: Stage
-    runs: Sequence[StageRun]
+    runs: Sequence[Run]
     solved: Solved
     stroke_um: float
 
     @classmethod
-    def of(cls, stage: Stage, runs: Sequence[StageRun], initial_hyper: Hyper) -> "_Held":
+    def of(cls, stage: Stage, runs: Sequence[Run], initial_hyper: Hyper) -> "_Held":
         stroke = max(float(np.ptp(run.displacement_um)) for run in runs)
         chain, columns = _chain(stage)
         hyper = initial_hyper if chain.grid is not None else None
@@ -137,11 +138,10 @@ class _Held:
         else:
             start = np.asarray(chain.coordinates.of(stage)), columns, self.runs, best.hyper, self.stroke_um
             solved = solve_chain(chain, *start, "squares", _quiet)
-            left, columns, size = [one.residual_um for one in solved.sums], solved.columns_um, chain.size
+            left, columns, size = solved.residuals_um, solved.columns_um, chain.size
             prior = prior_precision(chain, best.hyper, self.stroke_um)
         variance = best.weighing.least_um**2
-        misfit = best.weighing.cost_um2(self.runs, left)
-        misfit -= best.weighing.cost_um2(self.runs, [one.residual_um for one in best.sums])
+        misfit = best.weighing.cost_um2(self.runs, left) - best.weighing.cost_um2(self.runs, best.residuals_um)
         if size == 0:
             return misfit / variance
         return misfit / variance + float(columns @ prior @ columns - best.columns_um @ prior @ best.columns_um)

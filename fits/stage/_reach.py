@@ -6,12 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.loop._fit_checks import outlying
-from fits.loop._result import FitError
-from fits.stage._moments import Chain
-from fits.stage._result import StageFit
+from fits.loop._result import FitError, FitResult
 from fits.stage._solve import Solved, solve_chain
 from fits.stage._steps import Plan, Problem
 from fits.stage._uncertainty import Precision
+from microid import Stage
 
 # Half the width of a 95 % interval, in standard deviations.
 _NORMAL = 1.959964
@@ -34,20 +33,21 @@ class Reach:
     high: np.ndarray
 
     @classmethod
-    def of(cls, chain: Chain, solved: Solved, precision: Precision) -> "Reach":
+    def of(cls, precision: Precision) -> "Reach":
         """Read it off a solution."""
+        z, values = precision.solved.z, precision.chain.coordinates.values
         sd = np.sqrt(np.diagonal(precision.covariance(precision.influence())))
-        ends = (np.asarray(chain.coordinates.values(jnp.asarray(solved.z + k * _NORMAL * sd))) for k in (0, -1, 1))
+        ends = (np.asarray(values(jnp.asarray(z + k * _NORMAL * sd))) for k in (0, -1, 1))
         return cls(*ends)
 
     @classmethod
-    def in_unit(cls, fit: StageFit, factor: float) -> "Reach":
+    def in_unit(cls, fit: FitResult[Stage], factor: float) -> "Reach":
         """Where a fit comes out if a unit of its times is so many s."""
         powers = np.asarray([{"s": 1.0, "Hz": -1.0}.get(p.unit, 0.0) for p in fit.parameters])
         figures = [[getattr(p, name) for p in fit.parameters] for name in ("value", "lower", "upper")]
         return cls(*(factor**powers * np.asarray(each) for each in figures))
 
-    def ruined(self, fit: StageFit) -> list[str]:
+    def ruined(self, fit: FitResult[Stage]) -> list[str]:
         """Say which parameters of a fit are far from these, one sentence each."""
         return [
             f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
@@ -55,7 +55,7 @@ class Reach:
             if abs(v - p.value) > _RUINED * min(abs(v), abs(p.value))
         ]
 
-    def widen(self, fit: StageFit, said: str, remedy: str = "") -> StageFit:
+    def widen(self, fit: FitResult[Stage], said: str, remedy: str = "") -> FitResult[Stage]:
         """Let a fit's intervals reach these, and say so first.
 
         Parameters
@@ -99,14 +99,11 @@ def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[s
     sources = [run.record.source for one, run in zip(bad, solved.runs, strict=True) if one.any()]
     if plan.loss != "squares" or not sources:
         return None
-    runs = []
-    for run, one in zip(solved.runs, bad, strict=True):
-        kept = replace(run, fitted=run.fitted & ~one)
-        runs.append(kept.weighted(np.ones(len(one))))
+    runs = [replace(run, fitted=run.fitted & ~one) for run, one in zip(solved.runs, bad, strict=True)]
     plan.progress(f"fitting without the outliers of {', '.join(sources)}")
     start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
     try:
         found = solve_chain(problem.chain, *start, plan.loss, plan.progress, anyway=True, even=problem.even)
     except (FitError, np.linalg.LinAlgError):
         return None
-    return sources, Reach.of(problem.chain, found, Precision(problem.chain, found, problem.stroke_um))
+    return sources, Reach.of(Precision(problem.chain, found, problem.stroke_um))

@@ -11,8 +11,9 @@ from fits.loop._grid import solve_grid
 from fits.loop._moments import Data, Moments
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
+from fits.loop._run import Run
 from fits.stage._moments import Chain, RunSums, run_sums, split_moments
-from fits.stage._run import StageRun, residual_of
+from fits.stage._run import residual_of
 from fits.stage._weighing import Weighing
 from fits.stats._noise import huber_weight
 
@@ -27,33 +28,23 @@ _ROUNDING = 1e-20
 
 @dataclass(frozen=True)
 class Solved:
-    """Where a fit ended.
+    """Where a fit ended: coordinates, shape `(p,)`, and columns of the grid, shape `(D,)`.
 
-    Attributes
-    ----------
-    z
-        Coordinates, shape `(p,)`.
-    columns_um
-        Columns of the grid, shape `(D,)`.
-    hyper
-        Smoothness and noise of the grid; None without one.
-    runs
-        With the weights of their samples.
-    sums
-        Regression at the end, per run.
-    weighing
-        Noise of each run.
-    distance
-        How far the optimum may still be, in standard deviations of the coordinates.
+    `hyper` is the smoothness and noise of the grid, None without one. The runs have the weights of their samples, and
+    the sums are the regression at the end.
     """
 
     z: np.ndarray
     columns_um: np.ndarray
     hyper: Hyper | None
-    runs: list[StageRun]
+    runs: list[Run]
     sums: list[RunSums]
     weighing: Weighing
-    distance: float
+
+    @property
+    def residuals_um(self) -> list[np.ndarray]:
+        """Measurement less prediction of each run, its nuisance parameters taken off, shape `(n,)`."""
+        return [one.residual_um for one in self.sums]
 
     @property
     def cost(self) -> float:
@@ -66,7 +57,7 @@ def solve_chain(
     chain: Chain,
     z: np.ndarray,
     columns_um: np.ndarray,
-    runs: Sequence[StageRun],
+    runs: Sequence[Run],
     hyper: Hyper | None,
     stroke_um: float,
     loss: str,
@@ -79,24 +70,15 @@ def solve_chain(
 
     Each round linearises the stage, eliminates the coordinates from the regression, solves it for non-negative smooth
     columns with the smoothness that maximises the evidence, and damps the step until the true cost falls (variable
-    projection; Golub & Pereyra 2003). Without columns these are Levenberg and Marquardt's steps.
+    projection; Golub & Pereyra 2003). Without columns these are Levenberg and Marquardt's steps. A library's solver
+    would hold the smoothness, the weights of the runs and the columns at zero fixed, which change with every step.
 
     Parameters
     ----------
-    chain
-        The stage.
     z, columns_um
         Start.
-    runs
-        Prepared.
     hyper
         Smoothness and noise of the columns to start from; None to leave the columns as they are.
-    stroke_um
-        Unit of the columns.
-    loss
-        One of `LOSSES`.
-    progress
-        Told what is being done.
     rough
         Whether the place found is only a start for another fit, so that it need not be stationary.
     anyway
@@ -132,7 +114,7 @@ def solve_chain(
                 if damping > _HIGHEST and not (anyway and number):
                     raise
                 if damping > _HIGHEST:
-                    return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+                    return Solved(z, columns_um, hyper, list(runs), sums, weighing)
                 continue
             hyper = better
             prior = prior_precision(chain, hyper, stroke_um)
@@ -158,9 +140,9 @@ def solve_chain(
             continue
         if distance < _STATIONARY:
             runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
-            return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+            return Solved(z, columns_um, hyper, list(runs), sums, weighing)
     if rough or anyway:
-        return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+        return Solved(z, columns_um, hyper, list(runs), sums, weighing)
     raise FitError(FitStatus.MAX_STEPS)
 
 
@@ -172,10 +154,7 @@ def prior_precision(chain: Chain, hyper: Hyper | None, stroke_um: float) -> np.n
 
 
 def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
-    """Take off what a prior says of the scale of all columns together, shape `(D, D)`.
-
-    That is for the data alone to say: a gain beside the grid is not seen, however smooth the grid is.
-    """
+    """Take off what a prior says of the scale of all columns together, which is for the data to say; `(D, D)`."""
     pull = prior @ columns_um
     return prior - np.outer(pull, pull) / max(float(columns_um @ pull), 1e-300)
 
@@ -184,27 +163,25 @@ def _gather(
     chain: Chain,
     z: np.ndarray,
     columns_um: np.ndarray,
-    runs: Sequence[StageRun],
+    runs: Sequence[Run],
     loss: str,
     free: bool,
     counted: tuple[float, ...],
     even: float,
-) -> tuple[Sequence[StageRun], list[RunSums], Weighing]:
+) -> tuple[Sequence[Run], list[RunSums], Weighing]:
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
-        runs = [robust(run, residual) for run, residual in zip(runs, left, strict=True)]
+        # Outliers count linearly (Huber).
+        runs = [
+            replace(run, weight=huber_weight(residual, run.fitted)) for run, residual in zip(runs, left, strict=True)
+        ]
     sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
     return runs, sums, replace(Weighing.of(runs, [one.residual_um for one in sums], *counted), even=even)
 
 
-def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun]) -> list[np.ndarray]:
+def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[Run]) -> list[np.ndarray]:
     stage = chain.stage(jnp.asarray(z), jnp.asarray(columns_um))
     return [residual_of(stage, run) for run in runs]
-
-
-def robust(run: StageRun, residual_um: np.ndarray) -> StageRun:
-    """Weigh a run's samples by what they leave: outliers count linearly (Huber)."""
-    return run.weighted(huber_weight(residual_um, run.fitted))
 
 
 def _step(
@@ -238,19 +215,7 @@ def _step(
 
 
 def marginal_information(total: Moments, size: int, prior: np.ndarray, variance: float) -> np.ndarray:
-    """Precision of the coordinates, whatever the columns may be, shape `(p, p)`.
-
-    Parameters
-    ----------
-    total
-        Of columns and coordinates.
-    size
-        Number of columns, `D`.
-    prior
-        Precision of the columns before the data, shape `(D, D)`.
-    variance
-        Of the noise.
-    """
+    """Precision of the coordinates, whatever the first `size` unknowns, the columns, may be, shape `(p, p)`."""
     gram = np.asarray(total.gram) / variance
     if size == 0:
         return gram

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import signal
 from scipy.optimize import least_squares
 
-from fits.stage._run import StageRun
+from fits.loop._run import Run
 from microid import AbstractLinear, Driver, Mechanics, Stage
 
 # Segments whose spectra are averaged.
@@ -50,7 +50,7 @@ class MeasuredResponse:
     coherence: np.ndarray
 
 
-def measure_response(run: StageRun, drive: np.ndarray) -> MeasuredResponse:
+def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
     """Estimate the frequency response from a drive to the displacement of a run (Welch).
 
     Parameters

@@ -15,10 +15,10 @@ from fits.loop._design import Grid
 from fits.loop._fit_checks import without_impulses
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import prepare_run, simulate_run
+from fits.loop._run import Run, prepare_run, simulate_run
 from fits.stage._checks import UNSEEN, WORTH, compare_gains, gained, refuse_slopes, refuse_unseen, speed_Hz
 from fits.stage._moments import Chain
-from fits.stage._run import StageRun, place_of_hysteresis, prepare_stage_run, simulate_stage
+from fits.stage._run import place_of_hysteresis, simulate_stage
 from fits.stage._solve import Solved, solve_chain
 from fits.stage._start import measure_response, start_stages
 from fits.stage._uncertainty import Precision, offsets_out
@@ -52,12 +52,12 @@ class Plan:
     anyway: bool
     shifts_s: tuple[float, ...] = ()
 
-    def runs(self, stride: int) -> list[StageRun]:
+    def runs(self, stride: int) -> list[Run]:
         """The records, each interval divided into so many steps."""
         shifts = self.shifts_s or (0.0,) * len(self.records)
         return [self.run(k, stride, shift) for k, shift in enumerate(shifts)]
 
-    def run(self, k: int, stride: int, shift_s: float = 0.0) -> StageRun:
+    def run(self, k: int, stride: int, shift_s: float = 0.0) -> Run:
         """One of them, its command that much later."""
         record, usable = self.records[k], None
         if shift_s:
@@ -67,7 +67,7 @@ class Plan:
             later = np.interp(time, record.time_s, record.voltage_V)
             record = replace(record, voltage_V=later, extra=dict(record.extra))
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
-        return prepare_stage_run(record, *settings, usable)
+        return prepare_run(record, *settings, usable)
 
     def smoothed(self) -> "Plan":
         """The same without readings that jump out and back, of which a start must not be read off."""
@@ -105,7 +105,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     place = place_of_hysteresis(stage)
     law = None if place is None else stage.parts[place]
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
-    drives = [record.voltage_V for record in plan.records]
+    runs = plan.runs(1)
     name = stage.names[place or 0]
     if isinstance(law, Preisach) and isinstance(law.density, GridDensity) and name not in stage.frozen:
         refuse_slopes([plan.records[k] for k in slow])
@@ -115,24 +115,15 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
                 f"{', '.join(loose)} and the weights of {name} are both free, but only their product is seen, "
                 f"not each: freeze {loose[0]}, or the {name}"
             )
-        assert plan.gain is not None
-        lower, upper = plan.gain * plan.range_V[0], plan.gain * plan.range_V[1]
-        runs = [
-            prepare_run(replace(record, voltage_V=plan.gain * record.voltage_V), lower, upper, state, plan.fraction)
-            for record, state in zip(plan.records, plan.states, strict=True)
-        ]
         plan.progress(f"hysteresis from {', '.join(plan.records[k].source for k in slow)}")
         stroke, tried, _ = choose_grid([runs[k] for k in slow], levels, plan.progress, finest)
         grid, hyper = tried.data.grid, tried.solution.hyper
         columns = np.asarray(tried.solution.columns) * stroke
         law = grid.model(columns, np.zeros(()))
         stage = stage.swap(name, law)
-        drives = [simulate_run(law, run) for run in runs]
-    elif law is not None:
-        drives = [np.asarray(law(jnp.asarray(record.voltage_V))) for record in plan.records]  # type: ignore[operator]
-    runs_at_rate = plan.runs(1)
+    drives = hysteresis_alone(stage, runs)
     lively = [k for k in range(len(plan.records)) if k not in slow] or slow
-    responses = [measure_response(runs_at_rate[k], drives[k]) for k in lively]
+    responses = [measure_response(runs[k], drives[k]) for k in lively]
     candidates = start_stages(stage, responses)
     place = place if grid is not None else None
     best: tuple[float, Stage, Chain, Solved] | None = None
@@ -142,7 +133,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         chain = Chain(offsets_out(candidate, grid is not None), place, grid)
         z = np.asarray(chain.coordinates.of(candidate))
         try:
-            solved = solve_chain(chain, z, columns, runs_at_rate, None, stroke, plan.loss, plan.progress, rough=True)
+            solved = solve_chain(chain, z, columns, runs, None, stroke, plan.loss, plan.progress, rough=True)
         except FitError as error:
             failure = error
             continue
@@ -167,7 +158,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     if spare is not None:
         full = Problem(stage, chain, solved.z, columns, hyper, stroke, ()), solved
         return replace(_spared(plan, asked, spare, levels, finest), full=full)
-    remarks = compare_gains(found, runs_at_rate)
+    remarks = compare_gains(found, runs)
     return Problem(stage, chain, solved.z, columns, hyper, stroke, tuple(remarks))
 
 
@@ -221,20 +212,14 @@ def _lagging(
     return Problem(simple, chain, solved.z, solved.columns_um, solved.hyper, stroke_um, remark, _EVEN)
 
 
-def hysteresis_alone(stage: Stage, plan: Plan) -> list[np.ndarray]:
-    """What the hysteresis of a stage would give by itself for each run of a plan, in um, shape `(n,)`."""
+def hysteresis_alone(stage: Stage, runs: Sequence[Run]) -> list[np.ndarray]:
+    """What the hysteresis of a stage would give by itself for each run, in um, shape `(n,)`."""
     place = place_of_hysteresis(stage)
-    if place is None:
-        return [record.voltage_V for record in plan.records]
-    law = stage.parts[place]
-    if not isinstance(law, Preisach) or plan.gain is None:
-        return [np.asarray(law(jnp.asarray(record.voltage_V))) for record in plan.records]  # type: ignore[operator]
-    lower, upper = plan.gain * plan.range_V[0], plan.gain * plan.range_V[1]
-    runs = [
-        prepare_run(replace(record, voltage_V=plan.gain * record.voltage_V), lower, upper, state, plan.fraction)
-        for record, state in zip(plan.records, plan.states, strict=True)
-    ]
-    return [simulate_run(law, run) for run in runs]
+    law: Any = None if place is None else stage.parts[place]
+    if isinstance(law, Preisach):
+        return [simulate_run(law, run) for run in runs]
+    commands = [run.record.voltage_V for run in runs]
+    return commands if law is None else [np.asarray(law(jnp.asarray(voltage))) for voltage in commands]
 
 
 def refine_problem(plan: Plan, problem: Problem) -> tuple[Problem, Solved, Precision]:

@@ -2,26 +2,27 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy import fft
 
+from fits.io._errors import DataError
+from fits.io._record import Record
 from fits.loop._design import Grid
 from fits.loop._prior import interpolation
+from fits.loop._run import Run
+from fits.loop._uncertainty import AbstractUncertainty, Prediction
 from fits.stage._moments import Chain, RunSums, along
-from fits.stage._run import StageRun, place_of_hysteresis
+from fits.stage._run import place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, prior_precision, scale_free
-from fits.stats._noise import correlation_samples, shared_square
-from microid import Coordinates, ParameterInfo, Stage
+from fits.stats._noise import WHITE, correlation_samples, shared_square
+from microid import Coordinates, ParameterInfo, Preisach, Stage
 
 # Levels on which predictions are perturbed; finer ones move no displacement.
 _LEVELS = 16
 # Autocovariances are trusted up to so many correlation times.
 _LAGS = 6.0
-# A residual less correlated than this counts as white.
-_WHITE = 1.2
 # Precision, in scaled coordinates, that stands in for none.
 _FAINT = 1e-8
 
@@ -29,10 +30,7 @@ _FAINT = 1e-8
 def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
     """Coordinates of what a fit of a stage moves: all that is free, but for offsets and the grid's own parameters.
 
-    Raises
-    ------
-    ValueError
-        If nothing is left to move.
+    A `ValueError` where nothing is left to move.
     """
     place = place_of_hysteresis(stage)
     name = None if place is None or not grid else stage.names[place]
@@ -44,7 +42,7 @@ def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
     return Coordinates(stage, moves)
 
 
-class StageUncertainty(eqx.Module):
+class StageUncertainty(AbstractUncertainty):
     """Independent perturbations of a stage, each one standard deviation long.
 
     The variance of a prediction is the sum of the squared changes under all of them, to first order; sensor noise is
@@ -70,8 +68,9 @@ class StageUncertainty(eqx.Module):
     discrepancy_um: Float[Array, ""]
     grid: Grid | None
 
-    def sd_um(self, stage: Stage, run: StageRun) -> np.ndarray:
+    def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
         """Standard deviation of the predicted displacement of a run, shape `(n,)`."""
+        stage = _stage(model)
         coordinates = offsets_out(stage, self.grid is not None)
         chain = Chain(coordinates, None if self.grid is None else place_of_hysteresis(stage), self.grid)
         mean = np.asarray(self.mean_um)
@@ -83,19 +82,20 @@ class StageUncertainty(eqx.Module):
         square = along(chain, coordinates.of(stage), None, run, directions, variance)
         return np.sqrt(square + float(self.discrepancy_um) ** 2)
 
+    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
+        """Predict the displacement of a voltage program; see `fits.predict`."""
+        stage, run = prepare_program(_stage(model), record, initial)
+        return Prediction(simulate_stage(stage, run), self.sd_um(stage, run))
+
+
+def _stage(model: Preisach | Stage) -> Stage:
+    if isinstance(model, Stage):
+        return model
+    raise DataError("the uncertainty is that of a stage, and the model is a hysteresis: fit it again")
+
 
 class Precision:
-    """What a fit knows: the precision of its columns and coordinates together, and what each sample contributes.
-
-    Parameters
-    ----------
-    chain
-        The stage.
-    solved
-        Where its fit ended.
-    stroke_um
-        Unit of the columns.
-    """
+    """What a fit knows: the precision of its columns and coordinates together, and what each sample contributes."""
 
     def __init__(self, chain: Chain, solved: Solved, stroke_um: float):
         self.chain, self.solved = chain, solved
@@ -133,7 +133,7 @@ class Precision:
         weighing = self.solved.weighing
         for run, share in zip(self.solved.runs, weighing.shares, strict=True):
             slope = along(self.chain, *here, run, (answer[:size], answer[size:])).T
-            weight = np.asarray(run.samples.weight)[: len(run.record)]
+            weight = run.fit_weight
             slope = slope - np.average(slope, axis=1, weights=weight)[:, None]
             # The other half of the weight goes to the residual that this is multiplied by.
             out.append(slope * np.sqrt(weight) * share / weighing.least_um**2)
@@ -142,8 +142,6 @@ class Precision:
     def covariance(self, influence: Sequence[np.ndarray]) -> np.ndarray:
         """Covariance of the coordinates, the noise of each run as coloured as its residual is, shape `(p, p)`.
 
-        Notes
-        -----
         The estimate moves by the influence of each sample times its noise, so its covariance is a double sum over
         autocovariances (the sandwich of Newey & West 1987), to which comes what is not known of the columns.
         """
@@ -151,8 +149,7 @@ class Precision:
         # What nothing is known of stays unknown, whatever the residual.
         held = answer[:size].T @ self.prior[:size, :size] @ answer[:size] + _FAINT * answer[size:].T @ answer[size:]
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
-            weight = np.asarray(run.samples.weight)[: len(run.record)]
-            held = held + sandwich(own, np.sqrt(weight) * one.residual_um, run.fitted)
+            held = held + sandwich(own, np.sqrt(run.fit_weight) * one.residual_um, run.fitted)
         return held
 
     def uncertainty(self) -> StageUncertainty:
@@ -177,7 +174,7 @@ class Precision:
             grid,
         )
 
-    def _pairs(self) -> list[tuple[RunSums, StageRun]]:
+    def _pairs(self) -> list[tuple[RunSums, Run]]:
         return list(zip(self.solved.sums, self.solved.runs, strict=True))
 
 
@@ -188,7 +185,7 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
     size = fft.next_fast_len(2 * n)
     auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[:n] / fitted.sum()
     correlation = correlation_samples([residual_um[fitted]])
-    lags = 0 if correlation <= _WHITE else min(n - 1, int(np.ceil(_LAGS * correlation)))
+    lags = 0 if correlation <= WHITE else min(n - 1, int(np.ceil(_LAGS * correlation)))
     window = np.zeros(n)
     window[: lags + 1] = 1 - np.arange(lags + 1) / (lags + 1)
     kernel = np.zeros(size)

@@ -7,6 +7,8 @@ from scipy import fft
 
 # Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
 _HUBER = 1.345
+# A residual less correlated than this counts as white.
+WHITE = 1.2
 LOSSES = ("squares", "huber")
 # Sokal's window: sum the correlations up to this many correlation times.
 _WINDOW = 5.0
