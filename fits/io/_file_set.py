@@ -51,10 +51,7 @@ class FileSet:
     def file(self, path: str | os.PathLike[str]) -> Path:
         """Give a temporary name for a file to write; it does not exist yet, and ends as `path` does.
 
-        Raises
-        ------
-        DataError
-            `path` cannot be written to: its folder is missing or protected, or it is anything but a regular file.
+        A `DataError` says that `path` cannot be written to.
         """
         target = check_file(path)
         if any(is_temporary(part) for part in target.parts):
@@ -73,23 +70,11 @@ class FileSet:
     @overload
     def folder(self, path: str | os.PathLike[str], option: str = ...) -> Path: ...
     @overload
-    def folder(self, path: None, option: str = ...) -> None: ...
-    @overload
     def folder(self, path: str | os.PathLike[str] | None, option: str = ...) -> Path | None: ...
     def folder(self, path: str | os.PathLike[str] | None, option: str = "--plots") -> Path | None:
-        """Make a temporary folder, whose files go to the folder `path`, which is made if need be.
+        """Make a temporary folder, whose files go to the folder `path` that an option named; for None there is none.
 
-        Parameters
-        ----------
-        path
-            Of the folder; for None, None comes back.
-        option
-            That named it.
-
-        Raises
-        ------
-        DataError
-            `path` cannot be written to, or is no folder.
+        `path` is made if need be; a `DataError` says that it cannot be written to, or is no folder.
         """
         if path is None:
             return None
@@ -108,18 +93,14 @@ class FileSet:
         return files
 
     def _refuse_twice(self, target: Path, shown: str) -> None:
-        if target in {*(move.target for move in self._files), *(folder.target for folder in self._folders)}:
-            raise DataError(f"{shown}: two results would go to this place; choose another for one of them.")
+        _refuse_twice(target, shown, [each.target for each in self._files] + [each.target for each in self._folders])
 
     def commit(self) -> None:
         """Put all files in their places, or none."""
         files = [move for move in self._files if move.staged is not None or os.path.lexists(move.target)]
         moves = [*self._from_folders(), *files]
-        seen: dict[Path, str] = {}
-        for move in moves:
-            if move.target in seen:
-                raise DataError(f"{move.shown}: two results would go to this place; choose another for one of them.")
-            seen[move.target] = move.shown
+        for k, move in enumerate(moves):
+            _refuse_twice(move.target, move.shown, [each.target for each in moves[:k]])
             if move.staged is None or not move.staged.is_dir():
                 check_file(move.target, move.shown)
         for move in moves:
@@ -132,7 +113,10 @@ class FileSet:
                 if len(moves) > 1:
                     undo.callback(self._undoing(move))
                 with _told(move.shown):
-                    _put(move)
+                    if move.staged is None:
+                        move.target.unlink(missing_ok=True)
+                    else:
+                        os.replace(move.staged, move.target)
             undo.pop_all()
         for folder in {move.target.parent for move in moves}:
             _flush_folder(folder)
@@ -203,12 +187,8 @@ def file_set() -> Iterator[FileSet]:
 
     All are written to the disk before the first is renamed. If a rename fails, those before it are undone. A process
     that is killed meanwhile leaves each file as it was or whole, and temporary ones that the next `file_set` in the
-    same folder removes; a folder that was not there appears in one step with all that is in it.
-
-    Raises
-    ------
-    DataError
-        A file cannot be written, or the disk is full.
+    same folder removes; a folder that was not there appears in one step with all that is in it. A `DataError` says
+    that a file cannot be written, or that the disk is full.
     """
     files = FileSet()
     _OPEN.append(files)
@@ -234,13 +214,9 @@ def discard_all() -> None:
         files.discard()
 
 
-def _put(move: _Move) -> None:
-    if move.staged is None:
-        move.target.unlink(missing_ok=True)
-    elif move.staged.is_dir():
-        os.rename(move.staged, move.target)
-    else:
-        os.replace(move.staged, move.target)
+def _refuse_twice(target: Path, shown: str, others: list[Path]) -> None:
+    if target in others:
+        raise DataError(f"{shown}: two results would go to this place; choose another for one of them.")
 
 
 def _take_back(target: Path, staged: Path | None) -> None:

@@ -19,16 +19,9 @@ _KELVIN_AT_0_DEGC = 273.15
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measured quantity.
+    """A measured quantity: its name such as ``voltage``, and its canonical unit such as ``V``.
 
-    Attributes
-    ----------
-    stem
-        Name without unit, for example ``voltage``.
-    unit
-        Canonical unit, for example ``V``.
-    powers
-        Power of ten that takes each known unit to the canonical one.
+    `powers` are those of ten that take each known unit to the canonical one.
     """
 
     stem: str

@@ -43,22 +43,10 @@ def recognise(name: str) -> tuple[Quantity, str] | None:
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Read the text of the option ``--columns``.
+    """Read the option ``--columns``: pairs such as ``voltage_V=u1_V,displacement_um=-height[m]``.
 
-    Parameters
-    ----------
-    text
-        Pairs such as ``voltage_V=u1_V,displacement_um=-height[m]``.
-
-    Returns
-    -------
-    dict
-        Canonical column to source, as `read_csv` takes it.
-
-    Raises
-    ------
-    DataError
-        A pair without ``=``, an unknown or a repeated canonical column.
+    Canonical column to source comes back, as `read_csv` takes it. A `DataError` refuses a pair without ``=``, and an
+    unknown or a repeated column.
     """
     columns: dict[str, str] = {}
     for pair in filter(str.strip, text.split(",")):
@@ -86,23 +74,10 @@ def known_quantity(column: str) -> Quantity:
 def find_sources(
     names: Sequence[str], columns: Mapping[str, str], required: Collection[str], place: str
 ) -> dict[str, Source]:
-    """Choose the source column of every canonical column that the headers or the mapping give.
+    """Choose the source column of every canonical column that the headers, or the user's mapping, give.
 
-    Parameters
-    ----------
-    names
-        Headers of the file.
-    columns
-        Mapping that the user gave; it wins over the headers.
-    required
-        Canonical columns that must be found.
-    place
-        File and line of the header, to begin error messages with.
-
-    Raises
-    ------
-    DataError
-        Missing column, duplicate column, missing or unknown unit.
+    The mapping wins over the headers. `place`, file and line of the header, begins the sentence of a `DataError`: a
+    required column that is missing, a duplicate, a unit that is missing or unknown.
     """
     sources = {column: _mapped(column, text, names, place) for column, text in columns.items()}
     taken = {source.column for source in sources.values()}

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from fits.io._errors import DataError
-from fits.io._read_csv import _check_time, _converted
+from fits.io._read_csv import KnownColumns
 from fits.io._record import Reference
-from fits.io._table import data_error, open_table
-from fits.io._units import find_sources
+from fits.io._table import data_error
 from fits.stats._noise import correlation_samples
 from fits.stats._noise_spectrum import NoiseBand, NoiseLine, allan_deviation, find_lines, noise_bands
 
@@ -132,12 +131,8 @@ def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = 
         One sentence with file, line and column: a voltage that changes, fewer than 100 samples, uneven time steps, a
         reading that never changes, or what `read_csv` refuses.
     """
-    table = open_table(path)
-    place = f"{table.path}, line {table.header_line}"
-    sources = find_sources(table.names, columns or {}, ("time_s", "displacement_um"), place)
-    wanted = [name for name in ("time_s", "displacement_um", "voltage_V") if name in sources]
-    values, _ = table.read({sources[name].column for name in wanted})
-    arrays = {name: _converted(table, name, sources[name], values) for name in wanted}
+    read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), ("voltage_V",), alone=True)
+    table, sources, arrays = read.table, read.sources, read.arrays
     if "voltage_V" in arrays:
         voltage_V = arrays["voltage_V"]
         changes = np.flatnonzero(voltage_V != voltage_V[0])
@@ -147,7 +142,6 @@ def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = 
                 "out the part at rest, or drop the column if it is a noisy monitor of a constant voltage"
             )
             raise data_error(table.path, what, table.line(int(changes[0])), sources["voltage_V"].column)
-    _check_time(table, sources["time_s"].column, arrays["time_s"])
     fault = _find_fault(arrays["time_s"], arrays["displacement_um"])
     if fault:
         what, row, name = fault
