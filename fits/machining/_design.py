@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 
@@ -115,15 +115,14 @@ def paper_design(tolerance_mm: float = TOLERANCE_MM) -> Design:
 
 
 def uniform_tolerance(geometry: m.Geometry, length_mm: float) -> dict[str, float]:
-    """Tolerance of every dimension in its unit, the same for all lengths; angles as `default_tolerance`."""
-    sizes = {name: float(geometry[name]) for name in m.DIMENSIONS}
-    return {name: default_tolerance(name, sizes, length_mm) for name in m.DIMENSIONS}
+    """Tolerance of every dimension in its unit that goes with one of all lengths."""
+    return {name: length_mm / lever_mm(geometry, name) for name in m.DIMENSIONS}
 
 
-def default_tolerance(name: str, sizes: Mapping[str, float], length_mm: float = TOLERANCE_MM) -> float:
-    """Tolerance of a dimension that goes with one of lengths: for an angle, over the leg it is measured along."""
+def lever_mm(geometry: m.Geometry, name: str) -> float:
+    """Length of the leg at whose end an error of an angle is counted as a length; 1 for a length."""
     leg = m.DIMENSIONS[name].leg
-    return length_mm if leg is None else length_mm / sizes[leg]
+    return 1.0 if leg is None else float(geometry[leg])
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
