@@ -124,13 +124,13 @@ def fit(
     progress("comparing with the measurement")
     figures = {"noise_um": found.noise_um, "correlation_samples": found.correlation, "substeps": 1}
     reports = [
-        _report(_with_offset(model, offset), run, found.noise_um, **figures)
+        _report(_with_offset(model, offset), run, found, **figures)
         for offset, run in zip(offsets, runs, strict=True)
     ]
     for record in aside:
         run = prepare_run(record, range_V, initial, holdout=1.0)
         off = float(np.mean((run.displacement_um - simulate_run(model, run))[run.known]))
-        reports.append(_report(_with_offset(model, off), run, found.noise_um))
+        reports.append(_report(_with_offset(model, off), run, found))
     return FitResult(
         model=_with_offset(model, offsets[0]),
         uncertainty=_uncertainty(tried.data, found),
@@ -191,8 +191,8 @@ def _with_offset(model: Preisach, offset_um: float) -> Preisach:
     return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offset_um))
 
 
-def _report(model: Preisach, run: Run, noise_um: float, **figures: Any) -> RunReport:
-    start = run.start if run.known.all() else estimate_start(model, run, noise_um)
+def _report(model: Preisach, run: Run, found: Estimate, **figures: Any) -> RunReport:
+    start = run.start if run.known.all() else estimate_start(model, run, found.noise_um)
     return RunReport.of(run, simulate_run(model, run), float(model.offset_um), start, **figures)
 
 

@@ -28,18 +28,9 @@ _SPARSE_s = 1.0
 def remarks_on(
     records: Sequence[Record], residuals: Sequence[np.ndarray], fitted: Sequence[np.ndarray], robust: bool
 ) -> list[str]:
-    """Name what is wrong with records that were fitted.
+    """Name what is wrong with records that were fitted, by what the fit leaves of each in um, shape `(n,)`.
 
-    Parameters
-    ----------
-    records
-        The runs.
-    residuals
-        What the fit leaves of each, in um, shape `(n,)`.
-    fitted
-        Which samples were fitted, shape `(n,)`.
-    robust
-        Whether outliers count less in the fit already.
+    `robust` says whether outliers count less in the fit already.
     """
     out = []
     for record, residual, used in zip(records, residuals, fitted, strict=True):
@@ -82,15 +73,7 @@ def stuck(record: Record) -> list[str]:
 
 
 def outlying(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """Mark the readings that are far off their neighbours, where there are enough to matter to a fit, shape `(n,)`.
-
-    Parameters
-    ----------
-    residual_um
-        What the fit leaves, shape `(n,)`.
-    fitted
-        Which samples were fitted, shape `(n,)`.
-    """
+    """Mark readings far off their neighbours, where there are enough to matter to a fit, shape `(n,)`."""
     bad = impulsive(residual_um) & fitted
     height = _height(residual_um)
     if bad.any():

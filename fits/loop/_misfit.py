@@ -19,18 +19,8 @@ _FAR, _FAR_PCT = 2.0, 0.1
 class Misfit:
     """What a fit leaves of the run that it describes worst, against what the sensor's noise would leave.
 
-    Attributes
-    ----------
-    source
-        The run.
-    residual_um
-        Root mean square of its residual over the fitted samples.
-    share_pct
-        The same in % of the run's stroke.
-    noise_um
-        Standard deviation of the sensor's noise, its last digit included.
-    shown_by
-        What the noise was read off, in words.
+    `residual_um` is the root mean square over the fitted samples, `share_pct` the same in % of the run's stroke, and
+    `noise_um` the standard deviation of the sensor's noise, its last digit included, read off what `shown_by` says.
     """
 
     source: str
@@ -51,17 +41,7 @@ class Misfit:
 
 
 def misfits(records: Sequence[Record], residuals: Sequence[np.ndarray], fitted: Sequence[np.ndarray]) -> list[Misfit]:
-    """Compare the residual of each run with the noise of the sensor, which is that of its quietest run.
-
-    Parameters
-    ----------
-    records
-        The fitted runs.
-    residuals
-        What the fit leaves of each, in um, shape `(n,)`.
-    fitted
-        Which samples were fitted, shape `(n,)`.
-    """
+    """Compare the residual of each run, in um, with the noise of the sensor, which is that of its quietest run."""
     noise, shown_by = min(
         (sensor_noise_um(record, residual) for record, residual in zip(records, residuals, strict=True)),
         key=lambda one: one[0],

@@ -49,23 +49,8 @@ def check_loops(
 ) -> tuple[Misfit, list[str]]:
     """Say how far from noise a fitted hysteresis is, and what is wrong with the runs that it was fitted to.
 
-    Parameters
-    ----------
-    runs
-        What was fitted together.
-    prepare
-        Makes a record ready again.
-    model
-        The result.
-    stroke_um, hyper
-        Unit of the columns, and smoothness and noise to start from.
-    robust
-        Whether outliers counted less.
-
-    Raises
-    ------
-    DataError
-        As `disagreements`.
+    `prepare` makes a record ready again; `robust` says whether outliers counted less. A `DataError` as of
+    `disagreements`.
     """
     records = [run.record for run in runs]
     known = [left_of(model, run) for run in runs], [run.fitted for run in runs]
@@ -87,15 +72,7 @@ def check_loops(
 
 
 class Alone:
-    """Fits of single runs, or parts of them, on a coarse grid.
-
-    Parameters
-    ----------
-    stroke_um
-        Unit of the columns.
-    hyper
-        Smoothness and noise to start from.
-    """
+    """Fits of single runs, or parts of them, on a coarse grid, in strokes, with the smoothness and noise given."""
 
     def __init__(self, stroke_um: float, hyper: Hyper):
         self.stroke_um, self.hyper = stroke_um, hyper
@@ -123,26 +100,8 @@ def left_of(model: Preisach, run: Run) -> np.ndarray:
 def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequence[Misfit]) -> list[str]:
     """Look for runs, and parts of runs, that a hysteresis explains one by one but not together.
 
-    Parameters
-    ----------
-    runs
-        What was fitted together.
-    model
-        The result.
-    alone
-        Fits them alone.
-    left
-        What the joint fit leaves of each run.
-
-    Returns
-    -------
-    list of str
-        A sentence for each disagreement.
-
-    Raises
-    ------
-    DataError
-        If the gains of two runs, or parts, differ by so much that they are not of one rig in one setting.
+    Returns a sentence for each. A `DataError` if the gains of two runs differ by so much that they are not of one rig
+    in one setting.
     """
     if not any(one.far for one in left):
         return []
@@ -218,19 +177,7 @@ def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
 
 
 def delays(runs: Sequence[Run], prepare: Callable[[Record], Run], alone: Alone, left: Sequence[Misfit]) -> list[str]:
-    """Look for readings that come late, or before their command, by fitting each run again with its voltage shifted.
-
-    Parameters
-    ----------
-    runs
-        What was fitted together.
-    prepare
-        Makes a record ready again.
-    alone
-        Fits them alone.
-    left
-        What the joint fit leaves of each run.
-    """
+    """Look for readings that come late, or before their command, by fitting each run with its voltage shifted."""
     remarks = []
     for run, miss in zip(runs, left, strict=True):
         interval = float(np.median(np.diff(run.record.time_s)))

@@ -39,13 +39,7 @@ _POLES = ("time_constant_s", "natural_frequency_Hz")
 
 
 def refuse_slopes(records: Sequence[Record]) -> None:
-    """Refuse slow runs over one range of voltage that move differently far.
-
-    Raises
-    ------
-    DataError
-        If they cannot be of one rig.
-    """
+    """Refuse, in a `DataError`, slow runs over one range of voltage that move differently far."""
     spans = [
         (float(np.ptp(record.voltage_V)), float(np.ptp(record.displacement_um)), speed_Hz(record), record.source)
         for record in records
@@ -85,30 +79,12 @@ def refuse_unseen(
     fast: bool,
     spare: bool = False,
 ) -> str | None:
-    """Refuse runs that do not show the dynamics they are fitted with.
+    """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with.
 
-    Parameters
-    ----------
-    stage
-        With the poles that explain the runs best.
-    coordinates, solved
-        Of these poles, the hysteresis being given.
-    drives
-        What the hysteresis alone would give, for each run, shape `(n,)`.
-    fast
-        Whether a run is faster than the others.
-    spare
-        Whether a mechanics may be left out where a driver alone may do.
-
-    Returns
-    -------
-    str or None
-        Name of a mechanics that the runs do not show, though they are sampled finely enough: leave it out.
-
-    Raises
-    ------
-    DataError
-        If no run moves fast enough, or none is sampled fast enough.
+    The coordinates and the solution are those of the poles that explain the runs best, the hysteresis being given;
+    `drives` are what it alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the
+    others. Where a mechanics may be left out (`spare`) that the runs do not show, though they are sampled finely
+    enough, its name is returned instead.
     """
     information = marginal_information(
         solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
@@ -175,13 +151,7 @@ def refuse_unseen(
 
 
 def refuse_coarse(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
-    """Refuse a fitted resonance that the runs cannot show: they are sampled too slowly for it, and leave much.
-
-    Raises
-    ------
-    DataError
-        If they are.
-    """
+    """Refuse, in a `DataError`, a resonance that runs cannot show: sampled too slowly for it, they leave much."""
     finest = max(run.rate_Hz for run in runs)
     for part in stage.parts:
         if not isinstance(part, Mechanics):
@@ -211,17 +181,7 @@ def _resolved(run: Run) -> bool:
 def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> tuple[str, float] | None:
     """Find poles that no piezo stage has: the time is probably in another unit than its column says.
 
-    Parameters
-    ----------
-    names, values
-        Parameters of the fitted stage, in their units.
-    sources
-        The runs.
-
-    Returns
-    -------
-    tuple or None
-        A sentence, and what a time in the unit it suspects has to be multiplied by to be in s.
+    Returns a sentence, and what a time in the unit it suspects has to be multiplied by to be in s; None without such.
     """
     for name, value in zip(names, values, strict=True):
         field = name.rpartition(".")[2]
@@ -282,26 +242,9 @@ def _gains(stage: Stage, runs: Sequence[Run]) -> np.ndarray:
 
 
 def compare_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
-    """Find runs that move further, or less far, than the others under the same voltage.
+    """Find runs that move further, or less far, than the others under the same voltage: a remark, if any.
 
-    Parameters
-    ----------
-    stage
-        Fitted to all of them.
-    runs
-        The runs.
-    refuse
-        Whether too large a difference is an error.
-
-    Returns
-    -------
-    list of str
-        A remark, if there is anything to say.
-
-    Raises
-    ------
-    DataError
-        If they cannot be of one rig.
+    With `refuse`, too large a difference is a `DataError`, as such runs cannot be of one rig.
     """
     gains = _gains(stage, runs)
     low, high = int(np.argmin(gains)), int(np.argmax(gains))

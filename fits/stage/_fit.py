@@ -148,26 +148,8 @@ def fit_stage(
 class Solution:
     """What the fit of a stage found, before it is compared with anything.
 
-    Attributes
-    ----------
-    stage
-        The fitted stage, without an offset.
-    chain
-        The same in the coordinates of its fit.
-    solved
-        Where the fit ended.
-    precision
-        How sure it is.
-    stroke_um
-        Unit of the columns of the grid.
-    range_V
-        Range of the commands.
-    remarks
-        What the user should know, one sentence each.
-    plan, problem
-        What was asked for, and where the fit began.
-    failure
-        Why this is only the best place that was found; None where the fit converged.
+    The stage has no offset; `stroke_um` is the unit of its columns. The problem is where the fit began. `failure`
+    says why this is only the best place that was found; None where the fit converged.
     """
 
     stage: Stage
