@@ -3,21 +3,19 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._design import Grid
 from fits.loop._evidence import posterior
 from fits.loop._fit_checks import remarks_on
 from fits.loop._grid import non_negative, solve_grid
-from fits.loop._misfit import Misfit, misfits, worst
-from fits.loop._moments import gather
+from fits.loop._misfit import Misfit, compare_gains, misfits, worst
+from fits.loop._moments import gather, grid_of
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, simulate_run
-from fits.stats._noise import correlation_samples
+from fits.stats._noise import WHITE, correlation_samples
 from microid import Preisach
 
 # Levels on which parts are fitted alone: enough to see whether they agree.
@@ -34,7 +32,7 @@ _FARTHEST = 64
 # where more than so many times the noise stays.
 _WORTH, _MUCH, _NEAR = 30.0, 0.4, 2.0
 # What is so near the noise, and as white, holds no delay.
-_QUIET, _WHITE = 1.3, 1.2
+_QUIET = 1.3
 # A hysteresis takes part of a delay for width: it is known to half a sample at best.
 _ROUGHLY = 0.5
 
@@ -52,10 +50,8 @@ def check_loops(
     `prepare` makes a record ready again; `robust` says whether outliers counted less. A `DataError` as of
     `disagreements`.
     """
-    records = [run.record for run in runs]
-    known = [left_of(model, run) for run in runs], [run.fitted for run in runs]
-    left = misfits(records, *known)
-    remarks = remarks_on(records, *known, robust)
+    residuals = [left_of(model, run) for run in runs]
+    left, remarks = misfits(runs, residuals), remarks_on(runs, residuals, robust)
     alone = Alone(stroke_um, hyper)
     try:
         told = disagreements(runs, model, alone, left)
@@ -63,8 +59,8 @@ def check_loops(
         # Fits of parts are only asked for an opinion.
         told = []
     quiet = all(
-        one.times_noise < _QUIET and correlation_samples([residual[used]]) < _WHITE
-        for one, residual, used in zip(left, *known, strict=True)
+        one.times_noise < _QUIET and correlation_samples([residual[run.fitted]]) < WHITE
+        for one, residual, run in zip(left, residuals, runs, strict=True)
     )
     if not told and not quiet:
         told = delays(runs, prepare, alone, left)
@@ -79,16 +75,16 @@ class Alone:
 
     def fit(self, runs: Sequence[Run]) -> Preisach:
         """Fit a hysteresis to some runs; a `FitError` where that fails."""
-        grid = Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), _LEVELS)
-        solution = solve_grid(gather(grid, runs), self.stroke_um, 1.0, self.hyper)
-        return grid.model(np.asarray(solution.columns) * self.stroke_um, np.zeros(()))
+        data = gather(grid_of(runs, _LEVELS), runs)
+        solution = solve_grid(data, self.stroke_um, 1.0, self.hyper)
+        return data.grid.model(np.asarray(solution.columns) * self.stroke_um, np.zeros(()))
 
     def left(self, run: Run) -> np.ndarray:
         """What a run leaves that is fitted alone as smoothly as all are, at its fitted samples, in um."""
-        grid = Grid(jnp.asarray(run.lower_V), jnp.asarray(run.upper_V), _LEVELS)
-        moments = gather(grid, [run]).total.scaled(1.0, self.stroke_um)
+        data = gather(grid_of([run], _LEVELS), [run])
+        moments = data.total.scaled(1.0, self.stroke_um)
         columns, _ = non_negative(posterior(moments, roughness(_LEVELS), self.hyper))
-        return left_of(grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
+        return left_of(data.grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
 
 
 def left_of(model: Preisach, run: Run) -> np.ndarray:
@@ -110,9 +106,9 @@ def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequ
     own = [_rms(left_of(one, run)[run.fitted]) for one, run in zip(models, runs, strict=True)]
     together = [_rms(left_of(model, run)[run.fitted]) for run in runs]
     if len(runs) > 1 and _pooled(together, runs) > _TIMES * _pooled(own, runs):
-        gains = [_gain(left_of(model, run), run) for run in runs]
-        low, high = int(np.argmin(gains)), int(np.argmax(gains))
-        ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
+        left_um = [left_of(model, run) for run in runs]
+        said = [(run.displacement_um - one)[run.fitted] for run, one in zip(runs, left_um, strict=True)]
+        high, low, ratio = compare_gains(said, [one[run.fitted] for run, one in zip(runs, left_um, strict=True)])
         names = ", ".join(run.record.source for run in runs)
         strokes = [float(np.ptp(run.displacement_um[run.fitted])) for run in runs]
         apart = ", ".join(f"{100 * rms / stroke:.2g}" for rms, stroke in zip(own, strokes, strict=True))
@@ -236,13 +232,6 @@ def _profile(residual: Callable[[float], np.ndarray]) -> tuple[float, float, flo
     sd = float(np.sqrt(after / bend / count))
     before = cost(0.0)
     return at, sd, before**0.5, after**0.5, count * float(np.log(before / after)) if after > 0 else np.inf
-
-
-def _gain(left_um: np.ndarray, run: Run) -> float:
-    """How much further a run moves than the model says."""
-    left, said = left_um[run.fitted], (run.displacement_um - left_um)[run.fitted]
-    said = said - said.mean()
-    return 1 + float(said @ left / max(said @ said, 1e-300))
 
 
 def _rms(values: np.ndarray) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._misfit import Misfit
+from fits.loop._misfit import Misfit, compare_gains
 from fits.loop._run import Run
 from fits.stage._run import residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
@@ -119,7 +119,7 @@ def refuse_unseen(
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
         if noise[loudest] > _LOUD * min(noise):
-            compare_gains(stage, solved.runs, refuse=True)
+            check_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
             what = (
                 f"{noise[loudest]:.3g} um of it stay unexplained, {noise[loudest] / min(noise):.3g} times as much as "
@@ -231,24 +231,13 @@ def coordinates_slope(coordinates: Coordinates[Stage], z: np.ndarray) -> tuple[n
     return np.asarray(value), np.asarray(slope)
 
 
-def _gains(stage: Stage, runs: Sequence[Run]) -> np.ndarray:
-    """How much each run moves for what the stage says it moves."""
-    gains = []
-    for run in runs:
-        predicted, left = simulate_stage(stage, run)[run.fitted], residual_of(stage, run)[run.fitted]
-        predicted = predicted - predicted.mean()
-        gains.append(1 + float(predicted @ left / (predicted @ predicted)))
-    return np.asarray(gains)
-
-
-def compare_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
+def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
     """Find runs that move further, or less far, than the others under the same voltage: a remark, if any.
 
     With `refuse`, too large a difference is a `DataError`, as such runs cannot be of one rig.
     """
-    gains = _gains(stage, runs)
-    low, high = int(np.argmin(gains)), int(np.argmax(gains))
-    ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
+    predicted = [simulate_stage(stage, run)[run.fitted] for run in runs]
+    high, low, ratio = compare_gains(predicted, [residual_of(stage, run)[run.fitted] for run in runs])
     one, other = runs[high].record.source, runs[low].record.source
     if refuse and ratio > 1 + _REFUSED:
         raise DataError(_not_one_rig(one, other, ratio))

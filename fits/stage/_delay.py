@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
-from fits.io._record import Record
 from fits.loop._design import columns_of
 from fits.loop._misfit import Misfit, misfits
 from fits.loop._result import FitError, FitResult
@@ -81,9 +80,9 @@ class Undelayed:
     solved: Solved
     precision: Precision
 
-    def left(self, records: Sequence[Record]) -> list[Misfit]:
+    def left(self) -> list[Misfit]:
         """What stays of each run without its delay."""
-        return misfits(records, self.solved.residuals_um, [run.fitted for run in self.solved.runs])
+        return misfits(self.solved.runs, self.solved.residuals_um)
 
     def words(self) -> str:
         """Say what the columns of the runs look like."""

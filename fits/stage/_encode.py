@@ -72,11 +72,7 @@ def _classes() -> dict[str, type[eqx.Module]]:
     return (
         {name: cls for name, cls in modules.items() if not inspect.isabstract(cls)}
         | {plugin.__name__: plugin for plugin in plugins}
-        | {
-            "Grid": Grid,
-            "StageUncertainty": StageUncertainty,
-            "Uncertainty": Uncertainty,
-        }
+        | {"Grid": Grid, "StageUncertainty": StageUncertainty, "Uncertainty": Uncertainty}
     )
 
 

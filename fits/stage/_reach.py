@@ -53,10 +53,7 @@ class Reach:
         """Let a fit's intervals reach these, and say first what pulls it and what to do about that."""
         parameters = tuple(
             replace(
-                p,
-                sd=float(np.hypot(p.sd, v - p.value)),
-                lower=min(p.lower, float(a)),
-                upper=max(p.upper, float(b)),
+                p, sd=float(np.hypot(p.sd, v - p.value)), lower=min(p.lower, float(a)), upper=max(p.upper, float(b))
             )
             for p, v, a, b in zip(fit.parameters, self.values, self.low, self.high, strict=True)
         )
