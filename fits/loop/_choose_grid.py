@@ -4,15 +4,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from optimistix import RESULTS
 from scipy import signal
 
 from fits.io._errors import DataError
-from fits.loop._design import Grid
 from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, solve_grid
-from fits.loop._moments import Data, gather
+from fits.loop._moments import Data, gather, grid_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, FitStatus, LevelTrial
 from fits.loop._run import Run, simulate_run
@@ -56,12 +54,11 @@ def choose_grid(
     Returns the stroke in um, which is the unit of the columns, the grid that is kept, and all that were tried. A
     `DataError` where there is no loop to fit, a `FitError` where a solver fails.
     """
-    lower, upper = jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V)
     stroke = max(_stroke(run) for run in runs)
 
     def trial(n: int, hyper: Hyper) -> GridTrial:
         progress(f"{n} levels")
-        return try_grid(gather(Grid(lower, upper, n), runs), runs, stroke, hyper, levels is None)
+        return try_grid(gather(grid_of(runs, n), runs), runs, stroke, hyper, levels is None)
 
     digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
     tried, trials = _resolve(trial, levels, finest, _ROUNDED * digit / 12**0.5)
@@ -178,8 +175,7 @@ def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list
     """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid."""
     progress("weighing outliers")
     stroke = max(_stroke(run) for run in runs)
-    grid = Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), LADDER[0])
-    hyper = Hyper.start()
+    grid, hyper = grid_of(runs, LADDER[0]), Hyper.start()
     for _ in range(_REWEIGHED):
         solution = solve_grid(gather(grid, runs), stroke, 1.0, hyper)
         _check(solution.result)

@@ -14,7 +14,7 @@ from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits.loop._design import Grid, columns_of
 from fits.loop._grid import grid_estimate
 from fits.loop._history import estimate_start
-from fits.loop._moments import Data, gather
+from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._prior import interpolation
 from fits.loop._result import FitResult, FitStatus, RunReport
@@ -103,8 +103,7 @@ def fit(
             remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try --levels 100")
     else:
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
-            grid = Grid(tried.data.grid.lower_V, tried.data.grid.upper_V, _SHAPE_LEVELS)
-            tried = try_grid(gather(grid, runs), runs, stroke, tried.solution.hyper, True)
+            tried = try_grid(gather(grid_of(runs, _SHAPE_LEVELS), runs), runs, stroke, tried.solution.hyper, True)
         smooth, key = tried.solution.hyper, jax.random.key(seed)
         found, agree = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
         if not agree:
@@ -124,13 +123,12 @@ def fit(
     progress("comparing with the measurement")
     figures = {"noise_um": found.noise_um, "correlation_samples": found.correlation, "substeps": 1}
     reports = [
-        _report(_with_offset(model, offset), run, found.noise_um, **figures)
-        for offset, run in zip(offsets, runs, strict=True)
+        _report(_with_offset(model, offset), run, found, **figures) for offset, run in zip(offsets, runs, strict=True)
     ]
     for record in aside:
         run = prepare_run(record, range_V, initial, holdout=1.0)
         off = float(np.mean((run.displacement_um - simulate_run(model, run))[run.known]))
-        reports.append(_report(_with_offset(model, off), run, found.noise_um))
+        reports.append(_report(_with_offset(model, off), run, found))
     return FitResult(
         model=_with_offset(model, offsets[0]),
         uncertainty=_uncertainty(tried.data, found),
@@ -191,8 +189,8 @@ def _with_offset(model: Preisach, offset_um: float) -> Preisach:
     return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offset_um))
 
 
-def _report(model: Preisach, run: Run, noise_um: float, **figures: Any) -> RunReport:
-    start = run.start if run.known.all() else estimate_start(model, run, noise_um)
+def _report(model: Preisach, run: Run, found: Estimate, **figures: Any) -> RunReport:
+    start = run.start if run.known.all() else estimate_start(model, run, found.noise_um)
     return RunReport.of(run, simulate_run(model, run), float(model.offset_um), start, **figures)
 
 

@@ -87,6 +87,11 @@ def blocks_of(run: Run) -> np.ndarray:
     return np.where(run.fitted, order * BLOCKS // max(1, run.fitted.sum()), -1)
 
 
+def grid_of(runs: Sequence[Run], levels: int) -> Grid:
+    """A grid over the range of some runs, which is that of each."""
+    return Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), levels)
+
+
 def gather(grid: Grid, runs: Sequence[Run]) -> Data:
     """Pass runs with displacement through the regression once."""
     totals, means = [], []

@@ -8,7 +8,7 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._misfit import Misfit
+from fits.loop._misfit import Misfit, compare_gains
 from fits.loop._run import Run
 from fits.stage._run import residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
@@ -39,13 +39,7 @@ _POLES = ("time_constant_s", "natural_frequency_Hz")
 
 
 def refuse_slopes(records: Sequence[Record]) -> None:
-    """Refuse slow runs over one range of voltage that move differently far.
-
-    Raises
-    ------
-    DataError
-        If they cannot be of one rig.
-    """
+    """Refuse, in a `DataError`, slow runs over one range of voltage that move differently far."""
     spans = [
         (float(np.ptp(record.voltage_V)), float(np.ptp(record.displacement_um)), speed_Hz(record), record.source)
         for record in records
@@ -85,30 +79,12 @@ def refuse_unseen(
     fast: bool,
     spare: bool = False,
 ) -> str | None:
-    """Refuse runs that do not show the dynamics they are fitted with.
+    """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with.
 
-    Parameters
-    ----------
-    stage
-        With the poles that explain the runs best.
-    coordinates, solved
-        Of these poles, the hysteresis being given.
-    drives
-        What the hysteresis alone would give, for each run, shape `(n,)`.
-    fast
-        Whether a run is faster than the others.
-    spare
-        Whether a mechanics may be left out where a driver alone may do.
-
-    Returns
-    -------
-    str or None
-        Name of a mechanics that the runs do not show, though they are sampled finely enough: leave it out.
-
-    Raises
-    ------
-    DataError
-        If no run moves fast enough, or none is sampled fast enough.
+    The coordinates and the solution are those of the poles that explain the runs best, the hysteresis being given;
+    `drives` are what it alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the
+    others. Where a mechanics may be left out (`spare`) that the runs do not show, though they are sampled finely
+    enough, its name is returned instead.
     """
     information = marginal_information(
         solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
@@ -143,7 +119,7 @@ def refuse_unseen(
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
         if noise[loudest] > _LOUD * min(noise):
-            compare_gains(stage, solved.runs, refuse=True)
+            check_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
             what = (
                 f"{noise[loudest]:.3g} um of it stay unexplained, {noise[loudest] / min(noise):.3g} times as much as "
@@ -175,13 +151,7 @@ def refuse_unseen(
 
 
 def refuse_coarse(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
-    """Refuse a fitted resonance that the runs cannot show: they are sampled too slowly for it, and leave much.
-
-    Raises
-    ------
-    DataError
-        If they are.
-    """
+    """Refuse, in a `DataError`, a resonance that runs cannot show: sampled too slowly for it, they leave much."""
     finest = max(run.rate_Hz for run in runs)
     for part in stage.parts:
         if not isinstance(part, Mechanics):
@@ -211,17 +181,7 @@ def _resolved(run: Run) -> bool:
 def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> tuple[str, float] | None:
     """Find poles that no piezo stage has: the time is probably in another unit than its column says.
 
-    Parameters
-    ----------
-    names, values
-        Parameters of the fitted stage, in their units.
-    sources
-        The runs.
-
-    Returns
-    -------
-    tuple or None
-        A sentence, and what a time in the unit it suspects has to be multiplied by to be in s.
+    Returns a sentence, and what a time in the unit it suspects has to be multiplied by to be in s; None without such.
     """
     for name, value in zip(names, values, strict=True):
         field = name.rpartition(".")[2]
@@ -271,41 +231,13 @@ def coordinates_slope(coordinates: Coordinates[Stage], z: np.ndarray) -> tuple[n
     return np.asarray(value), np.asarray(slope)
 
 
-def _gains(stage: Stage, runs: Sequence[Run]) -> np.ndarray:
-    """How much each run moves for what the stage says it moves."""
-    gains = []
-    for run in runs:
-        predicted, left = simulate_stage(stage, run)[run.fitted], residual_of(stage, run)[run.fitted]
-        predicted = predicted - predicted.mean()
-        gains.append(1 + float(predicted @ left / (predicted @ predicted)))
-    return np.asarray(gains)
+def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
+    """Find runs that move further, or less far, than the others under the same voltage: a remark, if any.
 
-
-def compare_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
-    """Find runs that move further, or less far, than the others under the same voltage.
-
-    Parameters
-    ----------
-    stage
-        Fitted to all of them.
-    runs
-        The runs.
-    refuse
-        Whether too large a difference is an error.
-
-    Returns
-    -------
-    list of str
-        A remark, if there is anything to say.
-
-    Raises
-    ------
-    DataError
-        If they cannot be of one rig.
+    With `refuse`, too large a difference is a `DataError`, as such runs cannot be of one rig.
     """
-    gains = _gains(stage, runs)
-    low, high = int(np.argmin(gains)), int(np.argmax(gains))
-    ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
+    predicted = [simulate_stage(stage, run)[run.fitted] for run in runs]
+    high, low, ratio = compare_gains(predicted, [residual_of(stage, run)[run.fitted] for run in runs])
     one, other = runs[high].record.source, runs[low].record.source
     if refuse and ratio > 1 + _REFUSED:
         raise DataError(_not_one_rig(one, other, ratio))

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
-from fits.io._record import Record
 from fits.loop._design import columns_of
 from fits.loop._misfit import Misfit, misfits
 from fits.loop._result import FitError, FitResult
@@ -75,23 +74,15 @@ class Delay:
 
 @dataclass(frozen=True)
 class Undelayed:
-    """A fit of the same runs with their delays taken out.
-
-    Attributes
-    ----------
-    delays
-        Of the runs that have one.
-    solved, precision
-        The fit without them.
-    """
+    """A fit of the same runs without their delays, and the delays of those that have one."""
 
     delays: tuple[Delay, ...]
     solved: Solved
     precision: Precision
 
-    def left(self, records: Sequence[Record]) -> list[Misfit]:
+    def left(self) -> list[Misfit]:
         """What stays of each run without its delay."""
-        return misfits(records, self.solved.residuals_um, [run.fitted for run in self.solved.runs])
+        return misfits(self.solved.runs, self.solved.residuals_um)
 
     def words(self) -> str:
         """Say what the columns of the runs look like."""
@@ -101,25 +92,11 @@ class Undelayed:
 def take_out_delays(
     plan: Plan, problem: Problem, solved: Solved, precision: Precision | None, left: Sequence[Misfit]
 ) -> Undelayed | None:
-    """Look for delays in what a fit leaves, and fit again without them.
+    """Look for delays in what a fit leaves of each run, and fit again without them; None where that does not help.
 
     A small one shows as the derivative of the residual with respect to a delay, whatever the parameters may do
     beside it (the score test of Rao 1948). In runs that are far from noise the measured frequency response is
-    searched for larger ones.
-
-    Parameters
-    ----------
-    plan, problem
-        What was asked for.
-    solved, precision
-        The fit; without a precision, only large delays are looked for.
-    left
-        What it leaves of each run.
-
-    Returns
-    -------
-    Undelayed or None
-        None where no run has a delay, or taking it out does not help.
+    searched for larger ones; without a precision, only these are looked for.
     """
     # Between two samples a command in steps has no place where it could be shifted to, and without a resonance to
     # measure it by a delay is part of the lag.
@@ -205,10 +182,7 @@ def refuse_delays(undelayed: Undelayed | None) -> None:
 def own_up(fit: FitResult[Stage], undelayed: Undelayed) -> FitResult[Stage]:
     """Name the delays of a fit, and widen the intervals by what they did to its parameters.
 
-    Raises
-    ------
-    DataError
-        If a parameter moves so much that the fit says nothing.
+    A `DataError` if a parameter moves so much that the fit says nothing.
     """
     reach, said = Reach.of(undelayed.precision), undelayed.words()
     if ruined := reach.ruined(fit):

@@ -13,11 +13,7 @@ from microid import Preisach, Stage
 
 
 def draw_plants(
-    model: Preisach | Stage,
-    uncertainty: Uncertainty | StageUncertainty | None,
-    count: int,
-    *,
-    seed: int = 0,
+    model: Preisach | Stage, uncertainty: Uncertainty | StageUncertainty | None, count: int, *, seed: int = 0
 ) -> tuple[Stage, ...]:
     """Draw stages from the covariance of a fit.
 

@@ -29,21 +29,9 @@ _DTYPES = ("float32", "float64", "int32", "int64", "bool")
 
 
 def encode(value: Any, unit: str = "1", packed: Collection[str] = ()) -> Any:
-    """Turn a module, or what one of its fields may hold, into JSON values.
+    """Turn a module, or what one of its fields may hold, into JSON values; arrays in `packed` fields into base64.
 
-    Parameters
-    ----------
-    value
-        Module, array, tuple, string, number or None.
-    unit
-        Unit of the arrays in it.
-    packed
-        Names of array fields that are written in base64.
-
-    Raises
-    ------
-    DataError
-        If something in it cannot be written; the message says only what.
+    A `DataError` says what in it cannot be written.
     """
     if isinstance(value, eqx.nn.MLP):
         return _encode_network(value, unit)
@@ -61,22 +49,7 @@ def encode(value: Any, unit: str = "1", packed: Collection[str] = ()) -> Any:
 
 
 def decode(item: Any, where: str, spec: ParameterSpec | None = None) -> Any:
-    """Invert `encode`.
-
-    Parameters
-    ----------
-    item
-        From JSON.
-    where
-        Begins the error messages.
-    spec
-        What is known of the arrays in it.
-
-    Raises
-    ------
-    DataError
-        If anything is not as `encode` writes it.
-    """
+    """Invert `encode`; a `DataError` that begins with `where` if anything is not as `encode` writes it."""
     if isinstance(item, list):
         return tuple(decode(entry, f"{where}[{index}]", spec) for index, entry in enumerate(item))
     if isinstance(item, int | float) and abs(item) > _LARGEST_PLAIN:
@@ -99,11 +72,7 @@ def _classes() -> dict[str, type[eqx.Module]]:
     return (
         {name: cls for name, cls in modules.items() if not inspect.isabstract(cls)}
         | {plugin.__name__: plugin for plugin in plugins}
-        | {
-            "Grid": Grid,
-            "StageUncertainty": StageUncertainty,
-            "Uncertainty": Uncertainty,
-        }
+        | {"Grid": Grid, "StageUncertainty": StageUncertainty, "Uncertainty": Uncertainty}
     )
 
 

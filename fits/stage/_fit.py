@@ -104,12 +104,11 @@ def fit_stage(
     asked = stage, levels, holdout, initial, loss, progress
     found = solve_stage(records, *asked)
     runs, sources = found.solved.runs, [record.source for record in records]
-    known = found.solved.residuals_um, [run.fitted for run in runs]
-    left = misfits(records, *known)
+    left = misfits(runs, found.solved.residuals_um)
     progress("looking for delays")
     undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
     # What is sampled too slowly may look late; a delay is believed that leaves little else.
-    if undelayed is None or any(one.far for one in undelayed.left(records)):
+    if undelayed is None or any(one.far for one in undelayed.left()):
         refuse_coarse(found.stage, runs, left)
     if found.failure is not None or found.problem.even:
         refuse_delays(undelayed)
@@ -133,7 +132,7 @@ def fit_stage(
     outliers = leave_outliers(found.plan, found.problem, found.solved)
     if outliers is not None:
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
-    odd = remarks_on(records, *known, robust=loss == "huber")
+    odd = remarks_on(runs, found.solved.residuals_um, robust=loss == "huber")
     unit = implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
     if unit is not None:
         summary = Reach.in_unit(summary, unit[1]).widen(
@@ -148,26 +147,8 @@ def fit_stage(
 class Solution:
     """What the fit of a stage found, before it is compared with anything.
 
-    Attributes
-    ----------
-    stage
-        The fitted stage, without an offset.
-    chain
-        The same in the coordinates of its fit.
-    solved
-        Where the fit ended.
-    precision
-        How sure it is.
-    stroke_um
-        Unit of the columns of the grid.
-    range_V
-        Range of the commands.
-    remarks
-        What the user should know, one sentence each.
-    plan, problem
-        What was asked for, and where the fit began.
-    failure
-        Why this is only the best place that was found; None where the fit converged.
+    The stage has no offset; `stroke_um` is the unit of its columns. The problem is where the fit began. `failure`
+    says why this is only the best place that was found; None where the fit converged.
     """
 
     stage: Stage

@@ -23,16 +23,9 @@ _PIECE = 2048
 
 @dataclass(frozen=True)
 class Chain:
-    """A stage in the coordinates of its fit.
+    """A stage in the coordinates of its fit: of all parameters but those of the grid and the offsets.
 
-    Attributes
-    ----------
-    coordinates
-        Of all parameters but those of the grid and the offsets.
-    place
-        Where the hysteresis stands in the chain; None where no grid is fitted.
-    grid
-        Its columns; None where no grid is fitted.
+    The grid stands at a place in the chain; both are None where no grid is fitted.
     """
 
     coordinates: Coordinates[Stage]
@@ -130,16 +123,10 @@ _without = eqx.filter_jit(without)
 
 @dataclass(frozen=True)
 class RunSums:
-    """What one run adds to the regression.
+    """What one run adds to the regression on columns and coordinates, its nuisance parameters eliminated.
 
-    Attributes
-    ----------
-    moments
-        Of columns and coordinates, the run's nuisance parameters eliminated.
-    mean
-        Mean of the rows over the fitted samples, shape `(D + p,)`.
-    residual_um
-        Measurement less prediction at all samples, the run's nuisance parameters taken off, shape `(n,)`.
+    `mean` is that of the rows over the fitted samples, shape `(D + p,)`; `residual_um` is measurement less prediction
+    at all samples, the nuisance parameters taken off, shape `(n,)`.
     """
 
     moments: Moments
@@ -150,18 +137,9 @@ class RunSums:
 def run_sums(
     chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"], run: Run, free: bool = True
 ) -> RunSums:
-    """Pass one run through the regression.
+    """Pass one run through the regression, linearised at some coordinates and columns.
 
-    Parameters
-    ----------
-    chain
-        The stage.
-    z, columns_um
-        Where it is linearised.
-    run
-        Prepared, with its samples weighed.
-    free
-        Whether the columns are part of the regression, or left as they are.
+    The columns are part of it only if they are `free`.
     """
     samples, size = run.samples, chain.size if free else 0
     out, slope, own = linearise(chain, z, columns_um, run)
@@ -202,22 +180,11 @@ def along(
     directions: tuple[np.ndarray, np.ndarray],
     reduce: Callable[[np.ndarray], np.ndarray] = lambda moved: moved,
 ) -> np.ndarray:
-    """Move coordinates and columns along directions, to first order.
+    """Move coordinates and columns along `k` directions, to first order: changes of the displacement, shape `(n, k)`.
 
-    Parameters
-    ----------
-    chain, z, columns_um, run
-        The run, and where it is linearised: without columns, at those that the stage has, whose grid may then differ
-        from the chain's.
-    directions
-        Of the columns, shape `(D, k)`, and of the coordinates, shape `(p, k)`.
-    reduce
-        What is kept of the changes of each piece, shape `(samples, k)`.
-
-    Returns
-    -------
-    Array
-        Changes of the displacement, or what is kept of them, for all samples, shape `(n, ...)`.
+    The directions are those of the columns, shape `(D, k)`, and of the coordinates, shape `(p, k)`. Without columns
+    the run is linearised at those that the stage has, whose grid may then differ from the chain's. Of the changes of
+    each piece, shape `(samples, k)`, only what `reduce` makes of them is kept.
     """
     _, slope, _ = linearise(chain, z, columns_um, run)
     moved = [
@@ -230,8 +197,7 @@ def along(
 def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the rows of the columns, piece by piece, with the sample that each piece begins at.
 
-    They are not refined: as directions to move in they are good enough, and only the residual decides where the fit
-    ends.
+    They are not refined: good enough as directions to move in, while only the residual decides where the fit ends.
     """
     samples, grid, n = run.samples, chain.grid, len(run.record)
     if grid is None or chain.place is None or not free:
@@ -258,25 +224,11 @@ def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterato
 
 
 def split_moments(total: Moments, size: int, damping: float) -> tuple[Moments, np.ndarray, np.ndarray]:
-    """Eliminate the last unknowns of a regression.
+    """Eliminate the last unknowns of a regression, all but the first `size`.
 
-    Parameters
-    ----------
-    total
-        Of all unknowns.
-    size
-        Number of those that stay, `D`.
-    damping
-        Share of the diagonal that is added to the eliminated ones' own block (Marquardt).
-
-    Returns
-    -------
-    reduced
-        Moments of those that stay, with the best of the others for each.
-    answer
-        Best of the others without those that stay, shape `(p,)`.
-    follow
-        What it loses for each of those, shape `(p, D)`.
+    Returns the moments of those that stay, with the best of the others for each; the best of the others without them,
+    shape `(p,)`; and what that loses for each of them, shape `(p, D)`. Marquardt's damping is the share of the
+    diagonal that is added to the eliminated ones' own block.
     """
     gram, cross = np.asarray(total.gram), np.asarray(total.cross_um)
     own = gram[size:, size:]

@@ -84,16 +84,7 @@ def motion(
 ) -> tuple[Ranges, np.ndarray]:
     """Extremes of what a command makes a stage do, between its samples as well.
 
-    Parameters
-    ----------
-    stage
-        With or without effects.
-    record
-        The command, and further columns that effects need; the displacement is not looked at.
-    range_V
-        Range of the switching voltages of the hysteresis, as commands.
-    initial
-        Memory before the first sample, one of `INITIAL_STATES`.
+    The displacement of the record is not looked at. `range_V` is that of the switching voltages, as commands.
 
     Returns
     -------
@@ -129,18 +120,8 @@ def predicted_ranges(
 ) -> Ranges:
     """What a command is, and makes a model do, between its samples too where the model rings.
 
-    Parameters
-    ----------
-    model
-        From a fit or a model file.
-    program
-        The command.
-    displacement_um
-        What the model does at the samples, shape `(n,)`.
-    initial
-        Memory before the first sample.
-    every
-        Whether velocity, acceleration and current are asked for as well.
+    The displacement is what the model does at the samples, shape `(n,)`. Velocity, acceleration and current are given
+    if `every` range is asked for.
     """
     ranges = measured_ranges(replace(program, displacement_um=displacement_um))
     stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
@@ -178,18 +159,8 @@ def reached_by(
 ) -> tuple[Ranges, list[float]]:
     """What records have shown of a rig: the displacement as measured, its derivatives as a fitted stage has them.
 
-    Noise would make derivatives of the measurement larger than anything the rig did.
-
-    Parameters
-    ----------
-    stage
-        Fitted to the records.
-    records
-        With displacements.
-    range_V, states
-        See `motion`; a state for each record.
-    known
-        Samples whose response does not depend on an unknown past, one array of shape `(n,)` for each record.
+    Noise would make derivatives of the measurement larger than anything the rig did. Each record has a state before
+    it and samples that do not depend on an unknown past, shape `(n,)`; see `motion`.
 
     Returns
     -------

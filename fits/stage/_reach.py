@@ -20,13 +20,7 @@ _RUINED = 0.5
 
 @dataclass(frozen=True)
 class Reach:
-    """Where the parameters of a stage come out without something.
-
-    Attributes
-    ----------
-    values, low, high
-        The parameters and the ends of their 95 % intervals, shape `(p,)`.
-    """
+    """Where the parameters of a stage come out without something, and the ends of their 95 % intervals, `(p,)`."""
 
     values: np.ndarray
     low: np.ndarray
@@ -56,21 +50,10 @@ class Reach:
         ]
 
     def widen(self, fit: FitResult[Stage], said: str, remedy: str = "") -> FitResult[Stage]:
-        """Let a fit's intervals reach these, and say so first.
-
-        Parameters
-        ----------
-        fit
-            With all that pulls it.
-        said, remedy
-            What pulls it, and what to do about that where no other remark says so.
-        """
+        """Let a fit's intervals reach these, and say first what pulls it and what to do about that."""
         parameters = tuple(
             replace(
-                p,
-                sd=float(np.hypot(p.sd, v - p.value)),
-                lower=min(p.lower, float(a)),
-                upper=max(p.upper, float(b)),
+                p, sd=float(np.hypot(p.sd, v - p.value)), lower=min(p.lower, float(a)), upper=max(p.upper, float(b))
             )
             for p, v, a, b in zip(fit.parameters, self.values, self.low, self.high, strict=True)
         )
@@ -83,17 +66,7 @@ class Reach:
 def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[str], Reach] | None:
     """Fit again without readings that jump out; the files that have such, and where the parameters come out.
 
-    Parameters
-    ----------
-    plan, problem
-        What was asked for.
-    solved
-        The fit with all readings.
-
-    Returns
-    -------
-    tuple or None
-        None where there are none, or where a robust loss weighs them less already, or where that fit fails.
+    None where there are none, or where a robust loss weighs them less already, or where that fit fails.
     """
     bad = [outlying(one.residual_um, run.fitted) for one, run in zip(solved.sums, solved.runs, strict=True)]
     sources = [run.record.source for one, run in zip(bad, solved.runs, strict=True) if one.any()]

@@ -33,16 +33,10 @@ _LEADING, _REFINED, _KEPT = 200, 4, 3
 
 @dataclass(frozen=True)
 class MeasuredResponse:
-    """Frequency response of the linear part of a stage, as the runs show it.
+    """Frequency response of the linear part of a stage, as the runs show it, shape `(f,)` each.
 
-    Attributes
-    ----------
-    frequency_Hz
-        Shape `(f,)`.
-    response
-        Displacement per displacement that the hysteresis alone would give, complex, shape `(f,)`.
-    coherence
-        Share of the power that follows the input, shape `(f,)`.
+    It is the complex displacement per displacement that the hysteresis alone would give; the coherence is the share
+    of the power that follows the input.
     """
 
     frequency_Hz: np.ndarray
@@ -51,14 +45,9 @@ class MeasuredResponse:
 
 
 def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
-    """Estimate the frequency response from a drive to the displacement of a run (Welch).
+    """Estimate the frequency response from a drive, shape `(n,)`, to the displacement of a run (Welch).
 
-    Parameters
-    ----------
-    run
-        Its fitted samples are used, from the first to the last.
-    drive
-        What goes in, shape `(n,)`.
+    The fitted samples are used, from the first to the last.
     """
     which = np.flatnonzero(run.fitted)
     piece = slice(which[0], which[-1] + 1)
@@ -90,19 +79,10 @@ def _thinned(frequency: np.ndarray, size: np.ndarray, seen: np.ndarray) -> np.nd
 
 
 def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[Stage]:
-    """Find poles that explain measured frequency responses.
+    """Find poles that explain measured frequency responses, each of which has a gain of its own.
 
-    Parameters
-    ----------
-    stage
-        Its drivers and mechanics, where they are not frozen, are replaced; other linear parts are taken as they are.
-    responses
-        One per run; each has a gain of its own.
-
-    Returns
-    -------
-    list of Stage
-        Distinct candidates, the best first; the stage itself where the responses say nothing.
+    Drivers and mechanics that are not frozen are replaced; other linear parts are taken as they are. Returns distinct
+    candidates, the best first; the stage itself where the responses say nothing.
     """
     free = [
         (name, part)
@@ -132,10 +112,7 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
 
 
 def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) -> list[float]:
-    """Order delays by how well some poles of a stage and the delay explain a measured response, the best first.
-
-    Of neighbours only the best is kept.
-    """
+    """Order delays, the best first, by how well they and some poles explain a response; of neighbours the best."""
     parts = [part for part in stage.parts if isinstance(part, Driver | Mechanics)]
     if not parts or len(response.frequency_Hz) < _LINES:
         return []

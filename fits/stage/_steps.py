@@ -16,7 +16,7 @@ from fits.loop._fit_checks import without_impulses
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, prepare_run, simulate_run
-from fits.stage._checks import UNSEEN, WORTH, compare_gains, gained, refuse_slopes, refuse_unseen, speed_Hz
+from fits.stage._checks import UNSEEN, WORTH, check_gains, gained, refuse_slopes, refuse_unseen, speed_Hz
 from fits.stage._moments import Chain
 from fits.stage._run import place_of_hysteresis, simulate_stage
 from fits.stage._solve import Solved, solve_chain
@@ -158,7 +158,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     if spare is not None:
         full = Problem(stage, chain, solved.z, columns, hyper, stroke, ()), solved
         return replace(_spared(plan, asked, spare, levels, finest), full=full)
-    remarks = compare_gains(found, runs)
+    remarks = check_gains(found, runs)
     return Problem(stage, chain, solved.z, columns, hyper, stroke, tuple(remarks))
 
 

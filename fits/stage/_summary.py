@@ -10,7 +10,7 @@ import numpy as np
 
 from fits.loop._result import FitResult, FitStatus, ParameterEstimate, RunReport
 from fits.loop._run import Run
-from fits.stage._checks import compare_gains, coordinates_slope
+from fits.stage._checks import check_gains, coordinates_slope
 from fits.stage._run import residual_of, simulate_stage
 from fits.stage._uncertainty import Precision
 from fits.stats._identifiability import unseen_directions
@@ -29,7 +29,7 @@ def summarise(stage: Stage, precision: Precision, held: Sequence[Run]) -> FitRes
     A `DataError` if the runs turn out not to be of one rig.
     """
     coordinates, solved = precision.chain.coordinates, precision.solved
-    remarks = compare_gains(stage, solved.runs, refuse=True)
+    remarks = check_gains(stage, solved.runs, refuse=True)
     covariance = precision.covariance(precision.influence())
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     names = [
