@@ -1,5 +1,6 @@
 """Models of a piezo-driven micro-positioner as pure, differentiable JAX functions."""
 
+from microid._batch import respond_all as respond_all
 from microid._everett import Everett as Everett
 from microid._everett import everett as everett
 from microid._forest import forest_sum as forest_sum
@@ -43,11 +44,13 @@ from microid._refine import refined as refined
 from microid._reversible import Reversible as Reversible
 from microid._stage import Stage as Stage
 from microid._stage import Start as Start
+from microid.control import CONTROLLERS as CONTROLLERS
 from microid.control._base import AbstractController as AbstractController
 from microid.control._base import AbstractLinearController as AbstractLinearController
-from microid.control._bp_pid import BPPID as BPPID
-from microid.control._bp_pid import GainNetwork as GainNetwork
-from microid.control._cmac_pid import CMACPID as CMACPID
+from microid.control._base import ControlledPlant as ControlledPlant
+from microid.control._base import ControlTask as ControlTask
+from microid.control._base import Setting as Setting
+from microid.control._base import settings_of as settings_of
 from microid.control._errors import StepMetrics as StepMetrics
 from microid.control._errors import TrackingErrors as TrackingErrors
 from microid.control._errors import step_metrics as step_metrics
@@ -61,12 +64,15 @@ from microid.control._margins import Margins as Margins
 from microid.control._margins import loop_gain as loop_gain
 from microid.control._margins import margins as margins
 from microid.control._margins import require_stable as require_stable
-from microid.control._pid import PID as PID
-from microid.control._resonant_pid import ResonantPID as ResonantPID
 from microid.control._sampled import AbstractPlant as AbstractPlant
 from microid.control._sampled import SampledStage as SampledStage
 from microid.control._two_degrees import TwoDegrees as TwoDegrees
 from microid.control._two_degrees import two_degrees as two_degrees
+from microid.control.bp_pid import BPPID as BPPID
+from microid.control.bp_pid import GainNetwork as GainNetwork
+from microid.control.cmac_pid import CMACPID as CMACPID
+from microid.control.pid import PID as PID
+from microid.control.resonant import ResonantPID as ResonantPID
 from microid.densities import FAMILIES as FAMILIES
 from microid.densities import AbstractDensity as AbstractDensity
 from microid.densities._base import node_areas as node_areas

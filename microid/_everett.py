@@ -57,15 +57,19 @@ class Everett(eqx.Module):
 
     def respond(self, memory: Memory) -> Float[Array, " n"]:
         """Output along a record, zero at negative saturation (Eq. 11), in um."""
-        interval, fraction = self._place(memory.path_V)
+        place = self._place(memory.path_V)
+        total = forest_sum(self._steps(place, memory), memory.anchor)
+        return (total + self._branch(place, memory.rising))[memory.lead :]
+
+    def _steps(self, place: tuple[Int[Array, " m"], Float[Array, " m"]], memory: Memory) -> Float[Array, " m"]:
+        """What each entry of a record adds to the output of the one that its branch hangs from."""
+        interval, fraction = place
         a0, b0 = interval[memory.anchor], fraction[memory.anchor]
         up = memory.rising
         high = jnp.where(up, interval, a0), jnp.where(up, fraction, b0)
         low = jnp.where(up, a0, interval), jnp.where(up, b0, fraction)
         sign = jnp.where(up, -1.0, 1.0).astype(fraction.dtype)
-        step = sign * _window(self.window_um, *high, *low)
-        total = forest_sum(step.at[0].set(0), memory.anchor) + self._branch((interval, fraction), up)
-        return total[memory.lead :]
+        return (sign * _window(self.window_um, *high, *low)).at[0].set(0)
 
     def _place(self, voltage_V: Float[Array, " n"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
         """Interval and fraction of it; beyond the range there are no relays, so the voltage saturates."""

@@ -76,6 +76,7 @@ class LinearSystem(eqx.Module):
         signal: Float[Array, " t"],
         before: Float[Array, ""],
         hold: Hold = "first",
+        by_samples: bool = False,
     ) -> Float[Array, " t"]:
         """Respond to a sampled input, exactly for the given hold.
 
@@ -92,6 +93,9 @@ class LinearSystem(eqx.Module):
             `"first"`: the input runs in a line from sample to sample; `"zero"`: it keeps each sample until the next;
             `"smooth"`: it runs through the samples without corners, and the response is exact to the fourth order
             of the interval.
+        by_samples
+            Go from sample to sample, with one interval between all: on a CPU the fastest way for many systems that
+            are mapped over together (`jax.vmap`).
 
         Returns
         -------
@@ -117,7 +121,7 @@ class LinearSystem(eqx.Module):
         if hold == "smooth":
             bent = signal - _bend(jnp.asarray(time_s), signal)
             directly = self.gain - self.read @ self.rest
-            return self.respond(time_s, bent, before, "first") + directly * (signal - bent)
+            return self.respond(time_s, bent, before, "first", by_samples) + directly * (signal - bent)
         start = self.rest * (before - signal[0])
         first = level[0] + self.read @ start
         if signal.shape[0] == 1:
@@ -125,7 +129,8 @@ class LinearSystem(eqx.Module):
         change = jnp.diff(signal)
         time = lax.stop_gradient(jnp.asarray(time_s))
         if time.ndim == 0:
-            moved = self._on_even_times(time.astype(signal.dtype), start, change, hold)
+            even = self._by_samples if by_samples else self._on_even_times
+            moved = even(time.astype(signal.dtype), start, change, hold)
         else:
             interval = jnp.diff(time)
             mean = (time[-1] - time[0]) / interval.shape[0]
@@ -206,6 +211,21 @@ class LinearSystem(eqx.Module):
         across = jnp.broadcast_to(over, (blocks, *over.shape))
         state = recur(across, jnp.concatenate([start[None], left[:-1]]))
         return (inside @ answer + state @ later).ravel()[: change.shape[0]]
+
+    def _by_samples(
+        self, interval_s: Float[Array, ""], start: Float[Array, " n"], change: Float[Array, " k"], hold: Hold
+    ) -> Float[Array, " k"]:
+        """The same in one pass, whose states are scalars: mapped over many systems they are vectors."""
+        step, taken = (x[..., 0] for x in self.advance(interval_s[None], hold))
+
+        def visit(z: tuple[Array, ...], change: Array) -> tuple[tuple[Array, ...], Array]:
+            z = tuple(
+                sum((row[j] * z[j] for j in range(self.order)), start=-t * change)
+                for row, t in zip(step, taken, strict=True)
+            )
+            return z, sum((c * state for c, state in zip(self.read, z, strict=True)), start=jnp.zeros_like(change))
+
+        return lax.scan(visit, tuple(start), change)[1]
 
 
 def _bend(time_s: Times, signal: Float[Array, " t"]) -> Float[Array, " t"]:

@@ -1,6 +1,8 @@
 """What a part of a stage is: something that turns one sampled signal into another."""
 
 import abc
+from collections.abc import Iterable
+from functools import reduce
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -129,9 +131,14 @@ class AbstractHysteresis(AbstractPart):
         return Signal(displacement_um[1:], displacement_um[0], signal.hold)
 
 
-def _run_linear(system: LinearSystem, time_s: Times, signal: Signal) -> Signal:
-    """Pass a signal through a linear system that was at rest."""
-    values = system.respond(time_s, signal.values, signal.before, signal.hold)
+def _joined(parts: Iterable[AbstractLinear]) -> LinearSystem:
+    """Neighbouring linear parts as one system."""
+    return reduce(LinearSystem.then, (part.system() for part in parts))
+
+
+def _run_linear(system: LinearSystem, time_s: Times, signal: Signal, by_samples: bool = False) -> Signal:
+    """Pass a signal through a linear system that was at rest; see `LinearSystem.respond`."""
+    values = system.respond(time_s, signal.values, signal.before, signal.hold, by_samples)
     before = system.offset + system.gain * signal.before
     if system.order == 0:
         return Signal(values, before, signal.hold)

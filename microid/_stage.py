@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from itertools import groupby
 from typing import Any, Self
 
 import equinox as eqx
@@ -10,7 +11,16 @@ from jaxtyping import Array, Complex, Float
 
 from microid._linear import Hold, LinearSystem, Times
 from microid._param import ParameterInfo, _as_inexact, parameter_table, static
-from microid._part import AbstractHysteresis, AbstractLinear, AbstractPart, Scene, Signal, _imaginary, _run_linear
+from microid._part import (
+    AbstractHysteresis,
+    AbstractLinear,
+    AbstractPart,
+    Scene,
+    Signal,
+    _imaginary,
+    _joined,
+    _run_linear,
+)
 from microid._refine import _lines, refined
 
 # So many are exact to the last digit for any part; more take time and memory only.
@@ -144,13 +154,9 @@ class Stage(eqx.Module):
     def _links(self) -> list[LinearSystem | AbstractPart]:
         """The parts, with neighbouring linear ones joined."""
         links: list[LinearSystem | AbstractPart] = []
-        for part in self.parts:
-            if not isinstance(part, AbstractLinear):
-                links.append(part)
-            elif links and isinstance(links[-1], LinearSystem):
-                links[-1] = links[-1].then(part.system())
-            else:
-                links.append(part.system())
+        for linear, group in groupby(self.parts, lambda part: isinstance(part, AbstractLinear)):
+            parts: list[Any] = list(group)
+            links += [_joined(parts)] if linear else parts
         return links
 
     def with_substeps(self, substeps: int) -> Self:

@@ -166,7 +166,7 @@ def test_resonators_are_at_the_frequency_of_the_reference(rng):
     assert float(sweep.job._controllers.numbers["frequency_Hz"]) == pytest.approx(frequency, rel=1e-3)
     # What is stated is not made around the PID controller.
     own = made("resonant", "resonant_V_per_um_s = 12.0\nlead_deg = 30.0", sine).job._controllers
-    assert own.stage is None
+    assert own.plant is None
     assert float(own.at({}).lead_deg[0]) == 30.0
 
 

@@ -82,7 +82,7 @@ compute_chunk(read_sweep(folder / "simulate.toml"), 0, told.append)
 print(*told)
 """
 
-# Responds on two devices, as on CPUs and as elsewhere, and to the second half alone.
+# Responds on two devices, and to the second half alone.
 _SHARDED = """
 import jax
 jax.config.update("jax_enable_x64", True)
@@ -90,25 +90,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 from fits.sweeps._devices import place
-from fits.sweeps._kernel import respond
-from fits.sweeps._stages import memory_before, nominal_stage
+from fits.sweeps._stages import memory_before, nominal_stage, respond
 
 stage, first, second = nominal_stage(), *jax.local_devices()
 frequency_Hz, voltage_V = np.linspace(80, 160, 8)[:, None], np.linspace(0, 100, 8 * 40).reshape(8, 40)
-for cpu in (True, False):
-    def moved(rows, voltage):
-        names, memory = ("mechanics.natural_frequency_Hz",), memory_before(stage, "negative")
-        return respond(stage, rows, names, (), 1e-3, voltage, memory, cpu)
 
-    found = moved(place(frequency_Hz), place(voltage_V))
-    assert found.sharding.spec == PartitionSpec("rows"), found.sharding
-    assert {shard.device: shard.index[0] for shard in found.addressable_shards} == {
-        first: slice(0, 4), second: slice(4, 8)
-    }
-    assert {shard.data.shape for shard in found.addressable_shards} == {(4, 40)}
-    alone = moved(jnp.asarray(frequency_Hz[4:]), jnp.asarray(voltage_V[4:]))
-    assert alone.devices() == {first}
-    np.testing.assert_array_equal(found[4:], alone)
+def moved(rows, voltage):
+    names, memory = ("mechanics.natural_frequency_Hz",), memory_before(stage, "negative")
+    return respond(stage, rows, names, (), jnp.asarray(1e-3), voltage, memory)
+
+found = moved(place(frequency_Hz), place(voltage_V))
+assert found.sharding.spec == PartitionSpec("rows"), found.sharding
+places = {shard.device: shard.index[0] for shard in found.addressable_shards}
+assert places == {first: slice(0, 4), second: slice(4, 8)}
+assert {shard.data.shape for shard in found.addressable_shards} == {(4, 40)}
+alone = moved(jnp.asarray(frequency_Hz[4:]), jnp.asarray(voltage_V[4:]))
+assert alone.devices() == {first}
+np.testing.assert_array_equal(found[4:], alone)
 # What cannot be shared evenly stays on one device.
 assert place(np.zeros((3, 2))).devices() == {first}
 """

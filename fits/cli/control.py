@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +27,14 @@ _FINEST, _LARGEST = 1e-9, 1e9
 _LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "overshoot_max_pct")
 
 
+def _names() -> list[str]:
+    """Controllers by the names of their files, as importing them would start JAX; the default one first."""
+    spec = importlib.util.find_spec("microid")
+    folders = [str(Path(folder) / "control") for folder in (spec.submodule_search_locations if spec else None) or ()]
+    names = [found.name.replace("_", "-") for found in pkgutil.iter_modules(folders) if found.name[0] != "_"]
+    return sorted(names, key=lambda name: (name != "pid", name))
+
+
 @click.command()
 @options.model
 @options.reference
@@ -32,10 +42,10 @@ _LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "o
 @options.plots("plots")
 @click.option(
     "--controller",
-    type=click.Choice(["pid", "bp-pid", "cmac-pid", "resonant"]),
+    type=click.Choice(_names()),
     default="pid",
     show_default=True,
-    help="Which controller; the last three are made around a PID controller.",
+    help="Which controller; all others are made around a PID controller.",
 )
 @click.option(
     "--gains",
@@ -105,7 +115,7 @@ def control(given: Given) -> None:
     from fits.report._control import control_json, describe_control
     from fits.stage._draw_plants import draw_plants
     from fits.stage._model_file import load_model
-    from microid import Stage
+    from microid import CONTROLLERS, Stage
 
     for option, value in {
         "--noise": given.noise,
@@ -128,12 +138,14 @@ def control(given: Given) -> None:
         least = 0.0 if option == "--overshoot" else 1.0
         if bound is not None and not least <= bound <= _LARGEST:
             raise DataError(f"{option}: expected a number from {least:g} to {_LARGEST:g}, found {bound:g}.")
-    if given.frequency and given.controller != "resonant":
-        raise DataError(
-            f"--frequency: expected --controller resonant with it, found {given.controller}; leave it out."
-        )
     volts, allowed_here = parse_rig_limits(given.limits, given.limit, given.margin)
     start_jax()
+    tuned_to = [name for name, each in CONTROLLERS.items() if "frequency_Hz" in each.own]
+    if given.frequency and given.controller not in tuned_to:
+        raise DataError(
+            f"--frequency: expected --controller {' or '.join(tuned_to)} with it, found {given.controller}; leave it "
+            "out."
+        )
     keep_inputs(
         given.out,
         [given.model, given.reference] if given.gains is None else [given.model, given.reference, given.gains],
@@ -214,13 +226,15 @@ def control(given: Given) -> None:
 
 def _judged(passed: dict[str, str], stated: dict[str, float | None], kind: str, given: bool) -> list[str]:
     """What is said of limits that are passed; those that were asked for are not."""
+    from microid import CONTROLLERS
+
     remarks = []
     for option, words in passed.items():
         if stated[option] is None:
             remarks.append(f"a limit that tuning keeps by default is passed: {words} ({option})")
         elif given:
             raise DataError(f"{option}: {words}; choose other --gains, or leave them out to have them tuned.")
-        elif kind in ("bp-pid", "cmac-pid"):
+        elif CONTROLLERS[kind].learns:
             raise DataError(f"{option}: {words} while {kind} learns; relax it, or choose pid.")
         else:
             # Tuning kept it under the noise it heard.

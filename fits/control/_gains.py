@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import jax
@@ -12,34 +13,16 @@ import numpy as np
 from fits.control._tune import parameter_values
 from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
-from microid import PID, AbstractController, ResonantPID, parameter_table
+from microid import CONTROLLERS, PID, AbstractController, parameter_table, settings_of
 
 GAINS = ("proportional_V_per_um", "integral_V_per_um_s", "derivative_V_s_per_um")
-_WEIGHTS = ("reference_weight", "derivative_weight")
-_PID = (*GAINS, "filter_s", *_WEIGHTS)
-RESONATORS = ("frequency_Hz", "resonant_V_per_um_s", "lead_deg")
-_NETWORK = tuple(f"network.{side}_{what}" for side in ("hidden", "output") for what in ("weight", "threshold"))
-# What stands around the PID controller, by the kind of controller.
-_OWN: dict[str, tuple[str, ...]] = {
-    "pid": (),
-    "resonant": RESONATORS,
-    "bp-pid": (*_NETWORK, "learning_rate_per_um2", "momentum", "filter_s"),
-    "cmac-pid": ("learning_rate",),
-}
+PID_SETTINGS = {setting.name: setting for setting in settings_of(PID)}
 _Controller = TypeVar("_Controller", bound=AbstractController)
 
 
 @dataclass(frozen=True)
 class Given:
-    """Gains that are given.
-
-    Attributes
-    ----------
-    pid
-        Of the PID controller, by field.
-    others
-        Of what stands around it, by path; empty where only three numbers were given.
-    """
+    """Gains that are given: of the PID controller by field, and of what is made around it by path."""
 
     pid: Mapping[str, float]
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -48,74 +31,39 @@ class Given:
         """The PID controller, without limits."""
         return PID(**{name: jnp.asarray(x) for name, x in self.pid.items()}, interval_s=jnp.asarray(interval_s))
 
-    def resonators(self) -> tuple[np.ndarray, ...] | None:
-        """Frequencies, gains and leads, shape `(h,)` each; None where none are given.
 
-        Raises
-        ------
-        DataError
-            If not all of them are given, or their numbers differ.
-        """
-        found = [np.atleast_1d(self.others[name]) for name in RESONATORS if name in self.others]
-        if not found:
-            return None
-        if len(found) < len(RESONATORS) or len({one.shape for one in found}) > 1 or found[0].ndim != 1:
-            raise DataError(
-                f"--gains: expected {', '.join(RESONATORS)} with as many numbers each; state all or none."
-            )
-        if np.any(found[1] < 0):
-            raise DataError(f"--gains: expected {RESONATORS[1]} of 0 or more, found {found[1].min():g}.")
-        return tuple(found)
+def replaced(controller: _Controller, values: Mapping[str, np.ndarray]) -> _Controller:
+    """A controller with other values of some fields, by path; a `DataError` says which has a wrong shape or size."""
+    for row in parameter_table(controller):
+        if row.path not in values:
+            continue
+        value, low, high = values[row.path], row.spec.lower, row.spec.upper
+        if value.shape != tuple(row.shape):
+            raise DataError(f"--gains: expected {row.path} of shape {row.shape}, found {value.shape}.")
+        if value.min() < low and high == math.inf:
+            raise DataError(f"--gains: expected {row.path} of {low:g} or more, found {value.min():g}.")
+        if value.min() < low or value.max() > high:
+            raise DataError(f"--gains: expected {row.path} between {low:g} and {high:g}, found what is beyond.")
 
-    def put_into(self, kind: str, controller: _Controller) -> _Controller:
-        """Replace the parameters of a controller, but not of the PID controller within, by those that are given.
+    def replace(path: Any, leaf: Any) -> Any:
+        name = jax.tree_util.keystr(path).lstrip(".")
+        return jnp.asarray(values[name]) if name in values else leaf
 
-        Raises
-        ------
-        DataError
-            If one has another shape, or is beyond its bounds.
-        """
-        mine = {name: x for name, x in self.others.items() if name in _OWN[kind]}
-        for row in parameter_table(controller):
-            if row.path not in mine:
-                continue
-            value, low, high = mine[row.path], row.spec.lower, row.spec.upper
-            if value.shape != tuple(row.shape):
-                raise DataError(f"--gains: expected {row.path} of shape {row.shape}, found {value.shape}.")
-            if value.min() < low or value.max() > high:
-                raise DataError(f"--gains: expected {row.path} between {low:g} and {high:g}, found what is beyond.")
-
-        def replaced(path: Any, leaf: Any) -> Any:
-            name = jax.tree_util.keystr(path).lstrip(".")
-            return jnp.asarray(mine[name]) if name in mine else leaf
-
-        return jax.tree_util.tree_map_with_path(replaced, controller)
+    return jax.tree_util.tree_map_with_path(replace, controller)
 
 
 def printed_gains(controller: AbstractController, pid: PID) -> dict[str, np.ndarray]:
-    """All that makes a controller again, by path: its parameters, its resonators, and the PID controller it began as.
-
-    Parameters
-    ----------
-    controller, pid
-        The controller, and the PID controller it is or was made around.
-    """
+    """All that makes a controller again, by path: its own fields, and those of its PID controller."""
     values = parameter_values(controller)
     if isinstance(controller, PID):
         return values
     around = {f"pid.{name}": value for name, value in parameter_values(pid).items()}
-    if isinstance(controller, ResonantPID):
-        values |= {name: np.asarray(getattr(controller, name)) for name in RESONATORS}
-    return around | values
+    more = {name: np.asarray(attrgetter(name)(controller)) for name in controller.own if name not in values}
+    return around | values | more
 
 
 def read_gains(text: str) -> Given:
-    """Gains from the command line, or from a JSON file.
-
-    Parameters
-    ----------
-    text
-        Three numbers, or the name of a file as `--json` printed it, or with `gains` alone.
+    """Gains from the command line: three numbers, or a file as `--json` printed it, or with `gains` alone.
 
     Raises
     ------
@@ -133,7 +81,7 @@ def read_gains(text: str) -> Given:
     else:
         given = _read_file(text)
     for name, value in given.pid.items():
-        if not (math.isfinite(value) and (value >= 0 or name in _WEIGHTS)):
+        if not (math.isfinite(value) and value >= PID_SETTINGS[name].lower):
             raise DataError(f"--gains: expected {name} of 0 or more, found {value:g}.")
     return given
 
@@ -148,11 +96,11 @@ def _read_file(path: str) -> Given:
     if not isinstance(content, dict):
         content = {}
     prefix = "pid." if any(name.startswith("pid.") for name in content) else ""
-    fields = [f"{prefix}{name}" for name in _PID]
+    fields = [f"{prefix}{name}" for name in PID_SETTINGS]
     for name in GAINS:
         if f"{prefix}{name}" not in content:
             raise DataError(f"{path}: expected the key {prefix}{name} with a number, found none; add it.")
-    known = {*fields, *(name for names in _OWN.values() for name in names)}
+    known = {*fields, *(name for controller in CONTROLLERS.values() for name in controller.own)}
     found = {name: _numbers(path, name, value, known) for name, value in content.items()}
     for name in fields:
         if name in found and found[name].ndim:

@@ -1,38 +1,84 @@
 """Controllers of all kinds for one loop: the PID controller tuned, the others made around it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fits.control._defaults import PERIODS, bp_defaults, cmac_defaults, strongest_Hz
-from fits.control._gains import GAINS, Given
+from fits.control._gains import PID_SETTINGS, Given, replaced
 from fits.control._setup import Setup
-from fits.control._tune import tune_controller
-from fits.control._tune_problem import Goal, linear_part
+from fits.control._tune import parameter_values, tune_controller
+from fits.control._tune_problem import Goal
 from fits.control._tune_result import Tuning
-from fits.control._tune_start import relay_start, slope_array
+from fits.control._tune_start import relay_start, slope_array, steepest_slope
 from fits.io._errors import DataError
 from microid import (
-    BPPID,
-    CMACPID,
+    CONTROLLERS,
     PID,
     AbstractController,
+    ControlledPlant,
     ControlledRun,
+    ControlTask,
     Margins,
-    ResonantPID,
+    Setting,
     Stage,
     margins,
+    settings_of,
     simulate_loop,
 )
 
-_MOST_PEAK = 4.0
+_MOST_PEAK, _HALVINGS = 4.0, 20
 # Resonators that are nearer to each other than this share of their frequency fight.
 _ALIKE = 1e-3
+
+
+def own_settings(controller: type[AbstractController]) -> list[Setting]:
+    """What may be stated of a controller beside the fields of its PID controller."""
+    return [setting for setting in settings_of(controller) if setting.name not in PID_SETTINGS]
+
+
+def with_defaults(
+    settings: Collection[Setting], stated: Mapping[str, Any], task: ControlTask, place: Callable[[str], str]
+) -> tuple[dict[str, Any], list[str]]:
+    """Settings as they are stated, or else their defaults, and what is to be said of these.
+
+    Settings that the controller itself finds by its plant are left out. `place` names a setting as the user does, in
+    the sentence of the `DataError` that is raised where no default is found.
+    """
+    found: dict[str, Any] = {}
+    said = []
+    for setting in settings:
+        name, default = setting.name, setting.default
+        if name in stated:
+            found[name] = stated[name]
+        elif default is not None:
+            try:
+                found[name] = default(task) if callable(default) else default
+            except DataError as error:
+                raise DataError(f"{place(name)}: no default is found ({error}); state it.") from error
+            except ValueError as error:
+                raise DataError(f"{place(name)}: {error}; state it.") from error
+            if setting.said:
+                said.append(setting.said.format(found[name]))
+    return found, said
+
+
+def strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float | None:
+    """Frequency of the strongest line of a reference, shape `(t,)`, by a parabola through its transform.
+
+    None for a reference that stands still.
+    """
+    n = len(reference_um)
+    size = np.abs(np.fft.rfft((reference_um - reference_um.mean()) * np.hanning(n), 8 * n))
+    k = int(np.clip(np.argmax(size), 1, len(size) - 2))
+    if size[k] <= 0:
+        return None
+    left, here, right = np.log(np.maximum(size[k - 1 : k + 2], 1e-300))
+    bend = left - 2 * here + right
+    return float((k + (0.5 * (left - right) / bend if bend else 0.0)) / (8 * n * interval_s))
 
 
 @dataclass(frozen=True)
@@ -84,7 +130,7 @@ class Loop:
     def margins(self, controller: AbstractController) -> list[Margins]:
         """Margins of every plant, at the steepest slope of its hysteresis."""
         return [
-            margins(linear_part(controller), one, delay=self.delay, slope_um_per_V=slope_array(one))
+            margins(controller.linear(), one, delay=self.delay, slope_um_per_V=slope_array(one))
             for one in self.plants
         ]
 
@@ -132,13 +178,13 @@ class Maker:
     noise_um: np.ndarray | None
     tell: Callable[[str], None]
 
-    def make(self, kind: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
-        """Make a controller of a kind, with its tuning and what is to be said of it.
+    def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
+        """Make a controller by the name of its kind, with its tuning and what is to be said of it.
 
         Parameters
         ----------
-        kind
-            `"pid"`, `"bp-pid"`, `"cmac-pid"` or `"resonant"`.
+        name
+            One of `microid.CONTROLLERS`.
         given
             Gains; tuned if None.
         frequency_Hz
@@ -151,35 +197,47 @@ class Maker:
         FitError
             See `tune_controller`.
         """
-        loop, ready = self.loop, self.loop.ready
+        loop, kind = self.loop, CONTROLLERS[name]
         tuning: Tuning[Any] | None = None
         if given is None:
             self.tell("start by Ziegler and Nichols")
-            begin = relay_start(loop.plants, ready.interval_s, delay=loop.delay)
-            tuning = self._tuned(_limited(begin, ready.limits_V))
+            begin = relay_start(loop.plants, loop.ready.interval_s, delay=loop.delay)
+            tuning = self._tuned(_limited(begin, loop.ready.limits_V))
             pid = tuning.controller
         else:
-            pid = _limited(given.make_pid(ready.interval_s), ready.limits_V)
-        more = [] if tuning is None else list(tuning.remarks)
-        if kind == "pid":
-            return Made(pid, pid, tuning, more)
-        if kind == "resonant":
-            return self._resonant(pid, tuning, given, frequency_Hz, more)
-        which = "margins are" if tuning is None else "what was tuned, and margins, are"
-        more.append(f"{which} those of its PID controller, before it learns")
-        learner = self._learner(kind, pid)
-        return Made(learner if given is None else given.put_into(kind, learner), pid, tuning, more)
+            pid = _limited(given.make_pid(loop.ready.interval_s), loop.ready.limits_V)
+        remarks = [] if tuning is None else list(tuning.remarks)
+        if kind is PID:
+            return Made(pid, pid, tuning, remarks)
+        own, said = self._stated(kind, given, frequency_Hz)
+        if kind.learns:
+            which = "margins are" if tuning is None else "what was tuned, and margins, are"
+            said.append(f"{which} those of its PID controller, before it learns")
+        stated = {"seed": self.seed} | own
+        numbers, more = with_defaults(own_settings(kind), stated, self._task(), lambda each: _option(name, each))
+        remarks += [*said, *more]
+        if "frequency_Hz" in numbers:
+            self._check_frequencies(np.atleast_1d(numbers["frequency_Hz"]))
+        stage = loop.plants[0]
+        try:
+            made = kind.of(pid, numbers, ControlledPlant(stage, slope_array(stage), loop.delay))
+        except ValueError as error:
+            raise DataError(f"{name}: {error}; choose pid.") from error
+        if given is not None or kind.learns:
+            return Made(replaced(made, own), pid, tuning, remarks)
+        tuning = self._tuned(self._calmed(made))
+        return Made(tuning.controller, pid, tuning, [*remarks, *(x for x in tuning.remarks if x not in remarks)])
 
-    def _learner(self, kind: str, pid: PID) -> BPPID | CMACPID:
-        ready = self.loop.ready
-        if kind == "bp-pid":
-            if min(float(getattr(pid, name)) for name in GAINS) <= 0:
-                raise DataError("bp-pid: expected three gains above 0 to learn around, found one of 0; choose pid.")
-            around = bp_defaults(self.loop.plants[0], ready.reference_um)
-            return BPPID.around(pid, jax.random.key(self.seed), **around)
-        table = cmac_defaults(ready.reference_um, ready.static_V, ready.interval_s)
-        fields: dict[str, Any] = {name: jnp.asarray(value) for name, value in table.items()}
-        return CMACPID(pid, **fields)
+    def _task(self) -> ControlTask:
+        ready, stage = self.loop.ready, self.loop.plants[0]
+        return ControlTask(
+            stage,
+            ready.interval_s,
+            lambda: ready.reference_um,
+            lambda: ready.static_V,
+            lambda: steepest_slope(stage),
+            lambda: strongest_Hz(ready.reference_um, ready.interval_s),
+        )
 
     def _tuned(self, controller: Any) -> Tuning[Any]:
         ready = self.loop.ready
@@ -199,59 +257,48 @@ class Maker:
             progress=self.tell,
         )
 
-    def _resonant(
-        self,
-        pid: PID,
-        before: Tuning[Any] | None,
-        given: Given | None,
-        frequency_Hz: Sequence[float],
-        more: list[str],
-    ) -> Made:
-        ready = self.loop.ready
-        held = None if given is None else given.resonators()
-        kept = held is not None and (not frequency_Hz or np.array_equal(np.sort(held[0]), np.sort(frequency_Hz)))
-        own = list(frequency_Hz)
-        if held is not None and kept:
-            own = held[0].tolist()
-        elif held is not None:
-            more.append("the resonators of --gains are at other frequencies than --frequency, and made anew")
-        elif not own:
-            strongest = strongest_Hz(ready.reference_um, ready.interval_s)
-            if strongest is None:
-                raise DataError(
-                    "--controller resonant: expected a reference that oscillates, found none; state --frequency."
-                )
-            own = [strongest]
-            more.append(f"the resonator is at {own[0]:.6g} Hz, the strongest in the reference")
-        bad = [f for f in own if not 0 < f < 0.5 / ready.interval_s]
-        if bad:
-            raise DataError(
-                f"--frequency: expected one between 0 and {0.5 / ready.interval_s:g} Hz, found {bad[0]:g} Hz."
-            )
-        near = np.sort(own)
+    def _calmed(self, controller: Any) -> Any:
+        """A controller whose own gains are halved until its loop can be tuned."""
+        for _ in range(_HALVINGS):
+            every = self.loop.margins(controller)
+            if all(bool(one.stable) and float(one.sensitivity_peak) < _MOST_PEAK for one in every):
+                break
+            values = parameter_values(controller)
+            halves = {name: values[name] / 2 for name in controller.own if name in values}
+            controller = replaced(controller, halves)
+        return controller
+
+    def _stated(
+        self, kind: type[AbstractController], given: Given | None, frequency_Hz: Sequence[float]
+    ) -> tuple[dict[str, np.ndarray], list[str]]:
+        """What is given of a controller beside its PID controller, by path, and what is to be said of it."""
+        own = {} if given is None else {name: x for name, x in given.others.items() if name in kind.own}
+        several = [setting.name for setting in own_settings(kind) if setting.several]
+        found = {name: np.atleast_1d(own[name]) for name in several if name in own}
+        shapes = {value.shape for value in found.values()}
+        if found and (len(found) < len(several) or len(shapes) > 1 or len(shapes.pop()) != 1):
+            raise DataError(f"--gains: expected {', '.join(several)} with as many numbers each; state all or none.")
+        if not frequency_Hz:
+            return own | found, []
+        wanted = np.asarray(frequency_Hz)
+        if found and np.array_equal(np.sort(found["frequency_Hz"]), np.sort(wanted)):
+            return own | found, []
+        kept = {name: x for name, x in own.items() if name not in several} | {"frequency_Hz": wanted}
+        anew = "the resonators of --gains are at other frequencies than --frequency, and made anew"
+        return kept, [anew] if found else []
+
+    def _check_frequencies(self, frequency_Hz: np.ndarray) -> None:
+        highest = 0.5 / self.loop.ready.interval_s
+        bad = frequency_Hz[~((frequency_Hz > 0) & (frequency_Hz < highest))]
+        if len(bad):
+            raise DataError(f"--frequency: expected one between 0 and {highest:g} Hz, found {bad[0]:g} Hz.")
+        near = np.sort(frequency_Hz)
         if np.any(np.diff(near) <= _ALIKE * near[1:]):
             raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
-        if held is not None and kept:
-            found = ResonantPID(pid, *(jnp.asarray(x) for x in held))
-            return Made(found, pid, None, more)
-        stage = self.loop.plants[0]
-        found = ResonantPID.around(
-            pid,
-            stage,
-            jnp.asarray(own),
-            min(own) / PERIODS,
-            delay=self.loop.delay,
-            slope_um_per_V=slope_array(stage),
-        )
-        if before is None:
-            return Made(found, pid, None, more)
-        for _ in range(20):
-            if all(bool(one.stable) and float(one.sensitivity_peak) < _MOST_PEAK for one in self.loop.margins(found)):
-                break
-            found = eqx.tree_at(lambda x: x.resonant_V_per_um_s, found, found.resonant_V_per_um_s / 2)
-        tuning = self._tuned(found)
-        said = [*more, *(remark for remark in tuning.remarks if remark not in more)]
-        return Made(tuning.controller, tuning.controller.pid, tuning, said)
+
+
+def _option(controller: str, setting: str) -> str:
+    return "--frequency" if setting == "frequency_Hz" else f"--controller {controller}: {setting}"
 
 
 def _limited(pid: PID, limits_V: tuple[float, float]) -> PID:

@@ -8,18 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from microid import (
-    BPPID,
-    CMACPID,
-    AbstractController,
-    AbstractLinearController,
-    Coordinates,
-    Margins,
-    Stage,
-    Start,
-    margins,
-    simulate_loop,
-)
+from microid import Coordinates, Margins, Stage, Start, margins, simulate_loop
 
 # Every gain is searched for within `exp` of this of its start, to either side.
 REACH = 6.0
@@ -173,26 +162,9 @@ class Figures(eqx.Module):
         return self.margins.stable & jnp.all(jnp.isfinite(self.error_um2), axis=1)
 
 
-def linear_part(controller: AbstractController) -> AbstractLinearController:
-    """The linear controller that a controller is at first, for its margins.
-
-    Raises
-    ------
-    ValueError
-        If it is of a kind that has none.
-    """
-    if isinstance(controller, AbstractLinearController):
-        return controller
-    if isinstance(controller, CMACPID):
-        return controller.pid
-    if isinstance(controller, BPPID):
-        return controller.pid(controller.init())
-    raise ValueError(f"a {type(controller).__name__} has no linear part, and so no margins to be tuned for")
-
-
 def figures(problem: Problem, controller: Any) -> Figures:
     """Close all loops."""
-    linear = linear_part(controller)
+    linear = controller.linear()
 
     def around(plant: Stage, slope: Float[Array, ""] | None) -> tuple[Margins, tuple[Array, ...]]:
         def along(reference: Array, ahead: Array | None, noise: Array | None) -> tuple[Array, ...]:

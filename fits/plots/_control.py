@@ -7,7 +7,6 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from fits.control._tune_problem import linear_part
 from fits.control._tune_start import slope_array
 from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save
 from microid import AbstractController, ControlledRun, Stage, loop_gain
@@ -62,7 +61,7 @@ def plot_control(
     legend(picture, (above,))
     files = [save(picture, Path(folder) / "run.png")]
 
-    linear = linear_part(controller)
+    linear = controller.linear()
     nyquist = 0.5 / float(controller.interval_s)
     frequency = nyquist * np.logspace(-_DECADES, 0, _FREQUENCIES)
     picture = figure(WIDE_in, 4.4)

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from fits.control._tune_problem import linear_part
 from fits.sweeps._controllers import Controllers, read_controllers
 from fits.sweeps._devices import by_rows, in_turn, place
 from fits.sweeps._jobs import Request
@@ -186,7 +185,7 @@ def _radius(
     def one(row: Float[Array, " k"]) -> Float[Array, ""]:
         values = dict(zip(names, row, strict=True))
         changed = varied(stage, values, relative)
-        linear = linear_part(controllers.at(values))
+        linear = controllers.at(values).linear()
         return margins(linear, changed, delay=controllers.delay, slope_um_per_V=_slope(changed)).radius
 
     return jax.vmap(one)(table)

@@ -9,11 +9,10 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from fits.io._errors import DataError, shown
-from fits.sweeps._devices import by_rows, on_cpu, place
+from fits.sweeps._devices import by_rows, place
 from fits.sweeps._jobs import Request
-from fits.sweeps._kernel import respond
 from fits.sweeps._programs import Program, number, read_program
-from fits.sweeps._stages import memory_before, requested_stage, stage_parameters
+from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
 from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Rows
 from microid import Stage, Staircase
 
@@ -93,7 +92,6 @@ class SimulateJob(AbstractJob):
             self._memory,
             self._first,
             self._every,
-            on_cpu(),
         )
         outputs = {name: np.asarray(value) for name, value in found.items()}
         fine = np.isfinite(outputs["displacement_rms_um"])
@@ -143,10 +141,9 @@ def _simulate(
     memory: Staircase | None,
     first: int,
     every: int,
-    cpu: bool,
 ) -> dict[str, Float[Array, "n ..."]]:
     voltage = drive(table, names, program, given)
-    displacement = respond(stage, table, names, relative, program.interval_s, voltage, memory, cpu)
+    displacement = respond(stage, table, names, relative, jnp.asarray(program.interval_s), voltage, memory)
     found = _sum_up(voltage, displacement, first)
     if every:
         found |= {"displacement_um": displacement[:, ::every], "voltage_V": voltage[:, ::every]}

@@ -97,6 +97,11 @@ class Program:
         time = jnp.arange(self.samples, dtype=float) * self.interval_s
         return offset + at[f"amplitude_{self.unit}"] * self._unit_shape(time, at)
 
+    def wanted(self) -> FloatArray:
+        """The nominal signal, shape `(samples,)`."""
+        given = None if self.given is None else jnp.asarray(self.given)
+        return np.asarray(self.signal({}, given), dtype=np.float64)
+
     def _unit_shape(self, time: Float[Array, " t"], at: Mapping[str, Float[Array, ""]]) -> Float[Array, " t"]:
         if self.shape == "step":
             return (time >= at["step_s"]).astype(time.dtype)

@@ -16,12 +16,11 @@ from fits.io._read_csv import read_csv
 from fits.io._record import Record
 from fits.io._units import parse_columns
 from fits.machining._design import nearest
-from fits.sweeps._devices import on_cpu, place
+from fits.sweeps._devices import place
 from fits.sweeps._jobs import Request
-from fits.sweeps._kernel import respond
 from fits.sweeps._kinds_simulate import drive, table_of
 from fits.sweeps._programs import Program, number, read_program
-from fits.sweeps._stages import memory_before, requested_stage, stage_parameters
+from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
 from fits.sweeps._types import FloatArray, Parameter
 from microid import Stage
 
@@ -103,9 +102,8 @@ class Simulated:
         given = None if self.program.given is None else jnp.asarray(self.program.given)
         voltage = drive(table, names, self.program, given)
         memory = memory_before(self.stage, self.initial)
-        displacement = respond(
-            self.stage, table, names, self.relative, self.program.interval_s, voltage, memory, on_cpu()
-        )
+        interval_s = jnp.asarray(self.program.interval_s)
+        displacement = respond(self.stage, table, names, self.relative, interval_s, voltage, memory)
         time_s = np.arange(self.program.samples) * self.program.interval_s
         sd = values.get(_NOISE, np.full(len(rows), 1.0 if _NOISE in self.relative else self.noise_um))
         sd = sd * self.noise_um if _NOISE in self.relative else sd

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
+from fits.sweeps._devices import by_rows
 from fits.sweeps._files import in_a_file
 from fits.sweeps._jobs import Request
 from fits.sweeps._types import Parameter
@@ -27,6 +28,7 @@ from microid import (
     node_areas,
     parameter_table,
     positive_saturation,
+    respond_all,
 )
 
 NOMINAL = "nominal"
@@ -102,11 +104,27 @@ def varied(stage: Stage, values: Mapping[str, Float[Array, ""]], relative: Seque
         name = jax.tree_util.keystr(path).lstrip(".")
         if name in paths:
             value = values[stage.named(name)]
-            changed.append(leaf * value if stage.named(name) in relative else jnp.asarray(value, leaf.dtype))
+            factor = jnp.reshape(value, value.shape + (1,) * (leaf.ndim - value.ndim))
+            changed.append(leaf * factor if stage.named(name) in relative else jnp.asarray(value, leaf.dtype))
         else:
             changed.append(leaf)
     found: Stage = jax.tree_util.tree_unflatten(treedef, changed)
     return found
+
+
+@by_rows("table", "voltage_V")
+def respond(
+    stage: Stage,
+    table: Float[Array, "n k"],
+    names: tuple[str, ...],
+    relative: tuple[str, ...],
+    interval_s: Float[Array, ""],
+    voltage_V: Float[Array, "n t"],
+    memory: Staircase | None,
+) -> Float[Array, "n t"]:
+    """Respond to commands, each row at rest under its first sample; what varies are the columns of a table."""
+    rows = jax.tree.map(lambda leaf: leaf[None], stage)
+    return respond_all(varied(rows, dict(zip(names, table.T, strict=True)), relative), interval_s, voltage_V, memory)
 
 
 def range_of(stage: Stage) -> tuple[float, float] | None:

@@ -14,7 +14,7 @@ from microid._part import _complex
 from microid._stage import Stage
 from microid.control._base import AbstractLinearController
 from microid.control._margins import loop_gain
-from microid.control._pid import PID
+from microid.control.pid import PID
 
 _Scalar = Float[Array, ""] | float
 # Where the inverse of a sampled stage is asked for at no frequency: this share of half the sampling rate.

@@ -1,19 +1,23 @@
 """PID controller beside a table that learns to do its work (Eq. 31-33)."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from microid._param import array, param
-from microid.control._base import AbstractController
-from microid.control._pid import PID
+from microid.control._base import AbstractController, ControlledPlant, ControlTask, Setting, register
+from microid.control.pid import PID
 
 _Scalar = Float[Array, ""] | float
 # Knuth's multiplicative hashing: 2**32 over the golden ratio.
 _SPREAD = 2654435761
+# A table holds this share of the reference's voltage, and its range is wider than the reference's by these.
+_TABLE, _ASIDE, _FASTER = 0.5, 0.02, 1.02
 
 
 class _State(eqx.Module):
@@ -23,6 +27,25 @@ class _State(eqx.Module):
     rest_V: Float[Array, ""]
 
 
+def _lower_um(task: ControlTask) -> float:
+    reference = task.reference_um()
+    return float(reference.min() - _ASIDE * max(np.ptp(reference), 1e-9))
+
+
+def _upper_um(task: ControlTask) -> float:
+    reference = task.reference_um()
+    return float(reference.max() + _ASIDE * max(np.ptp(reference), 1e-9))
+
+
+def _fastest_um_per_s(task: ControlTask) -> float:
+    return float(_FASTER * np.abs(np.diff(task.reference_um())).max() / task.interval_s + 1e-9)
+
+
+def _limit_V(task: ControlTask) -> float:
+    return _TABLE * max(float(np.ptp(task.static_V())), 1e-6)
+
+
+@register
 class CMACPID(AbstractController):
     r"""Cerebellar model articulation controller in parallel with a PID controller.
 
@@ -61,6 +84,16 @@ class CMACPID(AbstractController):
         Cells per table, into which addresses are hashed; by default as many as there are addresses.
     """
 
+    settings: ClassVar[tuple[Setting, ...]] = (
+        *PID.settings,
+        Setting("learning_rate", default=0.1),
+        Setting("limit_V", "V", lower=0.0, default=_limit_V),
+        Setting("lower_um", "um", default=_lower_um, varies=False),
+        Setting("upper_um", "um", default=_upper_um, varies=False),
+        Setting("fastest_um_per_s", "um/s", lower=1e-9, default=_fastest_um_per_s, varies=False),
+    )
+    own: ClassVar[tuple[str, ...]] = ("learning_rate",)
+    learns: ClassVar[bool] = True
     pid: PID
     lower_um: Float[Array, ""] = array()
     upper_um: Float[Array, ""] = array()
@@ -78,6 +111,15 @@ class CMACPID(AbstractController):
                 f"levels, generalisation and memory must be 1 or more, got {self.levels}, {self.generalisation} "
                 f"and {self.memory}"
             )
+
+    @classmethod
+    def of(cls, pid: PID, numbers: Mapping[str, Any], plant: ControlledPlant | None) -> Self:
+        """Put an empty table beside a PID controller."""
+        return cls(pid, **numbers)
+
+    def linear(self) -> PID:
+        """Its PID controller, as the table is empty at first."""
+        return self.pid
 
     @property
     def interval_s(self) -> Float[Array, ""]:

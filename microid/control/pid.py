@@ -1,7 +1,8 @@
 """Discrete PID controller (Eq. 24)."""
 
 import math
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from jaxtyping import Array, Complex, Float
 
 from microid._param import _as_inexact, array, param
 from microid._part import _complex
-from microid.control._base import AbstractLinearController
+from microid.control._base import AbstractLinearController, ControlledPlant, Setting, register
 
 _Scalar = Float[Array, ""] | float
 
@@ -20,6 +21,7 @@ class _State(eqx.Module):
     before_um: Float[Array, ""]
 
 
+@register
 class PID(AbstractLinearController):
     r"""PID controller with a filtered derivative, limits and anti-windup by back-calculation.
 
@@ -46,6 +48,14 @@ class PID(AbstractLinearController):
         Limits of the whole command.
     """
 
+    settings: ClassVar[tuple[Setting, ...]] = (
+        Setting("proportional_V_per_um", default=0.0),
+        Setting("integral_V_per_um_s", default=100.0),
+        Setting("derivative_V_s_per_um", default=0.0),
+        Setting("filter_s", default=0.0),
+        Setting("reference_weight", default=1.0),
+        Setting("derivative_weight", default=1.0),
+    )
     proportional_V_per_um: Float[Array, ""] = param(unit="V/um", lower=0.0)
     integral_V_per_um_s: Float[Array, ""] = param(unit="V/(um s)", scale=100.0, lower=0.0)
     derivative_V_s_per_um: Float[Array, ""] = param(unit="V s/um", scale=1e-2, lower=0.0)
@@ -56,6 +66,11 @@ class PID(AbstractLinearController):
     tracking_s: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
     lower_V: Float[Array, ""] = eqx.field(converter=_as_inexact, default=-math.inf)
     upper_V: Float[Array, ""] = eqx.field(converter=_as_inexact, default=math.inf)
+
+    @classmethod
+    def of(cls, pid: Self, numbers: Mapping[str, Any], plant: ControlledPlant | None) -> Self:
+        """The PID controller itself."""
+        return pid
 
     @classmethod
     def from_times(

@@ -1,18 +1,21 @@
 """PID controller whose gains a small network chooses and learns while it runs (Eq. 25-30)."""
 
 import math
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from microid._param import _as_inexact, array, param
-from microid.control._base import AbstractController
-from microid.control._pid import PID
+from microid.control._base import AbstractController, ControlledPlant, ControlTask, Setting, register
+from microid.control.pid import PID
 
 _Scalar = Float[Array, ""] | float
+_LEAST_GAIN = 1e-12
 
 
 class GainNetwork(eqx.Module):
@@ -52,6 +55,15 @@ class _State(eqx.Module):
     free: Float[Array, ""]
 
 
+def _slope_um_per_V(task: ControlTask) -> float:
+    return float(task.stage.static_gain) * (task.slope_um_per_V() or 1.0)
+
+
+def _scale_um(task: ControlTask) -> float:
+    return max(float(np.ptp(task.reference_um())), 1e-9) / 10
+
+
+@register
 class BPPID(AbstractController):
     r"""PID controller in velocity form, of which a network trained by gradient descent chooses the gains.
 
@@ -88,6 +100,29 @@ class BPPID(AbstractController):
         Limits of the whole command. The velocity form starts from what was applied, so nothing winds up.
     """
 
+    # The gains of the network are shares of those that it begins with, which are above zero.
+    settings: ClassVar[tuple[Setting, ...]] = (
+        Setting("proportional_V_per_um", lower=_LEAST_GAIN, default=0.1),
+        Setting("integral_V_per_um_s", lower=_LEAST_GAIN, default=100.0),
+        Setting("derivative_V_s_per_um", lower=_LEAST_GAIN, default=1e-4),
+        Setting("filter_s", default=0.0),
+        Setting("learning_rate_per_um2", default=0.1),
+        Setting("momentum", default=0.05),
+        Setting("slope_um_per_V", "um/V", default=_slope_um_per_V),
+        Setting("scale_um", "um", lower=1e-9, default=_scale_um),
+        Setting("seed", "1", lower=0.0, upper=2.0**53, default=0.0, whole=True),
+        Setting("span", "1", lower=1.0, above=True, default=3.0, varies=False),
+    )
+    own: ClassVar[tuple[str, ...]] = (
+        "network.hidden_weight",
+        "network.hidden_threshold",
+        "network.output_weight",
+        "network.output_threshold",
+        "learning_rate_per_um2",
+        "momentum",
+        "filter_s",
+    )
+    learns: ClassVar[bool] = True
     network: GainNetwork
     gain_V_per_um: Float[Array, " 2"] = array()
     integral_time_s: Float[Array, " 2"] = array()
@@ -102,7 +137,14 @@ class BPPID(AbstractController):
     upper_V: Float[Array, ""] = eqx.field(converter=_as_inexact, default=math.inf)
 
     @classmethod
-    def around(cls, pid: PID, key: PRNGKeyArray, span: float = 3.0, **others: Any) -> Self:
+    def of(cls, pid: PID, numbers: Mapping[str, Any], plant: ControlledPlant | None) -> Self:
+        """Make it around a PID controller, with random weights; see `around`."""
+        others = dict(numbers)
+        key = jax.random.key(jnp.asarray(others.pop("seed"), dtype=int))
+        return cls.around(pid, key, others.pop("span"), **others)
+
+    @classmethod
+    def around(cls, pid: PID, key: PRNGKeyArray, span: _Scalar = 3.0, **others: Any) -> Self:
         """Start from the gains of a PID controller, at no error, with random weights.
 
         Parameters
@@ -119,15 +161,18 @@ class BPPID(AbstractController):
         Raises
         ------
         ValueError
-            If the span is not above one.
+            If the span is not above one, or a gain not above zero.
         """
-        if not span > 1:
+        if not isinstance(span, jax.core.Tracer) and not span > 1:
             raise ValueError(f"span must be above 1, got {span}")
+        gains = (pid.proportional_V_per_um, pid.integral_V_per_um_s, pid.derivative_V_s_per_um)
+        if not any(isinstance(gain, jax.core.Tracer) for gain in gains) and min(map(float, gains)) <= 0:
+            raise ValueError("expected three gains above 0 to learn around, found one of 0")
         kind = pid.proportional_V_per_um.dtype
         hidden, output = jax.random.uniform(key, (2, 3, 3), kind, -0.5, 0.5)
         share = (1 - 1 / span) / (span - 1 / span)
-        threshold = jnp.full(3, -math.log(share / (1 - share)) / 2, kind)
-        ends = jnp.asarray([1 / span, span], kind)
+        threshold = jnp.full(3, -jnp.log(share / (1 - share)) / 2, kind)
+        ends = jnp.asarray(jnp.stack([jnp.asarray(1 / span), jnp.asarray(span)]), kind)
         gain = pid.proportional_V_per_um
         return cls(
             GainNetwork(hidden, jnp.zeros(3, kind), output, threshold),
@@ -137,6 +182,10 @@ class BPPID(AbstractController):
             pid.interval_s,
             **{"filter_s": pid.filter_s, "lower_V": pid.lower_V, "upper_V": pid.upper_V, **others},
         )
+
+    def linear(self) -> PID:
+        """The PID controller that the network chooses at first."""
+        return self.pid(self.init())
 
     def init(self, rest_um: _Scalar = 0.0, feedback_V: _Scalar = 0.0) -> _State:
         """State at rest: the network and its last change, what it saw last, and the feedback."""

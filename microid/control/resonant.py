@@ -1,7 +1,8 @@
 """PID controller beside resonators, for references and disturbances that are sinusoids."""
 
 import math
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,11 +12,13 @@ from jaxtyping import Array, Complex, Float
 from microid._param import _as_inexact, array, param
 from microid._part import _complex
 from microid._stage import Stage
-from microid.control._base import AbstractLinearController
+from microid.control._base import AbstractLinearController, ControlledPlant, ControlTask, Setting, register
 from microid.control._margins import loop_gain
-from microid.control._pid import PID
+from microid.control.pid import PID
 
 _Scalar = Float[Array, ""] | float
+# Resonators take up an error over so many of their periods, and are below half the sampling rate.
+_PERIODS, _NYQUIST = 3.0, 0.5 - 1e-6
 
 
 class _State(eqx.Module):
@@ -24,6 +27,14 @@ class _State(eqx.Module):
     imag_V: Float[Array, " h"]
 
 
+def _frequency_Hz(task: ControlTask) -> float:
+    found = task.frequency_Hz()
+    if found is None:
+        raise ValueError("expected one for a reference that does not oscillate")
+    return found
+
+
+@register
 class ResonantPID(AbstractLinearController):
     r"""PID controller in parallel with one resonator per frequency.
 
@@ -47,6 +58,22 @@ class ResonantPID(AbstractLinearController):
         Phases `φ`, shape `(h,)`.
     """
 
+    settings: ClassVar[tuple[Setting, ...]] = (
+        *PID.settings,
+        Setting(
+            "frequency_Hz",
+            "Hz",
+            lower=1e-9,
+            upper=_NYQUIST,
+            default=_frequency_Hz,
+            said="the resonator is at {:.6g} Hz, the strongest in the reference",
+            several=True,
+            of_rate=True,
+        ),
+        Setting("resonant_V_per_um_s", several=True),
+        Setting("lead_deg", "deg", several=True),
+    )
+    own: ClassVar[tuple[str, ...]] = ("frequency_Hz", "resonant_V_per_um_s", "lead_deg")
     pid: PID
     frequency_Hz: Float[Array, " h"] = array()
     resonant_V_per_um_s: Float[Array, " h"] = param(unit="V/(um s)", scale=100.0, lower=0.0)
@@ -57,6 +84,17 @@ class ResonantPID(AbstractLinearController):
         shapes = {x.shape for x in (self.frequency_Hz, self.resonant_V_per_um_s, self.lead_deg)}
         if len(shapes) != 1 or self.frequency_Hz.ndim != 1:
             raise ValueError(f"frequencies, gains and leads need one shape (h,), got {sorted(shapes)}")
+
+    @classmethod
+    def of(cls, pid: PID, numbers: Mapping[str, Any], plant: ControlledPlant | None) -> Self:
+        """Put resonators beside a PID controller; gains and leads that are not given are found as by `around`."""
+        fields = {name: jnp.atleast_1d(_as_inexact(value)) for name, value in numbers.items()}
+        if plant is not None and len(fields) < len(cls.own):
+            frequency = fields["frequency_Hz"]
+            rate, slope = jnp.min(frequency) / _PERIODS, plant.slope_um_per_V
+            made = cls.around(pid, plant.stage, frequency, rate, delay=plant.delay, slope_um_per_V=slope)
+            fields = {name: getattr(made, name) for name in cls.own} | fields
+        return cls(pid, **fields)
 
     @classmethod
     def around(
