@@ -79,15 +79,15 @@ if TYPE_CHECKING:
     from fits.plots._sensitivity import plot_sensitivity as plot_sensitivity
     from fits.plots._stage import plot_stage as plot_stage
     from fits.plots._sweep import plot_sweep as plot_sweep
-    from fits.report._budget import budget_json as budget_json
-    from fits.report._budget import describe_budget as describe_budget
     from fits.report._diagnosis import report_html as report_html
     from fits.report._diagnosis_json import diagnosis_json as diagnosis_json
     from fits.report._diagnosis_json import diagnosis_schema as diagnosis_schema
     from fits.report._fit import describe as describe
     from fits.report._fit import fit_report as fit_report
-    from fits.report._sensitivity import describe_sensitivity as describe_sensitivity
-    from fits.report._sensitivity import sensitivity_json as sensitivity_json
+    from fits.report._machining import budget_json as budget_json
+    from fits.report._machining import describe_budget as describe_budget
+    from fits.report._machining import describe_sensitivity as describe_sensitivity
+    from fits.report._machining import sensitivity_json as sensitivity_json
     from fits.stage._draw_plants import draw_plants as draw_plants
     from fits.stage._fit import default_stage as default_stage
     from fits.stage._fit import fit_stage as fit_stage
@@ -177,13 +177,13 @@ _HOMES = {
     "Uncertainty": "loop._uncertainty",
     "allocate": "machining._allocate",
     "budget": "machining._budget",
-    "budget_json": "report._budget",
+    "budget_json": "report._machining",
     "compensate": "control._compensate",
     "default_stage": "stage._fit",
     "describe": "report._fit",
-    "describe_budget": "report._budget",
+    "describe_budget": "report._machining",
     "describe_claims": "machining._claims",
-    "describe_sensitivity": "report._sensitivity",
+    "describe_sensitivity": "report._machining",
     "diagnose": "diagnosis._diagnose",
     "diagnosis_json": "report._diagnosis_json",
     "diagnosis_schema": "report._diagnosis_json",
@@ -230,7 +230,7 @@ _HOMES = {
     "save_model": "stage._model_file",
     "second_order": "machining._second_order",
     "sensitivities": "machining._sensitivity",
-    "sensitivity_json": "report._sensitivity",
+    "sensitivity_json": "report._machining",
     "sign_change_guides": "machining._claims",
     "sobol": "machining._sobol",
     "steepest_slope": "control._tune_start",

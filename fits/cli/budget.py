@@ -54,7 +54,7 @@ def budget(given: Given) -> None:
     from fits.machining._design import paper_design
     from fits.machining._design_file import read_design
     from fits.machining._idle import idle_noise, read_idle
-    from fits.report._budget import budget_json, describe_budget
+    from fits.report._machining import budget_json, describe_budget
 
     start_jax()
     printed = given.json_file == "-"

@@ -43,7 +43,7 @@ def sensitivity(given: Given) -> None:
     from fits.machining._claims import describe_claims, paper_claims
     from fits.machining._design_file import design_text
     from fits.machining._sensitivity import sensitivities
-    from fits.report._sensitivity import describe_sensitivity, sensitivity_json
+    from fits.report._machining import describe_sensitivity, sensitivity_json
 
     start_jax()
     printed = given.json_file == "-"

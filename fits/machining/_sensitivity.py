@@ -1,5 +1,6 @@
 """What machining errors do to each axis: derivatives, ranking, and shares of the variance (Eq. 4 and 5)."""
 
+import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -126,6 +127,17 @@ class SensitivityReport:
     def __getitem__(self, axis: m.Axis) -> AxisSensitivity:
         """Sensitivities of an axis by its name."""
         return self.axes[axis]
+
+    def alike(self) -> list[list[AxisSensitivity]]:
+        """Group axes that differ in nothing but their names."""
+        groups: list[list[AxisSensitivity]] = []
+        for axis in self.axes.values():
+            group = next((each for each in groups if dataclasses.replace(each[0], axis=axis.axis) == axis), None)
+            if group is None:
+                groups.append([axis])
+            else:
+                group.append(axis)
+        return groups
 
 
 def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> SensitivityReport:

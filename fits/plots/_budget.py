@@ -4,8 +4,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+from fits.io._printable import plain
 from fits.machining._budget import Budget
-from fits.plots._sensitivity import AXIS_SIGNS, UNIT_SIGNS, plain
+from fits.plots._sensitivity import AXIS_SIGNS, UNIT_SIGNS
 from fits.plots._style import DARK, WIDE_in, figure, label, legend, save
 
 _PARTS = {"driving": "0.3", "machining": "0.65", "measuring": "0.95"}

@@ -1,6 +1,5 @@
 """Pictures of what machining errors do: tornado plots, and the curves of the paper's Fig. 7."""
 
-import dataclasses
 import os
 import re
 import textwrap
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 import microid as m
+from fits.io._printable import plain
 from fits.machining._claims import Claim, paper_claims
 from fits.machining._design import Design, paper_design
 from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at
@@ -34,30 +34,17 @@ _CHARACTERS = 64
 _DIMENSION = re.compile(rf"\b(?:{'|'.join({name for motion in m.MOTIONS.values() for name in motion.dimensions})})\b")
 
 
-_LEADER: dict[str, Any] = {
-    "arrowstyle": "-",
-    "color": "0.5",
-    "linewidth": 0.4,
-    "shrinkA": 1.5,
-    "shrinkB": 0,
-    "relpos": (0, 0.5),
-    "patchA": None,
-}
+# Of a thin line from a label to the end of its curve.
+_LEADER: dict[str, Any] = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.4, "patchA": None}
+_LEADER |= {"shrinkA": 1.5, "shrinkB": 0, "relpos": (0, 0.5)}
 
 
 @dataclass(frozen=True)
 class _Panel:
-    """One motion, or two that are alike.
+    """One motion, or two that are alike: the sensitivities of the first, and the names of all.
 
-    Attributes
-    ----------
-    axis
-        Sensitivities of the first.
-    title
-        Names of all.
-    curves
-        Relative change of the output by dimension over the steps of its error, from minus to plus one tolerance,
-        each of shape `(s,)`.
+    `curves` are relative changes of the output by dimension, over the steps of its error from minus to plus one
+    tolerance, each of shape `(s,)`.
     """
 
     axis: AxisSensitivity
@@ -87,24 +74,17 @@ def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os
     DataError
         If a file cannot be written.
     """
-    panels = _panels(design, report)
+    panels = [
+        _Panel(
+            axes[0], ", ".join(AXIS_SIGNS.get(each.axis, each.axis) for each in axes), _curves(design, axes[0].axis)
+        )
+        for axes in report.alike()
+    ]
     claims = paper_claims(design) if _is_the_papers(design) else ()
     return [
         save(_tornado(panels), Path(folder) / "tornado.png"),
         save(_machining_error(design, panels, claims), Path(folder) / "machining_error.png"),
     ]
-
-
-def _panels(design: Design, report: SensitivityReport) -> list[_Panel]:
-    panels: list[_Panel] = []
-    left = list(report.axes.values())
-    while left:
-        first = left[0]
-        names = [each.axis for each in left if dataclasses.replace(each, axis=first.axis) == first]
-        left = [each for each in left if each.axis not in names]
-        title = ", ".join(AXIS_SIGNS.get(name, name) for name in names)
-        panels.append(_Panel(first, title, _curves(design, first.axis)))
-    return panels
 
 
 def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
@@ -150,17 +130,14 @@ def _draw_bars(axes: Axes, panel: _Panel) -> None:
     axes.axvline(0, color=DARK, linewidth=0.6)
     axes.set_ylim(len(effects) - 0.4, -0.6)
     axes.set_yticks(places, [f"{symbol(effect.name)} ± {_tolerance(effect)}" for effect in effects])
+    beside: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "ha": "right", "va": "center", "fontsize": 7}
     for place, effect in zip(places, effects, strict=True):
-        words = _signed(f"{effect.relative_change_pct:+.3f} %")
-        axes.text(1.10, place, words, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
-        share = _signed(f"{100 * effect.share_of_variance:.1f} %")
-        axes.text(1.20, place, share, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
+        axes.text(1.10, place, _signed(f"{effect.relative_change_pct:+.3f} %"), **beside)
+        axes.text(1.20, place, _signed(f"{100 * effect.share_of_variance:.1f} %"), **beside)
     for x, words in ((1.10, "change"), (1.20, "share of\nvariance")):
         axes.text(x, 1.0, words, transform=axes.transAxes, ha="right", va="bottom", fontsize=_SMALL_pt)
-    axis = panel.axis
-    title = f"{panel.title}: root sum of squares {axis.rss_pct:.2f} %, worst case {axis.worst_case_pct:.2f} %"
-    axes.set_title(title, loc="left", fontsize=8)
-    label(axes)
+    sizes = f"root sum of squares {panel.axis.rss_pct:.2f} %, worst case {panel.axis.worst_case_pct:.2f} %"
+    label(axes, title=f"{panel.title}: {sizes}", size_pt=8)
     axes.tick_params(axis="y", length=0)
 
 
@@ -169,11 +146,8 @@ def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[
     columns = min(_COLUMNS, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     words = {panel.title: _claim_lines(panel, claims) for panel in panels}
-    heights = [
-        height
-        for row in rows
-        for height in (_PANEL_in, _LINE_in * max(1, *(len(words[panel.title]) for panel in row)))
-    ]
+    below_in = [_LINE_in * max(1, *(len(words[panel.title]) for panel in row)) for row in rows]
+    heights = [height for words_in in below_in for height in (_PANEL_in, words_in)]
     picture = figure(WIDE_in * (1 if columns > 1 else 0.55), sum(heights) + 0.55 * len(rows) + 0.25, gap=0.06)
     grid = picture.add_gridspec(2 * len(rows), columns, height_ratios=heights)
     for k, panel in enumerate(panels):
@@ -181,11 +155,9 @@ def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[
         axes = picture.add_subplot(grid[2 * row, column])
         _draw_curves(axes, design, panel)
         unit = UNIT_SIGNS[panel.axis.output_unit]
-        axes.set_title(f"({'abcdef'[k]}) {panel.title}: full stroke {plain(panel.axis.stroke)} {unit}", loc="left")
-        axes.title.set_fontsize(8)
-        below = picture.add_subplot(grid[2 * row + 1, column])
-        below.set_axis_off()
-        _write(below, words[panel.title])
+        title = f"({'abcdef'[k]}) {panel.title}: full stroke {plain(panel.axis.stroke)} {unit}"
+        label(axes, title=title, size_pt=8)
+        _write(picture.add_subplot(grid[2 * row + 1, column]), words[panel.title])
     kinds = [picture.axes[0].plot([], [], style, color="0.0", linewidth=0.8)[0] for style in ("-", "--")]
     names = ["length", "angle, by the error across its leg"]
     picture.legend(kinds, names, loc="outside upper center", ncols=2, frameon=False)
@@ -228,37 +200,26 @@ def _apart(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
     return np.asarray(isotonic_regression(wanted - steps).x) + steps
 
 
-@dataclass(frozen=True)
-class _Line:
-    """A line of words in a colour, with a verdict in bold before them where there is one."""
-
-    words: str
-    color: str = DARK
-    verdict: str = ""
-
-
-def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[_Line]:
-    """What the paper says of a motion, each with our verdict and the figures for it."""
-    lines: list[_Line] = []
+def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[tuple[str, str]]:
+    """What the paper says of a motion, each with our verdict and the figures for it: lines and their colours."""
+    lines: list[tuple[str, str]] = []
     for claim in claims:
         # One on several motions stands below the last of them.
         if panel.axis.axis in claim.axes and (panel.axis.axis == claim.axes[0]) == (len(claim.axes) < 3):
             reason = claim.reason.partition(". ")[0].rstrip(".")
             room = " " * len(f"{claim.verdict}: ")
             first, *more = textwrap.wrap(claim.statement, _CHARACTERS, initial_indent=room, subsequent_indent="   ")
-            lines.append(_Line(first[len(room) :], verdict=claim.verdict))
-            lines += [_Line(line) for line in more]
-            lines += [_Line(f"   {line}", "0.4") for line in textwrap.wrap(reason, _CHARACTERS - 3)]
-    return [_Line("The paper's reading of its Fig. 7, and this stage:"), *lines] if lines else []
+            lines.append((rf"$\bf{{{claim.verdict}}}$: {_with_symbols(first[len(room) :])}", DARK))
+            lines += [(_with_symbols(line), DARK) for line in more]
+            lines += [(f"   {_with_symbols(line)}", "0.4") for line in textwrap.wrap(reason, _CHARACTERS - 3)]
+    return [("The paper's reading of its Fig. 7, and this stage:", DARK), *lines] if lines else []
 
 
-def _write(axes: Axes, lines: Sequence[_Line]) -> None:
-    for k, line in enumerate(lines):
-        words = _with_symbols(line.words)
-        if line.verdict:
-            words = rf"$\bf{{{line.verdict}}}$: {words}"
+def _write(axes: Axes, lines: Sequence[tuple[str, str]]) -> None:
+    axes.set_axis_off()
+    for k, (words, color) in enumerate(lines):
         place: dict[str, Any] = {"xy": (0, 1), "xytext": (0, -72 * _LINE_in * k), "textcoords": "offset points"}
-        axes.annotate(words, **place, xycoords="axes fraction", va="top", fontsize=_SMALL_pt, color=line.color)
+        axes.annotate(words, **place, xycoords="axes fraction", va="top", fontsize=_SMALL_pt, color=color)
 
 
 def _with_symbols(words: str) -> str:
@@ -281,14 +242,8 @@ def symbol(name: str) -> str:
     return f"${stem}_{{{index}}}$" if index else f"${stem}$"
 
 
-def plain(number: float, digits: int = 4) -> str:
-    """Significant digits, or whole numbers where these are more, without an exponent for large ones."""
-    return f"{number:.{digits}g}" if abs(number) < 10**digits else f"{number:.0f}"
-
-
 def _tolerance(effect: DimensionEffect) -> str:
-    unit, scale = ("mrad", 1e3) if effect.unit == "rad" else ("µm", 1e3)
-    return f"{scale * effect.tolerance:.3g} {unit}"
+    return f"{1e3 * effect.tolerance:.3g} {'mrad' if effect.unit == 'rad' else 'µm'}"
 
 
 def _length_mm(design: Design, effect: DimensionEffect) -> float:
