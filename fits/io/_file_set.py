@@ -3,7 +3,7 @@
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -27,17 +27,30 @@ class _Move:
     target: Path
     shown: str
 
+    def refused(self, error: OSError) -> DataError:
+        """Say that the file cannot be written."""
+        return DataError(
+            f"{self.shown}: cannot be written ({reason_of(error)}); "
+            "free the disk, close the file in other programs or choose another place."
+        )
+
 
 @dataclass(frozen=True)
 class _Folder:
-    """A folder to be: `made` is the temporary one, and becomes `first`, the first that is missing on the way."""
+    """A folder to be: `staged` is the temporary one, and becomes `first`, the first that is missing on the way."""
 
-    made: Path
+    staged: Path
     first: Path
     files: Path
     target: Path
     shown: str
     option: str
+
+    def refused(self, error: OSError) -> DataError:
+        """Say that nothing can be put there."""
+        return DataError(
+            f"{self.shown}: files cannot be put there ({reason_of(error)}); choose another for {self.option}."
+        )
 
 
 class FileSet:
@@ -57,7 +70,7 @@ class FileSet:
         if any(is_temporary(part) for part in target.parts):
             # Of another set, which puts it in its place or deletes it.
             return target
-        self._refuse_twice(target, os.fspath(path))
+        _refuse_twice(target, os.fspath(path), self._all())
         remove_stale(target.parent)
         staged = target.with_name(temporary_name(target.suffix))
         self._files.append(_Move(staged, target, os.fspath(path)))
@@ -80,27 +93,25 @@ class FileSet:
             return None
         target, anchor = usable_folder(path, option)
         missing = target.relative_to(anchor).parts
-        made = anchor / temporary_name()
-        files = made.joinpath(*missing[1:])
-        folder = _Folder(made, anchor.joinpath(*missing[:1]), files, target, os.fspath(path), option)
-        self._refuse_twice(target, folder.shown)
+        staged = anchor / temporary_name()
+        files = staged.joinpath(*missing[1:])
+        folder = _Folder(staged, anchor.joinpath(*missing[:1]), files, target, os.fspath(path), option)
+        _refuse_twice(target, folder.shown, self._all())
         # Known before it is there, so that an interruption at any moment finds it.
         self._folders.append(folder)
-        try:
+        with _told(folder):
             files.mkdir(parents=True)
-        except OSError as error:
-            raise _refused(folder, error) from error
         return files
 
-    def _refuse_twice(self, target: Path, shown: str) -> None:
-        _refuse_twice(target, shown, [each.target for each in self._files] + [each.target for each in self._folders])
+    def _all(self) -> list[_Move | _Folder]:
+        return [*self._files, *self._folders]
 
     def commit(self) -> None:
         """Put all files in their places, or none."""
         files = [move for move in self._files if move.staged is not None or os.path.lexists(move.target)]
         moves = [*self._from_folders(), *files]
         for k, move in enumerate(moves):
-            _refuse_twice(move.target, move.shown, [each.target for each in moves[:k]])
+            _refuse_twice(move.target, move.shown, moves[:k])
             if move.staged is None or not move.staged.is_dir():
                 check_file(move.target, move.shown)
         for move in moves:
@@ -112,7 +123,7 @@ class FileSet:
                 # an interruption comes.
                 if len(moves) > 1:
                     undo.callback(self._undoing(move))
-                with _told(move.shown):
+                with _told(move):
                     if move.staged is None:
                         move.target.unlink(missing_ok=True)
                     else:
@@ -124,17 +135,15 @@ class FileSet:
     def _from_folders(self) -> list[_Move]:
         moves = []
         for folder in self._folders:
-            try:
+            with _told(folder):
+                files = sorted(folder.files.iterdir())
                 if not os.path.lexists(folder.first):
-                    for file in folder.files.iterdir():
+                    for file in files:
                         flush(file)
                     # All of it in one step.
-                    moves.append(_Move(folder.made, folder.first, folder.shown))
+                    moves.append(_Move(folder.staged, folder.first, folder.shown))
                     continue
                 folder.target.mkdir(parents=True, exist_ok=True)
-                files = sorted(folder.files.iterdir())
-            except OSError as error:
-                raise _refused(folder, error) from error
             for file in files:
                 real = Path(os.path.realpath(folder.target / file.name))
                 moves.append(_Move(file, real, str(Path(folder.shown) / file.name)))
@@ -146,7 +155,7 @@ class FileSet:
             return partial(_take_back, move.target, move.staged)
         kept = move.target.with_name(temporary_name())
         self._scraps.append(kept)
-        with _told(move.shown):
+        with _told(move):
             try:
                 # A second name: at no moment there is no file under the first.
                 os.link(move.target, kept)
@@ -160,20 +169,17 @@ class FileSet:
             with suppress(OSError):
                 path.unlink(missing_ok=True)
         for folder in self._folders:
-            shutil.rmtree(folder.made, ignore_errors=True)
+            shutil.rmtree(folder.staged, ignore_errors=True)
 
     def explain(self, error: OSError) -> DataError | None:
         """Put what the system says of these files into a sentence; errors of others are not ours to explain."""
         name = os.fspath(error.filename) if isinstance(error.filename, str | os.PathLike) else ""
-        for move in self._files:
-            if name == str(move.staged):
-                return _unwritable(move.shown, error)
-        for folder in self._folders:
-            if name == str(folder.made) or name.startswith(f"{folder.made}{os.sep}"):
-                return _refused(folder, error)
-        if error.errno in _DISK_TROUBLE:
-            shown = [move.shown for move in self._files] + [folder.shown for folder in self._folders]
-            return _unwritable(shown[0], error) if shown else None
+        for each in self._all():
+            if name == str(each.staged) or name.startswith(f"{each.staged}{os.sep}"):
+                return each.refused(error)
+        if error.errno in _DISK_TROUBLE and self._all():
+            first = self._all()[0]
+            return _Move(None, first.target, first.shown).refused(error)
         return None
 
 
@@ -214,8 +220,8 @@ def discard_all() -> None:
         files.discard()
 
 
-def _refuse_twice(target: Path, shown: str, others: list[Path]) -> None:
-    if target in others:
+def _refuse_twice(target: Path, shown: str, others: Iterable[_Move | _Folder]) -> None:
+    if any(target == each.target for each in others):
         raise DataError(f"{shown}: two results would go to this place; choose another for one of them.")
 
 
@@ -250,21 +256,8 @@ def _flush_folder(path: Path) -> None:
 
 
 @contextmanager
-def _told(shown: str) -> Iterator[None]:
+def _told(place: _Move | _Folder) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise _unwritable(shown, error) from error
-
-
-def _unwritable(shown: str, error: OSError) -> DataError:
-    return DataError(
-        f"{shown}: cannot be written ({reason_of(error)}); "
-        "free the disk, close the file in other programs or choose another place."
-    )
-
-
-def _refused(folder: _Folder, error: OSError) -> DataError:
-    return DataError(
-        f"{folder.shown}: files cannot be put there ({reason_of(error)}); choose another for {folder.option}."
-    )
+        raise place.refused(error) from error
