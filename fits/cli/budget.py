@@ -94,16 +94,12 @@ def budget(given: Given) -> None:
 def _law(path: str) -> m.Preisach:
     """The hysteresis of a model file, as slow voltages see it."""
     import microid as m
-    from fits.cli._models import preisach_of
+    from fits.cli._models import stage_or_preisach
     from fits.control._compensate_stage import static_equivalent
     from fits.stage._model_file import load_model
 
-    loaded = load_model(path)
-    if not isinstance(loaded.model, m.Stage):
-        return preisach_of(path, loaded)
+    model = stage_or_preisach(path, load_model(path))
     try:
-        return static_equivalent(loaded.model)
+        return static_equivalent(model) if isinstance(model, m.Stage) else model
     except DataError as error:
-        if not error.of_model:
-            raise
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{path}: {error}" if error.of_model else str(error)) from error

@@ -1,7 +1,5 @@
 """The command `microid simulate`: its options, and the work."""
 
-from __future__ import annotations
-
 import click
 
 from fits.cli import _options as options
