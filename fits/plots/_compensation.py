@@ -35,12 +35,7 @@ def plot_compensation(
     displacement_sd_um
         Standard deviation of the model's displacement, shape `(n,)`, from `predict`; no band is drawn if None.
     folder
-        Existing folder for `compensation.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The file written.
+        Existing folder for `compensation.png`; 200 dots per inch. The paths come back.
 
     Raises
     ------

@@ -34,12 +34,7 @@ def plot_control(
     plants
         Stages that the controller is to work with, the one that was run first.
     folder
-        Existing folder for `run.png` and `margins.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+        Existing folder for `run.png` and `margins.png`; 200 dots per inch. The paths come back.
 
     Raises
     ------

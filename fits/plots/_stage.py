@@ -45,12 +45,7 @@ def plot_stage(
         What `fit_stage` was given.
     folder
         Existing folder for `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
-        out) and `loop.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+        out) and `loop.png`; 200 dots per inch. The paths come back.
 
     Raises
     ------
