@@ -40,7 +40,8 @@ def plot_fit(
     records, holdout, initial
         What `fit` was given.
     folder
-        Existing folder for `loops.png`, `density.png`, `everett.png` and `heldout.png`; 200 dots per inch. The paths come back.
+        Existing folder for `loops.png`, `density.png`, `everett.png` and `heldout.png`; 200 dots per inch. The paths
+        come back.
 
     Raises
     ------
