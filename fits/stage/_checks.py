@@ -71,21 +71,15 @@ def _not_one_rig(one: str, other: str, ratio: float) -> str:
     )
 
 
-def refuse_unseen(
-    stage: Stage,
-    coordinates: Coordinates[Stage],
-    solved: Solved,
-    drives: Sequence[np.ndarray],
-    fast: bool,
-    spare: bool = False,
-) -> str | None:
+def refuse_unseen(solved: Solved, drives: Sequence[np.ndarray], fast: bool, spare: bool = False) -> str | None:
     """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with.
 
-    The coordinates and the solution are those of the poles that explain the runs best, the hysteresis being given;
-    `drives` are what it alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the
-    others. Where a mechanics may be left out (`spare`) that the runs do not show, though they are sampled finely
-    enough, its name is returned instead.
+    The solution is that of the poles that explain the runs best, the hysteresis being given; `drives` are what it
+    alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the others. Where a
+    mechanics may be left out (`spare`) that the runs do not show, though they are sampled finely enough, its name is
+    returned instead.
     """
+    stage, coordinates = solved.stage, solved.problem.chain.coordinates
     information = marginal_information(
         solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
     )

@@ -54,7 +54,8 @@ from fits.io._version import written_by
 from fits.loop._design import Grid
 from fits.loop._uncertainty import Uncertainty
 from fits.stage._encode import decode, encode
-from fits.stage._uncertainty import StageUncertainty, offsets_out
+from fits.stage._moments import offsets_out
+from fits.stage._uncertainty import StageUncertainty
 from microid import Preisach, Stage
 
 _FAMILY = "microid.model/"

@@ -14,11 +14,26 @@ from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
 from fits.loop._run import Run
 from fits.loop._samples import Samples
-from fits.stage._run import ahead, joined, lead_ins, respond, without
-from microid import Coordinates, LinearSystem, Stage, Staircase
+from fits.stage._run import ahead, joined, lead_ins, place_of_hysteresis, respond, without
+from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
 
 # Samples that go through the compiled regression at a time.
 _PIECE = 2048
+
+
+def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
+    """Coordinates of what a fit of a stage moves: all that is free, but for offsets and the grid's own parameters.
+
+    A `ValueError` where nothing is left to move.
+    """
+    place = place_of_hysteresis(stage)
+    name = None if place is None or not grid else stage.names[place]
+
+    def moves(info: ParameterInfo) -> bool:
+        path = stage.named(info.path)
+        return stage.free(info) and not path.endswith("offset_um") and path.partition(".")[0] != name
+
+    return Coordinates(stage, moves)
 
 
 @dataclass(frozen=True)
@@ -31,6 +46,12 @@ class Chain:
     coordinates: Coordinates[Stage]
     place: int | None
     grid: Grid | None
+
+    @classmethod
+    def of(cls, stage: Stage, grid: Grid | None) -> "Chain":
+        """Coordinates of a stage whose hysteresis is fitted on a grid, if there is one."""
+        place = None if grid is None else place_of_hysteresis(stage)
+        return cls(offsets_out(stage, grid is not None), place, grid)
 
     @property
     def size(self) -> int:

@@ -13,9 +13,9 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._result import FitResult
 from fits.loop._samples import Samples
+from fits.stage._moments import offsets_out
 from fits.stage._run import lead_ins, prepare_again, residual_of, respond, without
 from fits.stage._solve import Weighing
-from fits.stage._uncertainty import offsets_out
 from microid import Coordinates, Stage
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from fits.loop._fit_checks import outlying
 from fits.loop._result import FitError, FitResult
 from fits.stage._solve import Solved, solve_chain
-from fits.stage._steps import Plan, Problem
+from fits.stage._steps import Plan
 from fits.stage._uncertainty import Precision
 from microid import Stage
 
@@ -30,7 +30,7 @@ class Reach:
     def of(cls, precision: Precision) -> "Reach":
         """Read it off a solution."""
         z, values = precision.solved.z, precision.chain.coordinates.values
-        sd = np.sqrt(np.diagonal(precision.covariance(precision.influence())))
+        sd = precision.sd()
         ends = (np.asarray(values(jnp.asarray(z + k * _NORMAL * sd))) for k in (0, -1, 1))
         return cls(*ends)
 
@@ -63,7 +63,7 @@ class Reach:
         return replace(fit, parameters=parameters, remarks=(remark, *fit.remarks))
 
 
-def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[str], Reach] | None:
+def leave_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Reach] | None:
     """Fit again without readings that jump out; the files that have such, and where the parameters come out.
 
     None where there are none, or where a robust loss weighs them less already, or where that fit fails.
@@ -74,9 +74,8 @@ def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[s
         return None
     runs = [replace(run, fitted=run.fitted & ~one) for run, one in zip(solved.runs, bad, strict=True)]
     plan.progress(f"fitting without the outliers of {', '.join(sources)}")
-    start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
     try:
-        found = solve_chain(problem.chain, *start, plan.loss, plan.progress, anyway=True, even=problem.even)
+        found = solve_chain(solved.onward, runs, plan.loss, plan.progress, anyway=True)
     except (FitError, np.linalg.LinAlgError):
         return None
-    return sources, Reach.of(Precision(problem.chain, found, problem.stroke_um))
+    return sources, Reach.of(Precision(found))

@@ -23,12 +23,12 @@ _NORMAL = 1.959964
 _UNSEEN = 0.5
 
 
-def summarise(stage: Stage, precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
-    """Put a fitted stage and the runs that were held out into words and figures.
+def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
+    """Put the fit of a stage, and runs that were held out, into words and figures.
 
     A `DataError` if the runs turn out not to be of one rig.
     """
-    coordinates, solved = precision.chain.coordinates, precision.solved
+    coordinates, solved, stage = precision.chain.coordinates, precision.solved, precision.solved.stage
     remarks = check_gains(stage, solved.runs, refuse=True)
     covariance = precision.covariance(precision.influence())
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
