@@ -39,8 +39,10 @@ class Draws:
 
 
 def _potential(
-    z: Float[Array, " p"], coordinates: Coordinates[Stage], runs: list[Samples], precision: list[Float[Array, ""]]
+    data: tuple[Coordinates[Stage], list[Samples], list[Float[Array, ""]]], z: Float[Array, " p"]
 ) -> Float[Array, ""]:
+    """Minus the logarithm of the likelihood."""
+    coordinates, runs, precision = data
     stage, total = coordinates(z), jnp.zeros(())
     for samples, share in zip(runs, precision, strict=True):
         off = without(lead_ins(stage, samples), samples.weight, samples.displacement_um - respond(stage, samples))
@@ -92,7 +94,7 @@ def sample_posterior(
     coordinates = offsets_out(stage, True)
     data = coordinates, [run.samples for run in runs], precision
     sampler = MCMC(
-        NUTS(potential_fn=eqx.Partial(_swapped, data), dense_mass=True),
+        NUTS(potential_fn=eqx.Partial(_potential, data), dense_mass=True),
         num_warmup=warmup,
         num_samples=draws,
         progress_bar=False,
@@ -104,9 +106,3 @@ def sample_posterior(
         lost = int(np.sum(np.asarray(sampler.get_extra_fields()["diverging"])))
     values = np.asarray(jax.vmap(coordinates.values)(z))
     return Draws(tuple(parameter.name for parameter in result.parameters), values, lost)
-
-
-def _swapped(
-    data: tuple[Coordinates[Stage], list[Samples], list[Float[Array, ""]]], z: Float[Array, " p"]
-) -> Float[Array, ""]:
-    return _potential(z, *data)
