@@ -71,7 +71,9 @@ def _not_one_rig(one: str, other: str, ratio: float) -> str:
     )
 
 
-def refuse_unseen(solved: Solved, drives: Sequence[np.ndarray], fast: bool, spare: bool = False) -> str | None:
+def refuse_unidentifiable(
+    solved: Solved, drives: Sequence[np.ndarray], fast: bool, spare: bool = False
+) -> str | None:
     """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with.
 
     The solution is that of the poles that explain the runs best, the hysteresis being given; `drives` are what it
@@ -99,7 +101,7 @@ def refuse_unseen(solved: Solved, drives: Sequence[np.ndarray], fast: bool, spar
         if isinstance(part, Mechanics)
     ]
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST * fastest.rate_Hz]
-    seen = gained(solved, drives) >= WORTH
+    seen = likelihood_ratio(solved, drives) >= WORTH
     some = bool(blurred) and (len(blurred) == len(poles) or not fast)
     driven = any(isinstance(part, Driver) for part in stage.parts)
     if spare and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
@@ -144,7 +146,7 @@ def refuse_unseen(solved: Solved, drives: Sequence[np.ndarray], fast: bool, spar
     return None
 
 
-def refuse_coarse(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
+def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
     """Refuse, in a `DataError`, a resonance that runs cannot show: sampled too slowly for it, they leave much."""
     finest = max(run.rate_Hz for run in runs)
     for part in stage.parts:
@@ -194,18 +196,18 @@ def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence
     return None
 
 
-def gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:
+def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
     """Twice the logarithm of how much likelier poles make the run that shows them best.
 
     Slow runs may become less likely: the hysteresis read off them has taken in the driver's lag, which now counts
     twice.
     """
-    gained = []
+    ratios = []
     for run, drive, noise in zip(solved.runs, drives, solved.weighing.noise_um, strict=True):
         x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
         left = y - y.mean() - x * (x @ y / (x @ x))
-        gained.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
-    return max(gained)
+        ratios.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
+    return max(ratios)
 
 
 def _names(stage: Stage, coordinates: Coordinates[Stage]) -> list[str]:

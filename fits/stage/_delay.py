@@ -11,9 +11,9 @@ from fits.loop._design import columns_of
 from fits.loop._misfit import Misfit, misfits
 from fits.loop._result import FitError, FitResult
 from fits.loop._run import Run
+from fits.stage._alternative import Alternative
 from fits.stage._moments import along, linearise, pieces
-from fits.stage._reach import Reach
-from fits.stage._run import lead_ins, simulate_stage, without
+from fits.stage._run import nuisance_columns, project_out, simulate_stage
 from fits.stage._solve import Problem, Solved, solve_chain
 from fits.stage._start import best_shifts, measure_response, start_stages
 from fits.stage._steps import Plan, hysteresis_alone
@@ -73,7 +73,7 @@ class Delay:
 
 
 @dataclass(frozen=True)
-class Undelayed:
+class WithoutDelays:
     """A fit of the same runs without their delays, and the delays of those that have one."""
 
     delays: tuple[Delay, ...]
@@ -89,9 +89,9 @@ class Undelayed:
         return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
 
 
-def take_out_delays(
+def fit_without_delays(
     plan: Plan, solved: Solved, precision: Precision | None, left: Sequence[Misfit]
-) -> Undelayed | None:
+) -> WithoutDelays | None:
     """Look for delays in what a fit leaves of each run, and fit again without them; None where that does not help.
 
     A small one shows as the derivative of the residual with respect to a delay, whatever the parameters may do
@@ -106,7 +106,7 @@ def take_out_delays(
     if start.even:
         # Unless much is left, which may hide the resonance that was not found.
         gross = max(one.share_pct for one in left) > GROSS_PCT
-        return take_out_delays(plan, start.full, None, left) if gross and start.full is not None else None
+        return fit_without_delays(plan, start.full, None, left) if gross and start.full is not None else None
     shifts = np.zeros(len(plan.records))
     far = [k for k, one in enumerate(left) if one.times_noise > _LOUD]
     searched = _search(plan, solved, far)
@@ -156,7 +156,7 @@ def take_out_delays(
         return None
     if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd()) < _MOVED:
         return None
-    return Undelayed(seen, found, sure)
+    return WithoutDelays(seen, found, sure)
 
 
 def _solved_with(plan: Plan, start: Problem, stride: int, shifts_s: np.ndarray) -> tuple[Solved, Precision] | None:
@@ -168,21 +168,21 @@ def _solved_with(plan: Plan, start: Problem, stride: int, shifts_s: np.ndarray) 
     return found, Precision(found)
 
 
-def refuse_delays(undelayed: Undelayed | None) -> None:
+def refuse_delays(undelayed: WithoutDelays | None) -> None:
     """Refuse runs whose delays kept a fit from an answer, in a `DataError`; nothing where there are none."""
     if undelayed is not None:
         raise DataError(f"{undelayed.words()}, and no fit was found with that: {_REMEDY}")
 
 
-def own_up(fit: FitResult[Stage], undelayed: Undelayed) -> FitResult[Stage]:
+def widen_for_delays(fit: FitResult[Stage], undelayed: WithoutDelays) -> FitResult[Stage]:
     """Name the delays of a fit, and widen the intervals by what they did to its parameters.
 
     A `DataError` if a parameter moves so much that the fit says nothing.
     """
-    reach, said = Reach.of(undelayed.precision), undelayed.words()
-    if ruined := reach.ruined(fit):
-        raise DataError(f"{said}, and {ruined[0]}: {_REMEDY}")
-    return reach.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
+    other, said = Alternative.of(undelayed.precision), undelayed.words()
+    if moved := other.contradicted(fit):
+        raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")
+    return other.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
 
 
 def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray) -> list[Delay]:
@@ -198,8 +198,8 @@ def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray
         late, early = (simulate_stage(stage, plan.run(k, run.stride, shifts[k] + sign * step)) for sign in (1, -1))
         full = np.zeros(run.samples.weight.shape[0])
         full[:n] = (late - early) / (2 * step)
-        own = jnp.asarray(lead_ins(stage, run.samples))
-        late_um_per_s = np.asarray(without(own, run.samples.weight, jnp.asarray(full)))[:n]
+        own = jnp.asarray(nuisance_columns(stage, run.samples))
+        late_um_per_s = np.asarray(project_out(own, run.samples.weight, jnp.asarray(full)))[:n]
         worth = solved.weighing.shares[k] / precision.variance
         weighed = worth * weight * late_um_per_s
         _, slope, _ = linearise(chain, *here, run)

@@ -14,9 +14,9 @@ from fits.loop._misfit import misfits, worst
 from fits.loop._result import FitError, FitResult
 from fits.loop._run import prepare_run
 from fits.loop._samples import refuse_many_steps
-from fits.stage._checks import implausible, refuse_coarse
-from fits.stage._delay import GROSS_PCT, own_up, refuse_delays, take_out_delays
-from fits.stage._reach import Reach, leave_outliers
+from fits.stage._alternative import Alternative, fit_without_outliers
+from fits.stage._checks import implausible, refuse_undersampled
+from fits.stage._delay import GROSS_PCT, fit_without_delays, refuse_delays, widen_for_delays
 from fits.stage._run import gain_ahead, place_of_hysteresis
 from fits.stage._solve import Solved
 from fits.stage._steps import Plan, refine_problem, start_problem
@@ -104,10 +104,10 @@ def fit_stage(
     solved, runs = found.solved, found.solved.runs
     left, even = misfits(runs, solved.residuals_um), solved.problem.even
     progress("looking for delays")
-    undelayed = take_out_delays(found.plan, solved, found.precision, left)
+    undelayed = fit_without_delays(found.plan, solved, found.precision, left)
     # What is sampled too slowly may look late; a delay is believed that leaves little else.
     if undelayed is None or any(one.far for one in undelayed.left()):
-        refuse_coarse(solved.stage, runs, left)
+        refuse_undersampled(solved.stage, runs, left)
     if found.failure is not None or even:
         refuse_delays(undelayed)
     if found.failure is not None:
@@ -126,15 +126,15 @@ def fit_stage(
     held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
     summary = summarise(found.precision, held)
     if undelayed is not None:
-        summary = own_up(summary, undelayed)
-    outliers = leave_outliers(found.plan, solved)
+        summary = widen_for_delays(summary, undelayed)
+    outliers = fit_without_outliers(found.plan, solved)
     if outliers is not None:
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
     odd = remarks_on(runs, solved.residuals_um, robust=loss == "huber")
     sources = [record.source for record in records]
     unit = implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
     if unit is not None:
-        summary = Reach.in_unit(summary, unit[1]).widen(
+        summary = Alternative.in_unit(summary, unit[1]).widen(
             summary, unit[0], "name the right one as in --columns time_s=time_ms"
         )
     notes = [warning for record in (*records, *aside) for warning in record.warnings]

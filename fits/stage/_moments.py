@@ -14,7 +14,7 @@ from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
 from fits.loop._run import Run
 from fits.loop._samples import Samples
-from fits.stage._run import ahead, joined, lead_ins, place_of_hysteresis, respond, without
+from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
 from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
 
 # Samples that go through the compiled regression at a time.
@@ -97,7 +97,7 @@ def _linearised(
         return out, out
 
     slope, out = jax.jacfwd(response, has_aux=True)(z)
-    return out, slope, lead_ins(_stage(coordinates, place, grid, z, columns_um), samples)
+    return out, slope, nuisance_columns(_stage(coordinates, place, grid, z, columns_um), samples)
 
 
 @eqx.filter_jit
@@ -139,7 +139,7 @@ def _rows(
     return system.gain * response + more, memory, (state, response[-1])
 
 
-_without = eqx.filter_jit(without)
+_project_out = eqx.filter_jit(project_out)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def run_sums(
             used.T @ used, used.T @ target, np.asarray(target @ target), np.asarray(weight[piece].sum())
         )
     reduced, _, _ = split_moments(sums, known, 0.0)
-    off = np.asarray(_without(jnp.asarray(own), samples.weight, jnp.asarray(residual)))
+    off = np.asarray(_project_out(jnp.asarray(own), samples.weight, jnp.asarray(residual)))
     return RunSums(reduced, np.asarray(sums.gram)[:known, known] / weight.sum(), off[: len(run.record)])
 
 

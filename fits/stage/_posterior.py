@@ -14,7 +14,7 @@ from fits.io._record import Record
 from fits.loop._result import FitResult
 from fits.loop._samples import Samples
 from fits.stage._moments import offsets_out
-from fits.stage._run import lead_ins, prepare_again, residual_of, respond, without
+from fits.stage._run import nuisance_columns, prepare_again, project_out, residual_of, respond
 from fits.stage._solve import Weighing
 from microid import Coordinates, Stage
 
@@ -45,7 +45,9 @@ def _potential(
     coordinates, runs, precision = data
     stage, total = coordinates(z), jnp.zeros(())
     for samples, share in zip(runs, precision, strict=True):
-        off = without(lead_ins(stage, samples), samples.weight, samples.displacement_um - respond(stage, samples))
+        off = project_out(
+            nuisance_columns(stage, samples), samples.weight, samples.displacement_um - respond(stage, samples)
+        )
         total = total + share * jnp.sum(samples.weight * off**2) / 2
     return total
 

@@ -14,7 +14,15 @@ from fits.loop._choose_grid import choose_grid
 from fits.loop._fit_checks import without_impulses
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, prepare_run, simulate_run
-from fits.stage._checks import UNSEEN, WORTH, check_gains, gained, refuse_slopes, refuse_unseen, speed_Hz
+from fits.stage._checks import (
+    UNSEEN,
+    WORTH,
+    check_gains,
+    likelihood_ratio,
+    refuse_slopes,
+    refuse_unidentifiable,
+    speed_Hz,
+)
 from fits.stage._moments import offsets_out
 from fits.stage._run import place_of_hysteresis, simulate_stage
 from fits.stage._solve import Problem, Solved, solve_chain
@@ -32,7 +40,7 @@ _EVEN = 1.0
 # Samples that a driver lags by where its search begins.
 _LAG = 3.0
 # Parts of the sampling interval below which a driver has no time constant, and from which it may find one again.
-_ASLEEP, _WAKE = 1e-2, 0.3
+_VANISHED, _RESTARTED = 1e-2, 0.3
 
 
 @dataclass(frozen=True)
@@ -101,8 +109,8 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         law = grid.model(columns, np.zeros(()))
         stage = stage.swap(name, law)
     drives = hysteresis_alone(stage, runs)
-    lively = [k for k in range(len(plan.records)) if k not in slow] or slow
-    responses = [measure_response(runs[k], drives[k]) for k in lively]
+    fast = [k for k in range(len(plan.records)) if k not in slow] or slow
+    responses = [measure_response(runs[k], drives[k]) for k in fast]
     candidates = start_stages(stage, responses)
     found: list[Solved] = []
     failure = FitError(FitStatus.NONFINITE)
@@ -119,10 +127,10 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     solved = replace(solved, hyper=hyper)
     problem = solved.onward
     try:
-        spare = refuse_unseen(solved, drives, fast=lively != slow, spare=not plan.anyway)
+        spare = refuse_unidentifiable(solved, drives, fast=fast != slow, spare=not plan.anyway)
     except DataError:
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
-        lagging = None if plan.anyway or lively != slow else _lagging(plan, problem, runs, drives)
+        lagging = None if plan.anyway or fast != slow else _lagging(plan, problem, runs, drives)
         if lagging is None:
             raise
         return lagging
@@ -161,7 +169,7 @@ def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence
         solved = solve_chain(simpler, runs, plan.loss, plan.progress)
     except (FitError, np.linalg.LinAlgError):
         return None
-    if gained(solved, drives) < WORTH or float(np.max(Precision(solved).sd())) > UNSEEN:
+    if likelihood_ratio(solved, drives) < WORTH or float(np.max(Precision(solved).sd())) > UNSEEN:
         return None
     return solved.onward
 
@@ -195,10 +203,10 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
             return solved, precision
         stride = min(_FINEST, 2 ** math.ceil(math.log2(excess) / 2))
         plan.progress(f"{stride} steps per sample")
-        problem = replace(solved.onward, z=_awake(plan, solved))
+        problem = replace(solved.onward, z=_restart_driver(plan, solved))
 
 
-def _awake(plan: Plan, solved: Solved) -> np.ndarray:
+def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
 
     A command that jumps at every sample has all of the driver's answer between two: whole steps do not see it, and
@@ -208,8 +216,8 @@ def _awake(plan: Plan, solved: Solved) -> np.ndarray:
     interval_s = min(float(np.median(np.diff(record.time_s))) for record in plan.records)
     changed = False
     for name, part in zip(stage.names, stage.parts, strict=True):
-        if isinstance(part, Driver) and float(part.time_constant_s) < _ASLEEP * interval_s:
-            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_WAKE * interval_s)))
+        if isinstance(part, Driver) and float(part.time_constant_s) < _VANISHED * interval_s:
+            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_RESTARTED * interval_s)))
             changed = True
     if plan.hold != "zero" or not changed:
         return solved.z
