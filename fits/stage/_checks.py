@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
@@ -13,7 +11,7 @@ from fits.loop._run import Run
 from fits.stage._run import residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
 from fits.stats._noise import correlation_samples
-from microid import Coordinates, Driver, Mechanics, Stage
+from microid import Driver, Mechanics, Stage
 
 # Gains that differ by more than this are not those of one rig, and by more than that are worth a remark.
 _REFUSED, _REMARKED = 0.1, 0.05
@@ -81,12 +79,13 @@ def refuse_unidentifiable(
     mechanics may be left out (`spare`) that the runs do not show, though they are sampled finely enough, its name is
     returned instead.
     """
-    stage, coordinates = solved.stage, solved.problem.chain.coordinates
+    stage = solved.stage
     information = marginal_information(
         solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
     )
-    slope = np.abs(_relative(coordinates, solved.z))
-    names = _names(stage, coordinates)
+    named, value, derivative = solved.parameters()
+    slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
+    names = [name for name, _ in named]
     poles = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _POLES]
     if not poles:
         return None
@@ -208,23 +207,6 @@ def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
         left = y - y.mean() - x * (x @ y / (x @ x))
         ratios.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
     return max(ratios)
-
-
-def _names(stage: Stage, coordinates: Coordinates[Stage]) -> list[str]:
-    return [stage.named(info.path) for info in coordinates.table for _ in range(int(np.prod(info.shape)))]
-
-
-def _relative(coordinates: Coordinates[Stage], z: np.ndarray) -> np.ndarray:
-    """Change of each parameter's logarithm per coordinate, shape `(p,)`."""
-    value, slope = coordinates_slope(coordinates, z)
-    return slope / np.maximum(np.abs(value), 1e-300)
-
-
-def coordinates_slope(coordinates: Coordinates[Stage], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and their derivatives, each by its own coordinate, shapes `(p,)`."""
-    point = jnp.asarray(z)
-    value, slope = jax.jvp(coordinates.values, (point,), (jnp.ones_like(point),))
-    return np.asarray(value), np.asarray(slope)
 
 
 def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:

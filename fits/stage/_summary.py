@@ -10,7 +10,7 @@ import numpy as np
 
 from fits.loop._result import FitResult, FitStatus, ParameterEstimate, RunReport
 from fits.loop._run import Run
-from fits.stage._checks import check_gains, coordinates_slope
+from fits.stage._checks import check_gains
 from fits.stage._run import residual_of, simulate_stage
 from fits.stage._uncertainty import Precision
 from fits.stats._identifiability import unseen_directions
@@ -32,12 +32,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     remarks = check_gains(stage, solved.runs, refuse=True)
     covariance = precision.covariance(precision.influence())
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    names = [
-        (stage.named(info.path) + _index(info.shape, place), info.spec.unit)
-        for info in coordinates.table
-        for place in range(int(np.prod(info.shape)))
-    ]
-    value, slope = coordinates_slope(coordinates, solved.z)
+    names, value, slope = solved.parameters()
     ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * _NORMAL * sd))) for sign in (-1, 1)]
     # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
     width = np.where(sd > _UNSEEN, np.abs(ends[1] - ends[0]) / (2 * _NORMAL), np.abs(slope) * sd)
@@ -68,10 +63,6 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
         correlation=covariance / np.maximum(np.outer(sd, sd), 1e-300),
         unseen=unseen,
     )
-
-
-def _index(shape: tuple[int, ...], place: int) -> str:
-    return "" if shape == () else str(list(map(int, np.unravel_index(place, shape))))
 
 
 def _with_offset(stage: Stage, offset_um: float) -> Stage:
