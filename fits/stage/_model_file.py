@@ -177,9 +177,8 @@ def load_model(path: str | os.PathLike[str]) -> ModelFile:
         raise DataError(f"{name}: expected a model and its uncertainty; write the file again with 'microid fit'.")
     if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
         raise DataError(f"{name}: the uncertainty does not fit the stage; write the file again with 'microid fit'.")
-    if uncertainty is not None and uncertainty.columns_um.shape[1] != (
-        0 if uncertainty.grid is None else uncertainty.grid.columns
-    ):
+    columns = 0 if uncertainty is None or uncertainty.grid is None else uncertainty.grid.columns
+    if uncertainty is not None and uncertainty.columns_um.shape[1] != columns:
         raise DataError(f"{name}: the uncertainty does not fit its grid; write the file again with 'microid fit'.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
 
