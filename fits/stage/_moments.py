@@ -36,15 +36,14 @@ def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
     return Coordinates(stage, moves)
 
 
-@dataclass(frozen=True)
-class Chain:
+class Chain(eqx.Module):
     """A stage in the coordinates of its fit: of all parameters but those of the grid and the offsets.
 
     The grid stands at a place in the chain; both are None where no grid is fitted.
     """
 
     coordinates: Coordinates[Stage]
-    place: int | None
+    place: int | None = eqx.field(static=True)
     grid: Grid | None
 
     @classmethod
@@ -63,41 +62,24 @@ class Chain:
         """Levels of the grid."""
         return 0 if self.grid is None else self.grid.levels
 
-    def stage(self, z: Float[Array, " p"], columns_um: Float[Array, " D"]) -> Stage:
-        """The stage with these coordinates and columns, and no offset."""
-        return _stage(self.coordinates, self.place, self.grid, z, columns_um)
-
-
-def _stage(
-    coordinates: Coordinates[Stage],
-    place: int | None,
-    grid: Grid | None,
-    z: Float[Array, " p"],
-    columns_um: Float[Array, " D"] | None,
-) -> Stage:
-    stage = coordinates(z)
-    if grid is None or place is None or columns_um is None:
-        return stage
-    return stage.swap(stage.names[place], grid.model(columns_um, jnp.zeros(())))
+    def stage(self, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None) -> Stage:
+        """The stage with these coordinates and columns, and no offset; without columns, with those that it has."""
+        stage = self.coordinates(z)
+        if self.grid is None or self.place is None or columns_um is None:
+            return stage
+        return stage.swap(stage.names[self.place], self.grid.model(columns_um, jnp.zeros(())))
 
 
 @eqx.filter_jit
 def _linearised(
-    coordinates: Coordinates[Stage],
-    place: int | None,
-    grid: Grid | None,
-    z: Float[Array, " p"],
-    columns_um: Float[Array, " D"] | None,
-    samples: Samples,
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, samples: Samples
 ) -> tuple[Float[Array, " n"], Float[Array, "n p"], Float[Array, "n k"]]:
-    """Response of a run, its derivatives along the coordinates, and the run's nuisance parameters."""
-
     def response(z: Float[Array, " p"]) -> tuple[Array, Array]:
-        out = respond(_stage(coordinates, place, grid, z, columns_um), samples)
+        out = respond(chain.stage(z, columns_um), samples)
         return out, out
 
     slope, out = jax.jacfwd(response, has_aux=True)(z)
-    return out, slope, nuisance_columns(_stage(coordinates, place, grid, z, columns_um), samples)
+    return out, slope, nuisance_columns(chain.stage(z, columns_um), samples)
 
 
 @eqx.filter_jit
@@ -187,9 +169,8 @@ def run_sums(
 def linearise(
     chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, run: Run
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Response of a padded run, its slopes along the coordinates, and its own unknowns; see `_linearised`."""
-    here = chain.coordinates, chain.place, chain.grid
-    out, slope, own = _linearised(*here, z, columns_um, run.samples)
+    """Response of a padded run, its slopes along the coordinates, and its nuisance columns."""
+    out, slope, own = _linearised(chain, z, columns_um, run.samples)
     return np.asarray(out), np.asarray(slope), np.asarray(own)
 
 
