@@ -22,9 +22,8 @@ from fits.diagnosis._select import _inexact, select
 from fits.loop._design import Grid
 from fits.loop._run import prepare_run
 from fits.stage._fit import default_stage
-from fits.stage._moments import Chain
+from fits.stage._moments import Chain, offsets_out
 from fits.stage._run import place_of_hysteresis
-from fits.stage._uncertainty import offsets_out
 from fits.stats._whiten import Noise
 from microid import EFFECTS, Sensor
 from microid.effects.aging import Aging

@@ -22,9 +22,8 @@ from fits.diagnosis._tangent import passed
 from fits.loop._design import Grid
 from fits.loop._run import prepare_run
 from fits.stage._fit import default_stage
-from fits.stage._moments import Chain
+from fits.stage._moments import Chain, offsets_out
 from fits.stage._run import place_of_hysteresis
-from fits.stage._uncertainty import offsets_out
 from fits.stats._whiten import Noise
 from microid.effects.backlash import Backlash
 from microid.effects.clock_mismatch import ClockMismatch

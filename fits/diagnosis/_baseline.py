@@ -135,8 +135,9 @@ def fit_baseline(
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
         return _static(records, aside, range_V, holdout, initial, remarks, progress)
-    prior = prior_precision(found.chain, found.solved.hyper, found.stroke_um)
-    stride = found.solved.runs[0].samples.stride
+    solved, chain, stroke_um = found.solved, found.solved.problem.chain, found.solved.problem.stroke_um
+    prior = prior_precision(chain, solved.hyper, stroke_um)
+    stride = solved.runs[0].stride
 
     def prepared(many: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
         return (
@@ -148,21 +149,21 @@ def fit_baseline(
     many = _FINE_STEPS if hold == "zero" else _FINE
     (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, many))
     return Baseline(
-        found.chain,
-        found.solved.z,
-        found.solved.columns_um,
+        chain,
+        solved.z,
+        solved.columns_um,
         prior,
-        found.stroke_um,
+        stroke_um,
         range_V,
         runs,
         held,
         *prepared(min(stride, _COARSE)),
         finest,
         finest_held,
-        tuple(map(partial(_finely, found.stage), runs, finest)),
-        tuple(map(partial(_finely, found.stage), held, finest_held)),
+        tuple(map(partial(_finely, solved.stage), runs, finest)),
+        tuple(map(partial(_finely, solved.stage), held, finest_held)),
         True,
-        found.remarks,
+        solved.problem.remarks,
     )
 
 

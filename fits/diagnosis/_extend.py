@@ -15,7 +15,7 @@ from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import Gain
 from fits.loop._run import Run
 from fits.stage._motion import Prepared, signals
-from fits.stage._run import without
+from fits.stage._run import project_out
 from microid import AbstractEffect, Stage
 
 _BLOCKS = 24
@@ -60,7 +60,7 @@ def left_of(run: Run, own: np.ndarray, response_um: np.ndarray, using: np.ndarra
     return np.asarray(_without(jnp.asarray(own), weight, jnp.asarray(off)))
 
 
-_without = eqx.filter_jit(without)
+_without = eqx.filter_jit(project_out)
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from optimistix import RESULTS
 from scipy import signal
 
 from fits.io._errors import DataError
 from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, solve_grid
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._prior import Hyper
-from fits.loop._result import FitError, FitStatus, LevelTrial
+from fits.loop._result import FitError, LevelTrial
 from fits.loop._run import Run, simulate_run
 from fits.stats._at_rest import quantum_um
 from fits.stats._noise import WHITE, correlation_samples, huber_weight
@@ -96,7 +95,6 @@ def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compa
     grid = data.grid
     correlation = 1.0
     solution = solve_grid(data, stroke, correlation, hyper)
-    _check(solution.result)
     model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
     left = [run.weighed(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
@@ -104,7 +102,6 @@ def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compa
     if found > WHITE:
         correlation = found
         solution = solve_grid(data, stroke, correlation, hyper)
-        _check(solution.result)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
     return GridTrial(data, solution, correlation, error, discrepancy)
@@ -163,14 +160,6 @@ def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:
     return float(parts.sum() / (np.abs(parts).sum() + 1e-300))
 
 
-def _check(result: RESULTS) -> None:
-    if result == RESULTS.successful:
-        return
-    if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
-        raise FitError(FitStatus.MAX_STEPS)
-    raise FitError(FitStatus.NONFINITE)
-
-
 def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list[Run]:
     """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid."""
     progress("weighing outliers")
@@ -178,7 +167,6 @@ def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list
     grid, hyper = grid_of(runs, LADDER[0]), Hyper.start()
     for _ in range(_REWEIGHED):
         solution = solve_grid(gather(grid, runs), stroke, 1.0, hyper)
-        _check(solution.result)
         hyper = solution.hyper
         model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
         left = [run.displacement_um - simulate_run(model, run) for run in runs]

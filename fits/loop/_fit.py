@@ -12,7 +12,7 @@ from fits.io._errors import DataError
 from fits.io._record import Record, refuse_repeats
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits.loop._design import Grid, columns_of
-from fits.loop._grid import grid_estimate
+from fits.loop._grid import Estimate, grid_estimate
 from fits.loop._history import estimate_start
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
@@ -21,7 +21,6 @@ from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
 from fits.loop._shapes import solve_shape
 from fits.loop._uncertainty import Uncertainty, perturbations
-from fits.stats._estimate import Estimate
 from fits.stats._noise import LOSSES, WHITE
 from microid import FAMILIES, Preisach
 
@@ -144,14 +143,9 @@ def fit(
 def check_fit(
     records: Sequence[Record], holdout: float | Sequence[Record], loss: str
 ) -> tuple[float, tuple[Record, ...], tuple[float, float]]:
-    """Check what a fit is given; the fraction and the records that are held out, and the range of all voltages.
+    """Check what a fit is given: the fraction and the records that are held out, and the range of all voltages.
 
-    Raises
-    ------
-    DataError
-        If it cannot be fitted.
-    RuntimeError
-        If JAX computes in single precision.
+    A `DataError` if it cannot be fitted, a `RuntimeError` if JAX computes in single precision.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')

@@ -16,10 +16,11 @@ from scipy.optimize import nnls
 from fits.loop._evidence import Posterior, effective, maximise_evidence, posterior, renew_noise
 from fits.loop._moments import Data, Moments, blocks_of
 from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
-from fits.stats._estimate import Estimate
 from fits.stats._noise import shared_square
 from fits.stats._nonnegative import BlockPivoting
+from microid import Preisach
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
 EVIDENCE_LEVELS = 16
@@ -38,19 +39,36 @@ _FEW = 64
 
 
 @dataclass(frozen=True)
+class Estimate:
+    """What every family's solver hands over: a model in um, with no offset, how sure it is, and what it leaves.
+
+    `factor_um @ factor_um.T` is the covariance of the columns of a grid of `levels`, which may be coarser than the
+    model's. `noise_um` is the standard deviation of the residual, of which so many samples as `correlation` are worth
+    one independent one. `discrepancy_um` is that of the model's own error that the covariance does not own up to.
+    """
+
+    model: Preisach
+    levels: int
+    factor_um: Float[Array, "D k"]
+    noise_um: float
+    correlation: float
+    discrepancy_um: float
+
+
+@dataclass(frozen=True)
 class GridSolution:
     """Non-negative weights and slopes of a grid, in strokes, and the Gaussian posterior they are the mode of."""
 
     columns: Float[Array, " D"]
     belief: Posterior
     hyper: Hyper
-    result: RESULTS
 
 
 def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -> GridSolution:
     """Find the most probable non-negative columns, smoothness and noise, all in strokes.
 
-    So many samples as `correlation` are worth one independent one; the search begins at `start`.
+    So many samples as `correlation` are worth one independent one; the search begins at `start`. A `FitError` if the
+    regression does not converge.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
@@ -68,10 +86,13 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
         hyper = maximise_evidence(moments, rough, start)
         belief = posterior(moments, rough, hyper)
     if np.all(np.asarray(belief.mean) >= 0):
-        done: Any = RESULTS.successful
-        return GridSolution(belief.mean, belief, hyper, done)
+        return GridSolution(belief.mean, belief, hyper)
     columns, result = non_negative(belief)
-    return GridSolution(columns, belief, hyper, result)
+    if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
+        raise FitError(FitStatus.MAX_STEPS)
+    if result != RESULTS.successful:
+        raise FitError(FitStatus.NONFINITE)
+    return GridSolution(columns, belief, hyper)
 
 
 def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
@@ -88,7 +109,9 @@ def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     while True:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
-        columns, result = _bounded(belief, jnp.asarray(order))
+        spread, precision, mean, unit = _marginal(belief, jnp.asarray(order))
+        y, result = _pivot(precision, mean)
+        columns = _follow(belief, jnp.asarray(order), spread, precision, (y - mean, y), unit)
         left = np.asarray(columns) * scale
         if result != RESULTS.successful:
             return _one_by_one(belief)
@@ -113,12 +136,6 @@ def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     except RuntimeError:
         return jnp.maximum(belief.mean, 0), over
     return jnp.asarray(columns / scale), done
-
-
-def _bounded(belief: Posterior, which: Int[Array, " k"]) -> tuple[Float[Array, " D"], RESULTS]:
-    spread, precision, mean, scale = _marginal(belief, which)
-    y, result = _pivot(precision, mean)
-    return _follow(belief, which, spread, precision, (y - mean, y), scale), result
 
 
 @eqx.filter_jit

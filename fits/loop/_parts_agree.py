@@ -52,9 +52,9 @@ def check_loops(
     """
     residuals = [left_of(model, run) for run in runs]
     left, remarks = misfits(runs, residuals), remarks_on(runs, residuals, robust)
-    alone = Alone(stroke_um, hyper)
+    separate = SeparateFits(stroke_um, hyper)
     try:
-        told = disagreements(runs, model, alone, left)
+        told = disagreements(runs, model, separate, left)
     except FitError:
         # Fits of parts are only asked for an opinion.
         told = []
@@ -63,11 +63,11 @@ def check_loops(
         for one, residual, run in zip(left, residuals, runs, strict=True)
     )
     if not told and not quiet:
-        told = delays(runs, prepare, alone, left)
+        told = delays(runs, prepare, separate, left)
     return worst(left), [*told, *remarks]
 
 
-class Alone:
+class SeparateFits:
     """Fits of single runs, or parts of them, on a coarse grid, in strokes, with the smoothness and noise given."""
 
     def __init__(self, stroke_um: float, hyper: Hyper):
@@ -93,7 +93,7 @@ def left_of(model: Preisach, run: Run) -> np.ndarray:
     return np.asarray(left - run.mean(left, run.fitted))
 
 
-def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequence[Misfit]) -> list[str]:
+def disagreements(runs: Sequence[Run], model: Preisach, separate: SeparateFits, left: Sequence[Misfit]) -> list[str]:
     """Look for runs, and parts of runs, that a hysteresis explains one by one but not together.
 
     Returns a sentence for each. A `DataError` if the gains of two runs differ by so much that they are not of one rig
@@ -102,7 +102,7 @@ def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequ
     if not any(one.far for one in left):
         return []
     remarks = []
-    models = [alone.fit([run]) for run in runs]
+    models = [separate.fit([run]) for run in runs]
     own = [_rms(left_of(one, run)[run.fitted]) for one, run in zip(models, runs, strict=True)]
     together = [_rms(left_of(model, run)[run.fitted]) for run in runs]
     if len(runs) > 1 and _pooled(together, runs) > _TIMES * _pooled(own, runs):
@@ -123,11 +123,11 @@ def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequ
             raise DataError(sentence)
         remarks.append(sentence)
     for run, rms in zip(runs, own, strict=True):
-        remarks += _changed(run, alone, rms)
+        remarks += _change_point(run, separate, rms)
     return remarks
 
 
-def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
+def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
     """Find the place from where on a run shows another hysteresis."""
     order = np.cumsum(run.fitted)
     total = int(order[-1])
@@ -145,7 +145,7 @@ def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
             first, second = parts(place)
             if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST:
                 break
-            models = alone.fit([first]), alone.fit([second])
+            models = separate.fit([first]), separate.fit([second])
             squares = [
                 np.where(run.fitted, left_of(m, p) ** 2, 0.0) for m, p in zip(models, parts(place), strict=True)
             ]
@@ -172,7 +172,9 @@ def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
     return [sentence]
 
 
-def delays(runs: Sequence[Run], prepare: Callable[[Record], Run], alone: Alone, left: Sequence[Misfit]) -> list[str]:
+def delays(
+    runs: Sequence[Run], prepare: Callable[[Record], Run], separate: SeparateFits, left: Sequence[Misfit]
+) -> list[str]:
     """Look for readings that come late, or before their command, by fitting each run with its voltage shifted."""
     remarks = []
     for run, miss in zip(runs, left, strict=True):
@@ -181,7 +183,7 @@ def delays(runs: Sequence[Run], prepare: Callable[[Record], Run], alone: Alone, 
         def residual(samples: float, run: Run = run, interval: float = interval) -> np.ndarray:
             record = run.record
             voltage = np.interp(record.time_s - samples * interval, record.time_s, record.voltage_V)
-            return alone.left(prepare(replace(record, voltage_V=voltage, extra=dict(record.extra))))
+            return separate.left(prepare(replace(record, voltage_V=voltage, extra=dict(record.extra))))
 
         try:
             found = _profile(residual)

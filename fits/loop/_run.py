@@ -46,26 +46,12 @@ class Path:
 class Run:
     """A record for the fit of a hysteresis or of a whole stage.
 
-    Attributes
-    ----------
-    record
-        The measured columns.
-    lower_V, upper_V
-        Range of the switching voltages.
-    start
-        Memory before the first sample.
-    known
-        Samples whose output does not depend on an unknown past, but for a constant, shape `(n,)`.
-    fitted
-        Samples that are fitted: known, and not held out, shape `(n,)`.
-    weight
-        Of each sample in the sum of squares, shape `(n,)`; None where all count alike.
-    gain
-        Voltage at the hysteresis per command, at rest.
-    stride, hold
-        Steps into which a stage's intervals are divided, and how its command runs between samples, as in `Stage`.
-    moving
-        Whether the stage may have been moving when the record began.
+    The switching voltages range from `lower_V` to `upper_V`; `gain` is the voltage at the hysteresis per command, at
+    rest, and `start` the memory before the first sample. Samples are `known` whose output does not depend on an
+    unknown past, but for a constant, and `fitted` those of them that are not held out, shape `(n,)`; `weight` is that
+    of each in the sum of squares, None where all count alike. For a stage the intervals are divided into `stride`
+    steps, between samples the command runs as `hold` says (see `Stage`), and the stage may have been `moving` when
+    the record began.
     """
 
     record: Record
@@ -136,29 +122,11 @@ def prepare_run(
     hold: Hold = "first",
     usable: np.ndarray | None = None,
 ) -> Run:
-    """Make a record ready.
+    """Make a record ready whose command stays in a range; a `DataError` if nothing of it is left to fit.
 
-    Parameters
-    ----------
-    record
-        Measured voltage and displacement.
-    range_V
-        Range of the command; covers the record.
-    initial
-        Memory before the first sample, one of `INITIAL_STATES`, or `VIRGIN`.
-    holdout
-        Fraction at the end that is kept out of the fit.
-    stride, hold
-        See `Run`.
-    gain
-        See `Run`; None for a stage without a hysteresis, which no past is unknown of.
-    usable
-        Which samples may be fitted, shape `(n,)`; by default all.
-
-    Raises
-    ------
-    DataError
-        If nothing of the record is left to fit.
+    The memory before the first sample is `initial`, one of `INITIAL_STATES`, or `VIRGIN`; a fraction at the end is
+    held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Of the samples only those
+    that are `usable` may be fitted, shape `(n,)`. For the others see `Run`.
     """
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)

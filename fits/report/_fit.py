@@ -32,19 +32,21 @@ def fit_report(result: FitResult[Any]) -> dict[str, Any]:
     """
     model = result.model
     law: Any = model
+    parts: dict[str, Any] = {}
     if isinstance(model, Stage):
         place = place_of_hysteresis(model)
         law = None if place is None else model.parts[place]
+        named = zip(model.names, model.parts, strict=True)
+        parts["parts"] = [{"name": name, "type": type(part).__name__} for name, part in named]
     density = law.density if isinstance(law, Preisach) else None
     report = {
         "status": result.status.name.lower(),
+        **parts,
         "family": None if density is None else density.family,
         "levels": None if density is None else density.levels,
         "lower_V": None if density is None else float(density.lower_V),
         "upper_V": None if density is None else float(density.upper_V),
         **(_of_stage(result) if isinstance(model, Stage) else _of_hysteresis(result)),
-        "discrepancy_um": float(result.uncertainty.discrepancy_um),
-        "misfit": _misfit(result.misfit),
         "in_sample": _errors(result.in_sample),
         "held_out": _errors(result.held_out),
         "runs": [_run(run) for run in result.runs],
@@ -60,17 +62,15 @@ def _of_hysteresis(result: FitResult[Any]) -> dict[str, Any]:
     return {
         "noise_um": result.noise_um,
         "correlation_samples": result.correlation_samples,
+        "discrepancy_um": float(result.uncertainty.discrepancy_um),
         "smoothness": result.smoothness,
         "trials": [{"levels": trial.levels, "error_um": trial.error_um} for trial in result.trials],
+        "misfit": _misfit(result.misfit),
     }
 
 
 def _of_stage(result: FitResult[Any]) -> dict[str, Any]:
-    stage = result.model
     return {
-        "parts": [
-            {"name": name, "type": type(part).__name__} for name, part in zip(stage.names, stage.parts, strict=True)
-        ],
         "parameters": [
             {
                 "name": parameter.name,
@@ -81,6 +81,8 @@ def _of_stage(result: FitResult[Any]) -> dict[str, Any]:
         ],
         "correlation": [[_finite(value) for value in row] for row in np.asarray(result.correlation)],
         "unseen": list(result.unseen),
+        "misfit": _misfit(result.misfit),
+        "discrepancy_um": float(result.uncertainty.discrepancy_um),
     }
 
 

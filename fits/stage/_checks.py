@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
@@ -13,7 +11,7 @@ from fits.loop._run import Run
 from fits.stage._run import residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
 from fits.stats._noise import correlation_samples
-from microid import Coordinates, Driver, Mechanics, Stage
+from microid import Driver, Mechanics, Stage
 
 # Gains that differ by more than this are not those of one rig, and by more than that are worth a remark.
 _REFUSED, _REMARKED = 0.1, 0.05
@@ -71,26 +69,23 @@ def _not_one_rig(one: str, other: str, ratio: float) -> str:
     )
 
 
-def refuse_unseen(
-    stage: Stage,
-    coordinates: Coordinates[Stage],
-    solved: Solved,
-    drives: Sequence[np.ndarray],
-    fast: bool,
-    spare: bool = False,
+def refuse_unidentifiable(
+    solved: Solved, drives: Sequence[np.ndarray], fast: bool, spare: bool = False
 ) -> str | None:
     """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with.
 
-    The coordinates and the solution are those of the poles that explain the runs best, the hysteresis being given;
-    `drives` are what it alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the
-    others. Where a mechanics may be left out (`spare`) that the runs do not show, though they are sampled finely
-    enough, its name is returned instead.
+    The solution is that of the poles that explain the runs best, the hysteresis being given; `drives` are what it
+    alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the others. Where a
+    mechanics may be left out (`spare`) that the runs do not show, though they are sampled finely enough, its name is
+    returned instead.
     """
+    stage = solved.stage
     information = marginal_information(
         solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
     )
-    slope = np.abs(_relative(coordinates, solved.z))
-    names = _names(stage, coordinates)
+    named, value, derivative = solved.parameters()
+    slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
+    names = [name for name, _ in named]
     poles = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _POLES]
     if not poles:
         return None
@@ -105,7 +100,7 @@ def refuse_unseen(
         if isinstance(part, Mechanics)
     ]
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST * fastest.rate_Hz]
-    seen = gained(solved, drives) >= WORTH
+    seen = likelihood_ratio(solved, drives) >= WORTH
     some = bool(blurred) and (len(blurred) == len(poles) or not fast)
     driven = any(isinstance(part, Driver) for part in stage.parts)
     if spare and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
@@ -150,7 +145,7 @@ def refuse_unseen(
     return None
 
 
-def refuse_coarse(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
+def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
     """Refuse, in a `DataError`, a resonance that runs cannot show: sampled too slowly for it, they leave much."""
     finest = max(run.rate_Hz for run in runs)
     for part in stage.parts:
@@ -200,35 +195,18 @@ def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence
     return None
 
 
-def gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:
+def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
     """Twice the logarithm of how much likelier poles make the run that shows them best.
 
     Slow runs may become less likely: the hysteresis read off them has taken in the driver's lag, which now counts
     twice.
     """
-    gained = []
+    ratios = []
     for run, drive, noise in zip(solved.runs, drives, solved.weighing.noise_um, strict=True):
         x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
         left = y - y.mean() - x * (x @ y / (x @ x))
-        gained.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
-    return max(gained)
-
-
-def _names(stage: Stage, coordinates: Coordinates[Stage]) -> list[str]:
-    return [stage.named(info.path) for info in coordinates.table for _ in range(int(np.prod(info.shape)))]
-
-
-def _relative(coordinates: Coordinates[Stage], z: np.ndarray) -> np.ndarray:
-    """Change of each parameter's logarithm per coordinate, shape `(p,)`."""
-    value, slope = coordinates_slope(coordinates, z)
-    return slope / np.maximum(np.abs(value), 1e-300)
-
-
-def coordinates_slope(coordinates: Coordinates[Stage], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and their derivatives, each by its own coordinate, shapes `(p,)`."""
-    point = jnp.asarray(z)
-    value, slope = jax.jvp(coordinates.values, (point,), (jnp.ones_like(point),))
-    return np.asarray(value), np.asarray(slope)
+        ratios.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
+    return max(ratios)
 
 
 def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:

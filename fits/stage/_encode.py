@@ -102,7 +102,7 @@ def _encode_module(module: eqx.Module, packed: Collection[str]) -> dict[str, Any
     for key, field in _fields(type(module)).items():
         value, unit = getattr(module, key), _unit(field)
         if key in packed and isinstance(value, jax.Array) and value.dtype == np.float64:
-            out[key] = _encode_packed(np.asarray(value), unit)
+            out[key] = _encode_array(np.asarray(value), unit, packed=True)
         else:
             out[key] = encode(value, unit, packed)
     return out
@@ -136,20 +136,16 @@ def _words(kind: Any) -> str:
     return f"an array of {len(axes)} axes ({', '.join(axes)})" if axes else "a single number with its unit"
 
 
-def _encode_array(array: np.ndarray, unit: str) -> dict[str, Any]:
+def _encode_array(array: np.ndarray, unit: str, packed: bool = False) -> dict[str, Any]:
     if not np.all(np.isfinite(array)):
         raise DataError("it holds a number that is not finite")
+    if packed:
+        data = base64.b64encode(array.astype("<f8").tobytes()).decode("ascii")
+        return {"unit": unit, "shape": list(array.shape), "float64_base64": data}
     out = {"unit": unit, "value": array.tolist()}
     if array.dtype.name not in _DTYPES:
         raise DataError(f"it holds an array of {array.dtype.name}, for which the format has no form")
     return out if array.dtype == np.float64 else out | {"dtype": array.dtype.name}
-
-
-def _encode_packed(array: np.ndarray, unit: str) -> dict[str, Any]:
-    if not np.all(np.isfinite(array)):
-        raise DataError("it holds a number that is not finite")
-    data = base64.b64encode(array.astype("<f8").tobytes()).decode("ascii")
-    return {"unit": unit, "shape": list(array.shape), "float64_base64": data}
 
 
 def _decode_array(item: dict[str, Any], where: str, spec: ParameterSpec | None) -> jax.Array:

@@ -14,13 +14,12 @@ from fits.loop._misfit import misfits, worst
 from fits.loop._result import FitError, FitResult
 from fits.loop._run import prepare_run
 from fits.loop._samples import refuse_many_steps
-from fits.stage._checks import implausible, refuse_coarse
-from fits.stage._delay import GROSS_PCT, own_up, refuse_delays, take_out_delays
-from fits.stage._moments import Chain
-from fits.stage._reach import Reach, leave_outliers
+from fits.stage._alternative import Alternative, fit_without_outliers
+from fits.stage._checks import implausible, refuse_undersampled
+from fits.stage._delay import GROSS_PCT, fit_without_delays, refuse_delays, widen_for_delays
 from fits.stage._run import gain_ahead, place_of_hysteresis
 from fits.stage._solve import Solved
-from fits.stage._steps import Plan, Problem, refine_problem, start_problem
+from fits.stage._steps import Plan, refine_problem, start_problem
 from fits.stage._summary import summarise
 from fits.stage._uncertainty import Precision
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
@@ -101,21 +100,20 @@ def fit_stage(
     RuntimeError
         If JAX computes in single precision.
     """
-    asked = stage, levels, holdout, initial, loss, progress
-    found = solve_stage(records, *asked)
-    runs, sources = found.solved.runs, [record.source for record in records]
-    left = misfits(runs, found.solved.residuals_um)
+    found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
+    solved, runs = found.solved, found.solved.runs
+    left, even = misfits(runs, solved.residuals_um), solved.problem.even
     progress("looking for delays")
-    undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
+    undelayed = fit_without_delays(found.plan, solved, found.precision, left)
     # What is sampled too slowly may look late; a delay is believed that leaves little else.
     if undelayed is None or any(one.far for one in undelayed.left()):
-        refuse_coarse(found.stage, runs, left)
-    if found.failure is not None or found.problem.even:
+        refuse_undersampled(solved.stage, runs, left)
+    if found.failure is not None or even:
         refuse_delays(undelayed)
     if found.failure is not None:
         raise found.failure
     gross = worst(left)
-    if found.problem.even and gross.share_pct > GROSS_PCT:
+    if even and gross.share_pct > GROSS_PCT:
         raise DataError(
             f"{gross.source}: neither a lag nor a resonance explains what moves in it: {gross.share_pct:.3g} % of "
             f"its stroke stay unexplained, {gross.times_noise:.3g} times the sensor's noise; check columns, time "
@@ -123,44 +121,38 @@ def fit_stage(
         )
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
-    before = initial if isinstance(initial, str) else "unknown"
-    settings = before, 1.0, runs[-1].stride, gain_ahead(found.stage), found.stage.hold
-    held = [prepare_run(record, found.range_V, *settings) for record in aside]
-    summary = summarise(found.stage, found.precision, held)
+    before, stage = initial if isinstance(initial, str) else "unknown", solved.stage
+    settings = before, 1.0, runs[-1].stride, gain_ahead(stage), stage.hold
+    held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
+    summary = summarise(found.precision, held)
     if undelayed is not None:
-        summary = own_up(summary, undelayed)
-    outliers = leave_outliers(found.plan, found.problem, found.solved)
+        summary = widen_for_delays(summary, undelayed)
+    outliers = fit_without_outliers(found.plan, solved)
     if outliers is not None:
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
-    odd = remarks_on(runs, found.solved.residuals_um, robust=loss == "huber")
+    odd = remarks_on(runs, solved.residuals_um, robust=loss == "huber")
+    sources = [record.source for record in records]
     unit = implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
     if unit is not None:
-        summary = Reach.in_unit(summary, unit[1]).widen(
+        summary = Alternative.in_unit(summary, unit[1]).widen(
             summary, unit[0], "name the right one as in --columns time_s=time_ms"
         )
     notes = [warning for record in (*records, *aside) for warning in record.warnings]
-    told = tuple(dict.fromkeys((*odd, *notes, *found.remarks, *summary.remarks)))
+    told = tuple(dict.fromkeys((*odd, *notes, *solved.problem.remarks, *summary.remarks)))
     return replace(summary, misfit=worst(left), remarks=told)
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What the fit of a stage found, before it is compared with anything.
+    """What the fit of a stage found before it is compared with anything, and what was asked for.
 
-    The stage has no offset; `stroke_um` is the unit of its columns. The problem is where the fit began. `failure`
-    says why this is only the best place that was found; None where the fit converged.
+    `failure` says why this is only the best place that was found; None where the fit converged.
     """
 
-    stage: Stage
-    chain: Chain
     solved: Solved
     precision: Precision
-    stroke_um: float
-    range_V: tuple[float, float]
-    remarks: tuple[str, ...]
     plan: Plan
-    problem: Problem
-    failure: FitError | None
+    failure: FitError | None = None
 
 
 def solve_stage(
@@ -195,14 +187,10 @@ def solve_stage(
         tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, anyway
     )
     problem = start_problem(plan, stage, levels, finest)
-    failure = None
     try:
-        problem, solved, precision = refine_problem(plan, problem)
-    except FitError as error:
+        return Solution(*refine_problem(plan, problem), plan)
+    except FitError as failure:
         if anyway:
             raise
         # What the best place leaves may show why.
-        failure = error
-        problem, solved, precision = refine_problem(replace(plan, anyway=True), problem)
-    place = problem.at(solved), problem.chain, solved, precision, problem.stroke_um, range_V
-    return Solution(*place, problem.remarks, plan, problem, failure)
+        return Solution(*refine_problem(replace(plan, anyway=True), problem), plan, failure)

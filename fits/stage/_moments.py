@@ -14,23 +14,43 @@ from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
 from fits.loop._run import Run
 from fits.loop._samples import Samples
-from fits.stage._run import ahead, joined, lead_ins, respond, without
-from microid import Coordinates, LinearSystem, Stage, Staircase
+from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
+from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
 
 # Samples that go through the compiled regression at a time.
 _PIECE = 2048
 
 
-@dataclass(frozen=True)
-class Chain:
+def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
+    """Coordinates of what a fit of a stage moves: all that is free, but for offsets and the grid's own parameters.
+
+    A `ValueError` where nothing is left to move.
+    """
+    place = place_of_hysteresis(stage)
+    name = None if place is None or not grid else stage.names[place]
+
+    def moves(info: ParameterInfo) -> bool:
+        path = stage.named(info.path)
+        return stage.free(info) and not path.endswith("offset_um") and path.partition(".")[0] != name
+
+    return Coordinates(stage, moves)
+
+
+class Chain(eqx.Module):
     """A stage in the coordinates of its fit: of all parameters but those of the grid and the offsets.
 
     The grid stands at a place in the chain; both are None where no grid is fitted.
     """
 
     coordinates: Coordinates[Stage]
-    place: int | None
+    place: int | None = eqx.field(static=True)
     grid: Grid | None
+
+    @classmethod
+    def of(cls, stage: Stage, grid: Grid | None) -> "Chain":
+        """Coordinates of a stage whose hysteresis is fitted on a grid, if there is one."""
+        place = None if grid is None else place_of_hysteresis(stage)
+        return cls(offsets_out(stage, grid is not None), place, grid)
 
     @property
     def size(self) -> int:
@@ -42,41 +62,24 @@ class Chain:
         """Levels of the grid."""
         return 0 if self.grid is None else self.grid.levels
 
-    def stage(self, z: Float[Array, " p"], columns_um: Float[Array, " D"]) -> Stage:
-        """The stage with these coordinates and columns, and no offset."""
-        return _stage(self.coordinates, self.place, self.grid, z, columns_um)
-
-
-def _stage(
-    coordinates: Coordinates[Stage],
-    place: int | None,
-    grid: Grid | None,
-    z: Float[Array, " p"],
-    columns_um: Float[Array, " D"] | None,
-) -> Stage:
-    stage = coordinates(z)
-    if grid is None or place is None or columns_um is None:
-        return stage
-    return stage.swap(stage.names[place], grid.model(columns_um, jnp.zeros(())))
+    def stage(self, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None) -> Stage:
+        """The stage with these coordinates and columns, and no offset; without columns, with those that it has."""
+        stage = self.coordinates(z)
+        if self.grid is None or self.place is None or columns_um is None:
+            return stage
+        return stage.swap(stage.names[self.place], self.grid.model(columns_um, jnp.zeros(())))
 
 
 @eqx.filter_jit
 def _linearised(
-    coordinates: Coordinates[Stage],
-    place: int | None,
-    grid: Grid | None,
-    z: Float[Array, " p"],
-    columns_um: Float[Array, " D"] | None,
-    samples: Samples,
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, samples: Samples
 ) -> tuple[Float[Array, " n"], Float[Array, "n p"], Float[Array, "n k"]]:
-    """Response of a run, its derivatives along the coordinates, and the run's nuisance parameters."""
-
     def response(z: Float[Array, " p"]) -> tuple[Array, Array]:
-        out = respond(_stage(coordinates, place, grid, z, columns_um), samples)
+        out = respond(chain.stage(z, columns_um), samples)
         return out, out
 
     slope, out = jax.jacfwd(response, has_aux=True)(z)
-    return out, slope, lead_ins(_stage(coordinates, place, grid, z, columns_um), samples)
+    return out, slope, nuisance_columns(chain.stage(z, columns_um), samples)
 
 
 @eqx.filter_jit
@@ -118,7 +121,7 @@ def _rows(
     return system.gain * response + more, memory, (state, response[-1])
 
 
-_without = eqx.filter_jit(without)
+_project_out = eqx.filter_jit(project_out)
 
 
 @dataclass(frozen=True)
@@ -159,16 +162,15 @@ def run_sums(
             used.T @ used, used.T @ target, np.asarray(target @ target), np.asarray(weight[piece].sum())
         )
     reduced, _, _ = split_moments(sums, known, 0.0)
-    off = np.asarray(_without(jnp.asarray(own), samples.weight, jnp.asarray(residual)))
+    off = np.asarray(_project_out(jnp.asarray(own), samples.weight, jnp.asarray(residual)))
     return RunSums(reduced, np.asarray(sums.gram)[:known, known] / weight.sum(), off[: len(run.record)])
 
 
 def linearise(
     chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, run: Run
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Response of a padded run, its slopes along the coordinates, and its own unknowns; see `_linearised`."""
-    here = chain.coordinates, chain.place, chain.grid
-    out, slope, own = _linearised(*here, z, columns_um, run.samples)
+    """Response of a padded run, its slopes along the coordinates, and its nuisance columns."""
+    out, slope, own = _linearised(chain, z, columns_um, run.samples)
     return np.asarray(out), np.asarray(slope), np.asarray(own)
 
 

@@ -39,7 +39,7 @@ def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
     return stage(samples.time_s, samples.voltage_V, start, samples.beside)[:: samples.stride]
 
 
-def lead_ins(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
+def nuisance_columns(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, shape `(n, k)`: an offset in um, and how the stage moved before.
 
     The latter are the free motions of what follows the hysteresis, or of the whole chain without one. A voltage at
@@ -59,7 +59,7 @@ def lead_ins(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
     return jnp.concatenate([offset, jax.vmap(free)(jnp.eye(system.order)).T], axis=1)
 
 
-def without(
+def project_out(
     columns: Float[Array, "n k"], weight: Float[Array, " n"], values: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Take the best combination of some columns off, by weighted least squares."""
@@ -73,7 +73,7 @@ def without(
 @eqx.filter_jit
 def _compare(stage: Stage, samples: Samples) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     out = respond(stage, samples)
-    return out, without(lead_ins(stage, samples), samples.weight, samples.displacement_um - out)
+    return out, project_out(nuisance_columns(stage, samples), samples.weight, samples.displacement_um - out)
 
 
 def simulate_stage(stage: Stage, run: Run) -> np.ndarray:

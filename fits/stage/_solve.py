@@ -3,10 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
+from fits.loop._design import Grid
 from fits.loop._grid import solve_grid
 from fits.loop._moments import Data, Moments
 from fits.loop._prior import Hyper, roughness
@@ -16,6 +17,7 @@ from fits.stage._moments import Chain, RunSums, run_sums, split_moments
 from fits.stage._run import residual_of
 from fits.stage._weighing import Weighing
 from fits.stats._noise import huber_weight
+from microid import Stage
 
 _ROUNDS, _ROUGH = 40, 12
 # Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
@@ -27,6 +29,35 @@ _ROUNDING = 1e-20
 
 
 @dataclass(frozen=True)
+class Problem:
+    """A stage to be fitted, where its fit begins, and what the user should know.
+
+    The unit of the columns is `stroke_um`; `hyper` is their smoothness and noise to start from, None to leave them as
+    they are. No run counts as quieter than the part `even` of the loudest: where more than noise is left, one run
+    would otherwise be fitted ever better, and so count for ever more, at the cost of the others. Where a part was
+    left out, `full` is the stage with it, roughly fitted.
+    """
+
+    stage: Stage
+    chain: Chain
+    z: np.ndarray
+    columns_um: np.ndarray
+    hyper: Hyper | None
+    stroke_um: float
+    remarks: tuple[str, ...] = ()
+    even: float = 0.0
+    full: "Solved | None" = None
+
+    @classmethod
+    def of(
+        cls, stage: Stage, grid: Grid | None, columns_um: np.ndarray, hyper: Hyper | None, stroke_um: float
+    ) -> "Problem":
+        """Begin at a stage, and at columns of the grid of its hysteresis."""
+        chain = Chain.of(stage, grid)
+        return cls(stage, chain, np.asarray(chain.coordinates.of(stage)), columns_um, hyper, stroke_um)
+
+
+@dataclass(frozen=True)
 class Solved:
     """Where a fit ended: coordinates, shape `(p,)`, and columns of the grid, shape `(D,)`.
 
@@ -34,12 +65,35 @@ class Solved:
     the sums are the regression at the end.
     """
 
+    problem: Problem
     z: np.ndarray
     columns_um: np.ndarray
     hyper: Hyper | None
     runs: list[Run]
     sums: list[RunSums]
     weighing: Weighing
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that it stands for, without an offset."""
+        return self.problem.chain.stage(jnp.asarray(self.z), jnp.asarray(self.columns_um))
+
+    def parameters(self) -> tuple[list[tuple[str, str]], np.ndarray, np.ndarray]:
+        """Names and units of the parameters outside the grid, values, and derivatives by their own coordinates."""
+        stage, coordinates = self.stage, self.problem.chain.coordinates
+        named = [
+            (stage.named(info.path) + ("" if info.shape == () else str(list(place))), info.spec.unit)
+            for info in coordinates.table
+            for place in np.ndindex(info.shape)
+        ]
+        point = jnp.asarray(self.z)
+        value, slope = jax.jvp(coordinates.values, (point,), (jnp.ones_like(point),))
+        return named, np.asarray(value), np.asarray(slope)
+
+    @property
+    def onward(self) -> Problem:
+        """The problem of going on from here."""
+        return replace(self.problem, z=self.z, columns_um=self.columns_um, hyper=self.hyper)
 
     @property
     def residuals_um(self) -> list[np.ndarray]:
@@ -54,17 +108,12 @@ class Solved:
 
 
 def solve_chain(
-    chain: Chain,
-    z: np.ndarray,
-    columns_um: np.ndarray,
+    problem: Problem,
     runs: Sequence[Run],
-    hyper: Hyper | None,
-    stroke_um: float,
     loss: str,
     progress: Callable[[str], None],
     rough: bool = False,
     anyway: bool = False,
-    even: float = 0.0,
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
@@ -73,25 +122,11 @@ def solve_chain(
     projection; Golub & Pereyra 2003). Without columns these are Levenberg and Marquardt's steps. A library's solver
     would hold the smoothness, the weights of the runs and the columns at zero fixed, which change with every step.
 
-    Parameters
-    ----------
-    z, columns_um
-        Start.
-    hyper
-        Smoothness and noise of the columns to start from; None to leave the columns as they are.
-    rough
-        Whether the place found is only a start for another fit, so that it need not be stationary.
-    anyway
-        Whether the best place is an answer, too, if it does not become stationary: for those who go on from there.
-    even
-        No run counts as quieter than this part of the loudest. Where more than noise is left, one run would otherwise
-        be fitted ever better, and so count for ever more, at the cost of the others.
-
-    Raises
-    ------
-    FitError
-        If it does not become stationary and must.
+    A `rough` place is only a start for another fit, and need not be stationary. `anyway` takes the best place for an
+    answer, too, for those who go on from there; otherwise a `FitError` says that it did not become stationary.
     """
+    chain, stroke_um, even = problem.chain, problem.stroke_um, problem.even
+    z, columns_um, hyper = problem.z, problem.columns_um, problem.hyper
     damping = _DAMPING
     counted: tuple[float, ...] = ()
     for number in range(_ROUGH if rough else _ROUNDS):
@@ -114,7 +149,7 @@ def solve_chain(
                 if damping > _HIGHEST and not (anyway and number):
                     raise
                 if damping > _HIGHEST:
-                    return Solved(z, columns_um, hyper, list(runs), sums, weighing)
+                    return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
                 continue
             hyper = better
             prior = prior_precision(chain, hyper, stroke_um)
@@ -140,9 +175,9 @@ def solve_chain(
             continue
         if distance < _STATIONARY:
             runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
-            return Solved(z, columns_um, hyper, list(runs), sums, weighing)
+            return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
     if rough or anyway:
-        return Solved(z, columns_um, hyper, list(runs), sums, weighing)
+        return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
     raise FitError(FitStatus.MAX_STEPS)
 
 
@@ -201,8 +236,6 @@ def _step(
         return step, columns_um, hyper, variance, float(step @ information @ step / len(step)) ** 0.5
     reduced, answer, follow = split_moments(total, chain.size, damping)
     solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, 1.0, hyper)
-    if solution.result != optx.RESULTS.successful:
-        raise FitError(FitStatus.MAX_STEPS)
     columns = np.asarray(solution.columns) * stroke_um
     step = answer - follow @ columns
     variance = float(jnp.exp(solution.hyper.log_variance)) * stroke_um**2

@@ -1,6 +1,6 @@
 """Where the fit of a stage begins: poles read off a measured frequency response, so that nobody has to guess them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -99,9 +99,8 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
         if isinstance(part, AbstractLinear) and name not in moved
     ]
     problem = _LogResponse.of(responses, [isinstance(part, Driver) for _, part in free], fixed)
-    candidates = problem.candidates()
     found: list[tuple[float, np.ndarray]] = []
-    for x in _distinct(candidates[:_LEADING], _COARSE)[:_REFINED]:
+    for x in _distinct(problem.ranked()[1][:_LEADING], _COARSE)[:_REFINED]:
         low, high = problem.bounds()
         end: Any = least_squares(problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200)
         found.append((float(end.cost), end.x))
@@ -120,13 +119,13 @@ def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) 
     costs = []
     for shift in shifts_s:
         turned = problem.measured * np.exp(2j * np.pi * problem.frequency_Hz * shift)
-        costs.append(replace(problem, measured=turned).least())
+        costs.append(replace(problem, measured=turned).ranked()[0][0])
     cost = np.asarray(costs)
     low = np.flatnonzero((cost <= np.r_[np.inf, cost[:-1]]) & (cost <= np.r_[cost[1:], np.inf]))
     return [float(shifts_s[k]) for k in low[np.argsort(cost[low])]]
 
 
-def _distinct(points: Sequence[np.ndarray], apart: float) -> list[np.ndarray]:
+def _distinct(points: Iterable[np.ndarray], apart: float) -> list[np.ndarray]:
     kept: list[np.ndarray] = []
     for point in points:
         if all(np.max(np.abs(point - other)) > apart for other in kept):
@@ -198,15 +197,8 @@ class _LogResponse:
         pairs = [pair for one in self.drivers for pair in (driver if one else mechanics)]
         return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
 
-    def least(self) -> float:
-        """Misfit of the best candidate."""
-        return float(self._ranked()[0][0])
-
-    def candidates(self) -> list[np.ndarray]:
-        """All combinations of some poles for each part, the best first."""
-        return list(self._ranked()[1])
-
-    def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
+    def ranked(self) -> tuple[np.ndarray, np.ndarray]:
+        """All combinations of some poles for each part, the best first: their misfits and their coordinates."""
         low, high = float(self.frequency_Hz.min()), float(self.frequency_Hz.max())
         size = np.abs(self.measured) * np.minimum(self.weight, 1)
         peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] > size[2:])) + 1

@@ -10,7 +10,7 @@ import numpy as np
 
 from fits.loop._result import FitResult, FitStatus, ParameterEstimate, RunReport
 from fits.loop._run import Run
-from fits.stage._checks import check_gains, coordinates_slope
+from fits.stage._checks import check_gains
 from fits.stage._run import residual_of, simulate_stage
 from fits.stage._uncertainty import Precision
 from fits.stats._identifiability import unseen_directions
@@ -23,21 +23,16 @@ _NORMAL = 1.959964
 _UNSEEN = 0.5
 
 
-def summarise(stage: Stage, precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
-    """Put a fitted stage and the runs that were held out into words and figures.
+def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
+    """Put the fit of a stage, and runs that were held out, into words and figures.
 
     A `DataError` if the runs turn out not to be of one rig.
     """
-    coordinates, solved = precision.chain.coordinates, precision.solved
+    coordinates, solved, stage = precision.chain.coordinates, precision.solved, precision.solved.stage
     remarks = check_gains(stage, solved.runs, refuse=True)
     covariance = precision.covariance(precision.influence())
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    names = [
-        (stage.named(info.path) + _index(info.shape, place), info.spec.unit)
-        for info in coordinates.table
-        for place in range(int(np.prod(info.shape)))
-    ]
-    value, slope = coordinates_slope(coordinates, solved.z)
+    names, value, slope = solved.parameters()
     ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * _NORMAL * sd))) for sign in (-1, 1)]
     # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
     width = np.where(sd > _UNSEEN, np.abs(ends[1] - ends[0]) / (2 * _NORMAL), np.abs(slope) * sd)
@@ -68,10 +63,6 @@ def summarise(stage: Stage, precision: Precision, held: Sequence[Run]) -> FitRes
         correlation=covariance / np.maximum(np.outer(sd, sd), 1e-300),
         unseen=unseen,
     )
-
-
-def _index(shape: tuple[int, ...], place: int) -> str:
-    return "" if shape == () else str(list(map(int, np.unravel_index(place, shape))))
 
 
 def _with_offset(stage: Stage, offset_um: float) -> Stage:

@@ -14,10 +14,10 @@ from fits.loop._prior import interpolation
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Prediction
 from fits.stage._moments import Chain, RunSums, along
-from fits.stage._run import place_of_hysteresis, prepare_program, simulate_stage
+from fits.stage._run import prepare_program, simulate_stage
 from fits.stage._solve import Solved, prior_precision, scale_free
 from fits.stats._noise import WHITE, correlation_samples, shared_square
-from microid import Coordinates, ParameterInfo, Preisach, Stage
+from microid import Preisach, Stage
 
 # Levels on which predictions are perturbed; finer ones move no displacement.
 _LEVELS = 16
@@ -25,21 +25,6 @@ _LEVELS = 16
 _LAGS = 6.0
 # Precision, in scaled coordinates, that stands in for none.
 _FAINT = 1e-8
-
-
-def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
-    """Coordinates of what a fit of a stage moves: all that is free, but for offsets and the grid's own parameters.
-
-    A `ValueError` where nothing is left to move.
-    """
-    place = place_of_hysteresis(stage)
-    name = None if place is None or not grid else stage.names[place]
-
-    def moves(info: ParameterInfo) -> bool:
-        path = stage.named(info.path)
-        return stage.free(info) and not path.endswith("offset_um") and path.partition(".")[0] != name
-
-    return Coordinates(stage, moves)
 
 
 class StageUncertainty(AbstractUncertainty):
@@ -71,15 +56,14 @@ class StageUncertainty(AbstractUncertainty):
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
         """Standard deviation of the predicted displacement of a run, shape `(n,)`."""
         stage = _stage(model)
-        coordinates = offsets_out(stage, self.grid is not None)
-        chain = Chain(coordinates, None if self.grid is None else place_of_hysteresis(stage), self.grid)
+        chain = Chain.of(stage, self.grid)
         mean = np.asarray(self.mean_um)
 
         def variance(moved: np.ndarray) -> np.ndarray:
             return np.asarray(np.sum((moved - mean) ** 2, axis=1))
 
         directions = np.asarray(self.columns_um).T, np.asarray(self.coordinates).T
-        square = along(chain, coordinates.of(stage), None, run, directions, variance)
+        square = along(chain, chain.coordinates.of(stage), None, run, directions, variance)
         return np.sqrt(square + float(self.discrepancy_um) ** 2)
 
     def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
@@ -97,15 +81,15 @@ def _stage(model: Preisach | Stage) -> Stage:
 class Precision:
     """What a fit knows: the precision of its columns and coordinates together, and what each sample contributes."""
 
-    def __init__(self, chain: Chain, solved: Solved, stroke_um: float):
-        self.chain, self.solved = chain, solved
+    def __init__(self, solved: Solved):
+        self.chain, self.solved = solved.problem.chain, solved
         total = solved.weighing.total(solved.sums)
-        size, count = chain.size, len(solved.z)
+        size, count = self.chain.size, len(solved.z)
         self.variance = solved.weighing.least_um**2
         self.gram = np.asarray(total.gram) / self.variance
         self.prior = np.zeros_like(self.gram)
         if solved.hyper is not None:
-            prior = prior_precision(chain, solved.hyper, stroke_um)
+            prior = prior_precision(self.chain, solved.hyper, solved.problem.stroke_um)
             self.prior[:size, :size] = scale_free(prior, solved.columns_um)
         rest = np.arange(size), np.arange(size, size + count)
         self.information = self._marginal(*rest)
@@ -151,6 +135,10 @@ class Precision:
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
             held = held + sandwich(own, np.sqrt(run.fit_weight) * one.residual_um, run.fitted)
         return held
+
+    def sd(self) -> np.ndarray:
+        """Standard deviations of the coordinates, shape `(p,)`."""
+        return np.sqrt(np.diagonal(self.covariance(self.influence())))
 
     def uncertainty(self) -> StageUncertainty:
         """Perturbations for predictions."""

@@ -8,7 +8,7 @@ import numpy as np
 from fits.loop._fit_checks import outlying
 from fits.loop._result import FitError, FitResult
 from fits.stage._solve import Solved, solve_chain
-from fits.stage._steps import Plan, Problem
+from fits.stage._steps import Plan
 from fits.stage._uncertainty import Precision
 from microid import Stage
 
@@ -19,7 +19,7 @@ _RUINED = 0.5
 
 
 @dataclass(frozen=True)
-class Reach:
+class Alternative:
     """Where the parameters of a stage come out without something, and the ends of their 95 % intervals, `(p,)`."""
 
     values: np.ndarray
@@ -27,21 +27,21 @@ class Reach:
     high: np.ndarray
 
     @classmethod
-    def of(cls, precision: Precision) -> "Reach":
+    def of(cls, precision: Precision) -> "Alternative":
         """Read it off a solution."""
         z, values = precision.solved.z, precision.chain.coordinates.values
-        sd = np.sqrt(np.diagonal(precision.covariance(precision.influence())))
+        sd = precision.sd()
         ends = (np.asarray(values(jnp.asarray(z + k * _NORMAL * sd))) for k in (0, -1, 1))
         return cls(*ends)
 
     @classmethod
-    def in_unit(cls, fit: FitResult[Stage], factor: float) -> "Reach":
+    def in_unit(cls, fit: FitResult[Stage], factor: float) -> "Alternative":
         """Where a fit comes out if a unit of its times is so many s."""
         powers = np.asarray([{"s": 1.0, "Hz": -1.0}.get(p.unit, 0.0) for p in fit.parameters])
         figures = [[getattr(p, name) for p in fit.parameters] for name in ("value", "lower", "upper")]
         return cls(*(factor**powers * np.asarray(each) for each in figures))
 
-    def ruined(self, fit: FitResult[Stage]) -> list[str]:
+    def contradicted(self, fit: FitResult[Stage]) -> list[str]:
         """Say which parameters of a fit are far from these, one sentence each."""
         return [
             f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
@@ -63,7 +63,7 @@ class Reach:
         return replace(fit, parameters=parameters, remarks=(remark, *fit.remarks))
 
 
-def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[str], Reach] | None:
+def fit_without_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Alternative] | None:
     """Fit again without readings that jump out; the files that have such, and where the parameters come out.
 
     None where there are none, or where a robust loss weighs them less already, or where that fit fails.
@@ -74,9 +74,8 @@ def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[s
         return None
     runs = [replace(run, fitted=run.fitted & ~one) for run, one in zip(solved.runs, bad, strict=True)]
     plan.progress(f"fitting without the outliers of {', '.join(sources)}")
-    start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
     try:
-        found = solve_chain(problem.chain, *start, plan.loss, plan.progress, anyway=True, even=problem.even)
+        found = solve_chain(solved.onward, runs, plan.loss, plan.progress, anyway=True)
     except (FitError, np.linalg.LinAlgError):
         return None
-    return sources, Reach.of(Precision(problem.chain, found, problem.stroke_um))
+    return sources, Alternative.of(Precision(found))
