@@ -11,11 +11,11 @@ from _timing import Table, side_by_side
 from scipy.signal import StateSpace, lsim
 
 import fits
-from fits.sweeps._kinds_simulate import SimulateJob, summary
 from fits.sweeps._programs import Program, read_program
 from fits.sweeps._records import Simulated
 from fits.sweeps._spec import parse_sweep
 from fits.sweeps._stages import nominal_stage, varied
+from fits.sweeps.kinds.simulate import SimulateJob, summary
 from microid import Preisach, Stage
 
 _INTERVAL_s = 1e-4

@@ -114,7 +114,7 @@ def test_rows_one_by_one_ask_for_their_own_options(monkeypatch, seed):
         weights = np.tril(np.arange(options["levels"] ** 2.0).reshape(2 * [options["levels"]]))
         return SimpleNamespace(runs=[report], noise_um=0.1, weights_um=weights)
 
-    monkeypatch.setattr("fits.sweeps._kinds_fit.fit", fitted)
+    monkeypatch.setattr("fits.sweeps.kinds.fit.fit", fitted)
     options = 'method = "one_by_one"\n'
     sweep = parsed(text(seed, words(["negative", "unknown"]), LEVELS.format(levels=[6, 9]), options=options))
     for chunk in range(chunk_count(sweep)):

@@ -15,13 +15,14 @@ from _sweeps import parsed, small
 from fits import DataError
 from fits.sweeps import _run
 from fits.sweeps._chunks import chunk_rows
-from fits.sweeps._examples import EXAMPLES
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep, summarise
 from fits.sweeps._spec import _sweep, read_sweep
 from fits.sweeps._store import opened
 from fits.sweeps._types import Rows
+from fits.sweeps.kinds import examples
 
+EXAMPLES = examples()
 HEAD = 'schema = "microid.sweep/1"\nkind = "simulate"\n'
 LIST = HEAD + '[list]\nfile = "rows.csv"\n'
 CONTROL = (

@@ -21,11 +21,11 @@ from _sweeps import parsed, small, stage_um
 from fits import DataError
 from fits.sweeps import _store
 from fits.sweeps._chunks import chunk_count
-from fits.sweeps._kinds_simulate import _simulate
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep, summarise
 from fits.sweeps._spec import read_sweep
 from fits.sweeps._stages import memory_before, nominal_stage, varied
+from fits.sweeps.kinds.simulate import _simulate
 from microid import Start
 
 ROOT = Path(__file__).parents[1]

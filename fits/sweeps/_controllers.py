@@ -16,10 +16,10 @@ from fits.control._tune_start import slope_array, steepest_slope
 from fits.io._errors import DataError, shown
 from fits.io._record import Reference
 from fits.machining._design import nearest
-from fits.sweeps._choices import check_plain
-from fits.sweeps._programs import Program, number
+from fits.sweeps._programs import Program
 from fits.sweeps._stages import memory_before, range_of
-from fits.sweeps._types import FloatArray, Parameter
+from fits.sweeps._toml import number
+from fits.sweeps._types import FloatArray, Parameter, check_plain
 from microid import (
     CONTROLLERS,
     PID,
@@ -166,7 +166,9 @@ def _task(stage: Stage, initial: str, reference: Program) -> ControlTask:
     def static_V() -> FloatArray:
         way_um = from_rest_um()
         time_s = np.arange(len(way_um)) * reference.interval_s
-        return setup(stage, Reference(np.asarray(time_s, dtype=np.float64), way_um, "reference"), "none", initial=initial).static_V
+        return setup(
+            stage, Reference(np.asarray(time_s, dtype=np.float64), way_um, "reference"), "none", initial=initial
+        ).static_V
 
     def frequency_Hz() -> float | None:
         nominal = dict(reference.nominal)

@@ -1,7 +1,7 @@
 """Blocks of rows on all local devices: as many blocks as there are devices are one array, sharded over them."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Any
 
@@ -14,6 +14,19 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 _ROWS = "rows"
+# Arrays of one value per sample that a row needs at a time, and how much memory all rows of a block may need.
+_ARRAYS, _BLOCK_BYTES, _LARGEST_BLOCK = 30, 128e6, 256
+
+
+def block_rows(samples: int) -> int:
+    """Rows to compute together: a power of two that depends on the number of samples alone."""
+    fit = _BLOCK_BYTES / (8 * _ARRAYS * samples)
+    return int(min(_LARGEST_BLOCK, 2 ** max(0, int(np.log2(max(fit, 1.0))))))
+
+
+def table_of(values: Mapping[str, NDArray[np.float64]], names: tuple[str, ...], count: int) -> NDArray[np.float64]:
+    """Values as the columns of a table, shape `(count, names)`."""
+    return np.stack([values[name] for name in names], axis=1) if names else np.zeros((count, 0))
 
 
 def on_cpu() -> bool:
@@ -39,16 +52,8 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
     Nothing goes from device to device: each does for its block what it would do with that block alone.
 
-    Parameters
-    ----------
-    own
-        Names of the arguments whose arrays have the rows along their first axis, as all results have. What else there
-        is of arrays belongs to all rows.
-
-    Returns
-    -------
-    Callable
-        Decorator. What it makes takes arguments by place.
+    `own` names the arguments whose arrays have the rows along their first axis, as all results have. Other arrays
+    belong to all rows. What the decorator makes takes arguments by place.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -85,17 +90,7 @@ def in_turn(function: Callable[..., Any], *rows: NDArray[Any]) -> Any:
     For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads
     of several CPU devices that factor many matrices at once wait for each other for ever.
 
-    Parameters
-    ----------
-    function
-        Of arrays with the rows of one block along their first axis, as its results have.
-    rows
-        Its arguments, for the blocks of all devices.
-
-    Returns
-    -------
-    Any
-        Its results for all blocks, joined.
+    The arguments have the rows of all blocks along their first axis, and so have the results.
     """
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         blocks = zip(*(np.split(each, _shares(len(each))) for each in rows), strict=True)

@@ -9,13 +9,7 @@ _EXTRA = {"distributed": "cluster"}
 
 
 def need(name: str) -> Any:
-    """Import a package of the extras `sweep` and `cluster`.
-
-    Raises
-    ------
-    DataError
-        If it is not installed; the sentence says what to run.
-    """
+    """Import a package of the extras `sweep` and `cluster`; a `DataError` says what to run if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:

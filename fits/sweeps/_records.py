@@ -1,53 +1,46 @@
 """The records that a sweep fits or diagnoses: files that a pattern finds, or simulations with noise."""
 
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from fits.io._errors import DataError, shown
 from fits.io._read_csv import read_csv
 from fits.io._record import Record
 from fits.io._units import parse_columns
-from fits.machining._design import nearest
-from fits.sweeps._devices import place
-from fits.sweeps._jobs import Request
-from fits.sweeps._kinds_simulate import drive, table_of
-from fits.sweeps._programs import Program, number, read_program
+from fits.loop._run import INITIAL_STATES
+from fits.sweeps._devices import place, table_of
+from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
-from fits.sweeps._types import FloatArray, Parameter
+from fits.sweeps._toml import check_keys, number
+from fits.sweeps._types import FloatArray, Parameter, Request
 from microid import Stage
 
 _KEYS = ("files", "columns", "noise_um")
 _NOISE = "records.noise_um"
+# Options of what is done with records.
+Holdout = Annotated[float, Meta(ge=0, le=0.9, description="a share between 0 and 0.9")]
+_Word = Literal["unknown", "negative", "positive", "demagnetised"]
+Initial = Annotated[_Word | None, Meta(description=f"one of {', '.join(INITIAL_STATES)}")]
 
 
 @dataclass(frozen=True)
 class Files:
-    """Records in CSV files.
-
-    Attributes
-    ----------
-    folder, names
-        Where they are, and their names in it.
-    columns
-        Mapping of columns, as `read_csv` takes it.
-    """
+    """Records in CSV files: their folder, their names in it, and the mapping of columns, as `read_csv` takes it."""
 
     folder: Path
-    names: tuple[str, ...]
+    sources: tuple[str, ...]
     columns: dict[str, str]
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Nothing about a file can be varied."""
-        return ()
+    # Nothing about a file can be varied.
+    parameters: tuple[Parameter, ...] = ()
 
     def records(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
@@ -56,26 +49,19 @@ class Files:
         del values, seed
         found: dict[int, Record | str] = {}
         for source in np.unique(sources):
-            path = self.folder / self.names[source]
+            path = self.folder / self.sources[source]
             try:
                 found[int(source)] = read_csv(path, self.columns)
             except DataError as error:
-                found[int(source)] = str(error).replace(str(path), self.names[source])
+                found[int(source)] = str(error).replace(str(path), self.sources[source])
         return [found[int(source)] for source in sources[: len(rows)]]
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """Records made by a stage under a program, with white noise of the sensor.
+    """Records made by a stage under a program, with white noise of the sensor, whose standard deviation is given.
 
-    Attributes
-    ----------
-    stage, program, initial
-        See `SimulateJob`.
-    noise_um
-        Standard deviation where it does not vary.
-    names, relative
-        Parameters that vary, and which of them as factors.
+    The names of the parameters that vary, and which of them as factors, are those of the `Request`.
     """
 
     stage: Stage
@@ -84,6 +70,8 @@ class Simulated:
     noise_um: float
     names: tuple[str, ...]
     relative: tuple[str, ...]
+    # They are made by the axes alone.
+    sources: tuple[str, ...] = ()
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -123,14 +111,12 @@ class Simulated:
 def requested_records(request: Request) -> Files | Simulated:
     """What a sweep says of its records; a `DataError` says what is wrong with it."""
     table = request.table.get("records", {})
-    for key in table:
-        if key not in _KEYS:
-            raise DataError(f"records.{key}: expected a known key, found {shown(key)}; {nearest(key, _KEYS)}")
+    check_keys(table, _KEYS, "records")
     if "files" not in table:
         stage, initial = requested_stage(request)
         program = read_program(request.table.get("program", {"shape": "sine"}), "program", "V", request.load)
         noise = number(table.get("noise_um", 0.01), "records.noise_um")
-        if noise < 0 or not math.isfinite(noise):
+        if noise < 0:
             raise DataError(f"records.noise_um: expected 0 um or more, found {noise:g}; correct it.")
         return Simulated(stage, program, initial, noise, request.names, request.relative)
     for key in ("model", "program"):
@@ -149,3 +135,8 @@ def requested_records(request: Request) -> Files | Simulated:
     if not names:
         raise DataError(f"records.files: the axis is empty: no file matches {pattern}; correct the pattern.")
     return Files(request.folder, names, parse_columns(str(table.get("columns", ""))))
+
+
+def assumed_initial(request: Request, records: Files | Simulated) -> str:
+    """Memory before each record, where the options say nothing of it: known of what is simulated."""
+    return str(request.table.get("initial", "negative")) if isinstance(records, Simulated) else "unknown"

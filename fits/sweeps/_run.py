@@ -23,18 +23,9 @@ _BAR = 24
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run did.
+    """What a run did: rows of the whole sweep, those of them that failed, and those that this run computed.
 
-    Attributes
-    ----------
-    rows, failed
-        Of the whole sweep.
-    computed
-        Rows that this run added.
-    again
-        Chunks that were kept but broken, and were computed again.
-    seconds
-        That it took.
+    Chunks that were kept but broken were computed again; it took so many seconds.
     """
 
     rows: int

@@ -59,15 +59,7 @@ def readable(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def summarise(folder: str | os.PathLike[str], by: str | None = None, largest: bool = False) -> dict[str, Any]:
-    """Sum up a sweep as JSON values.
-
-    Parameters
-    ----------
-    folder
-        Of the sweep.
-    by, largest
-        Output by which rows are ranked, the first by default, and whether large is good.
-    """
+    """Sum up a sweep as JSON values; its rows are ranked by an output, the first by default."""
     about, data = about_of(folder), open_sweep(folder)
     with readable(folder):
         return _summary(folder, about, data, by, largest)

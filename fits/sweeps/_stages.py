@@ -12,9 +12,8 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
 from fits.sweeps._devices import by_rows
-from fits.sweeps._files import in_a_file
-from fits.sweeps._jobs import Request
-from fits.sweeps._types import Parameter
+from fits.sweeps._toml import in_a_file
+from fits.sweeps._types import Parameter, Request
 from microid import (
     Driver,
     GridDensity,
@@ -54,13 +53,7 @@ def nominal_stage() -> Stage:
 
 
 def stage_from(text: bytes | None, name: str) -> Stage:
-    """Read a stage from the content of a model file, or make the nominal one where there is none.
-
-    Raises
-    ------
-    DataError
-        As `load_model`, or if the file holds something else than a stage or a `Preisach`.
-    """
+    """Read a stage from the content of a model file, or make the nominal one where there is none."""
     if text is None:
         return nominal_stage()
     model = in_a_file(text, name, load_model).model

@@ -136,13 +136,7 @@ class Store:
             path.unlink(missing_ok=True)
 
     def write(self, chunk: int, rows: Rows) -> None:
-        """Keep a chunk, then say so in the ledger.
-
-        Raises
-        ------
-        DataError
-            If the disk is full or cannot be written to; all chunks before are kept.
-        """
+        """Keep a chunk, then say so in the ledger; a `DataError` says that the disk does not take it."""
         arrays = dict(rows.outputs) | {"reason": np.array(rows.reasons, dtype=REASON.dtype)}
         with _sentences(self.folder):
             group = self._open()
@@ -212,11 +206,8 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
 def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
     """Open the folder of a sweep, new or to go on with, and keep other processes out of it.
 
-    Raises
-    ------
-    DataError
-        If it cannot be written to, holds another sweep, or one that was begun with other versions, or the results
-        would not fit on the disk.
+    A `DataError` says that it cannot be written to, holds another sweep or one that was begun with other versions, or
+    that the results would not fit on the disk.
     """
     check_folder(sweep, out, resume)
     folder = Path(os.path.realpath(out))

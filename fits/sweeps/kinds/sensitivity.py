@@ -1,29 +1,40 @@
 """The job `sensitivity`: gains, strokes and resonances of a stage of other dimensions, and what its tolerances do."""
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array, Float
+from msgspec import Meta
 from numpy.typing import NDArray
 
 import microid as m
 from fits.io._errors import DataError, shown
 from fits.machining._design import Design, paper_design
 from fits.machining._design_file import read_design
-from fits.sweeps._devices import by_rows, place
-from fits.sweeps._files import in_a_file
-from fits.sweeps._jobs import Request
-from fits.sweeps._kinds_simulate import table_of
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Rows
+from fits.sweeps._devices import by_rows, place, table_of
+from fits.sweeps._toml import in_a_file, read_table
+from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Request, Rows
 
+KEYS = ("stage", "sensitivity")
 _BLOCK = 256
 # So short a stroke that all motions are in proportion to it, to the last digit.
 _SHORT_UM = 1e-6
 # Beyond it a bridge has no inclination left.
 _LARGEST_ANGLE_RAD = 1.5
+
+
+class _Options(msgspec.Struct):
+    """The table `[sensitivity]`."""
+
+    axes: Annotated[tuple[m.Axis, ...], Meta(min_length=1, description=f"some of {', '.join(m.AXES)} in a list")] = (
+        "x",
+        "z",
+    )
 
 
 class SensitivityJob(AbstractJob):
@@ -86,13 +97,7 @@ def make(request: Request) -> SensitivityJob:
     if not isinstance(name, str):
         raise DataError(f'stage: expected "paper" or the name of the TOML of a stage, found {shown(name)}; give one.')
     design = paper_design() if name == "paper" else in_a_file(request.load(name), name, read_design)
-    options = request.table.get("sensitivity", {})
-    for key in options:
-        if key != "axes":
-            raise DataError(f"sensitivity.{key}: expected a known key, found {shown(key)}; use axes.")
-    axes = options.get("axes", ["x", "z"])
-    if not isinstance(axes, list) or not axes or any(axis not in m.AXES for axis in axes):
-        raise DataError(f"sensitivity.axes: expected some of {', '.join(m.AXES)} in a list, found {shown(axes)}.")
+    axes = read_table(request.table.get("sensitivity", {}), _Options, "sensitivity").axes
     return SensitivityJob(design, tuple(dict.fromkeys(axes)), request.names, request.relative)
 
 

@@ -1,29 +1,43 @@
 """The job `simulate`: the response of a stage to a program, and figures that sum it up."""
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array, Float
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from fits.io._errors import DataError, shown
-from fits.sweeps._devices import by_rows, place
-from fits.sweeps._jobs import Request
-from fits.sweeps._programs import Program, number, read_program
+from fits.io._errors import DataError
+from fits.sweeps._devices import block_rows, by_rows, place, table_of
+from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Rows
+from fits.sweeps._toml import read_table
+from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Request, Rows
 from microid import Stage, Staircase
 
-# Arrays of one value per sample that a row needs at a time, and how much memory all rows of a block may need.
-_ARRAYS, _BLOCK_BYTES, _LARGEST_BLOCK = 30, 128e6, 256
+KEYS = ("model", "initial", "program", "outputs")
+_OUTPUTS = (
+    Output("displacement_min_um", "um", "smallest displacement"),
+    Output("displacement_max_um", "um", "largest displacement"),
+    Output("displacement_mean_um", "um", "mean displacement"),
+    Output("displacement_rms_um", "um", "root mean square of the displacement"),
+    Output("displacement_final_um", "um", "displacement at the last sample"),
+    Output("stroke_um", "um", "largest less smallest displacement"),
+    Output("hysteresis_width_um", "um", "width of the loop at the middle of the voltage's range; 0 without a loop"),
+    Output("hysteresis_width_pct", "%", "the same in percent of the stroke"),
+)
 
 
-def block_rows(samples: int) -> int:
-    """Rows to compute together: a power of two that depends on the number of samples alone."""
-    fit = _BLOCK_BYTES / (8 * _ARRAYS * samples)
-    return int(min(_LARGEST_BLOCK, 2 ** max(0, int(np.log2(max(fit, 1.0))))))
+class _Options(msgspec.Struct):
+    """The table `[outputs]`: where figures begin to count, and whether traces are kept, at every so many samples."""
+
+    traces: Annotated[bool, Meta(description="true or false")] = False
+    every: Annotated[int, Meta(ge=1, description="a number of samples, 1 or more")] = 1
+    from_s: Annotated[float, Meta(ge=0, description="a time within the program")] = 0.0
 
 
 class SimulateJob(AbstractJob):
@@ -39,20 +53,9 @@ class SimulateJob(AbstractJob):
         from_s: float = 0.0,
         every: int = 0,
     ):
-        """Prepare the job.
+        """Take a stage, its voltage, its memory before each row, what varies, and which of it as factors.
 
-        Parameters
-        ----------
-        stage, program
-            What is simulated, and the voltage.
-        initial
-            Memory before each row.
-        names, relative
-            Parameters that vary, and which of them as factors.
-        from_s
-            Where the figures begin to count.
-        every
-            Traces are kept at every so many samples; not at all if 0.
+        Figures count from `from_s` on; traces are kept at every so many samples, not at all if that is 0.
         """
         self._stage, self._program, self._names, self._relative = stage, program, names, relative
         self._memory = memory_before(stage, initial)
@@ -73,8 +76,7 @@ class SimulateJob(AbstractJob):
             ]
             coordinates["time_s"] = ("time", "s", np.asarray(time_s, dtype=np.float64))
         parameters = (*stage_parameters(self._stage), *self._program.parameters)
-        block = block_rows(samples)
-        return Facts(parameters, tuple(outputs), block, coordinates=coordinates)
+        return Facts(parameters, tuple(outputs), block_rows(samples), coordinates=coordinates)
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
@@ -99,35 +101,15 @@ class SimulateJob(AbstractJob):
         return Rows(outputs, reasons)
 
 
-_OUTPUTS = (
-    Output("displacement_min_um", "um", "smallest displacement"),
-    Output("displacement_max_um", "um", "largest displacement"),
-    Output("displacement_mean_um", "um", "mean displacement"),
-    Output("displacement_rms_um", "um", "root mean square of the displacement"),
-    Output("displacement_final_um", "um", "displacement at the last sample"),
-    Output("stroke_um", "um", "largest less smallest displacement"),
-    Output("hysteresis_width_um", "um", "width of the loop at the middle of the voltage's range; 0 without a loop"),
-    Output("hysteresis_width_pct", "%", "the same in percent of the stroke"),
-)
-
-
 def make(request: Request) -> SimulateJob:
     """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
     stage, initial = requested_stage(request)
     program = read_program(request.table.get("program", {"shape": "sine"}), "program", "V", request.load)
-    asked = request.table.get("outputs", {})
-    for key in asked:
-        if key not in ("traces", "every", "from_s"):
-            raise DataError(f"outputs.{key}: expected a known key, found {shown(key)}; use traces, every and from_s.")
-    traces, every = asked.get("traces", False), asked.get("every", 1)
-    if not isinstance(traces, bool):
-        raise DataError(f"outputs.traces: expected true or false, found {shown(traces)}; correct it.")
-    if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-        raise DataError(f"outputs.every: expected a number of samples, 1 or more, found {shown(every)}; correct it.")
-    from_s = number(asked.get("from_s", 0.0), "outputs.from_s")
-    if not 0 <= from_s < (program.samples - 1) * program.interval_s:
-        raise DataError(f"outputs.from_s: expected a time within the program, found {from_s:g}; correct it.")
-    return SimulateJob(stage, program, initial, request.names, request.relative, from_s, every if traces else 0)
+    asked = read_table(request.table.get("outputs", {}), _Options, "outputs")
+    if not asked.from_s < program.last_s:
+        raise DataError(f"outputs.from_s: expected a time within the program, found {asked.from_s:g}; correct it.")
+    every = asked.every if asked.traces else 0
+    return SimulateJob(stage, program, initial, request.names, request.relative, asked.from_s, every)
 
 
 # In programs of their own: compiled as one, XLA computes much of it several times.
@@ -148,19 +130,6 @@ def _simulate(
     if every:
         found |= {"displacement_um": displacement[:, ::every], "voltage_V": voltage[:, ::every]}
     return found
-
-
-def table_of(values: Mapping[str, FloatArray], names: tuple[str, ...], count: int) -> FloatArray:
-    """Values as the columns of a table, shape `(count, names)`."""
-    return np.stack([values[name] for name in names], axis=1) if names else np.zeros((count, 0))
-
-
-@by_rows("table")
-def drive(
-    table: Float[Array, "n k"], names: tuple[str, ...], program: Program, given: Float[Array, " t"] | None
-) -> Float[Array, "n t"]:
-    """Signals of all rows, whose parameters are the columns of a table."""
-    return jax.vmap(lambda row: program.signal(dict(zip(names, row, strict=True)), given))(table)
 
 
 @by_rows("voltage", "displacement")

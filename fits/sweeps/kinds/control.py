@@ -10,12 +10,10 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from fits.sweeps._controllers import Controllers, read_controllers
-from fits.sweeps._devices import by_rows, in_turn, place
-from fits.sweeps._jobs import Request
-from fits.sweeps._kinds_simulate import block_rows, drive, table_of
-from fits.sweeps._programs import Program, read_program
+from fits.sweeps._devices import block_rows, by_rows, in_turn, place, table_of
+from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, stage_parameters, varied
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Rows
+from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Request, Rows
 from microid import (
     AbstractLinear,
     Preisach,
@@ -26,7 +24,7 @@ from microid import (
     step_metrics,
 )
 
-_SHAPES = ("step", "sine", "triangle", "decay", "chirp", "file")
+KEYS = ("model", "initial", "reference", "controller")
 _OUTPUTS = (
     Output("e_rms_pct", "%", "root mean square of the tracking error, of the reference's range"),
     Output("e_max_pct", "%", "largest tracking error, of the reference's range"),
@@ -65,17 +63,7 @@ class ControlJob(AbstractJob):
         names: tuple[str, ...],
         relative: tuple[str, ...],
     ):
-        """Prepare the job.
-
-        Parameters
-        ----------
-        stage, controllers, reference
-            The loop and what it follows.
-        initial
-            Memory before each row.
-        names, relative
-            Parameters that vary, and which of them as factors.
-        """
+        """Take the loop and what it follows, the memory before each row, what varies, and which of it as factors."""
         self._stage, self._controllers, self._reference = stage, controllers, reference
         self._start = Start(None, memory_before(stage, initial))
         self._names, self._relative = names, relative
@@ -86,8 +74,7 @@ class ControlJob(AbstractJob):
         """What is known before it runs."""
         parameters = (*self._controllers.parameters(), *stage_parameters(self._stage), *self._reference.parameters)
         outputs = (*_OUTPUTS, *_STEP) if self._reference.shape == "step" else _OUTPUTS
-        samples = self._reference.samples
-        return Facts(parameters, outputs, block_rows(samples))
+        return Facts(parameters, outputs, block_rows(self._reference.samples))
 
     def compute(
         self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
