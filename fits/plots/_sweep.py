@@ -9,8 +9,8 @@ import numpy as np
 
 from fits.io._atomic import atomic_path
 from fits.plots._style import figure, label, verbatim
-from fits.sweeps._about import about_of
 from fits.sweeps._show import open_sweep, readable, summarise
+from fits.sweeps._store import about_of
 from fits.sweeps._types import DONE
 
 _CELLS = 12

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fits.sweeps._devices import device_count
 from fits.sweeps._spec import Sweep, outside
-from fits.sweeps._types import DONE, FAILED, Output, Parameter, Rows
+from fits.sweeps._types import DONE, FAILED, Block, Output, Parameter, Rows
 
 # A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
 # Rows that go one by one are slow ones, of which few are to be lost.
@@ -83,7 +83,8 @@ def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
     padded = np.pad(rows, (0, together - len(rows)), mode="edge")
     values = sweep.plan.values(padded)
     inside, refused = outside(sweep, values) if values else (values, [""] * len(padded))
-    found = sweep.job.compute(inside, padded, sweep.plan.repeat_of(padded), sweep.seed)
+    relative = tuple(axis.parameter for axis in sweep.plan.axes if axis.relative)
+    found = sweep.job.compute(Block(inside, relative, padded, sweep.plan.repeat_of(padded), sweep.seed))
     reasons = tuple((why or reason)[:_REASON_LENGTH] for why, reason in zip(refused, found.reasons, strict=True))[
         : len(rows)
     ]

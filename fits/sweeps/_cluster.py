@@ -12,10 +12,9 @@ from typing import Any
 
 from fits.io._errors import DataError, shown
 from fits.sweeps._chunks import compute_chunk
-from fits.sweeps._extra import need
+from fits.sweeps._packages import need, versions
 from fits.sweeps._spec import Sweep, parse_sweep
 from fits.sweeps._types import Rows
-from fits.sweeps._versions import versions
 
 # Chunks that wait per thread of the workers, so that none is idle; and how often a chunk may lose its worker.
 _AHEAD, _LOSSES = 2, 5

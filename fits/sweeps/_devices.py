@@ -1,7 +1,7 @@
 """Blocks of rows on all local devices: as many blocks as there are devices are one array, sharded over them."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array
-from numpy.typing import NDArray
 
 _ROWS = "rows"
 # Arrays of one value per sample that a row needs at a time, and how much memory all rows of a block may need.
@@ -24,11 +22,6 @@ def block_rows(samples: int) -> int:
     return int(min(_LARGEST_BLOCK, 2 ** max(0, int(np.log2(max(fit, 1.0))))))
 
 
-def table_of(values: Mapping[str, NDArray[np.float64]], names: tuple[str, ...], count: int) -> NDArray[np.float64]:
-    """Values as the columns of a table, shape `(count, names)`."""
-    return np.stack([values[name] for name in names], axis=1) if names else np.zeros((count, 0))
-
-
 def on_cpu() -> bool:
     """Whether the devices are CPUs."""
     return jax.default_backend() == "cpu"
@@ -39,10 +32,10 @@ def device_count() -> int:
     return jax.local_device_count()
 
 
-def place(rows: NDArray[Any]) -> Array:
-    """Put an array on the devices, a block of its first axis on each, or on one if they cannot share it evenly."""
-    if _shares(len(rows)) == 1:
-        return jnp.asarray(rows)
+def place(rows: Any) -> Any:
+    """Put arrays on the devices, a block of their first axis on each, or on one if they cannot share it evenly."""
+    if _shares(rows) == 1:
+        return jax.tree.map(jnp.asarray, rows)
     mesh = Mesh(np.array(jax.local_devices()), (_ROWS,))
     return jax.device_put(rows, NamedSharding(mesh, PartitionSpec(_ROWS)))
 
@@ -84,7 +77,7 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     return decorate
 
 
-def in_turn(function: Callable[..., Any], *rows: NDArray[Any]) -> Any:
+def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
     """Call a function for block after block on one CPU.
 
     For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads
@@ -93,13 +86,16 @@ def in_turn(function: Callable[..., Any], *rows: NDArray[Any]) -> Any:
     The arguments have the rows of all blocks along their first axis, and so have the results.
     """
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        blocks = zip(*(np.split(each, _shares(len(each))) for each in rows), strict=True)
-        found = [jax.device_get(function(*map(jnp.asarray, block))) for block in blocks]
+        count = _shares(rows)
+        found = []
+        for k in range(count):
+            block = jax.tree.map(lambda each, k=k: jnp.asarray(np.split(each, count)[k]), rows)
+            found.append(jax.device_get(function(*block)))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
 
 
-def _shares(rows: int) -> int:
-    return 1 if rows % device_count() else device_count()
+def _shares(rows: Any) -> int:
+    return 1 if any(len(leaf) % device_count() for leaf in jax.tree.leaves(rows)) else device_count()
 
 
 def _mesh(rows: Any) -> Mesh | None:

@@ -9,16 +9,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fits.io._errors import DataError, shown
 from fits.io._plausible import SHORTEST_STEP_s
 from fits.io._read_csv import read_csv, read_reference
 from fits.io._table import open_table
 from fits.io._units import recognise
-from fits.sweeps._devices import by_rows
+from fits.sweeps._devices import by_rows, place
 from fits.sweeps._toml import check_keys, in_a_file, number
-from fits.sweeps._types import FloatArray, Parameter
+from fits.sweeps._types import Block, FloatArray, Parameter
 
 # Parameters of each shape beside offset and amplitude.
 SHAPES: dict[str, tuple[str, ...]] = {
@@ -172,9 +172,15 @@ def _read_displacement(path: Path) -> tuple[FloatArray, FloatArray]:
     return reference.time_s, reference.displacement_um
 
 
-@by_rows("table")
-def drive(
-    table: Float[Array, "n k"], names: tuple[str, ...], program: Program, given: Float[Array, " t"] | None
+def drive(program: Program, block: Block, values: Mapping[str, Array]) -> Float[Array, "n t"]:
+    """Signals of all rows of a block, by the values that vary."""
+    given = None if program.given is None else jnp.asarray(program.given)
+    signals: Array = _drive(place(block.rows), values, program, given)
+    return signals
+
+
+@by_rows("rows", "values")
+def _drive(
+    rows: Int[Array, " n"], values: Mapping[str, Array], program: Program, given: Float[Array, " t"] | None
 ) -> Float[Array, "n t"]:
-    """Signals of all rows, whose parameters are the columns of a table."""
-    return jax.vmap(lambda row: program.signal(dict(zip(names, row, strict=True)), given))(table)
+    return jax.vmap(lambda _, own: program.signal(own, given))(rows, values)

@@ -1,7 +1,6 @@
 """The records that a sweep fits or diagnoses: files that a pattern finds, or simulations with noise."""
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,18 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from fits.io._errors import DataError, shown
 from fits.io._read_csv import read_csv
 from fits.io._record import Record
 from fits.io._units import parse_columns
 from fits.loop._run import INITIAL_STATES
-from fits.sweeps._devices import place, table_of
+from fits.sweeps._devices import place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
 from fits.sweeps._toml import check_keys, number
-from fits.sweeps._types import FloatArray, Parameter, Request
+from fits.sweeps._types import Block, Parameter, Request
 from microid import Stage
 
 _KEYS = ("files", "columns", "noise_um")
@@ -42,34 +40,26 @@ class Files:
     # Nothing about a file can be varied.
     parameters: tuple[Parameter, ...] = ()
 
-    def records(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> list[Record | str]:
+    def records(self, block: Block) -> list[Record | str]:
         """Read the file of each row; a sentence stands for one that cannot be read."""
-        del values, seed
         found: dict[int, Record | str] = {}
-        for source in np.unique(sources):
+        for source in np.unique(block.sources):
             path = self.folder / self.sources[source]
             try:
                 found[int(source)] = read_csv(path, self.columns)
             except DataError as error:
                 found[int(source)] = str(error).replace(str(path), self.sources[source])
-        return [found[int(source)] for source in sources[: len(rows)]]
+        return [found[int(source)] for source in block.sources]
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """Records made by a stage under a program, with white noise of the sensor, whose standard deviation is given.
-
-    The names of the parameters that vary, and which of them as factors, are those of the `Request`.
-    """
+    """Records made by a stage under a program, with white noise of a sensor, whose standard deviation is given."""
 
     stage: Stage
     program: Program
     initial: str
     noise_um: float
-    names: tuple[str, ...]
-    relative: tuple[str, ...]
     # They are made by the axes alone.
     sources: tuple[str, ...] = ()
 
@@ -79,26 +69,19 @@ class Simulated:
         noise = Parameter(_NOISE, "um", self.noise_um, 0.0)
         return (*stage_parameters(self.stage), *self.program.parameters, noise)
 
-    def records(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> list[Record | str]:
+    def records(self, block: Block) -> list[Record | str]:
         """Simulate the record of each row; its noise depends on the seed and the row's number alone."""
-        del sources
-        own = tuple(parameter.name for parameter in self.parameters)
-        names = tuple(name for name in self.names if name in own)
-        table = place(table_of(values, names, len(rows)))
-        given = None if self.program.given is None else jnp.asarray(self.program.given)
-        voltage = drive(table, names, self.program, given)
-        memory = memory_before(self.stage, self.initial)
-        interval_s = jnp.asarray(self.program.interval_s)
-        displacement = respond(self.stage, table, names, self.relative, interval_s, voltage, memory)
+        own = {parameter.name for parameter in self.parameters}
+        values = place({name: value for name, value in block.values.items() if name in own})
+        voltage = drive(self.program, block, values)
+        memory, interval_s = memory_before(self.stage, self.initial), jnp.asarray(self.program.interval_s)
+        displacement = respond(self.stage, values, block.relative, interval_s, voltage, memory)
         time_s = np.arange(self.program.samples) * self.program.interval_s
-        sd = values.get(_NOISE, np.full(len(rows), 1.0 if _NOISE in self.relative else self.noise_um))
-        sd = sd * self.noise_um if _NOISE in self.relative else sd
+        sd = block.numbers(_NOISE, self.noise_um)
         found: list[Record | str] = []
-        pairs = zip(rows, sd, *jax.device_get((voltage, displacement)), strict=True)
+        pairs = zip(block.rows, sd, *jax.device_get((voltage, displacement)), strict=True)
         for row, spread, v, w in pairs:
-            noise = np.random.default_rng([seed, int(row)]).normal(0.0, 1.0, len(w))
+            noise = np.random.default_rng([block.seed, int(row)]).normal(0.0, 1.0, len(w))
             fine = np.all(np.isfinite(w))
             found.append(
                 Record(np.asarray(time_s, dtype=np.float64), v, w + spread * noise, source=f"row {row}")
@@ -118,7 +101,7 @@ def requested_records(request: Request) -> Files | Simulated:
         noise = number(table.get("noise_um", 0.01), "records.noise_um")
         if noise < 0:
             raise DataError(f"records.noise_um: expected 0 um or more, found {noise:g}; correct it.")
-        return Simulated(stage, program, initial, noise, request.names, request.relative)
+        return Simulated(stage, program, initial, noise)
     for key in ("model", "program"):
         if key in request.table:
             raise DataError(f"{key}: records come from files here; leave out {key}, or records.files.")

@@ -17,7 +17,7 @@ from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_CSV_BYTES, MOST_TOML_BYTES, parse_toml, read_bytes, read_text
 from fits.sweeps import kinds
 from fits.sweeps._axes import Plan
-from fits.sweeps._read_axes import read_list, read_plan
+from fits.sweeps._read_axes import read_plan
 from fits.sweeps._toml import read_table
 from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request
 
@@ -145,13 +145,9 @@ def _sweep(
         raise DataError(f"seed: expected a whole number of 0 or more, found {shown(seed)}; correct it.")
     options = read_table(table.get("run", {}), _Run, "run")
     chunk_rows = options.chunk_rows
-    names, relative = _names(table, load)
-    job = made_by.make(Request(table, names, relative, load, folder))
+    job = made_by.make(Request(table, load, folder))
     facts = job.facts
     plan = read_plan(table, facts.parameters, max(1, len(facts.sources)), seed, load)
-    factors = tuple(axis.parameter for axis in plan.axes if axis.relative)
-    if set(factors) != set(relative):
-        job = made_by.make(Request(table, names, factors, load, folder))
     if chunk_rows is not None and chunk_rows % job.facts.block:
         raise DataError(
             f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, found "
@@ -168,18 +164,6 @@ def _sum_of(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return "unreadable"
-
-
-def _names(table: Mapping[str, Any], load: Callable[[str], bytes]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of what varies, in the order of the plan, and those that vary relatively, as far as they can be read."""
-    axes = table.get("axis")
-    entries = [entry for entry in axes if isinstance(entry, dict)] if isinstance(axes, list) else []
-    names = [str(entry.get("parameter")) for entry in entries]
-    relative = [str(entry.get("parameter")) for entry in entries if entry.get("relative") is True]
-    listing = table.get("list")
-    if isinstance(listing, dict) and isinstance(listing.get("file"), str):
-        names += read_list(load(listing["file"]), listing["file"])[0]
-    return tuple(names), tuple(relative)
 
 
 def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:

@@ -105,19 +105,18 @@ def varied(stage: Stage, values: Mapping[str, Float[Array, ""]], relative: Seque
     return found
 
 
-@by_rows("table", "voltage_V")
+@by_rows("voltage_V", "values")
 def respond(
     stage: Stage,
-    table: Float[Array, "n k"],
-    names: tuple[str, ...],
+    values: Mapping[str, Float[Array, " n"]],
     relative: tuple[str, ...],
     interval_s: Float[Array, ""],
     voltage_V: Float[Array, "n t"],
     memory: Staircase | None,
 ) -> Float[Array, "n t"]:
-    """Respond to commands, each row at rest under its first sample; what varies are the columns of a table."""
+    """Respond to commands, each row at rest under its first sample."""
     rows = jax.tree.map(lambda leaf: leaf[None], stage)
-    return respond_all(varied(rows, dict(zip(names, table.T, strict=True)), relative), interval_s, voltage_V, memory)
+    return respond_all(varied(rows, values, relative), interval_s, voltage_V, memory)
 
 
 def range_of(stage: Stage) -> tuple[float, float] | None:

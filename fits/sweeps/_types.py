@@ -83,11 +83,6 @@ def check_plain(parameter: Parameter, values: FloatArray | None, relative: bool,
         raise DataError(f"{place}: {parameter.name} is {what}, found {broken[0]:g}; give whole values.")
 
 
-def chosen(values: Mapping[str, FloatArray], name: str, words: Sequence[str], nominal: str, count: int) -> list[str]:
-    """The word of each row, the nominal one where it does not vary."""
-    return [words[int(code)] for code in values[name]] if name in values else [nominal] * count
-
-
 @dataclass(frozen=True)
 class Output:
     """One number, text or trace per row.
@@ -169,6 +164,39 @@ class Facts:
 
 
 @dataclass(frozen=True)
+class Block:
+    """Rows that are computed together, `n` in all.
+
+    Attributes
+    ----------
+    values
+        Swept parameters by name, in their own units, shape `(n,)`.
+    relative
+        Names of those that are factors.
+    rows
+        Their numbers in the sweep, shape `(n,)`; numbers of filling are repeated.
+    sources
+        Which of `Facts.sources` each has, shape `(n,)`.
+    seed
+        Of the sweep.
+    """
+
+    values: dict[str, FloatArray]
+    relative: tuple[str, ...]
+    rows: NDArray[np.int64]
+    sources: NDArray[np.int64]
+    seed: int
+
+    def numbers(self, name: str, nominal: float) -> FloatArray:
+        """Values of a parameter, the nominal one where it does not vary, shape `(n,)`."""
+        return self.values.get(name, np.full(len(self.rows), float(nominal)))
+
+    def words(self, name: str, words: Sequence[str], nominal: str) -> list[str]:
+        """The word of each row, the nominal one where it does not vary."""
+        return [words[int(code)] for code in self.numbers(name, words.index(nominal))]
+
+
+@dataclass(frozen=True)
 class Request:
     """What a job is made from.
 
@@ -176,8 +204,6 @@ class Request:
     ----------
     table
         The sweep as TOML gives it.
-    names, relative
-        What varies, in the order of the plan, and which of it as factors.
     load
         Gives the content of a file by its name in the sweep.
     folder
@@ -185,8 +211,6 @@ class Request:
     """
 
     table: Mapping[str, Any]
-    names: tuple[str, ...]
-    relative: tuple[str, ...]
     load: Callable[[str], bytes]
     folder: Path | None
 
@@ -203,19 +227,5 @@ class AbstractJob(abc.ABC):
         """What is known before it runs."""
 
     @abc.abstractmethod
-    def compute(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> Rows:
-        """Compute one block on each device, `n` rows in all.
-
-        Parameters
-        ----------
-        values
-            Swept parameters by name, in their own units, shape `(n,)`. Relative ones are factors.
-        rows
-            Their numbers in the sweep, shape `(n,)`; numbers of filling are repeated.
-        sources
-            Which of `facts.sources` each has, shape `(n,)`.
-        seed
-            Of the sweep.
-        """
+    def compute(self, block: Block) -> Rows:
+        """Compute one block on each device."""

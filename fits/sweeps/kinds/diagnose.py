@@ -1,12 +1,9 @@
 """The job `diagnose`: what a fitted stage gets wrong in each of many records, one by one."""
 
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from fits.io._errors import DataError
 from fits.io._record import Record
@@ -14,7 +11,7 @@ from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
 from fits.sweeps._toml import read_table
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Request, Rows, choice, chosen
+from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows, choice
 
 KEYS = ("model", "initial", "program", "records", "diagnose")
 _OUTPUTS = (
@@ -54,15 +51,13 @@ class DiagnoseJob(AbstractJob):
         )
         return Facts((*self._records.parameters, *options), _OUTPUTS, 1, self._records.sources, alone=True)
 
-    def compute(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> Rows:
+    def compute(self, block: Block) -> Rows:
         """Diagnose one record; see `AbstractJob.compute`."""
-        records, every = self._records.records(values, rows, sources, seed), np.ones(len(rows))
-        alarm = values.get("diagnose.false_alarm", every * self._options.false_alarm).tolist()
-        holdout = values.get("diagnose.holdout", every * self._options.holdout).tolist()
-        initial = chosen(values, "diagnose.initial", INITIAL_STATES, self._initial, len(rows))
-        found = [_diagnosed(*each, seed) for each in zip(records, alarm, holdout, initial, strict=True)]
+        alarm = block.numbers("diagnose.false_alarm", self._options.false_alarm).tolist()
+        holdout = block.numbers("diagnose.holdout", self._options.holdout).tolist()
+        initial = block.words("diagnose.initial", INITIAL_STATES, self._initial)
+        rows = zip(self._records.records(block), alarm, holdout, initial, strict=True)
+        found = [_diagnosed(*options, block.seed) for options in rows]
         return Rows.one_by_one(_OUTPUTS, found)
 
 

@@ -1,6 +1,5 @@
 """The job `fit`: loop fits of many records, in one batch or one by one."""
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
@@ -22,7 +21,7 @@ from fits.sweeps._devices import in_turn, on_cpu, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
 from fits.sweeps._toml import read_table
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Request, Rows, choice, chosen
+from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
 from microid import Staircase, node_areas
 
 KEYS = ("model", "initial", "program", "records", "fit")
@@ -72,30 +71,30 @@ class FitJob(AbstractJob):
             size = len(_packed(self._levels or 0)[0])
             outputs.append(Output("weights_um", "um", "weights of Eq. 9, packed row by row", (("weight", size),)))
         levels = float(self._levels or _DEFAULT_LEVELS)
-        parameters = (
+        parameters: tuple[Parameter, ...] = (
             *self._records.parameters,
             Parameter("fit.holdout", "1", self._holdout, 0.0, 0.9),
-            Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),
             choice("fit.initial", INITIAL_STATES, self._initial),
         )
+        if not self._weights:
+            # Rows of other levels have other weights.
+            parameters += (Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),)
         if self._batch:
-            parameters = (*parameters, Parameter("fit.smoothness", "1", self._smoothness, 1e-12, 1e6))
+            parameters += (Parameter("fit.smoothness", "1", self._smoothness, 1e-12, 1e6),)
         block = _BLOCK if self._batch else 1
         return Facts(parameters, tuple(outputs), block, self._records.sources, alone=not self._batch)
 
-    def compute(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> Rows:
+    def compute(self, block: Block) -> Rows:
         """Fit the records of some blocks; see `AbstractJob.compute`."""
-        records, every = self._records.records(values, rows, sources, seed), np.ones(len(rows))
-        holdout = values.get("fit.holdout", every * self._holdout)
-        initial = chosen(values, "fit.initial", INITIAL_STATES, self._initial, len(rows))
+        records, holdout = self._records.records(block), block.numbers("fit.holdout", self._holdout)
+        initial = block.words("fit.initial", INITIAL_STATES, self._initial)
         if self._batch:
-            levels = values.get("fit.levels", every * (self._levels or _DEFAULT_LEVELS)).astype(int)
-            smoothness = values.get("fit.smoothness", every * self._smoothness)
-            return self._together(records, holdout, initial, levels, smoothness)
-        swept = values.get("fit.levels")
-        numbers = [self._levels] * len(rows) if swept is None else swept.astype(int).tolist()
+            levels = block.numbers("fit.levels", self._levels or _DEFAULT_LEVELS).astype(int)
+            return self._together(
+                records, holdout, initial, levels, block.numbers("fit.smoothness", self._smoothness)
+            )
+        swept = block.values.get("fit.levels")
+        numbers = [self._levels] * len(records) if swept is None else swept.astype(int).tolist()
         found = [_alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
         return Rows.one_by_one(self.facts.outputs, found)
 
@@ -217,7 +216,8 @@ def make(request: Request) -> FitJob:
         options.levels = _DEFAULT_LEVELS
     if options.weights and options.levels is None:
         raise DataError("fit.weights: expected true, with fit.levels, or false, found true; correct it.")
-    if options.weights and "fit.levels" in request.names:
+    axes = request.table.get("axis")
+    if options.weights and isinstance(axes, list) and {"fit.levels"} & {str(each.get("parameter")) for each in axes}:
         raise DataError("fit.weights: rows of other fit.levels have other weights; leave out one of the two.")
     if options.method == "one_by_one" and "smoothness" in table:
         raise DataError("fit.smoothness: one_by_one finds it from the data; leave it out.")

@@ -1,6 +1,5 @@
 """The job `simulate`: the response of a stage to a program, and figures that sum it up."""
 
-from collections.abc import Mapping
 from typing import Annotated
 
 import jax
@@ -9,15 +8,14 @@ import msgspec
 import numpy as np
 from jaxtyping import Array, Float
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from fits.io._errors import DataError
-from fits.sweeps._devices import block_rows, by_rows, place, table_of
+from fits.sweeps._devices import block_rows, by_rows, place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
 from fits.sweeps._toml import read_table
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Request, Rows
-from microid import Stage, Staircase
+from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Request, Rows
+from microid import Stage
 
 KEYS = ("model", "initial", "program", "outputs")
 _OUTPUTS = (
@@ -43,23 +41,13 @@ class _Options(msgspec.Struct):
 class SimulateJob(AbstractJob):
     """Simulations of a stage."""
 
-    def __init__(
-        self,
-        stage: Stage,
-        program: Program,
-        initial: str,
-        names: tuple[str, ...],
-        relative: tuple[str, ...],
-        from_s: float = 0.0,
-        every: int = 0,
-    ):
-        """Take a stage, its voltage, its memory before each row, what varies, and which of it as factors.
+    def __init__(self, stage: Stage, program: Program, initial: str, from_s: float = 0.0, every: int = 0):
+        """Take a stage, its voltage, and its memory before each row.
 
         Figures count from `from_s` on; traces are kept at every so many samples, not at all if that is 0.
         """
-        self._stage, self._program, self._names, self._relative = stage, program, names, relative
+        self._stage, self._program = stage, program
         self._memory = memory_before(stage, initial)
-        self._given = None if program.given is None else jnp.asarray(program.given)
         self._first, self._every = round(from_s / program.interval_s), every
 
     @property
@@ -78,23 +66,15 @@ class SimulateJob(AbstractJob):
         parameters = (*stage_parameters(self._stage), *self._program.parameters)
         return Facts(parameters, tuple(outputs), block_rows(samples), coordinates=coordinates)
 
-    def compute(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> Rows:
+    def compute(self, block: Block) -> Rows:
         """Simulate a block on each device; see `AbstractJob.compute`."""
-        del sources, seed
-        table = table_of(values, self._names, len(rows))
-        found = _simulate(
-            self._stage,
-            place(table),
-            self._names,
-            self._relative,
-            self._program,
-            self._given,
-            self._memory,
-            self._first,
-            self._every,
-        )
+        # In programs of their own: compiled as one, XLA computes much of it several times.
+        values, interval_s = place(block.values), jnp.asarray(self._program.interval_s)
+        voltage = drive(self._program, block, values)
+        displacement = respond(self._stage, values, block.relative, interval_s, voltage, self._memory)
+        found = _sum_up(voltage, displacement, self._first)
+        if self._every:
+            found |= {"displacement_um": displacement[:, :: self._every], "voltage_V": voltage[:, :: self._every]}
         outputs = {name: np.asarray(value) for name, value in found.items()}
         fine = np.isfinite(outputs["displacement_rms_um"])
         reasons = tuple("" if good else "the displacement is not finite" for good in fine)
@@ -109,27 +89,7 @@ def make(request: Request) -> SimulateJob:
     if not asked.from_s < program.last_s:
         raise DataError(f"outputs.from_s: expected a time within the program, found {asked.from_s:g}; correct it.")
     every = asked.every if asked.traces else 0
-    return SimulateJob(stage, program, initial, request.names, request.relative, asked.from_s, every)
-
-
-# In programs of their own: compiled as one, XLA computes much of it several times.
-def _simulate(
-    stage: Stage,
-    table: Float[Array, "n k"],
-    names: tuple[str, ...],
-    relative: tuple[str, ...],
-    program: Program,
-    given: Float[Array, " t"] | None,
-    memory: Staircase | None,
-    first: int,
-    every: int,
-) -> dict[str, Float[Array, "n ..."]]:
-    voltage = drive(table, names, program, given)
-    displacement = respond(stage, table, names, relative, jnp.asarray(program.interval_s), voltage, memory)
-    found = _sum_up(voltage, displacement, first)
-    if every:
-        found |= {"displacement_um": displacement[:, ::every], "voltage_V": voltage[:, ::every]}
-    return found
+    return SimulateJob(stage, program, initial, asked.from_s, every)
 
 
 @by_rows("voltage", "displacement")
