@@ -11,11 +11,12 @@ from _timing import Table, side_by_side
 from scipy.signal import StateSpace, lsim
 
 import fits
-from fits.sweeps._kinds_simulate import SimulateJob, summary
 from fits.sweeps._programs import Program, read_program
 from fits.sweeps._records import Simulated
 from fits.sweeps._spec import parse_sweep
 from fits.sweeps._stages import nominal_stage, varied
+from fits.sweeps._types import Block
+from fits.sweeps.kinds.simulate import SimulateJob, summary
 from microid import Preisach, Stage
 
 _INTERVAL_s = 1e-4
@@ -84,22 +85,22 @@ def sweep(samples: int, repeats: int, seed: int, table: Table) -> None:
     rng, stage = np.random.default_rng(seed), nominal_stage()
     text = {"shape": "sine", "samples": samples, "interval_s": _INTERVAL_s, "offset_V": 60.0}
     program = read_program(text, "program", "V", lambda _: b"")
-    job = SimulateJob(stage, program, "negative", _NAMES, ())
+    job = SimulateJob(stage, program, "negative")
     count = job.facts.block
     values = {name: rng.uniform(*ends, count) for name, ends in zip(_NAMES, _ENDS, strict=True)}
-    rows, zero = np.arange(count), np.zeros(count, dtype=np.int64)
+    block = Block(values, (), np.arange(count), np.zeros(count, dtype=np.int64), 0)
     table_of = np.stack([values[name] for name in _NAMES], axis=1)
     centre_V = 1.2 * (np.arange(_RELAYS) + 0.5)
     hysteresis = stage["hysteresis"]
     assert isinstance(hysteresis, Preisach)
     weight_um = np.asarray(hysteresis.density(*np.meshgrid(centre_V, centre_V, indexing="ij"))) * 1.2**2
     weight_um = np.tril(weight_um) - np.diag(np.diag(weight_um)) / 2
-    found = job.compute(values, rows, zero, 0).outputs["displacement_final_um"][0]
+    found = job.compute(block).outputs["displacement_final_um"][0]
     peer = _numpy(stage, weight_um, centre_V, table_of[0], samples)
     off = abs(found - peer[-1]) / np.ptp(peer)
 
     def ours() -> Any:
-        return job.compute(values, rows, zero, 0).outputs
+        return job.compute(block).outputs
 
     def singles() -> Any:
         return [jax.block_until_ready(_single(stage, program, row)) for row in jnp.asarray(table_of[:_SINGLES])]
@@ -120,15 +121,16 @@ def sweep(samples: int, repeats: int, seed: int, table: Table) -> None:
 def _fits(repeats: int, seed: int, table: Table) -> None:
     plan = parse_sweep(_FIT.format(seed=seed), "sweep.toml", lambda _: b"")
     count = plan.facts.block
-    rows, zero = np.arange(count), np.zeros(count, dtype=np.int64)
-    values = plan.plan.values(rows)
+    rows = np.arange(count)
+    relative = ("hysteresis.density.packed_um",)
+    block = Block(plan.plan.values(rows), relative, rows, np.zeros(count, dtype=np.int64), seed)
     source = plan.job._records  # type: ignore[attr-defined]
     assert isinstance(source, Simulated)
-    records = [record for record in source.records(values, rows, zero, seed) if not isinstance(record, str)]
+    records = [record for record in source.records(block) if not isinstance(record, str)]
     few = records[:4]
     taken = side_by_side(
         {
-            "batch": lambda: plan.job.compute(values, rows, zero, seed).outputs,
+            "batch": lambda: plan.job.compute(block).outputs,
             "alone": lambda: [fits.fit([record], levels=8, initial="negative").noise_um for record in few],
         },
         repeats,

@@ -1,5 +1,6 @@
-"""A new density, law, effect, column or command is one new file, and works from the command at once."""
+"""Each new law, density, effect, column, controller, command or kind of sweep is one file, and works at once."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import textwrap
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -205,3 +207,126 @@ def test_a_column_is_one_file_and_an_effect_uses_it(copy):
     (copy / "program.csv").write_text("time_s,voltage_V\n0,0\n1,8\n2,4\n")
     sentence = "program.csv: the model depends on humidity_pct: add a column of that name that varies.\n"
     assert python(copy, "-m", "fits", *arguments, code=2) == sentence
+
+
+CONTROLLER = '''
+    """An integral of the error, and nothing else."""
+    from typing import ClassVar
+    import jax.numpy as jnp
+    from jaxtyping import Array, Float
+    from microid._param import array, param
+    from microid.control._base import AbstractLinearController, Setting, register
+
+    @register
+    class Integrator(AbstractLinearController):
+        """A sum."""
+        settings: ClassVar[tuple[Setting, ...]] = (
+            Setting("integral_V_per_um_s", default=50.0), Setting("share", "1", lower=0.0, upper=1.0, default=1.0)
+        )
+        own: ClassVar[tuple[str, ...]] = ("gain_V_per_um_s",)
+        gain_V_per_um_s: Float[Array, ""] = param(unit="V/(um s)", scale=100.0, lower=0.0)
+        interval_s: Float[Array, ""] = array()
+
+        @classmethod
+        def of(cls, pid, numbers, plant):
+            return cls(numbers["share"] * pid.integral_V_per_um_s, pid.interval_s)
+
+        def init(self, rest_um=0.0, feedback_V=0.0):
+            return jnp.zeros_like(self.interval_s) + feedback_V
+
+        def step(self, state, reference_um, measured_um, feedforward_V=0.0):
+            state = state + self.gain_V_per_um_s * self.interval_s * (reference_um - measured_um)
+            return state, feedforward_V + state
+
+        def transfer(self, z):
+            return (self.gain_V_per_um_s * self.interval_s).astype(z.dtype) * z / (z - 1)
+
+        def _unlimited(self):
+            return self
+
+        def _driven(self, state):
+            return jnp.where(self.gain_V_per_um_s == 0, 0, state)
+'''
+LINEAR = """
+import jax; jax.config.update("jax_enable_x64", True)
+import microid, fits
+fits.save_model("linear.json", microid.Stage.of(piezo=microid.Piezo(0.1)), None, {})
+"""
+SWEEP = """
+schema = "microid.sweep/1"
+kind = "control"
+model = "linear.json"
+[reference]
+shape = "step"
+samples = 20
+interval_s = 1e-3
+amplitude_um = 2.0
+[controller]
+kind = "integrator"
+share = 0.5
+[[axis]]
+parameter = "controller.integral_V_per_um_s"
+values = [4000.0, 8000.0]
+"""
+
+
+def integrated(rate_V_per_um_s, samples, wanted_um=2.0):
+    """Errors of an integral around 0.1 um/V that answers a millisecond late, from 0 V and 0 um on."""
+    voltage, displacement, errors = 0.0, 0.0, []
+    for _ in range(samples):
+        errors.append(wanted_um - displacement)
+        voltage += rate_V_per_um_s * 1e-3 * errors[-1]
+        displacement = 0.1 * voltage
+    return errors
+
+
+def test_a_controller_is_one_file_and_is_run_and_swept(copy):
+    (copy / "microid/control/integrator.py").write_text(textwrap.dedent(CONTROLLER).lstrip())
+    assert "|integrator|" in python(copy, "-m", "fits", "control", "--help")
+    python(copy, "-c", LINEAR)
+    rows = [f"{k * 1e-3},{2.0 if k else 0.0}" for k in range(20)]
+    (copy / "step.csv").write_text("\n".join(["time_s,displacement_um", *rows]) + "\n")
+    control = ("control", "linear.json", "step.csv", "--controller", "integrator", "--feedforward", "none", "--json")
+    told = python(copy, "-m", "fits", *control, "--gains", "0,4000,0", "--out", "run.csv")
+    assert json.loads(told)["gains"]["gain_V_per_um_s"] == 4000.0
+    header, *lines = (copy / "run.csv").read_text().splitlines()
+    errors = [float(line.split(",")[header.split(",").index("error_um")]) for line in lines]
+    assert errors == pytest.approx([0.0, *integrated(4000.0, 19)], abs=1e-12)
+    # What is printed, changed, is what runs.
+    (copy / "gains.json").write_text(told.replace("4000.0", "2000.0"))
+    told = python(copy, "-m", "fits", *control, "--gains", "gains.json", "--out", "again.csv")
+    assert json.loads(told)["gains"]["gain_V_per_um_s"] == 2000.0
+    (copy / "sweep.toml").write_text(SWEEP)
+    python(copy, "-m", "fits", "sweep", "sweep.toml", "--out", "results")
+    found = pd.read_parquet(copy / "results" / "results.parquet")
+    expected = [integrated(rate, 20)[-1] for rate in (2000.0, 4000.0)]
+    assert found["error_final_um"].tolist() == pytest.approx(expected, abs=1e-12)
+
+
+KIND = '''
+    """The job `double`: twice a number."""
+    from fits.sweeps._types import AbstractJob, Facts, Output, Parameter, Rows
+
+    KEYS = ("double",)
+
+    class DoubleJob(AbstractJob):
+        """A product."""
+
+        @property
+        def facts(self):
+            return Facts((Parameter("double.of_um", "um", 1.0),), (Output("twice_um", "um", "double"),), 4)
+
+        def compute(self, values, rows, sources, seed):
+            return Rows({"twice_um": 2 * values["double.of_um"]}, ("",) * len(rows))
+
+    def make(request):
+        return DoubleJob()
+'''
+
+
+def test_a_kind_of_sweep_is_one_file(copy):
+    (copy / "fits/sweeps/kinds/double.py").write_text(textwrap.dedent(KIND).lstrip())
+    text = 'schema = "microid.sweep/1"\nkind = "double"\n[[axis]]\nparameter = "double.of_um"\nvalues = [1, 2, 5]\n'
+    (copy / "double.toml").write_text(text)
+    python(copy, "-m", "fits", "sweep", "double.toml", "--out", "doubled")
+    assert pd.read_parquet(copy / "doubled" / "results.parquet")["twice_um"].tolist() == [2, 4, 10]

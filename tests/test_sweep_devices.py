@@ -93,11 +93,11 @@ from fits.sweeps._devices import place
 from fits.sweeps._stages import memory_before, nominal_stage, respond
 
 stage, first, second = nominal_stage(), *jax.local_devices()
-frequency_Hz, voltage_V = np.linspace(80, 160, 8)[:, None], np.linspace(0, 100, 8 * 40).reshape(8, 40)
+frequency_Hz, voltage_V = np.linspace(80, 160, 8), np.linspace(0, 100, 8 * 40).reshape(8, 40)
 
 def moved(rows, voltage):
-    names, memory = ("mechanics.natural_frequency_Hz",), memory_before(stage, "negative")
-    return respond(stage, rows, names, (), jnp.asarray(1e-3), voltage, memory)
+    values, memory = {"mechanics.natural_frequency_Hz": rows}, memory_before(stage, "negative")
+    return respond(stage, values, (), jnp.asarray(1e-3), voltage, memory)
 
 found = moved(place(frequency_Hz), place(voltage_V))
 assert found.sharding.spec == PartitionSpec("rows"), found.sharding

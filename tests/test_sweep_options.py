@@ -19,6 +19,7 @@ from fits.sweeps._chunks import chunk_count, compute_chunk
 from fits.sweeps._fit_batch import fit_batch
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep
+from fits.sweeps._types import Block
 from microid import Staircase
 
 HEAD = """
@@ -50,7 +51,9 @@ def words(chosen, kind="fit"):
 
 
 def records_of(sweep, rows):
-    return sweep.job._records.records(sweep.plan.values(rows), rows, sweep.plan.repeat_of(rows), sweep.seed)
+    relative = tuple(axis.parameter for axis in sweep.plan.axes if axis.relative)
+    block = Block(sweep.plan.values(rows), relative, rows, sweep.plan.repeat_of(rows), sweep.seed)
+    return sweep.job._records.records(block)
 
 
 def batch_of(record, levels, initial, smoothness=0.01, holdout=0.2):
@@ -114,7 +117,7 @@ def test_rows_one_by_one_ask_for_their_own_options(monkeypatch, seed):
         weights = np.tril(np.arange(options["levels"] ** 2.0).reshape(2 * [options["levels"]]))
         return SimpleNamespace(runs=[report], noise_um=0.1, weights_um=weights)
 
-    monkeypatch.setattr("fits.sweeps._kinds_fit.fit", fitted)
+    monkeypatch.setattr("fits.sweeps.kinds.fit.fit", fitted)
     options = 'method = "one_by_one"\n'
     sweep = parsed(text(seed, words(["negative", "unknown"]), LEVELS.format(levels=[6, 9]), options=options))
     for chunk in range(chunk_count(sweep)):

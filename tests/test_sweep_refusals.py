@@ -15,13 +15,14 @@ from _sweeps import parsed, small
 from fits import DataError
 from fits.sweeps import _run
 from fits.sweeps._chunks import chunk_rows
-from fits.sweeps._examples import EXAMPLES
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep, summarise
 from fits.sweeps._spec import _sweep, read_sweep
 from fits.sweeps._store import opened
 from fits.sweeps._types import Rows
+from fits.sweeps.kinds import examples
 
+EXAMPLES = examples()
 HEAD = 'schema = "microid.sweep/1"\nkind = "simulate"\n'
 LIST = HEAD + '[list]\nfile = "rows.csv"\n'
 CONTROL = (
@@ -48,7 +49,7 @@ def test_headers_of_lists_may_have_quotes_and_blank_lines_before_them():
     sweep = parsed(
         LIST, rows=b'\n"program.amplitude_V", "mechanics.damping_ratio"\n'.replace(b", ", b",") + b"1.5,0.1\n"
     )
-    assert sweep.job._names == ("program.amplitude_V", "mechanics.damping_ratio")
+    assert tuple(axis.parameter for axis in sweep.plan.axes) == ("program.amplitude_V", "mechanics.damping_ratio")
 
 
 WRONG = (3, 10**400, "", "x\0y", "**.csv", [3], {"a": 1}, True, float("nan"), [[1]], [{}])
@@ -250,15 +251,15 @@ def test_changed_records_are_noticed(tmp_path, monkeypatch):
 def test_a_checkout_is_told_from_others(monkeypatch):
     from importlib.metadata import PackageNotFoundError
 
-    from fits.sweeps import _versions
+    from fits.sweeps import _packages
 
     def version(name):
         if name == "microid":
             raise PackageNotFoundError(name)
         return "1"
 
-    monkeypatch.setattr(_versions, "version", version)
-    before = _versions.versions.__wrapped__()["microid"]
+    monkeypatch.setattr(_packages, "version", version)
+    before = _packages.versions.__wrapped__()["microid"]
     assert before.startswith("checkout ")
-    monkeypatch.setattr(_versions.Path, "read_bytes", lambda path: b"other")
-    assert _versions.versions.__wrapped__()["microid"] != before
+    monkeypatch.setattr(_packages.Path, "read_bytes", lambda path: b"other")
+    assert _packages.versions.__wrapped__()["microid"] != before

@@ -21,11 +21,12 @@ from _sweeps import parsed, small, stage_um
 from fits import DataError
 from fits.sweeps import _store
 from fits.sweeps._chunks import chunk_count
-from fits.sweeps._kinds_simulate import _simulate
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep, summarise
 from fits.sweeps._spec import read_sweep
 from fits.sweeps._stages import memory_before, nominal_stage, varied
+from fits.sweeps._types import Block
+from fits.sweeps.kinds.simulate import SimulateJob
 from microid import Start
 
 ROOT = Path(__file__).parents[1]
@@ -76,15 +77,16 @@ def test_rows_agree_with_the_stage_itself(rng):
     sweep = parsed(small(1))
     stage, program = nominal_stage(), sweep.job._program
     names = ("mechanics.damping_ratio", "driver.gain", "hysteresis.density.packed_um", "program.amplitude_V")
-    values = np.stack(
-        [rng.uniform(0.01, 0.3, 8), rng.uniform(0.5, 1.1, 8), rng.uniform(0, 2, 8), rng.uniform(1, 90, 8)]
-    )
+    ends = (0.01, 0.3), (0.5, 1.1), (0, 2), (1, 90)
+    values = {name: rng.uniform(*each, 8) for name, each in zip(names, ends, strict=True)}
     # One of three, as compiling takes long.
-    memory = memory_before(stage, str(rng.choice(["negative", "positive", "demagnetised"])))
+    initial = str(rng.choice(["negative", "positive", "demagnetised"]))
+    memory = memory_before(stage, initial)
     relative = ("hysteresis.density.packed_um",)
-    found = _simulate(stage, values.T, names, relative, program, None, memory, 0, 1)
-    for row, own in enumerate(values.T):
-        changed = varied(stage, dict(zip(names, map(jnp.asarray, own), strict=True)), relative)
+    block = Block(values, relative, np.arange(8), np.zeros(8, dtype=int), 0)
+    found = SimulateJob(stage, program, initial, every=1).compute(block).outputs
+    for row in range(8):
+        changed = varied(stage, {name: jnp.asarray(each[row]) for name, each in values.items()}, relative)
         moved = changed(jnp.asarray(program.interval_s), found["voltage_V"][row], Start(memory=memory))
         assert jnp.abs(found["displacement_um"][row] - moved).max() < 1e-12 * jnp.abs(moved).max()
 

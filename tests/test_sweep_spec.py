@@ -6,8 +6,9 @@ from _sweeps import parsed, small
 from scipy.stats import qmc
 
 from fits import DataError
-from fits.sweeps._examples import EXAMPLES
+from fits.sweeps.kinds import examples
 
+EXAMPLES = examples()
 HEAD = 'schema = "microid.sweep/1"\nkind = "simulate"\n'
 
 

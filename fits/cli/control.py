@@ -101,10 +101,10 @@ def control(given: Given) -> None:
 
     from fits.cli._models import parse_rig_limits, stage_or_preisach
     from fits.control._gains import read_gains
-    from fits.control._limits import passed_limits
     from fits.control._make import Loop, Maker
     from fits.control._setup import setup
     from fits.control._tune_problem import Goal
+    from fits.control._tune_result import passed_limits
     from fits.io._atomic import finite_json, write_csv
     from fits.io._jax_setup import start_jax
     from fits.io._limits import check_command, joined, measured_ranges, reached_in

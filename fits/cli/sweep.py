@@ -6,6 +6,7 @@ from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences, stopped
 from fits.cli._files import answer, progress_to_stderr, put_in
 from fits.io._file_set import file_set
+from fits.sweeps import kinds
 
 
 class _Sweep(click.Group):
@@ -21,7 +22,7 @@ class _Sweep(click.Group):
 @click.group(cls=_Sweep, invoke_without_command=True, subcommand_metavar="SWEEP.toml | show DIR [OPTIONS]")
 @click.option(
     "--example",
-    type=click.Choice(["simulate", "sensitivity", "fit", "diagnose", "control"]),
+    type=click.Choice([*kinds.examples()]),
     help="Print a commented SWEEP.toml of about 1,000 rows.",
 )
 @click.pass_context
@@ -32,9 +33,7 @@ def sweep(context: click.Context, example: str | None) -> None:
     --resume goes on. microid sweep show DIR says how far it is and what came out.
     """
     if example is not None:
-        from fits.sweeps._examples import EXAMPLES
-
-        click.echo(EXAMPLES[example], nl=False)
+        click.echo(kinds.examples()[example], nl=False)
         context.exit()
     if context.invoked_subcommand is None:
         click.echo(context.get_help())

@@ -38,21 +38,8 @@ def follow(
 ) -> np.ndarray:
     """Find the voltage under which a stage with effects follows a reference, shape `(n,)`, in V.
 
-    Parameters
-    ----------
-    stage
-        With its effects.
-    reference
-        What is to be followed.
-    inverse
-        Voltage by which the plain stage follows another reference.
-    response
-        Displacement of a stage under a voltage.
-
-    Raises
-    ------
-    DataError
-        If an effect needs a column that a reference does not have, as a temperature is.
+    `inverse` gives the voltage by which the plain stage follows another reference, `response` the displacement of a
+    stage under a voltage. A `DataError` refuses an effect that needs a column, as a temperature is.
     """
     needs = sorted({name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs})
     if needs:

@@ -1,6 +1,6 @@
 """A whole stage in feedforward: what its driver and mechanics ask for beyond the inverse of the hysteresis."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,18 +20,10 @@ _FEWEST = 16
 _ROUNDING = 1e-13
 
 
-@dataclass(frozen=True)
-class Gains:
-    """What the linear parts of a stage do at rest.
+class Gains(NamedTuple):
+    """Static gains of a stage: piezo voltage per command, measured displacement per displacement of the piezo.
 
-    Attributes
-    ----------
-    ahead
-        Piezo voltage per command.
-    behind
-        Measured displacement per displacement of the piezo.
-    offset_um
-        Measured displacement where the piezo's is zero.
+    The offset is the measured displacement where the piezo's is zero.
     """
 
     ahead: float
@@ -74,10 +66,7 @@ def gains_of(stage: Stage) -> Gains:
 def static_equivalent(stage: Stage) -> Preisach:
     """Return the hysteresis between command and sensor, as slow commands see it: the static gains folded in.
 
-    Raises
-    ------
-    DataError
-        If the stage has no Preisach hysteresis, or a static gain that is not positive.
+    A `DataError` refuses a stage without a Preisach hysteresis, or with a static gain that is not positive.
     """
     stage = plain_of(stage)
     law, gains = hysteresis_of(stage), gains_of(stage)
@@ -93,18 +82,8 @@ def static_equivalent(stage: Stage) -> Preisach:
 def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: str) -> tuple[np.ndarray, float]:
     """Find what the sensor would have to read at rest for the mechanics to follow a reference, and how sure that is.
 
-    Parameters
-    ----------
-    stage, time_s, reference_um
-        The times have shape `(n,)`, as the reference has.
-    source
-        Named in the refusal.
-
-    Returns
-    -------
-    tuple
-        The displacement in um, shape `(n,)`, and the largest estimate of its error: a third of what it would be off
-        if every other sample were missing.
+    The displacement in um has the shape `(n,)` of the times and the reference. Its largest error is estimated as a
+    third of what it would be off if every other sample were missing.
     """
     if len(time_s) < _FEWEST:
         raise DataError(
@@ -150,14 +129,7 @@ def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarra
 def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.ndarray:
     """Displacement of a hysteresis or a whole stage under a voltage, in um, shape `(n,)`.
 
-    Parameters
-    ----------
-    model
-        From a fit or a model file.
-    record
-        Times and voltages.
-    initial
-        Memory before the first sample: `negative`, `positive` or `demagnetised`.
+    The memory before the first sample is `negative`, `positive` or `demagnetised`.
     """
     law = model if isinstance(model, Preisach) else hysteresis_of(model)
     lower, upper = float(law.density.lower_V), float(law.density.upper_V)

@@ -83,20 +83,9 @@ def strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float | None:
 
 @dataclass(frozen=True)
 class Loop:
-    """All that stays the same while controllers change.
+    """All that stays the same while controllers change: the plants, the one to be run first, and the readings.
 
-    Attributes
-    ----------
-    ready
-        Stage, reference and feedforward.
-    plants
-        To be controlled, the one that is run first.
-    noise_um
-        Standard deviation of the sensor's noise.
-    delay, resolution_um
-        Of the readings.
-    skip
-        How many samples at the beginning do not count.
+    Noise is a standard deviation, the delay a number of samples; the first `skip` samples do not count.
     """
 
     ready: Setup
@@ -137,18 +126,9 @@ class Loop:
 
 @dataclass(frozen=True)
 class Made:
-    """A controller that was made.
+    """A controller that was made, and the PID controller that it is or was made around.
 
-    Attributes
-    ----------
-    controller
-        For the loop.
-    pid
-        The PID controller that it is, or was made around.
-    tuning
-        None where gains were given.
-    remarks
-        One sentence each.
+    There is no tuning where gains were given.
     """
 
     controller: AbstractController
@@ -159,17 +139,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Maker:
-    """Makes controllers for a loop.
-
-    Attributes
-    ----------
-    loop, goal, starts, seed
-        See `tune_controller`.
-    noise_um
-        Noise to tune under, shape `(t,)`; None for none.
-    tell
-        Told what is being done.
-    """
+    """Makes controllers for a loop; see `tune_controller`. The noise they are tuned under has the shape `(t,)`."""
 
     loop: Loop
     goal: Goal
@@ -181,21 +151,9 @@ class Maker:
     def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
         """Make a controller by the name of its kind, with its tuning and what is to be said of it.
 
-        Parameters
-        ----------
-        name
-            One of `microid.CONTROLLERS`.
-        given
-            Gains; tuned if None.
-        frequency_Hz
-            Of resonators; if there are none, those that are given, or the strongest in the reference.
-
-        Raises
-        ------
-        DataError
-            If the reference or the gains do not suit the controller.
-        FitError
-            See `tune_controller`.
+        It is tuned if no gains are given. Frequencies are those of resonators; without them those that are given, or
+        the strongest in the reference. A `DataError` says that reference or gains do not suit the controller; of a
+        `FitError` see `tune_controller`.
         """
         loop, kind = self.loop, CONTROLLERS[name]
         tuning: Tuning[Any] | None = None

@@ -1,12 +1,13 @@
 """A model and a reference made ready for a closed loop: interval, feedforward, limits, and how the stage stands."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
 
-from fits.control._compensate import Compensation, Way, compensate
+from fits.control._compensate import compensate
 from fits.io._errors import DataError
 from fits.io._record import Reference
 from fits.loop._run import initial_state
@@ -24,22 +25,8 @@ _EVEN = 1e-3
 class Setup:
     """What a closed loop needs beside its controller.
 
-    Attributes
-    ----------
-    stage
-        Under a held command.
-    interval_s
-        Between two samples.
-    reference_um, feedforward_V
-        Shape `(t,)`; the latter None without feedforward.
-    limits_V
-        Of the command.
-    start
-        At rest where the reference begins.
-    static_V
-        Command that would hold the stage at the reference, shape `(t,)`.
-    remarks
-        One sentence each.
+    The stage is under a held command, and at rest where the reference begins. Signals have the shape `(t,)`:
+    `static_V` would hold the stage at the reference.
     """
 
     stage: Stage
@@ -62,24 +49,10 @@ def setup(
 ) -> Setup:
     """Make a model and a reference ready for a closed loop.
 
-    Parameters
-    ----------
-    model
-        A hysteresis, which becomes a stage of one part, or a stage of parts that have a form for single samples.
-    reference
-        With even times; the stage is at rest at its first sample.
-    feedforward
-        None, the inverse of the hysteresis alone, or that of the whole stage.
-    initial
-        Memory before the reference: `negative`, `positive` or `demagnetised`.
-    limits_V
-        Of the command; by default the range that the model was fitted on.
-
-    Raises
-    ------
-    DataError
-        If the times are uneven or too few, the stage cannot be stepped or inverted, or the limits are not within the
-        model's range.
+    A hysteresis becomes a stage of one part, which is at rest at the first sample of the reference. The feedforward
+    is none, the inverse of the hysteresis alone, or that of the whole stage; limits are by default the range that
+    the model was fitted on. A `DataError` says that the times are uneven or too few, that the stage cannot be stepped
+    or inverted, or that the limits are not within the model's range.
     """
     stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
     stage = Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
@@ -97,7 +70,8 @@ def setup(
             f"{stage.names[place]!r} is a {type(law).__name__}, expected a Preisach hysteresis; fit one",
             of_model=True,
         )
-    found = _compensation(stage, reference, initial, limits_V, "static")
+    invert = partial(compensate, stage, reference, initial, clip=True, limits_V=limits_V)
+    found = invert(way="static")
     remarks = []
     if found.clipped.any():
         remarks.append(f"{int(found.clipped.sum())} samples of the reference are out of reach within the limits")
@@ -107,7 +81,7 @@ def setup(
             raise DataError(
                 "expected a model with mechanics for --feedforward dynamic, found a hysteresis alone", of_model=True
             )
-        led = _compensation(stage, reference, initial, limits_V, "dynamic")
+        led = invert(way="dynamic")
         ahead, remarks = led.voltage_V, [*remarks, *led.remarks]
     memory = initial_state(initial, float(law.density.lower_V), float(law.density.upper_V))
     rest_V = float(found.voltage_V[0] if ahead is None else ahead[0])
@@ -121,12 +95,6 @@ def setup(
         found.voltage_V,
         tuple(remarks),
     )
-
-
-def _compensation(
-    stage: Stage, reference: Reference, initial: str, limits_V: tuple[float, float] | None, way: Way
-) -> Compensation:
-    return compensate(stage, reference, initial, clip=True, limits_V=limits_V, way=way)
 
 
 def _linear(

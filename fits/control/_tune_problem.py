@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from microid import Coordinates, Margins, Stage, Start, margins, simulate_loop
+from microid import ControlledRun, Coordinates, Margins, Stage, Start, margins, simulate_loop
 
 # Every gain is searched for within `exp` of this of its start, to either side.
 REACH = 6.0
@@ -82,34 +82,11 @@ class Goal:
 
 
 class Problem(eqx.Module):
-    """A controller in the coordinates of its search, and all loops it is to close.
+    """A controller in the coordinates of its search, and all loops it is to close: of `p` plants and `r` references.
 
-    Attributes
-    ----------
-    coordinates
-        Of the controller.
-    origin, stretch
-        Where the search begins, and by how much a coordinate changes its parameter e-fold there, shape `(n,)`.
-    plants
-        Stages with `p` values in every leaf.
-    slope_um_per_V
-        Of their hysteresis, shape `(p,)`; None without one.
-    reference_um, feedforward_V, noise_um
-        Shape `(r, t)`; None where there is none.
-    counts
-        Which samples count, shape `(t,)`.
-    start
-        How all stages stand before.
-    weights_um_per_V
-        Of effort and rate.
-    limits
-        By their names in `Goal`.
-    command_width_V
-        What the excess of a command is counted in.
-    resolution_um
-        Of the sensor.
-    delay
-        Of the reading, in samples.
+    The search begins at `origin`, where `stretch` is by how much a coordinate changes its parameter e-fold. The
+    plants are stages with `p` values in every leaf; signals are None where there are none; `counts` says which
+    samples count.
     """
 
     coordinates: Coordinates[Any]
@@ -134,17 +111,7 @@ class Problem(eqx.Module):
 
 
 class Figures(eqx.Module):
-    """What loops do, for `p` plants and `r` references.
-
-    Attributes
-    ----------
-    margins
-        Shape `(p,)` each.
-    error_um2, effort_V2, rate_V2
-        Mean squares, shape `(p, r)`.
-    error_max_um, overshoot_pct, command_min_V, command_max_V, command_step_V
-        Extremes, shape `(p, r)`.
-    """
+    """What loops do, for `p` plants and `r` references: margins, mean squares, and extremes."""
 
     margins: Margins
     error_um2: Float[Array, "p r"]
@@ -206,20 +173,24 @@ def _run(
     rate = jnp.diff(run.command_V, prepend=before)
     count = jnp.sum(problem.counts)
     squares = (jnp.sum(problem.counts * x**2) / count for x in (run.error_um, effort, rate))
-    low = jnp.minimum(jnp.min(reference), run.displacement_um[0])
-    high = jnp.maximum(jnp.max(reference), run.displacement_um[0])
-    beyond = jnp.maximum(run.displacement_um - high, low - run.displacement_um)
-    moves = high - low > NO_RANGE_um
-    # Both arms are finite: a quotient by zero would leave no derivative, whichever arm is taken.
-    overshoot = jnp.where(moves, 100 * jnp.maximum(jnp.max(beyond), 0) / jnp.where(moves, high - low, 1), 0)
     extremes = (
         jnp.max(problem.counts * jnp.abs(run.error_um)),
-        overshoot,
+        overshoot_pct(run),
         jnp.min(run.command_V),
         jnp.max(run.command_V),
         jnp.max(jnp.abs(rate)),
     )
     return (*squares, *extremes)
+
+
+def overshoot_pct(run: ControlledRun) -> Float[Array, ""]:
+    """Displacement beyond the range of the reference and the rest before it, in percent of it; see `Goal`."""
+    low = jnp.minimum(jnp.min(run.reference_um), run.displacement_um[0])
+    high = jnp.maximum(jnp.max(run.reference_um), run.displacement_um[0])
+    beyond = jnp.maximum(run.displacement_um - high, low - run.displacement_um)
+    moves = high - low > NO_RANGE_um
+    # Both arms are finite: a quotient by zero would leave no derivative, whichever arm is taken.
+    return jnp.where(moves, 100 * jnp.maximum(jnp.max(beyond), 0) / jnp.where(moves, high - low, 1), 0)
 
 
 def cost_um(problem: Problem, found: Figures) -> Float[Array, ""]:

@@ -1,15 +1,18 @@
-"""What tuning gives back."""
+"""What tuning gives back, and whether a loop keeps its limits."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import jax
 import numpy as np
 
-from fits.control._tune_problem import Figures
-from microid import AbstractController, Margins
+from fits.control._tune_problem import Figures, Goal, overshoot_pct
+from microid import AbstractController, ControlledRun, Margins
 
 _Controller = TypeVar("_Controller", bound=AbstractController)
+# Tuning keeps limits to a share of 2e-3.
+_TOLERANCE = 3e-3
 
 
 @dataclass(frozen=True)
@@ -92,3 +95,34 @@ def reports(found: Figures) -> tuple[LoopReport, ...]:
             )
         )
     return tuple(out)
+
+
+def passed_limits(goal: Goal, every: Sequence[Margins], runs: Sequence[ControlledRun]) -> dict[str, str]:
+    """Find which limits a loop is beyond, with what was expected and found, by the option of the command.
+
+    There are margins of each plant, and runs of those whose overshoot counts.
+    """
+    worst = {
+        "--gain-margin": min(float(one.gain_margin) for one in every),
+        "--phase-margin": min(float(one.phase_margin_deg) for one in every),
+        "--peak": max(float(one.sensitivity_peak) for one in every),
+        "--overshoot": max(float(overshoot_pct(run)) for run in runs),
+    }
+    words = {
+        "--gain-margin": (goal.gain_margin_min, "a gain margin of {} or more", ""),
+        "--phase-margin": (goal.phase_margin_min_deg, "a phase margin of {} degrees or more", " degrees"),
+        "--peak": (goal.sensitivity_peak_max, "a peak of the sensitivity of {} or less", ""),
+        "--overshoot": (goal.overshoot_max_pct, "an overshoot of {} % or less", " %"),
+    }
+    out = {}
+    for option, (limit, expected, unit) in words.items():
+        if limit is None:
+            continue
+        found = worst[option]
+        if option == "--overshoot":
+            beyond = (found + 1) / (limit + 1) - 1
+        else:
+            beyond = found / limit - 1 if option == "--peak" else 1 - found / limit
+        if beyond > _TOLERANCE:
+            out[option] = f"expected {expected.format(f'{limit:g}')}, found {found:.4g}{unit}"
+    return out

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from fits.plots._style import WIDE_in, figure, label, save, verbatim
-from fits.sweeps._about import about_of
 from fits.sweeps._show import open_sweep, readable, summarise
+from fits.sweeps._store import about_of
 from fits.sweeps._types import DONE
 
 _CELLS = 12

@@ -2,7 +2,6 @@
 
 import abc
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -25,25 +24,14 @@ _TINY = 2.0**-54
 
 @dataclass(frozen=True)
 class Axis:
-    """One parameter and how it varies, in the parameter's own unit.
+    """One parameter and how it varies, in its own unit; values that are relative multiply the nominal one.
 
-    Attributes
-    ----------
-    parameter
-        Name.
-    relative
-        Whether the values multiply the nominal one.
-    values
-        Of a grid or a list, or None where they are drawn.
-    distribution
-        `uniform`, `log` or `normal`, where they are drawn.
-    first, second
-        Low and high, or mean and standard deviation.
+    Where they are drawn, the distribution is `uniform` or `log`, between the first and the second number, or `normal`
+    with a mean and a standard deviation.
     """
 
     parameter: str
     relative: bool = False
-    values: tuple[float, ...] | None = None
     distribution: str = "uniform"
     first: float = 0.0
     second: float = 1.0
@@ -61,10 +49,7 @@ class Axis:
 class AbstractGroup(abc.ABC):
     """Axes that run together; groups are crossed."""
 
-    @property
-    @abc.abstractmethod
-    def axes(self) -> tuple[Axis, ...]:
-        """Which."""
+    axes: tuple[Axis, ...]
 
     @abc.abstractmethod
     def __len__(self) -> int: ...
@@ -74,75 +59,66 @@ class AbstractGroup(abc.ABC):
         """Values at some places of the group, shape `(axes, n)`."""
 
 
+@dataclass(frozen=True)
 class Listed(AbstractGroup):
-    """Axes with stated values of one length: one axis of a grid, zipped axes, or the columns of a CSV."""
+    """Axes with stated values, shape `(axes, n)`: one axis of a grid, zipped axes, or the columns of a CSV."""
 
-    def __init__(self, axes: Sequence[Axis], table: FloatArray):
-        """Take axes and their values, shape `(axes, n)`."""
-        self._axes, self._table = tuple(axes), table
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """Which."""
-        return self._axes
+    axes: tuple[Axis, ...]
+    table: FloatArray
 
     def __len__(self) -> int:
-        return self._table.shape[1]
+        return self.table.shape[1]
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
         """Values at some places, shape `(axes, n)`."""
-        return np.asarray(self._table[:, place])
+        return np.asarray(self.table[:, place])
 
 
+@dataclass(frozen=True)
 class Drawn(AbstractGroup):
-    """Axes that are drawn together: at random, in a Latin hypercube or as a Sobol sequence."""
+    """Axes that are drawn together: at random, in a Latin hypercube or as a Sobol sequence, one of `SAMPLERS`.
 
-    def __init__(self, axes: Sequence[Axis], method: str, rows: int, seed: int):
-        """Take axes, one of `SAMPLERS`, how many rows and the seed.
+    A `DataError` refuses a design that is larger than its method can be.
+    """
 
-        Raises
-        ------
-        DataError
-            If the design is larger than its method can be.
-        """
-        self._axes, self._method, self._rows, self._seed = tuple(axes), method, rows, seed
-        if method == "latin_hypercube" and rows > _LARGEST_HYPERCUBE:
+    axes: tuple[Axis, ...]
+    method: str
+    rows: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.method == "latin_hypercube" and self.rows > _LARGEST_HYPERCUBE:
             raise DataError(
-                f"design.rows: a Latin hypercube has up to {_LARGEST_HYPERCUBE:,} rows, found {rows:,}; choose "
+                f"design.rows: a Latin hypercube has up to {_LARGEST_HYPERCUBE:,} rows, found {self.rows:,}; choose "
                 'method = "sobol" or "random".'
             )
-        if method == "sobol" and rows > 2**30:
-            raise DataError(f'design.rows: a Sobol design has up to 2^30 rows, found {rows:,}; choose "random".')
-        if method == "sobol" and len(axes) > qmc.Sobol.MAXDIM:
+        if self.method == "sobol" and self.rows > 2**30:
+            raise DataError(f'design.rows: a Sobol design has up to 2^30 rows, found {self.rows:,}; choose "random".')
+        if self.method == "sobol" and len(self.axes) > qmc.Sobol.MAXDIM:
             raise DataError(f'design.method: a Sobol design has up to {qmc.Sobol.MAXDIM} axes; choose "random".')
 
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """Which."""
-        return self._axes
-
     def __len__(self) -> int:
-        return self._rows
+        return self.rows
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
         """Values at some places, shape `(axes, n)`."""
-        chance = np.empty((len(place), len(self._axes)))
-        if self._method == "latin_hypercube":
-            chance[:] = _hypercube(len(self._axes), self._rows, self._seed)[place]
+        chance = np.empty((len(place), len(self.axes)))
+        if self.method == "latin_hypercube":
+            chance[:] = _hypercube(len(self.axes), self.rows, self.seed)[place]
         else:
             for piece in np.unique(place // _PIECE):
                 here = place // _PIECE == piece
                 chance[here] = self._piece(int(piece))[place[here] - piece * _PIECE]
-        return np.stack([axis.quantile(chance[:, k]) for k, axis in enumerate(self._axes)])
+        return np.stack([axis.quantile(chance[:, k]) for k, axis in enumerate(self.axes)])
 
     def _piece(self, piece: int) -> FloatArray:
-        dimensions = len(self._axes)
-        if self._method == "sobol":
-            sampler = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(self._seed))
+        dimensions = len(self.axes)
+        if self.method == "sobol":
+            sampler = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(self.seed))
             if piece:
                 sampler.fast_forward(piece * _PIECE)
             return np.asarray(sampler.random(_PIECE))
-        rng = np.random.default_rng([self._seed, piece])
+        rng = np.random.default_rng([self.seed, piece])
         return rng.random((_PIECE, dimensions))
 
 
@@ -153,14 +129,9 @@ def _hypercube(dimensions: int, rows: int, seed: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Plan:
-    """All rows, as groups crossed with each other; the last runs fastest.
+    """All rows: groups crossed with each other, of which the last runs fastest, for each of some repeats.
 
-    Attributes
-    ----------
-    groups
-        Crossed with each other and with `repeats`.
-    repeats
-        Rows there are by themselves, such as files: they run slowest.
+    Repeats are rows there are by themselves, such as files.
     """
 
     groups: tuple[AbstractGroup, ...]

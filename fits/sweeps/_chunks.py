@@ -5,10 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.sweeps._choices import kept_as, spelt
 from fits.sweeps._devices import device_count
 from fits.sweeps._spec import Sweep, outside
-from fits.sweeps._types import DONE, FAILED, Output, Rows
+from fits.sweeps._types import DONE, FAILED, Block, Output, Parameter, Rows
 
 # A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
 # Rows that go one by one are slow ones, of which few are to be lost.
@@ -42,6 +41,13 @@ def swept_of(sweep: Sweep) -> tuple[Output, ...]:
     return tuple(kept_as(known[axis.parameter], axis.relative) for axis in sweep.plan.axes)
 
 
+def kept_as(parameter: Parameter, relative: bool) -> Output:
+    """How the values of an axis are kept: numbers in their unit, or words."""
+    widest = max(map(len, parameter.words), default=0)
+    dtype = f"U{widest}" if widest else "f8"
+    return Output(parameter.name, "1" if relative else parameter.unit, "swept", dtype=dtype)
+
+
 def source_of(sweep: Sweep) -> Output:
     """The variable that says which source a row has, as wide as the longest name."""
     return Output("source", "1", "file of the row", dtype=f"U{max(map(len, sweep.facts.sources), default=1)}")
@@ -61,17 +67,7 @@ def rows_of(sweep: Sweep, chunk: int) -> NDArray[np.int64]:
 def compute_chunk(sweep: Sweep, chunk: int, tell: Callable[[int], None] = lambda _: None) -> Rows:
     """Compute a chunk, as many blocks at a time as there are devices, the last ones filled up with the last row.
 
-    Parameters
-    ----------
-    sweep, chunk
-        Which.
-    tell
-        Called with the number of rows that are added each time.
-
-    Returns
-    -------
-    Rows
-        With the swept values beside the outputs, and `status`.
+    The rows have the swept values beside the outputs, and `status`; `tell` is called with the number that is added.
     """
     rows, facts = rows_of(sweep, chunk), sweep.facts
     together = facts.block * (1 if facts.alone else device_count())
@@ -87,14 +83,17 @@ def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
     padded = np.pad(rows, (0, together - len(rows)), mode="edge")
     values = sweep.plan.values(padded)
     inside, refused = outside(sweep, values) if values else (values, [""] * len(padded))
-    found = sweep.job.compute(inside, padded, sweep.plan.repeat_of(padded), sweep.seed)
+    relative = tuple(axis.parameter for axis in sweep.plan.axes if axis.relative)
+    found = sweep.job.compute(Block(inside, relative, padded, sweep.plan.repeat_of(padded), sweep.seed))
     reasons = tuple((why or reason)[:_REASON_LENGTH] for why, reason in zip(refused, found.reasons, strict=True))[
         : len(rows)
     ]
     failed = np.array([bool(reason) for reason in reasons])
     outputs = {output.name: _kept(found, output, failed, len(rows)) for output in sweep.facts.outputs}
     known = {parameter.name: parameter for parameter in sweep.facts.parameters}
-    outputs |= {name: spelt(known[name], value[: len(rows)]) for name, value in values.items()}
+    for name, value in values.items():
+        words = np.array(known[name].words)
+        outputs[name] = words[value[: len(rows)].astype(int)] if len(words) else value[: len(rows)]
     if sweep.facts.sources:
         names = [sweep.facts.sources[k] for k in sweep.plan.repeat_of(rows)]
         outputs["source"] = np.array(names, dtype=source_of(sweep).dtype)

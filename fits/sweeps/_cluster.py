@@ -12,10 +12,9 @@ from typing import Any
 
 from fits.io._errors import DataError, shown
 from fits.sweeps._chunks import compute_chunk
-from fits.sweeps._extra import need
+from fits.sweeps._packages import need, versions
 from fits.sweeps._spec import Sweep, parse_sweep
 from fits.sweeps._types import Rows
-from fits.sweeps._versions import versions
 
 # Chunks that wait per thread of the workers, so that none is idle; and how often a chunk may lose its worker.
 _AHEAD, _LOSSES = 2, 5
@@ -50,17 +49,9 @@ class _Answer:
 
 @contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """Connect to a scheduler, and give its client.
+    """Connect to a scheduler by its address, or to N processes of this machine by `local:N`, and give its client.
 
-    Parameters
-    ----------
-    address
-        Of a scheduler, or `local:N` for N processes of this machine.
-
-    Raises
-    ------
-    DataError
-        If there is no scheduler.
+    A `DataError` says that there is no scheduler.
     """
     distributed = need("distributed")
     # What it tells of a lost scheduler is told here in a sentence.
@@ -98,19 +89,8 @@ def on_cluster(
 ) -> Iterator[tuple[int, Rows]]:
     """Compute chunks on the workers of a scheduler and give them back as they come.
 
-    Parameters
-    ----------
-    client
-        From `connected`.
-    sweep, chunks
-        What is to be computed.
-    progress
-        Told of workers that are refused, and if there is none.
-
-    Raises
-    ------
-    DataError
-        If the scheduler is lost, has no workers, or none with the versions of this process.
+    `progress` is told of workers that are refused, and if there is none. A `DataError` says that the scheduler is
+    lost, has no workers, or none with the versions of this process.
     """
     distributed = need("distributed")
     if not chunks:
@@ -134,13 +114,7 @@ class _Workers:
         self.banned: dict[str, str] = {}
 
     def usable(self) -> dict[str, int]:
-        """Threads of each worker that may compute, by address.
-
-        Raises
-        ------
-        DataError
-            If all are refused, or none has been there for long.
-        """
+        """Threads of each worker that may compute, by address; a `DataError` if all are refused, or none comes."""
         found = self._client.scheduler_info(n_workers=-1)["workers"]
         new = [address for address in found if address not in self._known]
         if new:

@@ -16,10 +16,10 @@ from fits.control._tune_start import slope_array, steepest_slope
 from fits.io._errors import DataError, shown
 from fits.io._record import Reference
 from fits.machining._design import nearest
-from fits.sweeps._choices import check_plain
-from fits.sweeps._programs import Program, number
+from fits.sweeps._programs import Program
 from fits.sweeps._stages import memory_before, range_of
-from fits.sweeps._types import FloatArray, Parameter
+from fits.sweeps._toml import number
+from fits.sweeps._types import FloatArray, Parameter, check_plain
 from microid import (
     CONTROLLERS,
     PID,

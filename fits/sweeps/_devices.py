@@ -10,10 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array
-from numpy.typing import NDArray
 
 _ROWS = "rows"
+# Arrays of one value per sample that a row needs at a time, and how much memory all rows of a block may need.
+_ARRAYS, _BLOCK_BYTES, _LARGEST_BLOCK = 30, 128e6, 256
+
+
+def block_rows(samples: int) -> int:
+    """Rows to compute together: a power of two that depends on the number of samples alone."""
+    fit = _BLOCK_BYTES / (8 * _ARRAYS * samples)
+    return int(min(_LARGEST_BLOCK, 2 ** max(0, int(np.log2(max(fit, 1.0))))))
 
 
 def on_cpu() -> bool:
@@ -26,10 +32,10 @@ def device_count() -> int:
     return jax.local_device_count()
 
 
-def place(rows: NDArray[Any]) -> Array:
-    """Put an array on the devices, a block of its first axis on each, or on one if they cannot share it evenly."""
-    if _shares(len(rows)) == 1:
-        return jnp.asarray(rows)
+def place(rows: Any) -> Any:
+    """Put arrays on the devices, a block of their first axis on each, or on one if they cannot share it evenly."""
+    if _shares(rows) == 1:
+        return jax.tree.map(jnp.asarray, rows)
     mesh = Mesh(np.array(jax.local_devices()), (_ROWS,))
     return jax.device_put(rows, NamedSharding(mesh, PartitionSpec(_ROWS)))
 
@@ -39,16 +45,8 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
     Nothing goes from device to device: each does for its block what it would do with that block alone.
 
-    Parameters
-    ----------
-    own
-        Names of the arguments whose arrays have the rows along their first axis, as all results have. What else there
-        is of arrays belongs to all rows.
-
-    Returns
-    -------
-    Callable
-        Decorator. What it makes takes arguments by place.
+    `own` names the arguments whose arrays have the rows along their first axis, as all results have. Other arrays
+    belong to all rows. What the decorator makes takes arguments by place.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -79,32 +77,25 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     return decorate
 
 
-def in_turn(function: Callable[..., Any], *rows: NDArray[Any]) -> Any:
+def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
     """Call a function for block after block on one CPU.
 
     For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads
     of several CPU devices that factor many matrices at once wait for each other for ever.
 
-    Parameters
-    ----------
-    function
-        Of arrays with the rows of one block along their first axis, as its results have.
-    rows
-        Its arguments, for the blocks of all devices.
-
-    Returns
-    -------
-    Any
-        Its results for all blocks, joined.
+    The arguments have the rows of all blocks along their first axis, and so have the results.
     """
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        blocks = zip(*(np.split(each, _shares(len(each))) for each in rows), strict=True)
-        found = [jax.device_get(function(*map(jnp.asarray, block))) for block in blocks]
+        count = _shares(rows)
+        found = []
+        for k in range(count):
+            block = jax.tree.map(lambda each, k=k: jnp.asarray(np.split(each, count)[k]), rows)
+            found.append(jax.device_get(function(*block)))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
 
 
-def _shares(rows: int) -> int:
-    return 1 if rows % device_count() else device_count()
+def _shares(rows: Any) -> int:
+    return 1 if any(len(leaf) % device_count() for leaf in jax.tree.leaves(rows)) else device_count()
 
 
 def _mesh(rows: Any) -> Mesh | None:

@@ -26,18 +26,9 @@ _NOISE, _ROUNDS = 1e-6, 4
 
 
 class BatchFit(eqx.Module):
-    """What a batch of fits gives, one row each.
+    """What a batch of fits gives, one row each: densities and slopes as in `Grid`, and the offset of the sensor.
 
-    Attributes
-    ----------
-    columns_um
-        Densities and slopes as in `Grid`, shape `(n, D)`.
-    offset_um, noise_um
-        Sensor offset, and standard deviation of the noise, shape `(n,)`.
-    predicted_um
-        At all samples, shape `(n, t)`.
-    success
-        Whether the regression met its conditions.
+    The noise is a standard deviation; success is whether the regression met its conditions.
     """
 
     columns_um: Float[Array, "n D"]
@@ -59,22 +50,10 @@ def fit_batch(
     smoothness: Float[Array, " n"],
     starts: Staircase,
 ) -> BatchFit:
-    """Fit all rows.
+    """Fit all rows on a grid, of which `table` is the `branch_table` and `rough` the `roughness`.
 
-    Parameters
-    ----------
-    levels, table, rough
-        Of the grid: their number, `branch_table` and `roughness`.
-    voltage_V, displacement_um
-        Shape `(n, t)`.
-    weight
-        1 for samples that are fitted, 0 for others, shape `(n, t)`.
-    limits_V
-        Range of the levels, shape `(n, 2)`.
-    smoothness
-        Weight of the curvature of density and slopes, see `Hyper`, shape `(n,)`.
-    starts
-        Memory before each row.
+    The weight is 1 for samples that are fitted and 0 for others; the smoothness that of the curvature, see `Hyper`;
+    the range of the levels and the memory before it belong to each row.
     """
 
     def responses(row: tuple[Array, Array, Staircase]) -> Float[Array, "t D"]:

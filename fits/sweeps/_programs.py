@@ -6,18 +6,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fits.io._errors import DataError, shown
 from fits.io._plausible import SHORTEST_STEP_s
 from fits.io._read_csv import read_csv, read_reference
 from fits.io._table import open_table
 from fits.io._units import recognise
-from fits.machining._design import nearest
-from fits.sweeps._files import in_a_file
-from fits.sweeps._types import FloatArray, Parameter
+from fits.sweeps._devices import by_rows, place
+from fits.sweeps._toml import check_keys, in_a_file, number
+from fits.sweeps._types import Block, FloatArray, Parameter
 
 # Parameters of each shape beside offset and amplitude.
 SHAPES: dict[str, tuple[str, ...]] = {
@@ -33,26 +34,14 @@ _UNITS = {"frequency_Hz": "Hz", "frequency_end_Hz": "Hz", "phase_rad": "rad", "s
 _SAMPLES, _LONGEST_s = 10_000_000, 1e4
 # Samples that differ by less from even intervals, as a fraction of one, count as even.
 _EVEN = 1e-3
-# Squares and products of what is larger overflow.
-_LARGEST = 1e30
 
 
 @dataclass(frozen=True)
 class Program:
-    """A signal over evenly spaced times.
+    """A signal over evenly spaced times, of one of `SHAPES`; one that decays is a sine that ends at nothing.
 
-    Attributes
-    ----------
-    table, unit
-        `program` and `V`, or `reference` and `um`.
-    shape
-        One of `SHAPES`: a sine, a triangle, a sine that decays to nothing, a chirp, a step, or a file.
-    samples, interval_s
-        How many, and the time between two.
-    nominal
-        Values of the parameters, each with its name without the table.
-    given
-        The signal of a file, shape `(samples,)`.
+    The table is `program`, in V, or `reference`, in um. Nominal values have their names without it; a file gives the
+    signal, shape `(samples,)`.
     """
 
     table: str
@@ -116,13 +105,7 @@ class Program:
 
 
 def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes]) -> Program:
-    """Read the table `[program]` or `[reference]` of a sweep.
-
-    Raises
-    ------
-    DataError
-        For the first thing that is not as it should be.
-    """
+    """Read the table `[program]` or `[reference]` of a sweep; a `DataError` says what is wrong with it."""
     if not isinstance(table, dict):
         raise DataError(f"{name}: expected a table, found {shown(table)}; write [{name}] and its keys below.")
     shape = table.get("shape", "file" if "file" in table else None)
@@ -132,9 +115,7 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
     known = ["shape", "samples", "interval_s", *own]
     if shape == "file":
         known = ["shape", "file", f"offset_{unit}", "gain"]
-    for key in table:
-        if key not in known:
-            raise DataError(f"{name}.{key}: expected a known key, found {shown(key)}; {nearest(key, known)}")
+    check_keys(table, known, name)
     if shape == "file":
         return _from_file(table, name, unit, load)
     nominal = {f"offset_{unit}": 0.0, f"amplitude_{unit}": 1.0} | {key: _DEFAULTS[key] for key in SHAPES[shape]}
@@ -191,14 +172,15 @@ def _read_displacement(path: Path) -> tuple[FloatArray, FloatArray]:
     return reference.time_s, reference.displacement_um
 
 
-def number(found: Any, place: str) -> float:
-    """A finite number, or a `DataError` that begins with its place."""
-    try:
-        value = float(found) if isinstance(found, int | float) and not isinstance(found, bool) else math.nan
-    except OverflowError:
-        value = math.inf
-    if not math.isfinite(value):
-        raise DataError(f"{place}: expected a finite number, found {shown(found)}; give one without quotes.")
-    if abs(value) > _LARGEST or 0 < abs(value) < 1 / _LARGEST:
-        raise DataError(f"{place}: expected 0, or {1 / _LARGEST:g} to {_LARGEST:g} in size, found {value:g}.")
-    return value
+def drive(program: Program, block: Block, values: Mapping[str, Array]) -> Float[Array, "n t"]:
+    """Signals of all rows of a block, by the values that vary."""
+    given = None if program.given is None else jnp.asarray(program.given)
+    signals: Array = _drive(place(block.rows), values, program, given)
+    return signals
+
+
+@by_rows("rows", "values")
+def _drive(
+    rows: Int[Array, " n"], values: Mapping[str, Array], program: Program, given: Float[Array, " t"] | None
+) -> Float[Array, "n t"]:
+    return jax.vmap(lambda _, own: program.signal(own, given))(rows, values)

@@ -5,17 +5,17 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from fits.io._errors import DataError, shown
 from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
-from fits.sweeps._choices import check_plain, code_of
-from fits.sweeps._programs import number
-from fits.sweeps._types import Parameter
+from fits.sweeps._toml import number, read_table
+from fits.sweeps._types import Parameter, check_plain, code_of
 
-_KEYS = ("parameter", "unit", "relative", "values", "low", "high", "count", "spacing", "mean", "sd", "zip")
 _PREFIXES = {"": 0, "k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
 _BASES = ("s", "V", "m", "Hz", "Pa", "rad")
 _MOST = 2**62
@@ -23,6 +23,31 @@ _MOST = 2**62
 _LONGEST = 1_000_000
 # Keys beside those that every axis may have, by the one that says where its values come from.
 _WAYS = {"values": ("values", "zip"), "low": ("low", "high", "count", "spacing", "zip"), "mean": ("mean", "sd")}
+
+
+class _Axis(msgspec.Struct):
+    """A table `[[axis]]`; what belongs together is checked by `_values`."""
+
+    parameter: Annotated[str, Meta(description="the name of what varies")]
+    unit: Annotated[str | None, Meta(description="a unit in quotes")] = None
+    relative: Annotated[bool, Meta(description="true or false")] = False
+    values: Any = None
+    low: Any = None
+    high: Any = None
+    mean: Any = None
+    sd: Any = None
+    spacing: Annotated[Literal["linear", "log"], Meta(description="linear or log")] = "linear"
+    count: Annotated[int | None, Meta(description="a number of 1 or more")] = None
+    zip: Annotated[str | None, Meta(description="a name that zipped axes share")] = None
+
+
+class _Design(msgspec.Struct):
+    """The table `[design]`."""
+
+    method: Annotated[
+        Literal["random", "latin_hypercube", "sobol"], Meta(description=f"one of {', '.join(SAMPLERS)}")
+    ]
+    rows: Annotated[int, Meta(ge=1, le=_MOST, description="a number from 1 to 2^62")]
 
 
 def read_plan(
@@ -34,23 +59,8 @@ def read_plan(
 ) -> Plan:
     """Read `[[axis]]`, `[design]` and `[list]` of a sweep.
 
-    Parameters
-    ----------
-    table
-        The sweep.
-    parameters
-        Those that may be varied.
-    repeats
-        Rows there are by themselves.
-    seed
-        Of what is drawn.
-    load
-        Gives the content of a file by its name.
-
-    Raises
-    ------
-    DataError
-        For the first thing that is not as it should be.
+    There are `repeats` rows by themselves; the seed is that of what is drawn, and `load` gives the content of a file.
+    A `DataError` says what is not as it should be.
     """
     known = {parameter.name: parameter for parameter in parameters}
     listed: dict[str, list[tuple[Axis, np.ndarray]]] = {}
@@ -61,8 +71,6 @@ def read_plan(
             drawn.append(axis)
         else:
             label = entry.get("zip")
-            if label is not None and not isinstance(label, str):
-                raise DataError(f"axis[{k}].zip: expected a name that zipped axes share, found {shown(label)}.")
             listed.setdefault(f"{k}" if label is None else f"zip {label}", []).append((axis, values))
     groups: list[AbstractGroup] = []
     for label, members in listed.items():
@@ -72,7 +80,7 @@ def read_plan(
                 f"axis.zip: the axes of {label[4:]!r} have {' and '.join(map(str, sorted(lengths)))} values; zipped "
                 "axes need as many each."
             )
-        groups.append(Listed([axis for axis, _ in members], np.stack([values for _, values in members])))
+        groups.append(Listed(tuple(axis for axis, _ in members), np.stack([values for _, values in members])))
     if "list" in table:
         groups.append(_list(table["list"], known, load))
     design = table.get("design")
@@ -99,32 +107,20 @@ def _tables(table: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
     return found
 
 
-def _parameter(name: Any, place: str, known: Mapping[str, Parameter]) -> Parameter:
-    if not isinstance(name, str) or name not in known:
-        close = get_close_matches(str(name), [*known], n=3, cutoff=0.4)
+def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) -> tuple[Axis, np.ndarray | None]:
+    table = read_table(entry, _Axis, place)
+    name, relative = table.parameter, table.relative
+    if name not in known:
+        close = get_close_matches(name, [*known], n=3, cutoff=0.4)
         meant = f"did you mean {' or '.join(close)}?" if close else f"use one of {', '.join(known)}."
         raise DataError(f"{place}.parameter: there is no parameter {shown(name)}; {meant}")
-    return known[name]
-
-
-def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) -> tuple[Axis, np.ndarray | None]:
-    for key in entry:
-        if key not in _KEYS:
-            close = get_close_matches(key, _KEYS, n=1, cutoff=0.5)
-            meant = f"did you mean {close[0]}?" if close else f"use some of {', '.join(_KEYS)}."
-            raise DataError(f"{place}.{key}: expected a known key, found {shown(key)}; {meant}")
-    if "parameter" not in entry:
-        raise DataError(f"{place}.parameter: expected the name of what varies, found none; add it.")
-    parameter = _parameter(entry["parameter"], place, known)
-    relative = entry.get("relative", False)
-    if not isinstance(relative, bool):
-        raise DataError(f"{place}.relative: expected true or false, found {shown(relative)}; correct it.")
+    parameter = known[name]
     if not relative and math.isnan(parameter.nominal):
         raise DataError(
             f"{place}.parameter: {parameter.name} is an array, varied relative to itself; add relative = true."
         )
-    factor = _factor(entry.get("unit"), "1" if relative else parameter.unit, f"{place}.unit", parameter.name)
-    found = _values(entry, place, factor, parameter)
+    factor = _factor(table.unit, "1" if relative else parameter.unit, f"{place}.unit", name)
+    found = _values(entry, table, place, factor, parameter)
     check_plain(parameter, found if isinstance(found, np.ndarray) else None, relative, place)
     if relative and math.isfinite(parameter.nominal):
         # Factors of single numbers become values at once; only those of arrays stay factors.
@@ -132,24 +128,20 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
             raise DataError(f"{place}.relative: {parameter.name} is 0, which no factor changes; give values.")
         relative, nominal = False, parameter.nominal
         found = found * nominal if isinstance(found, np.ndarray) else _scaled(*found, nominal)
+    lower, upper = parameter.lower, parameter.upper
     if isinstance(found, np.ndarray):
-        if not relative and np.all((found < parameter.lower) | (found > parameter.upper)):
-            raise DataError(_all_outside(place, parameter))
-        return Axis(parameter.name, relative, tuple(found.tolist())), found
-    distribution, first, second = found
-    axis = Axis(parameter.name, relative, None, distribution, first, second)
-    ends = [first, second]
-    if not relative and distribution != "normal" and (min(ends) > parameter.upper or max(ends) < parameter.lower):
-        raise DataError(_all_outside(place, parameter))
-    return axis, None
-
-
-def _all_outside(place: str, parameter: Parameter) -> str:
-    return f"{place}: all values lie outside the bounds of {parameter.name}, {parameter.range_words}; correct them."
+        outside = bool(np.all((found < lower) | (found > upper)))
+    else:
+        outside = found[0] != "normal" and (min(found[1:]) > upper or max(found[1:]) < lower)
+    if outside and not relative:
+        raise DataError(
+            f"{place}: all values lie outside the bounds of {name}, {parameter.range_words}; correct them."
+        )
+    return (Axis(name, relative), found) if isinstance(found, np.ndarray) else (Axis(name, relative, *found), None)
 
 
 def _values(
-    entry: Mapping[str, Any], place: str, factor: float, parameter: Parameter
+    entry: Mapping[str, Any], table: _Axis, place: str, factor: float, parameter: Parameter
 ) -> np.ndarray | tuple[str, float, float]:
     """Values of a list or grid, or the distribution to draw from with its two numbers."""
     ways = [way for way in ("values", "low", "mean") if way in entry]
@@ -168,7 +160,7 @@ def _values(
     if ways[0] == "low" and "zip" in entry and "count" not in entry:
         raise DataError(f"{place}.zip: an axis that is drawn is not zipped; add count, or leave out zip.")
     if ways[0] == "values":
-        values = entry["values"]
+        values = table.values
         if not isinstance(values, list):
             kind = "words" if parameter.words else "numbers"
             raise DataError(f"{place}.values: expected a list of {kind}, found {shown(values)}.")
@@ -183,16 +175,13 @@ def _values(
             raise DataError(f"{place}.sd: expected a standard deviation above 0, found {sd:g}; correct it.")
         return "normal", mean, sd
     low, high = (number(entry.get(key), f"{place}.{key}") * factor for key in ("low", "high"))
-    spacing = entry.get("spacing", "linear")
-    if spacing not in ("linear", "log"):
-        raise DataError(f"{place}.spacing: expected linear or log, found {shown(spacing)}; choose one.")
+    spacing, count = table.spacing, table.count
     if not low <= high or (spacing == "log" and not low > 0):
         above = " above 0" if spacing == "log" else ""
         raise DataError(f"{place}: expected low{above} and no higher than high, found {low:g} and {high:g}.")
-    if "count" not in entry:
+    if count is None:
         return ("log" if spacing == "log" else "uniform"), low, high
-    count = entry["count"]
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+    if count < 1:
         raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {shown(count)}.")
     if count > _LONGEST:
         raise DataError(
@@ -210,12 +199,10 @@ def _scaled(distribution: str, first: float, second: float, nominal: float) -> t
     return distribution, ends[0], ends[1]
 
 
-def _factor(unit: Any, wanted: str, place: str, name: str) -> float:
+def _factor(unit: str | None, wanted: str, place: str, name: str) -> float:
     """What takes a unit to the parameter's own."""
     if unit is None or unit == wanted:
         return 1.0
-    if not isinstance(unit, str):
-        raise DataError(f"{place}: expected a unit in quotes, found {shown(unit)}.")
     plain = unit.replace("µ", "u").replace("μ", "u")
     for mine, power in _PREFIXES.items():
         for other, wanted_power in _PREFIXES.items():
@@ -227,28 +214,14 @@ def _factor(unit: Any, wanted: str, place: str, name: str) -> float:
 
 
 def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:
-    known = ("method", "rows")
     if not isinstance(design, dict):
         raise DataError("design: expected how axes without a count are drawn; add [design] with method and rows.")
-    for key in design:
-        if key not in known:
-            raise DataError(f"design.{key}: expected a known key, found {shown(key)}; use {' and '.join(known)}.")
-    method, rows = design.get("method"), design.get("rows")
-    if method not in SAMPLERS:
-        raise DataError(f"design.method: expected one of {', '.join(SAMPLERS)}, found {shown(method)}; choose one.")
-    if isinstance(rows, bool) or not isinstance(rows, int) or not 1 <= rows <= _MOST:
-        raise DataError(f"design.rows: expected a number from 1 to 2^62, found {shown(rows)}; correct it.")
-    return Drawn(axes, method, rows, seed)
+    found = read_table(design, _Design, "design")
+    return Drawn(tuple(axes), found.method, found.rows, seed)
 
 
 def read_list(content: bytes, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Names in the header of a CSV, and the cells of each row with the number of its line; blank lines are left out.
-
-    Raises
-    ------
-    DataError
-        If it is no CSV.
-    """
+    """Names in the header of a CSV, and the cells of each row with the number of its line, but blank ones."""
     reader = csv.reader(io.StringIO(content.decode("utf-8-sig", errors="replace"), newline=""))
     try:
         lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
@@ -268,7 +241,7 @@ def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], byte
         if column not in known:
             # What stands in a file that is no list is not ours to show.
             raise DataError(f"{name}: cell {k} of its header is no parameter; use some of {', '.join(known)}.")
-    axes = [Axis(column) for column in header]
+    axes = tuple(Axis(column) for column in header)
     for axis in axes:
         if math.isnan(known[axis.parameter].nominal):
             raise DataError(f"{name}: {axis.parameter} is an array; vary it by [[axis]] with relative = true.")

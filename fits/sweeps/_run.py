@@ -12,7 +12,7 @@ import numpy as np
 
 from fits.io._atomic import atomic_path
 from fits.sweeps._chunks import chunk_count, compute_chunk, rows_of
-from fits.sweeps._extra import need
+from fits.sweeps._packages import need
 from fits.sweeps._spec import Sweep
 from fits.sweeps._store import TABLE, Store, check_folder, opened
 from fits.sweeps._types import FAILED, Rows
@@ -23,18 +23,9 @@ _BAR = 24
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run did.
+    """What a run did: rows of the whole sweep, those of them that failed, and those that this run computed.
 
-    Attributes
-    ----------
-    rows, failed
-        Of the whole sweep.
-    computed
-        Rows that this run added.
-    again
-        Chunks that were kept but broken, and were computed again.
-    seconds
-        That it took.
+    Chunks that were kept but broken were computed again; it took so many seconds.
     """
 
     rows: int

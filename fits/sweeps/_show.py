@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from fits.io._errors import DataError
-from fits.sweeps._about import about_of
-from fits.sweeps._extra import need
-from fits.sweeps._store import LEDGER, RESULTS
+from fits.sweeps._packages import need
+from fits.sweeps._store import LEDGER, RESULTS, about_of
 from fits.sweeps._types import DONE, FAILED
 
 SCHEMA = "microid.sweep.summary/1"
@@ -59,15 +58,7 @@ def readable(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def summarise(folder: str | os.PathLike[str], by: str | None = None, largest: bool = False) -> dict[str, Any]:
-    """Sum up a sweep as JSON values.
-
-    Parameters
-    ----------
-    folder
-        Of the sweep.
-    by, largest
-        Output by which rows are ranked, the first by default, and whether large is good.
-    """
+    """Sum up a sweep as JSON values; its rows are ranked by an output, the first by default."""
     about, data = about_of(folder), open_sweep(folder)
     with readable(folder):
         return _summary(folder, about, data, by, largest)

@@ -7,22 +7,31 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_CSV_BYTES, MOST_TOML_BYTES, parse_toml, read_bytes, read_text
+from fits.sweeps import kinds
 from fits.sweeps._axes import Plan
-from fits.sweeps._jobs import KINDS, Request
-from fits.sweeps._read_axes import read_list, read_plan
-from fits.sweeps._types import SCHEMA, AbstractJob, Facts
+from fits.sweeps._read_axes import read_plan
+from fits.sweeps._toml import read_table
+from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request
 
 _COMMON = ("schema", "kind", "title", "seed", "axis", "design", "list", "run")
-_RUN = ("memory_MB", "chunk_rows")
 _MOST_MB = 1_000_000_000
 # Keys of kinds that are words; all others are tables.
 _NO_TABLES = ("model", "initial", "stage")
+
+
+class _Run(msgspec.Struct):
+    """The table `[run]`."""
+
+    memory_MB: Annotated[float, Meta(ge=1, le=_MOST_MB, description=f"a number from 1 to {_MOST_MB:,}")] = 256.0
+    chunk_rows: Annotated[Annotated[int, Meta(ge=1)] | None, Meta(description="a number of 1 or more")] = None
 
 
 @dataclass(frozen=True)
@@ -119,9 +128,10 @@ def _sweep(
     if table.get("schema") != SCHEMA:
         raise DataError(f'schema: expected "{SCHEMA}", found {shown(table.get("schema"))}; give that.')
     kind = table.get("kind")
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise DataError(f"kind: expected one of {', '.join(KINDS)}, found {shown(kind)}; choose one.")
-    tables = KINDS[kind].tables
+    if not isinstance(kind, str) or kind not in kinds.names():
+        raise DataError(f"kind: expected one of {', '.join(kinds.names())}, found {shown(kind)}; choose one.")
+    made_by = kinds.kind(kind)
+    tables = made_by.KEYS
     for key in table:
         known = [*_COMMON, *tables]
         if key not in known:
@@ -133,20 +143,17 @@ def _sweep(
     seed = table.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise DataError(f"seed: expected a whole number of 0 or more, found {shown(seed)}; correct it.")
-    memory, chunk_rows = _run_options(table.get("run", {}))
-    names, relative = _names(table, load)
-    job = KINDS[kind].make(Request(table, names, relative, load, folder))
+    options = read_table(table.get("run", {}), _Run, "run")
+    chunk_rows = options.chunk_rows
+    job = made_by.make(Request(table, load, folder))
     facts = job.facts
     plan = read_plan(table, facts.parameters, max(1, len(facts.sources)), seed, load)
-    factors = tuple(axis.parameter for axis in plan.axes if axis.relative)
-    if set(factors) != set(relative):
-        job = KINDS[kind].make(Request(table, names, factors, load, folder))
     if chunk_rows is not None and chunk_rows % job.facts.block:
         raise DataError(
             f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, found "
             f"{chunk_rows}; correct it, or leave it out."
         )
-    return Sweep(text, name, inputs, kind, seed, plan, job, facts, memory, chunk_rows, folder)
+    return Sweep(text, name, inputs, kind, seed, plan, job, facts, options.memory_MB, chunk_rows, folder)
 
 
 def _sum_of(path: Path) -> str:
@@ -157,32 +164,6 @@ def _sum_of(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return "unreadable"
-
-
-def _run_options(table: Any) -> tuple[float, int | None]:
-    if not isinstance(table, dict):
-        raise DataError("run: expected a table; write [run] and its keys below.")
-    for key in table:
-        if key not in _RUN:
-            raise DataError(f"run.{key}: expected a known key, found {shown(key)}; use {' and '.join(_RUN)}.")
-    memory, rows = table.get("memory_MB", 256), table.get("chunk_rows")
-    if isinstance(memory, bool) or not isinstance(memory, int | float) or not 1 <= memory <= _MOST_MB:
-        raise DataError(f"run.memory_MB: expected a number from 1 to {_MOST_MB:,}, found {shown(memory)}.")
-    if rows is not None and (isinstance(rows, bool) or not isinstance(rows, int) or rows < 1):
-        raise DataError(f"run.chunk_rows: expected a number of 1 or more, found {shown(rows)}; correct it.")
-    return float(memory), rows
-
-
-def _names(table: Mapping[str, Any], load: Callable[[str], bytes]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of what varies, in the order of the plan, and those that vary relatively, as far as they can be read."""
-    axes = table.get("axis")
-    entries = [entry for entry in axes if isinstance(entry, dict)] if isinstance(axes, list) else []
-    names = [str(entry.get("parameter")) for entry in entries]
-    relative = [str(entry.get("parameter")) for entry in entries if entry.get("relative") is True]
-    listing = table.get("list")
-    if isinstance(listing, dict) and isinstance(listing.get("file"), str):
-        names += read_list(load(listing["file"]), listing["file"])[0]
-    return tuple(names), tuple(relative)
 
 
 def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:

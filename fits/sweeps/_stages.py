@@ -12,9 +12,8 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
 from fits.sweeps._devices import by_rows
-from fits.sweeps._files import in_a_file
-from fits.sweeps._jobs import Request
-from fits.sweeps._types import Parameter
+from fits.sweeps._toml import in_a_file
+from fits.sweeps._types import Parameter, Request
 from microid import (
     Driver,
     GridDensity,
@@ -54,13 +53,7 @@ def nominal_stage() -> Stage:
 
 
 def stage_from(text: bytes | None, name: str) -> Stage:
-    """Read a stage from the content of a model file, or make the nominal one where there is none.
-
-    Raises
-    ------
-    DataError
-        As `load_model`, or if the file holds something else than a stage or a `Preisach`.
-    """
+    """Read a stage from the content of a model file, or make the nominal one where there is none."""
     if text is None:
         return nominal_stage()
     model = in_a_file(text, name, load_model).model
@@ -112,19 +105,18 @@ def varied(stage: Stage, values: Mapping[str, Float[Array, ""]], relative: Seque
     return found
 
 
-@by_rows("table", "voltage_V")
+@by_rows("voltage_V", "values")
 def respond(
     stage: Stage,
-    table: Float[Array, "n k"],
-    names: tuple[str, ...],
+    values: Mapping[str, Float[Array, " n"]],
     relative: tuple[str, ...],
     interval_s: Float[Array, ""],
     voltage_V: Float[Array, "n t"],
     memory: Staircase | None,
 ) -> Float[Array, "n t"]:
-    """Respond to commands, each row at rest under its first sample; what varies are the columns of a table."""
+    """Respond to commands, each row at rest under its first sample."""
     rows = jax.tree.map(lambda leaf: leaf[None], stage)
-    return respond_all(varied(rows, dict(zip(names, table.T, strict=True)), relative), interval_s, voltage_V, memory)
+    return respond_all(varied(rows, values, relative), interval_s, voltage_V, memory)
 
 
 def range_of(stage: Stage) -> tuple[float, float] | None:

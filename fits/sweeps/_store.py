@@ -13,29 +13,43 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
+import msgspec
 import numpy as np
 
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import DataError
 from fits.io._file_set import flush
 from fits.io._places import usable_folder
+from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
 from fits.io._temporary import is_temporary
-from fits.sweeps._about import ABOUT, SCHEMA, about_of
 from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of
-from fits.sweeps._extra import need
+from fits.sweeps._packages import need, versions
 from fits.sweeps._spec import Sweep
 from fits.sweeps._types import STATUS_WORDS, Output, Rows
-from fits.sweeps._versions import versions
 
-RESULTS, LEDGER, TEXT, TABLE = "results.zarr", "ledger", "sweep.toml", "results.parquet"
+SCHEMA = "microid.sweep.results/1"
+ABOUT, RESULTS, LEDGER, TEXT, TABLE = "about.json", "results.zarr", "ledger", "sweep.toml", "results.parquet"
 _STATUS = Output("status", "1", "of the row: 0 pending, 1 done, 2 failed", dtype="i1")
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 # A disk that is nearly full is full for others.
 _SHARE = 0.9
 # What zarr calls a file before it is whole.
 _PARTIAL = "**/*.partial"
+
+
+class _About(TypedDict):
+    """What `about.json` says of a sweep, beside what it has for the reader."""
+
+    kind: str
+    rows: int
+    chunk_rows: int
+    chunks: int
+    parameters: list[str]
+    outputs: list[str]
+    digest: str
+    versions: dict[str, str]
 
 
 class Store:
@@ -136,13 +150,7 @@ class Store:
             path.unlink(missing_ok=True)
 
     def write(self, chunk: int, rows: Rows) -> None:
-        """Keep a chunk, then say so in the ledger.
-
-        Raises
-        ------
-        DataError
-            If the disk is full or cannot be written to; all chunks before are kept.
-        """
+        """Keep a chunk, then say so in the ledger; a `DataError` says that the disk does not take it."""
         arrays = dict(rows.outputs) | {"reason": np.array(rows.reasons, dtype=REASON.dtype)}
         with _sentences(self.folder):
             group = self._open()
@@ -191,6 +199,22 @@ class Store:
         return total.hexdigest()
 
 
+def about_of(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read what is known of a sweep; a `DataError` says why it cannot be read."""
+    shown, again = os.fspath(folder), "run the sweep again in another folder."
+    if not (Path(folder) / ABOUT).exists():
+        raise DataError(f"{shown}: there is no sweep in this folder; give what --out named.")
+    try:
+        what = "what is known of a sweep"
+        about: Any = parse_json(read_text(Path(folder) / ABOUT, what, MOST_JSON_BYTES), ABOUT, what)
+        if isinstance(about, dict) and about.get("schema") == SCHEMA:
+            msgspec.convert(about, _About)
+            return about
+    except (DataError, msgspec.ValidationError) as error:
+        raise DataError(f"{shown}: {ABOUT} is broken ({error}); {again}") from None
+    raise DataError(f"{shown}: expected results of the format {SCHEMA}; {again}")
+
+
 def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
     """Refuse a folder that cannot be written to, or holds something else, before anything starts; see `opened`."""
     need("zarr")
@@ -212,11 +236,8 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
 def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
     """Open the folder of a sweep, new or to go on with, and keep other processes out of it.
 
-    Raises
-    ------
-    DataError
-        If it cannot be written to, holds another sweep, or one that was begun with other versions, or the results
-        would not fit on the disk.
+    A `DataError` says that it cannot be written to, holds another sweep or one that was begun with other versions, or
+    that the results would not fit on the disk.
     """
     check_folder(sweep, out, resume)
     folder = Path(os.path.realpath(out))

@@ -2,12 +2,16 @@
 
 import abc
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from fits.io._errors import DataError, shown
+from fits.machining._design import nearest
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "microid.sweep/1"
@@ -30,7 +34,7 @@ class Parameter:
     lower, upper
         Bounds. A row outside fails with a reason.
     words
-        Those it may be, where it is a choice: its values are places among them.
+        Those it may be, where it is a choice: a word goes through a sweep as its place among them.
     whole
         Whether it is a whole number.
     """
@@ -48,6 +52,35 @@ class Parameter:
         """Its bounds and unit in words."""
         unit = "" if self.unit == "1" else f" {self.unit}"
         return f"{self.lower:g} to {self.upper:g}{unit}"
+
+
+def choice(name: str, words: Sequence[str], nominal: str) -> Parameter:
+    """A parameter that is one of some words."""
+    return Parameter(name, "1", float(words.index(nominal)), 0.0, len(words) - 1.0, tuple(words))
+
+
+def code_of(found: Any, parameter: Parameter, place: str) -> float:
+    """Place of a word among those of its parameter, or a `DataError` that begins with its place in the sweep."""
+    if not isinstance(found, str) or found not in parameter.words:
+        raise DataError(
+            f"{place}: expected one of {', '.join(parameter.words)}, found {shown(found)}; "
+            f"{nearest(str(found), parameter.words)}"
+        )
+    return float(parameter.words.index(found))
+
+
+def check_plain(parameter: Parameter, values: FloatArray | None, relative: bool, place: str) -> None:
+    """Refuse factors, draws (no values) and fractions of what is a word or a whole number."""
+    if not (parameter.words or parameter.whole):
+        return
+    what = "a choice of words" if parameter.words else "a whole number"
+    if relative:
+        raise DataError(f"{place}.relative: {parameter.name} is {what}, which no factor changes; give values.")
+    if values is None:
+        raise DataError(f"{place}: {parameter.name} is {what}, which is not drawn; give values.")
+    broken = values[values != np.round(values)]
+    if len(broken):
+        raise DataError(f"{place}: {parameter.name} is {what}, found {broken[0]:g}; give whole values.")
 
 
 @dataclass(frozen=True)
@@ -80,21 +113,25 @@ class Output:
         """On disk, before compression."""
         return int(np.dtype(self.dtype).itemsize * math.prod(self.shape))
 
+    @property
+    def missing(self) -> Any:
+        """What stands for it in a row that failed."""
+        return "" if self.dtype[0] == "U" else np.full(self.shape, np.nan)
+
 
 @dataclass(frozen=True)
 class Rows:
-    """Some rows of a sweep, or what came of them.
-
-    Attributes
-    ----------
-    outputs
-        By name, shape `(n, ...)`.
-    reasons
-        Why a row failed, empty where it did not, `n` of them.
-    """
+    """Some rows: outputs by name, shape `(n, ...)`, and why each failed, empty where it did not."""
 
     outputs: dict[str, NDArray[Any]]
     reasons: tuple[str, ...]
+
+    @classmethod
+    def one_by_one(cls, outputs: Sequence[Output], found: Sequence[Mapping[str, Any] | str]) -> "Rows":
+        """Rows of which each is its outputs by name, or the reason why it failed."""
+        each = [{} if isinstance(row, str) else row for row in found]
+        values = {output.name: np.array([row.get(output.name, output.missing) for row in each]) for output in outputs}
+        return cls(values, tuple(row if isinstance(row, str) else "" for row in found))
 
 
 @dataclass(frozen=True)
@@ -126,6 +163,58 @@ class Facts:
     alone: bool = False
 
 
+@dataclass(frozen=True)
+class Block:
+    """Rows that are computed together, `n` in all.
+
+    Attributes
+    ----------
+    values
+        Swept parameters by name, in their own units, shape `(n,)`.
+    relative
+        Names of those that are factors.
+    rows
+        Their numbers in the sweep, shape `(n,)`; numbers of filling are repeated.
+    sources
+        Which of `Facts.sources` each has, shape `(n,)`.
+    seed
+        Of the sweep.
+    """
+
+    values: dict[str, FloatArray]
+    relative: tuple[str, ...]
+    rows: NDArray[np.int64]
+    sources: NDArray[np.int64]
+    seed: int
+
+    def numbers(self, name: str, nominal: float) -> FloatArray:
+        """Values of a parameter, the nominal one where it does not vary, shape `(n,)`."""
+        return self.values.get(name, np.full(len(self.rows), float(nominal)))
+
+    def words(self, name: str, words: Sequence[str], nominal: str) -> list[str]:
+        """The word of each row, the nominal one where it does not vary."""
+        return [words[int(code)] for code in self.numbers(name, words.index(nominal))]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a job is made from.
+
+    Attributes
+    ----------
+    table
+        The sweep as TOML gives it.
+    load
+        Gives the content of a file by its name in the sweep.
+    folder
+        Where patterns of file names start; None on a worker, where `sources` are given.
+    """
+
+    table: Mapping[str, Any]
+    load: Callable[[str], bytes]
+    folder: Path | None
+
+
 class AbstractJob(abc.ABC):
     """What is done with each row. Rows go through in blocks of one size, the last one filled up.
 
@@ -138,19 +227,5 @@ class AbstractJob(abc.ABC):
         """What is known before it runs."""
 
     @abc.abstractmethod
-    def compute(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> Rows:
-        """Compute one block on each device, `n` rows in all.
-
-        Parameters
-        ----------
-        values
-            Swept parameters by name, in their own units, shape `(n,)`. Relative ones are factors.
-        rows
-            Their numbers in the sweep, shape `(n,)`; numbers of filling are repeated.
-        sources
-            Which of `facts.sources` each has, shape `(n,)`.
-        seed
-            Of the sweep.
-        """
+    def compute(self, block: Block) -> Rows:
+        """Compute one block on each device."""

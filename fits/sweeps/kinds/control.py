@@ -6,16 +6,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from numpy.typing import NDArray
+from jaxtyping import Array, Float, Int
 
 from fits.sweeps._controllers import Controllers, read_controllers
-from fits.sweeps._devices import by_rows, in_turn, place
-from fits.sweeps._jobs import Request
-from fits.sweeps._kinds_simulate import block_rows, drive, table_of
-from fits.sweeps._programs import Program, read_program
+from fits.sweeps._devices import block_rows, by_rows, in_turn, place
+from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, stage_parameters, varied
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Rows
+from fits.sweeps._types import AbstractJob, Block, Facts, Output, Request, Rows
 from microid import (
     AbstractLinear,
     Preisach,
@@ -26,7 +23,7 @@ from microid import (
     step_metrics,
 )
 
-_SHAPES = ("step", "sine", "triangle", "decay", "chirp", "file")
+KEYS = ("model", "initial", "reference", "controller")
 _OUTPUTS = (
     Output("e_rms_pct", "%", "root mean square of the tracking error, of the reference's range"),
     Output("e_max_pct", "%", "largest tracking error, of the reference's range"),
@@ -56,60 +53,28 @@ _FINE = 8
 class ControlJob(AbstractJob):
     """Closed loops of a stage."""
 
-    def __init__(
-        self,
-        stage: Stage,
-        controllers: Controllers,
-        reference: Program,
-        initial: str,
-        names: tuple[str, ...],
-        relative: tuple[str, ...],
-    ):
-        """Prepare the job.
-
-        Parameters
-        ----------
-        stage, controllers, reference
-            The loop and what it follows.
-        initial
-            Memory before each row.
-        names, relative
-            Parameters that vary, and which of them as factors.
-        """
+    def __init__(self, stage: Stage, controllers: Controllers, reference: Program, initial: str):
+        """Take the loop and what it follows, and the memory before each row."""
         self._stage, self._controllers, self._reference = stage, controllers, reference
         self._start = Start(None, memory_before(stage, initial))
-        self._names, self._relative = names, relative
-        self._given = None if reference.given is None else jnp.asarray(reference.given)
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
         parameters = (*self._controllers.parameters(), *stage_parameters(self._stage), *self._reference.parameters)
         outputs = (*_OUTPUTS, *_STEP) if self._reference.shape == "step" else _OUTPUTS
-        samples = self._reference.samples
-        return Facts(parameters, outputs, block_rows(samples))
+        return Facts(parameters, outputs, block_rows(self._reference.samples))
 
-    def compute(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> Rows:
+    def compute(self, block: Block) -> Rows:
         """Run a block of loops on each device; see `AbstractJob.compute`."""
-        del sources, seed
-        settings = table_of(values, self._names, len(rows))
-        table = place(settings)
-        wanted = drive(table, self._names, self._reference, self._given)
-        found = _control(
-            self._stage,
-            self._controllers,
-            table,
-            self._names,
-            self._relative,
-            wanted,
-            self._start,
-            self._reference.shape == "step",
-        )
+        values, step = place(block.values), self._reference.shape == "step"
+        wanted = drive(self._reference, block, values)
+        found = _control(self._stage, self._controllers, values, block.relative, wanted, self._start, step)
         outputs = {name: np.asarray(value) for name, value in found.items()}
         outputs["pole_radius"] = in_turn(
-            lambda rows: _radius(self._stage, self._controllers, rows, self._names, self._relative), settings
+            lambda rows, values: _radius(self._stage, self._controllers, rows, values, block.relative),
+            block.rows,
+            block.values,
         )
         moved = np.ptp(np.asarray(wanted), axis=1)
         way = np.maximum(moved, np.abs(outputs.pop("from_um")))
@@ -131,22 +96,20 @@ def make(request: Request) -> ControlJob:
     stage, initial = requested_stage(request)
     reference = read_program(request.table.get("reference", {"shape": "step"}), "reference", "um", request.load)
     controllers = read_controllers(request.table.get("controller", {}), stage, initial, reference)
-    return ControlJob(stage, controllers, reference, initial, request.names, request.relative)
+    return ControlJob(stage, controllers, reference, initial)
 
 
-@by_rows("table", "wanted")
+@by_rows("wanted", "values")
 def _control(
     stage: Stage,
     controllers: Controllers,
-    table: Float[Array, "n k"],
-    names: tuple[str, ...],
+    values: Mapping[str, Float[Array, " n"]],
     relative: tuple[str, ...],
     wanted: Float[Array, "n t"],
     start: Start,
     step: bool,
 ) -> dict[str, Float[Array, " n"]]:
-    def one(row: Float[Array, " k"], reference: Float[Array, " t"]) -> dict[str, Float[Array, ""]]:
-        values = dict(zip(names, row, strict=True))
+    def one(values: Mapping[str, Float[Array, ""]], reference: Float[Array, " t"]) -> dict[str, Float[Array, ""]]:
         changed = varied(stage, values, relative)
         run = simulate_loop(controllers.at(values), changed, reference, delay=controllers.delay, start=start)
         # A step at the first sample is none within the record, but from where the stage stood.
@@ -167,28 +130,27 @@ def _control(
             found |= {"settling_time_s": answer.settling_time_s - waited, "overshoot_pct": answer.overshoot_pct}
         return found
 
-    return jax.vmap(one)(table, wanted)
+    return jax.vmap(one)(values, wanted)
 
 
 @eqx.filter_jit
 def _radius(
     stage: Stage,
     controllers: Controllers,
-    table: Float[Array, "n k"],
-    names: tuple[str, ...],
+    rows: Int[Array, " n"],
+    values: Mapping[str, Float[Array, " n"]],
     relative: tuple[str, ...],
 ) -> Float[Array, " n"]:
     """Largest modulus of the poles of each loop, NaN where a part of the stage has no linear form."""
     if not all(isinstance(part, AbstractLinear | Preisach) for part in stage.parts):
-        return jnp.full(table.shape[0], jnp.nan)
+        return jnp.full(rows.shape, jnp.nan)
 
-    def one(row: Float[Array, " k"]) -> Float[Array, ""]:
-        values = dict(zip(names, row, strict=True))
+    def one(values: Mapping[str, Float[Array, ""]]) -> Float[Array, ""]:
         changed = varied(stage, values, relative)
         linear = controllers.at(values).linear()
         return margins(linear, changed, delay=controllers.delay, slope_um_per_V=_slope(changed)).radius
 
-    return jax.vmap(one)(table)
+    return jax.vmap(one)(values)
 
 
 def _slope(stage: Stage) -> Float[Array, ""] | None:

@@ -1,24 +1,26 @@
 """The job `sensitivity`: gains, strokes and resonances of a stage of other dimensions, and what its tolerances do."""
 
+import dataclasses
 from collections.abc import Mapping
+from typing import Annotated, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import NDArray
+from msgspec import Meta
 
 import microid as m
 from fits.io._errors import DataError, shown
 from fits.machining._design import Design, paper_design
 from fits.machining._design_file import read_design
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._files import in_a_file
-from fits.sweeps._jobs import Request
-from fits.sweeps._kinds_simulate import table_of
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Rows
+from fits.sweeps._toml import in_a_file, read_table
+from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows
 
+_Tree = TypeVar("_Tree", m.Geometry, m.Actuation)
+KEYS = ("stage", "sensitivity")
 _BLOCK = 256
 # So short a stroke that all motions are in proportion to it, to the last digit.
 _SHORT_UM = 1e-6
@@ -26,12 +28,21 @@ _SHORT_UM = 1e-6
 _LARGEST_ANGLE_RAD = 1.5
 
 
+class _Options(msgspec.Struct):
+    """The table `[sensitivity]`."""
+
+    axes: Annotated[tuple[m.Axis, ...], Meta(min_length=1, description=f"some of {', '.join(m.AXES)} in a list")] = (
+        "x",
+        "z",
+    )
+
+
 class SensitivityJob(AbstractJob):
     """Axes of a stage as its dimensions vary."""
 
-    def __init__(self, design: Design, axes: tuple[m.Axis, ...], names: tuple[str, ...], relative: tuple[str, ...]):
-        """Take a design, the axes that are looked at, what varies, and which of it as factors."""
-        self._design, self._axes, self._names, self._relative = design, axes, names, relative
+    def __init__(self, design: Design, axes: tuple[m.Axis, ...]):
+        """Take a design and the axes that are looked at."""
+        self._design, self._axes = design, axes
 
     @property
     def facts(self) -> Facts:
@@ -47,14 +58,11 @@ class SensitivityJob(AbstractJob):
             ]
         return Facts(_parameters(self._design), tuple(outputs), _BLOCK)
 
-    def compute(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> Rows:
+    def compute(self, block: Block) -> Rows:
         """Evaluate a block of stages on each device; see `AbstractJob.compute`."""
-        del sources, seed
         design = self._design
         outputs: dict[str, np.ndarray] = {}
-        table = place(table_of(values, self._names, len(rows)))
+        values = place(block.values)
         for axis in self._axes:
             names = m.MOTIONS[axis].dimensions
             tolerance = jnp.asarray([design.tolerance[name] for name in names])
@@ -64,11 +72,10 @@ class SensitivityJob(AbstractJob):
                 design.geometry,
                 design.actuation,
                 nominal,
-                table,
+                values,
                 tolerance,
                 together,
-                self._names,
-                self._relative,
+                block.relative,
                 axis,
                 design.level,
             )
@@ -86,14 +93,8 @@ def make(request: Request) -> SensitivityJob:
     if not isinstance(name, str):
         raise DataError(f'stage: expected "paper" or the name of the TOML of a stage, found {shown(name)}; give one.')
     design = paper_design() if name == "paper" else in_a_file(request.load(name), name, read_design)
-    options = request.table.get("sensitivity", {})
-    for key in options:
-        if key != "axes":
-            raise DataError(f"sensitivity.{key}: expected a known key, found {shown(key)}; use axes.")
-    axes = options.get("axes", ["x", "z"])
-    if not isinstance(axes, list) or not axes or any(axis not in m.AXES for axis in axes):
-        raise DataError(f"sensitivity.axes: expected some of {', '.join(m.AXES)} in a list, found {shown(axes)}.")
-    return SensitivityJob(design, tuple(dict.fromkeys(axes)), request.names, request.relative)
+    axes = read_table(request.table.get("sensitivity", {}), _Options, "sensitivity").axes
+    return SensitivityJob(design, tuple(dict.fromkeys(axes)))
 
 
 def _parameters(design: Design) -> tuple[Parameter, ...]:
@@ -111,32 +112,25 @@ def _parameters(design: Design) -> tuple[Parameter, ...]:
     return tuple(found)
 
 
-@by_rows("table")
+@by_rows("values")
 def _evaluate(
     geometry: m.Geometry,
     actuation: m.Actuation,
     material: tuple[Float[Array, ""], Float[Array, ""]],
-    table: Float[Array, "n k"],
+    values: Mapping[str, Float[Array, " n"]],
     tolerance: Float[Array, " d"],
     together: Float[Array, "d d"],
-    names: tuple[str, ...],
     relative: tuple[str, ...],
     axis: m.Axis,
     level: int,
 ) -> tuple[Float[Array, " n"], ...]:
-    def set_in(tree: m.Geometry | m.Actuation, start: str, values: dict[str, Array]) -> m.Geometry | m.Actuation:
-        own = [name for name in names if name.startswith(f"{start}.")]
-        if not own:
-            return tree
-        fields = [name.removeprefix(f"{start}.") for name in own]
-        new = [getattr(tree, f) * values[n] if n in relative else values[n] for f, n in zip(fields, own, strict=True)]
-        return eqx.tree_at(lambda t: [getattr(t, field) for field in fields], tree, new)
+    def set_in(tree: _Tree, start: str, values: Mapping[str, Array]) -> _Tree:
+        own = {name.removeprefix(f"{start}."): name for name in values if name.startswith(f"{start}.")}
+        new = {f: getattr(tree, f) * values[name] if name in relative else values[name] for f, name in own.items()}
+        return dataclasses.replace(tree, **new) if new else tree
 
-    def one(row: Float[Array, " k"]) -> tuple[Float[Array, ""], ...]:
-        values = dict(zip(names, row, strict=True))
+    def one(values: Mapping[str, Array]) -> tuple[Float[Array, ""], ...]:
         changed, piezos = set_in(geometry, "geometry", values), set_in(actuation, "actuation", values)
-        assert isinstance(changed, m.Geometry)
-        assert isinstance(piezos, m.Actuation)
         modulus, guides = (
             nominal * values[name] if name in relative else values.get(name, nominal)
             for name, nominal in zip(("material.youngs_modulus_GPa", "material.guides"), material, strict=True)
@@ -149,4 +143,4 @@ def _evaluate(
         spread = 100 * jnp.sqrt(jnp.maximum(changes @ together @ changes, 0))
         return stage.gain, stage.stroke, stage.resonance_Hz, spread
 
-    return jax.vmap(one)(table)
+    return jax.vmap(one)(values)

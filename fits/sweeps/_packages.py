@@ -1,12 +1,28 @@
-"""Versions that results depend on."""
+"""Packages that only sweeps need, and the versions that results depend on."""
 
 import hashlib
+import importlib
 import platform
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
+
+from fits.io._errors import DataError
 
 _NAMES = ("microid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy")
+
+
+def need(name: str) -> Any:
+    """Import a package of the extras `sweep` and `cluster`; a `DataError` says what to run if it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = name.partition(".")[0]
+        extras = "sweep,cluster" if package == "distributed" else "sweep"
+        raise DataError(
+            f'this needs the package {package}, which is not installed; run: pip install "microid[{extras}]"'
+        ) from None
 
 
 @lru_cache(maxsize=1)

@@ -1,32 +1,30 @@
 """The job `fit`: loop fits of many records, in one batch or one by one."""
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from fits.io._errors import DataError, shown
+from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import branch_table
 from fits.loop._fit import fit
 from fits.loop._prior import roughness
 from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES, initial_state, known_samples
-from fits.machining._design import nearest
 from fits.stats._metrics import errors
-from fits.sweeps._choices import choice, chosen
 from fits.sweeps._devices import in_turn, on_cpu, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch
-from fits.sweeps._jobs import Request
-from fits.sweeps._programs import number
-from fits.sweeps._records import Files, Simulated, requested_records
-from fits.sweeps._types import AbstractJob, Facts, FloatArray, Output, Parameter, Rows
+from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
+from fits.sweeps._toml import read_table
+from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
 from microid import Staircase, node_areas
 
-_KEYS = ("method", "levels", "holdout", "initial", "samples", "weights", "smoothness")
+KEYS = ("model", "initial", "program", "records", "fit")
 _BLOCK, _PLACES, _FEWEST, _MOST = 32, 64, 50, 100_000
 _FEWEST_LEVELS, _MOST_LEVELS, _DEFAULT_LEVELS = 4, 32, 8
 _OUTPUTS = (
@@ -41,106 +39,64 @@ _OUTPUTS = (
 )
 
 
+class _Options(msgspec.Struct):
+    """The table `[fit]`. Without levels one by one chooses them; a batch has a stated smoothness."""
+
+    method: Annotated[Literal["batch", "one_by_one"], Meta(description="batch or one_by_one")] = "batch"
+    levels: Annotated[
+        Annotated[int, Meta(ge=_FEWEST_LEVELS, le=_MOST_LEVELS)] | None,
+        Meta(description=f"a number from {_FEWEST_LEVELS} to {_MOST_LEVELS}"),
+    ] = None
+    holdout: Holdout = 0.2
+    initial: Initial = None
+    samples: Annotated[int, Meta(ge=_FEWEST, le=_MOST, description=f"a number from {_FEWEST} to {_MOST:,}")] = 2048
+    weights: Annotated[bool, Meta(description="true, with fit.levels, or false")] = False
+    smoothness: Annotated[float, Meta(ge=1e-12, le=1e6, description="a weight from 1e-12 to 1e6")] = 0.01
+
+
 class FitJob(AbstractJob):
     """Fits of a Preisach operator."""
 
-    def __init__(
-        self,
-        records: Files | Simulated,
-        levels: int | None,
-        holdout: float,
-        initial: str,
-        samples: int,
-        batch: bool,
-        weights: bool,
-        smoothness: float,
-    ):
-        """Prepare the job.
-
-        Parameters
-        ----------
-        records
-            What is fitted.
-        levels
-            Of the grid where they do not vary; None chooses them, one by one only.
-        holdout
-            Share at the end of each record that is only predicted.
-        initial
-            Memory before each record, one of `INITIAL_STATES`.
-        samples
-            That a record of a batch has at most.
-        batch
-            Whether all fits of a block are made together.
-        weights
-            Whether the weights are kept, too.
-        smoothness
-            Weight of the density's curvature in a batch; one by one it is found from the data.
-        """
-        self._records, self._levels, self._holdout, self._initial = records, levels, holdout, initial
-        self._samples, self._batch, self._weights, self._smoothness = samples, batch, weights, smoothness
+    def __init__(self, records: Files | Simulated, options: _Options, initial: str):
+        """Take the records, the options of all rows, and the memory before each record, one of `INITIAL_STATES`."""
+        self._records, self._initial, self._batch = records, initial, options.method == "batch"
+        self._levels, self._holdout, self._weights = options.levels, options.holdout, options.weights
+        self._samples, self._smoothness = options.samples, options.smoothness
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
-        sources = self._records.names if isinstance(self._records, Files) else ()
         outputs = list(_OUTPUTS)
         if self._weights:
             size = len(_packed(self._levels or 0)[0])
             outputs.append(Output("weights_um", "um", "weights of Eq. 9, packed row by row", (("weight", size),)))
         levels = float(self._levels or _DEFAULT_LEVELS)
-        parameters = (
+        parameters: tuple[Parameter, ...] = (
             *self._records.parameters,
             Parameter("fit.holdout", "1", self._holdout, 0.0, 0.9),
-            Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),
             choice("fit.initial", INITIAL_STATES, self._initial),
         )
+        if not self._weights:
+            # Rows of other levels have other weights.
+            parameters += (Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),)
         if self._batch:
-            parameters = (*parameters, Parameter("fit.smoothness", "1", self._smoothness, 1e-12, 1e6))
+            parameters += (Parameter("fit.smoothness", "1", self._smoothness, 1e-12, 1e6),)
         block = _BLOCK if self._batch else 1
-        return Facts(parameters, tuple(outputs), block, sources, alone=not self._batch)
+        return Facts(parameters, tuple(outputs), block, self._records.sources, alone=not self._batch)
 
-    def compute(
-        self, values: Mapping[str, FloatArray], rows: NDArray[np.int64], sources: NDArray[np.int64], seed: int
-    ) -> Rows:
+    def compute(self, block: Block) -> Rows:
         """Fit the records of some blocks; see `AbstractJob.compute`."""
-        records, every = self._records.records(values, rows, sources, seed), np.ones(len(rows))
-        holdout = values.get("fit.holdout", every * self._holdout)
-        initial = chosen(values, "fit.initial", INITIAL_STATES, self._initial, len(rows))
+        records, holdout = self._records.records(block), block.numbers("fit.holdout", self._holdout)
+        initial = block.words("fit.initial", INITIAL_STATES, self._initial)
         if self._batch:
-            levels = values.get("fit.levels", every * (self._levels or _DEFAULT_LEVELS)).astype(int)
-            smoothness = values.get("fit.smoothness", every * self._smoothness)
-            return self._together(records, holdout, initial, levels, smoothness)
-        swept = values.get("fit.levels")
-        numbers = [self._levels] * len(rows) if swept is None else swept.astype(int).tolist()
-        found = [self._alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
-        outputs = {
-            output.name: np.array([each[0].get(output.name, np.full(output.shape, np.nan)) for each in found])
-            for output in self.facts.outputs
-        }
-        return Rows(outputs, tuple(reason for _, reason in found))
-
-    def _alone(
-        self, record: Record | str, levels: int | None, holdout: float, initial: str
-    ) -> tuple[dict[str, Any], str]:
-        if isinstance(record, str):
-            return {}, record
-        try:
-            result = fit([record], levels=levels, holdout=holdout, initial=initial)
-        except (DataError, FitError) as error:
-            return {}, " ".join(str(error).split())
-        run = result.runs[0]
-        weights = np.asarray(result.weights_um)
-        found: dict[str, Any] = {
-            "offset_um": run.offset_um,
-            "noise_um": result.noise_um,
-            "loops_um": float(weights.sum()),
-            "levels": len(weights),
-            "weights_um": weights[_packed(len(weights))],
-        }
-        for start, figures in (("", run.in_sample), ("heldout_", run.held_out)):
-            if figures is not None:
-                found |= {f"{start}e_rms_pct": figures.e_rms_pct, f"{start}e_max_pct": figures.e_max_pct}
-        return found, ""
+            levels = block.numbers("fit.levels", self._levels or _DEFAULT_LEVELS).astype(int)
+            return self._together(
+                records, holdout, initial, levels, block.numbers("fit.smoothness", self._smoothness)
+            )
+        swept = block.values.get("fit.levels")
+        numbers = [self._levels] * len(records) if swept is None else swept.astype(int).tolist()
+        found = [_alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
+        return Rows.one_by_one(self.facts.outputs, found)
 
     def _together(
         self,
@@ -195,6 +151,29 @@ class FitJob(AbstractJob):
         return ""
 
 
+def _alone(record: Record | str, levels: int | None, holdout: float, initial: str) -> dict[str, Any] | str:
+    """What comes of the fit of one record, or why there is none."""
+    if isinstance(record, str):
+        return record
+    try:
+        result = fit([record], levels=levels, holdout=holdout, initial=initial)
+    except (DataError, FitError) as error:
+        return " ".join(str(error).split())
+    run = result.runs[0]
+    weights = np.asarray(result.weights_um)
+    found: dict[str, Any] = {
+        "offset_um": run.offset_um,
+        "noise_um": result.noise_um,
+        "loops_um": float(weights.sum()),
+        "levels": len(weights),
+        "weights_um": weights[_packed(len(weights))],
+    }
+    for start, figures in (("", run.in_sample), ("heldout_", run.held_out)):
+        if figures is not None:
+            found |= {f"{start}e_rms_pct": figures.e_rms_pct, f"{start}e_max_pct": figures.e_max_pct}
+    return found
+
+
 def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[Any]]:
     """Fit whole blocks on one number of levels; figures by output, weights, predictions and success."""
     table, rough = jnp.asarray(branch_table(levels)), roughness(levels)
@@ -232,38 +211,19 @@ def _errors(measured: FloatArray, predicted: FloatArray, samples: Any, known: An
 def make(request: Request) -> FitJob:
     """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
     records, table = requested_records(request), request.table.get("fit", {})
-    for key in table:
-        if key not in _KEYS:
-            raise DataError(f"fit.{key}: expected a known key, found {shown(key)}; {nearest(key, _KEYS)}")
-    method, initial = table.get("method", "batch"), table.get("initial")
-    if method not in ("batch", "one_by_one"):
-        raise DataError(f"fit.method: expected batch or one_by_one, found {shown(method)}; choose one.")
-    known = request.table.get("initial", "negative") if isinstance(records, Simulated) else "unknown"
-    initial = known if initial is None else initial
-    if initial not in INITIAL_STATES:
-        raise DataError(f"fit.initial: expected one of {', '.join(INITIAL_STATES)}, found {shown(initial)}.")
-    levels = table.get("levels", _DEFAULT_LEVELS if method == "batch" else None)
-    whole = isinstance(levels, int) and not isinstance(levels, bool)
-    if levels is not None and not (whole and _FEWEST_LEVELS <= levels <= _MOST_LEVELS):
-        raise DataError(
-            f"fit.levels: expected a number from {_FEWEST_LEVELS} to {_MOST_LEVELS}, found {shown(levels)}."
-        )
-    weights = table.get("weights", False)
-    if not isinstance(weights, bool) or (weights and levels is None):
-        raise DataError(f"fit.weights: expected true, with fit.levels, or false, found {shown(weights)}; correct it.")
-    if weights and "fit.levels" in request.names:
+    options = read_table(table, _Options, "fit")
+    if options.method == "batch" and options.levels is None:
+        options.levels = _DEFAULT_LEVELS
+    if options.weights and options.levels is None:
+        raise DataError("fit.weights: expected true, with fit.levels, or false, found true; correct it.")
+    axes = request.table.get("axis")
+    if options.weights and isinstance(axes, list) and {"fit.levels"} & {str(each.get("parameter")) for each in axes}:
         raise DataError("fit.weights: rows of other fit.levels have other weights; leave out one of the two.")
-    if isinstance(records, Simulated) and "samples" in table:
-        raise DataError("fit.samples: simulated records have the samples of their program; leave it out.")
-    if method == "one_by_one" and "smoothness" in table:
+    if options.method == "one_by_one" and "smoothness" in table:
         raise DataError("fit.smoothness: one_by_one finds it from the data; leave it out.")
-    samples = records.program.samples if isinstance(records, Simulated) else table.get("samples", 2048)
-    if isinstance(samples, bool) or not isinstance(samples, int) or not _FEWEST <= samples <= _MOST:
-        raise DataError(f"fit.samples: expected a number from {_FEWEST} to {_MOST:,}, found {shown(samples)}.")
-    holdout = number(table.get("holdout", 0.2), "fit.holdout")
-    if not 0 <= holdout <= 0.9:
-        raise DataError(f"fit.holdout: expected a share between 0 and 0.9, found {holdout:g}; correct it.")
-    smoothness = number(table.get("smoothness", 0.01), "fit.smoothness")
-    if not 1e-12 <= smoothness <= 1e6:
-        raise DataError(f"fit.smoothness: expected a weight from 1e-12 to 1e6, found {smoothness:g}; correct it.")
-    return FitJob(records, levels, holdout, initial, samples, method == "batch", weights, smoothness)
+    if isinstance(records, Simulated):
+        if "samples" in table:
+            raise DataError("fit.samples: simulated records have the samples of their program; leave it out.")
+        samples = {"samples": records.program.samples}
+        options.samples = read_table(samples, _Options, "fit").samples
+    return FitJob(records, options, options.initial or assumed_initial(request, records))
