@@ -178,9 +178,9 @@ def _design(table: Mapping[str, Any]) -> Design:
         # A leg of no length is refused below.
         tolerance.setdefault(name, TOLERANCE_MM / (lever_mm(geometry, name) or 1.0))
     moved = {}
-    for key, units, field, _ in _ACTUATION:
+    for key, scale, field, _ in _ACTUATION:
         number, place = getattr(stage.actuation, key), f"actuation.{key}"
-        moved[field] = _converted(number.value, number.unit, units, place) if units else number
+        moved[field] = _converted(number.value, number.unit, scale, place) if scale else number
         if not moved[field] > 0:
             raise DataError(f"{place}: expected a number above 0, found {moved[field]:g}; correct it.")
     modulus = stage.material.youngs_modulus
@@ -223,11 +223,13 @@ def typed(table: Mapping[str, Any], kind: Any) -> Any:
 
 def _sentence(message: str, found: Any, kind: Any) -> str:
     """Say what msgspec says in our words, with the value found and the keys that there are."""
-    what, path = re.fullmatch(r"(.*?)(?: - at `\$\.?(.*)`)?", message, re.DOTALL).groups()
-    for step in re.findall(r"\w+", path or ""):
-        inside = isinstance(found, list)
-        found = found[int(step) if inside else step]
-        kind = typing.get_args(kind)[0] if inside else typing.get_type_hints(kind)[step]
+    split = re.fullmatch(r"(.*?)(?: - at `\$\.?([\w.\[\]]*)`)?", message, re.DOTALL)
+    what, path = (split[1], split[2] or "") if split else (message, "")
+    for step in re.findall(r"\w+", path):
+        if isinstance(found, list):
+            found, kind = found[int(step)], typing.get_args(kind)[0]
+        elif step in getattr(kind, "__struct_fields__", ()):
+            found, kind = found[step], typing.get_type_hints(kind)[step]
     names = list(getattr(kind, "__struct_fields__", ()))
     above = f"{path}." if path else ""
     if key := re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL):

@@ -149,9 +149,9 @@ def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> Sensitivit
         If JAX is not in double precision.
     """
     require_float64("sensitivities")
-    axes = (axes,) if isinstance(axes, str) else axes
-    check_axes(axes)
-    return SensitivityReport(design.level, once_per_function(axes, lambda axis: _of_axis(design, axis)))
+    chosen: Sequence[m.Axis] = (axes,) if isinstance(axes, str) else axes  # type: ignore[assignment]
+    check_axes(chosen)
+    return SensitivityReport(design.level, once_per_function(chosen, lambda axis: _of_axis(design, axis)))
 
 
 class AxisDerivatives(eqx.Module):

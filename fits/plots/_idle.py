@@ -14,7 +14,7 @@ _MOST_LINES = 5
 
 
 def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
+    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation, in a file.
 
     Parameters
     ----------
@@ -24,11 +24,6 @@ def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[
         From `idle_noise`.
     folder
         Existing folder for `idle.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The file written.
 
     Raises
     ------
@@ -54,10 +49,12 @@ def _draw_readings(axes: Axes, margin: Axes, reference: Reference, noise: IdleNo
     values = reference.displacement_um
     keep = thinned(values)
     axes.plot(reference.time_s[keep], values[keep], label="readings", **MEASURED | {"linewidth": 0.4})
-    half = noise.error_um()
-    for level in (noise.mean_um - half, noise.mean_um, noise.mean_um + half):
-        style = "-" if level == noise.mean_um else ":"
-        name = {noise.mean_um: "offset", noise.mean_um + half: "offset ± measuring error"}.get(level, "")
+    middle, half = noise.mean_um, noise.error_um()
+    for level, style, name in (
+        (middle - half, ":", ""),
+        (middle, "-", "offset"),
+        (middle + half, ":", "offset ± measuring error"),
+    ):
         for each in (axes, margin):
             each.axhline(level, color=DARK, linestyle=style, linewidth=0.8, label=name)
     label(axes, "time (s)", "displacement (µm)")
