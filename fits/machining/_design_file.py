@@ -225,11 +225,13 @@ def _sentence(message: str, found: Any, kind: Any) -> str:
     """Say what msgspec says in our words, with the value found and the keys that there are."""
     split = re.fullmatch(r"(.*?)(?: - at `\$\.?([\w.\[\]]*)`)?", message, re.DOTALL)
     what, path = (split[1], split[2] or "") if split else (message, "")
-    for step in re.findall(r"\w+", path):
-        if isinstance(found, list):
-            found, kind = found[int(step)], typing.get_args(kind)[0]
-        elif step in getattr(kind, "__struct_fields__", ()):
-            found, kind = found[step], typing.get_type_hints(kind)[step]
+    try:
+        for step in re.findall(r"\w+", path):
+            inside = isinstance(found, list)
+            found = found[int(step) if inside else step]
+            kind = typing.get_args(kind)[0] if inside else typing.get_type_hints(kind)[step]
+    except (LookupError, ValueError):  # A key that looks like the end of a message.
+        path = ""
     names = list(getattr(kind, "__struct_fields__", ()))
     above = f"{path}." if path else ""
     if key := re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL):
