@@ -65,13 +65,9 @@ class AxisBudget:
         Output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
     driving_highest, driving_lowest
         Largest driving errors to either side, with their signs.
-    machining_signed
-        Sum over all dimensions, each at plus one tolerance, the elongation being imposed (Eq. 4).
-    machining_worst_case
-        Sum of the sizes.
-    machining_root_sum_square
-        For errors that are independent, or correlated as the design says; for normal ones of three standard
-        deviations.
+    machining_signed, machining_worst_case, machining_root_sum_square
+        Of all dimensions, each at plus one tolerance, the elongation being imposed (Eq. 4): the sum, the sum of the
+        sizes, and the root of the sum of squares with the design's correlations.
     machining_voltage_worst_case, machining_voltage_root_sum_square
         The same with the voltage being imposed, which the paper leaves out: the input stiffness then acts too.
     measuring
@@ -133,14 +129,10 @@ class Budget:
         Of the piezo.
     measures
         What the displacement of the model was: the piezo's elongation (`pzt`), or the output of an axis.
-    noise_um
-        Measuring error of the sensor.
-    zeroed
-        Whether its offset is left out of that.
-    arm_mm
-        Distance from the axis of rotation at which the sensor reads, or None.
-    level
-        Of the motion functions.
+    noise_um, zeroed
+        Measuring error of the sensor, and whether its offset is left out of that.
+    arm_mm, level
+        Distance from the axis of rotation at which the sensor reads, or None; and level of the motion functions.
     remarks
         What a reader must know, one sentence each.
     """

@@ -26,14 +26,9 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Together:
-    """Dimensions whose errors go together, as one offset of a wire cut shifts several thicknesses.
+    """Dimensions, named as in `microid.DIMENSIONS`, whose errors go together with a correlation of any two, -1 to 1.
 
-    Attributes
-    ----------
-    dimensions
-        Names in `microid.DIMENSIONS`.
-    correlation
-        Of the errors of any two of them, -1 to 1.
+    One offset of a wire cut, for example, shifts several thicknesses.
     """
 
     dimensions: tuple[str, ...]
@@ -102,13 +97,8 @@ class Design:
 def paper_design(tolerance_mm: float = TOLERANCE_MM) -> Design:
     """Return the paper's stage (Table 1).
 
-    The paper gives no tolerance for angles (erratum 9), here that of a length over its leg, and no value for `l`
-    (erratum 7), here 40 mm.
-
-    Parameters
-    ----------
-    tolerance_mm
-        Of every length.
+    All lengths have one tolerance. The paper gives none for angles (erratum 9), here that of a length over its leg,
+    and no value for `l` (erratum 7), here 40 mm.
     """
     geometry = m.Geometry()
     return Design(geometry, uniform_tolerance(geometry, tolerance_mm))

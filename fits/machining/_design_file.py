@@ -66,37 +66,31 @@ class _Group(msgspec.Struct, forbid_unknown_fields=True):
     correlation: _Finite
 
 
-def _struct(fields: Mapping[str, Any], **defaults: Any) -> type[msgspec.Struct]:
-    listed = [(name, kind, defaults[name]) if name in defaults else (name, kind) for name, kind in fields.items()]
-    return msgspec.defstruct("_Table", listed, forbid_unknown_fields=True)
-
-
-_STAGE = _struct(
-    {
-        "schema": str,
-        "level": int,
-        "geometry": _struct(dict.fromkeys(m.DIMENSIONS, _Dimension)),
-        "material": _Material,
-        "actuation": _struct({key: _Quantity if units else _Finite for key, units, *_ in _ACTUATION}),
-        "together": list[_Group],
-    },
-    together=[],
+_Geometry = msgspec.defstruct("_Geometry", [(name, _Dimension) for name in m.DIMENSIONS], forbid_unknown_fields=True)
+_Actuation = msgspec.defstruct(
+    "_Actuation",
+    [(key, _Quantity if units else _Finite) for key, units, *_ in _ACTUATION],
+    forbid_unknown_fields=True,
 )
 
 
+class _Stage(msgspec.Struct, forbid_unknown_fields=True):
+    schema: str
+    level: int
+    geometry: _Geometry  # type: ignore[valid-type]
+    material: _Material
+    actuation: _Actuation  # type: ignore[valid-type]
+    together: list[_Group] = []
+
+
 def read_design(path: str | os.PathLike[str]) -> Design:
-    """Read the design of a stage.
+    """Read the design of a stage, in mm and rad.
 
     Parameters
     ----------
     path
         TOML as `write_design` writes it. Lengths may be in mm, um or m and angles in rad, mrad or deg; a tolerance is
         in the unit of its dimension, and 0.02 mm, for an angle over its leg, where none is given.
-
-    Returns
-    -------
-    Design
-        In mm and rad.
 
     Raises
     ------
@@ -165,7 +159,7 @@ def _design(table: Mapping[str, Any]) -> Design:
     if table.get("schema") != SCHEMA:
         found = shown(table["schema"]) if "schema" in table else "none"
         raise DataError(f"schema: expected {_quoted(SCHEMA)}, found {found}; give that, or another file.")
-    stage = typed(table, _STAGE)
+    stage = typed(table, _Stage)
     sizes, tolerance = {}, {}
     for name, dimension in m.DIMENSIONS.items():
         written = getattr(stage.geometry, name)
@@ -178,9 +172,9 @@ def _design(table: Mapping[str, Any]) -> Design:
         # A leg of no length is refused below.
         tolerance.setdefault(name, TOLERANCE_MM / (lever_mm(geometry, name) or 1.0))
     moved = {}
-    for key, units, field, _ in _ACTUATION:
+    for key, scale, field, _ in _ACTUATION:
         number, place = getattr(stage.actuation, key), f"actuation.{key}"
-        moved[field] = _converted(number.value, number.unit, units, place) if units else number
+        moved[field] = _converted(number.value, number.unit, scale, place) if scale else number
         if not moved[field] > 0:
             raise DataError(f"{place}: expected a number above 0, found {moved[field]:g}; correct it.")
     modulus = stage.material.youngs_modulus
@@ -223,11 +217,15 @@ def typed(table: Mapping[str, Any], kind: Any) -> Any:
 
 def _sentence(message: str, found: Any, kind: Any) -> str:
     """Say what msgspec says in our words, with the value found and the keys that there are."""
-    what, path = re.fullmatch(r"(.*?)(?: - at `\$\.?(.*)`)?", message, re.DOTALL).groups()
-    for step in re.findall(r"\w+", path or ""):
-        inside = isinstance(found, list)
-        found = found[int(step) if inside else step]
-        kind = typing.get_args(kind)[0] if inside else typing.get_type_hints(kind)[step]
+    split = re.fullmatch(r"(.*?)(?: - at `\$\.?([\w.\[\]]*)`)?", message, re.DOTALL)
+    what, path = (split[1], split[2] or "") if split else (message, "")
+    try:
+        for step in re.findall(r"\w+", path):
+            inside = isinstance(found, list)
+            found = found[int(step) if inside else step]
+            kind = typing.get_args(kind)[0] if inside else typing.get_type_hints(kind)[step]
+    except (LookupError, TypeError, ValueError):  # A key that looks like the end of a message.
+        path = ""
     names = list(getattr(kind, "__struct_fields__", ()))
     above = f"{path}." if path else ""
     if key := re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL):

@@ -285,8 +285,9 @@ def _remarks(noise: IdleNoise) -> Iterator[str]:
     )
     if abs(noise.drift_um_per_s) > 3 * noise.drift_sd_um_per_s:
         yield (
-            f"The readings drift by {noise.drift_um_per_s:.3g} um/s, {noise.drift_um_per_s * noise.duration_s:.3g} um "
-            "over the record, so the standard deviation depends on how long one waits; zero again from time to time."
+            f"The readings drift by {noise.drift_um_per_s:.3g} um/s, {noise.drift_um_per_s * noise.duration_s:.3g} "
+            "um over the record, so the standard deviation depends on how long one waits; zero again from time to "
+            "time."
         )
     if noise.duration_s < _MIN_STRETCHES * noise.correlation_s:
         yield (

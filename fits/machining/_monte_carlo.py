@@ -30,18 +30,14 @@ class AxisSpread:
     ----------
     axis, unit
         Which, and the unit of its gain: `um/um` or `rad/um`; per um of free elongation with an imposed voltage.
-    nominal
-        Gain at the nominal dimensions.
-    mean, sd, skewness
-        Of the draws.
+    nominal, mean, sd, skewness
+        Gain at the nominal dimensions, and statistics of the draws.
     sd_error
         Standard error of `sd` for independent draws, from the fourth moment; the draws of `monte_carlo` err less.
     quantiles
         By percentage: 0.135, 2.5, 50, 97.5 and 99.865.
-    first_order_sd
-        Standard deviation from the gradient.
-    second
-        The expansion to second order where `flagged`, else `None`.
+    first_order_sd, second
+        Standard deviation from the gradient, and the expansion to second order where `flagged`, else `None`.
     """
 
     axis: Axis

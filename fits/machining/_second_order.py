@@ -22,14 +22,10 @@ class SecondOrder:
         As asked for.
     names
         Dimensions that the gain depends on, `k` of them.
-    gain
-        At the nominal dimensions.
-    gradient, hessian
-        Derivatives per mm or rad, shapes `(k,)` and `(k, k)`.
-    first_order_sd
-        Standard deviation from the gradient alone.
-    mean_shift
-        Mean less the gain at the nominal dimensions.
+    gain, gradient, hessian
+        At the nominal dimensions, and derivatives per mm or rad, shapes `(k,)` and `(k, k)`.
+    first_order_sd, mean_shift
+        Standard deviation from the gradient alone, and mean less the gain at the nominal dimensions.
     pairs
         What each pair adds to the variance at second order, shape `(k, k)`; the sum of all counts, and two equal
         halves of a pair stand at either side of the diagonal.

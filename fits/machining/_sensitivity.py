@@ -1,6 +1,5 @@
 """What machining errors do to each axis: derivatives, ranking, and shares of the variance (Eq. 4 and 5)."""
 
-import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -41,10 +40,8 @@ class DimensionEffect:
         The dimension, in mm or rad.
     derivative
         Of the gain, in its unit per mm or rad.
-    relative_change_pct
-        Of the output at an error of plus one tolerance, to first order.
-    relative_change_exact_pct
-        The same without linearising.
+    relative_change_pct, relative_change_exact_pct
+        Of the output at an error of plus one tolerance, to first order and without linearising.
     share_of_variance
         Of the output, to first order; with correlated dimensions it can be negative. Zero where no tolerance has any
         effect, otherwise the shares of an axis add up to 1.
@@ -70,22 +67,16 @@ class AxisSensitivity:
 
     Attributes
     ----------
-    axis
-        Its name.
-    output_unit
-        `um` or `urad`.
+    axis, output_unit
+        Its name, and `um` or `urad`.
     gain
         Output per elongation of the piezo for small strokes, in `output_unit` per um.
-    loaded_stroke_um
-        Elongation of the loaded piezo at the highest voltage (Eq. 14).
-    stroke
-        Output there, in `output_unit`.
+    loaded_stroke_um, stroke
+        Elongation of the loaded piezo at the highest voltage (Eq. 14), and the output there, in `output_unit`.
     dimensions
         The arguments of Eq. 5, largest relative change first.
-    rss_pct
-        Root sum of squares of the relative changes, with their correlations.
-    worst_case_pct
-        Sum of their sizes.
+    rss_pct, worst_case_pct
+        Root sum of squares of the relative changes, with their correlations, and sum of their sizes.
     voltage_change_pct
         Relative change of the output at plus one tolerance, to first order, the voltage being imposed instead of the
         elongation: for every dimension that has an effect, also by the input stiffness, largest first.
@@ -129,15 +120,11 @@ class SensitivityReport:
         return self.axes[axis]
 
     def alike(self) -> list[list[AxisSensitivity]]:
-        """Group axes that differ in nothing but their names."""
-        groups: list[list[AxisSensitivity]] = []
-        for axis in self.axes.values():
-            group = next((each for each in groups if dataclasses.replace(each[0], axis=axis.axis) == axis), None)
-            if group is None:
-                groups.append([axis])
-            else:
-                group.append(axis)
-        return groups
+        """Group axes that are the same function of the same dimensions."""
+        groups: dict[m.Axis, list[AxisSensitivity]] = {}
+        for name, axis in self.axes.items():
+            groups.setdefault(twin(name), []).append(axis)
+        return list(groups.values())
 
 
 def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> SensitivityReport:
@@ -161,9 +148,9 @@ def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> Sensitivit
         If JAX is not in double precision.
     """
     require_float64("sensitivities")
-    axes = (axes,) if isinstance(axes, str) else axes
-    check_axes(axes)
-    return SensitivityReport(design.level, once_per_function(axes, lambda axis: _of_axis(design, axis)))
+    chosen: Sequence[m.Axis] = (axes,) if isinstance(axes, str) else axes  # type: ignore[assignment]
+    check_axes(chosen)
+    return SensitivityReport(design.level, once_per_function(chosen, lambda axis: _of_axis(design, axis)))
 
 
 class AxisDerivatives(eqx.Module):

@@ -25,10 +25,9 @@ class SobolIndices:
         Which.
     names
         Dimensions that the gain depends on, `k` of them.
-    first
-        Part that a dimension explains by itself, shape `(k,)`.
-    total
-        Part that would not be there without it: with all its interactions, shape `(k,)`.
+    first, total
+        Part that a dimension explains by itself, and part that would not be there without it: with all its
+        interactions, shape `(k,)`.
     first_interval, total_interval
         Lower and upper end of confidence intervals by bootstrap, shape `(k, 2)`. Points that fill the space evenly
         err less than independent ones, so these are on the safe side.

@@ -14,7 +14,7 @@ _MOST_LINES = 5
 
 
 def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
+    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation, in a file.
 
     Parameters
     ----------
@@ -24,11 +24,6 @@ def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[
         From `idle_noise`.
     folder
         Existing folder for `idle.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The file written.
 
     Raises
     ------

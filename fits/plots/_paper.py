@@ -71,15 +71,7 @@ def plot_steps(time_s: np.ndarray, target_um: float, steps: Mapping[str, np.ndar
 def plot_tracking(
     interval_s: float, runs: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]], path: Path
 ) -> Path:
-    """Draw Fig. 11 and 12: rows of a run and its errors.
-
-    Parameters
-    ----------
-    interval_s
-        Between two samples.
-    runs
-        A title per row, the reference, and displacements by scheme, each of shape `(n,)`.
-    """
+    """Draw Fig. 11 and 12: rows of a title, a reference and displacements by scheme, each of shape `(n,)`."""
     picture: Figure = figure(WIDE_in, 2.1 * len(runs) + 0.4, gap=0.08)
     rows = np.atleast_2d(picture.subplots(len(runs), 2))
     for (shown, error), (title, reference_um, schemes) in zip(rows, runs, strict=True):
