@@ -5,13 +5,13 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import NDArray
 
 import microid as m
 from fits.io._errors import DataError
+from fits.io._typed import nearest
 
 TOLERANCE_MM = 0.02
 LARGEST_ANGLE_RAD = 1.5
@@ -113,12 +113,6 @@ def lever_mm(geometry: m.Geometry, name: str) -> float:
     """Length of the leg at whose end an error of an angle is counted as a length; 1 for a length."""
     leg = m.DIMENSIONS[name].leg
     return 1.0 if leg is None else float(geometry[leg])
-
-
-def nearest(name: str, known: Sequence[str]) -> str:
-    """Say what a name may have been meant for."""
-    close = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean {close[0]}?" if close else f"use one of {', '.join(known)}."
 
 
 def _faults(design: Design) -> Iterator[str]:

@@ -3,10 +3,8 @@
 import math
 import os
 import re
-import sys
-import typing
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import jax.numpy as jnp
 import msgspec
@@ -15,7 +13,8 @@ import microid as m
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_TOML_BYTES, parse_toml, read_text
-from fits.machining._design import TOLERANCE_MM, Design, Together, lever_mm, nearest
+from fits.io._typed import typed
+from fits.machining._design import TOLERANCE_MM, Design, Together, lever_mm
 
 SCHEMA = "microid.stage/1"
 _DEGREE = math.pi / 180
@@ -42,39 +41,32 @@ _ACTUATION: tuple[tuple[str, _Units, str, str], ...] = (
 )
 
 
-_Finite = Annotated[float, msgspec.Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
-
-
-class _Quantity(msgspec.Struct, forbid_unknown_fields=True):
-    value: _Finite
+class _Quantity(msgspec.Struct):
+    value: float
     unit: str
 
 
-class _Dimension(msgspec.Struct, forbid_unknown_fields=True):
-    value: _Finite
+class _Dimension(msgspec.Struct):
+    value: float
     unit: str
-    tolerance: _Finite | None = None
+    tolerance: float | None = None
 
 
-class _Material(msgspec.Struct, forbid_unknown_fields=True):
+class _Material(msgspec.Struct):
     youngs_modulus: _Quantity
-    guides: _Finite
+    guides: float
 
 
-class _Group(msgspec.Struct, forbid_unknown_fields=True):
+class _Group(msgspec.Struct):
     dimensions: list[str]
-    correlation: _Finite
+    correlation: float
 
 
-_Geometry = msgspec.defstruct("_Geometry", [(name, _Dimension) for name in m.DIMENSIONS], forbid_unknown_fields=True)
-_Actuation = msgspec.defstruct(
-    "_Actuation",
-    [(key, _Quantity if units else _Finite) for key, units, *_ in _ACTUATION],
-    forbid_unknown_fields=True,
-)
+_Geometry = msgspec.defstruct("_Geometry", [(name, _Dimension) for name in m.DIMENSIONS])
+_Actuation = msgspec.defstruct("_Actuation", [(key, _Quantity if units else float) for key, units, *_ in _ACTUATION])
 
 
-class _Stage(msgspec.Struct, forbid_unknown_fields=True):
+class _Stage(msgspec.Struct):
     schema: str
     level: int
     geometry: _Geometry  # type: ignore[valid-type]
@@ -196,47 +188,6 @@ def _converted(value: float, unit: str, units: _Units, place: str) -> float:
         raise DataError(f"{place}.unit: expected one of {', '.join(units)}, found {shown(unit)}; convert the value.")
     times, over = units[plain]
     return value * times / over
-
-
-# What msgspec calls the kinds of values: in words, and what to do.
-_KINDS = {
-    "float": ("a finite number", "give one without quotes"),
-    "int": ("a whole number", "give one without quotes or a point"),
-    "str": ("a text", "put it in quotes"),
-    "array": ("a list", "put what is in it in brackets"),
-}
-
-
-def typed(table: Mapping[str, Any], kind: Any) -> Any:
-    """Turn a table of TOML or JSON into a `msgspec.Struct`; a `DataError` begins with the place of the fault."""
-    try:
-        return msgspec.convert(table, kind)
-    except msgspec.ValidationError as error:
-        raise DataError(_sentence(str(error), table, kind)) from None
-
-
-def _sentence(message: str, found: Any, kind: Any) -> str:
-    """Say what msgspec says in our words, with the value found and the keys that there are."""
-    split = re.fullmatch(r"(.*?)(?: - at `\$\.?([\w.\[\]]*)`)?", message, re.DOTALL)
-    what, path = (split[1], split[2] or "") if split else (message, "")
-    try:
-        for step in re.findall(r"\w+", path):
-            inside = isinstance(found, list)
-            found = found[int(step) if inside else step]
-            kind = typing.get_args(kind)[0] if inside else typing.get_type_hints(kind)[step]
-    except (LookupError, TypeError, ValueError):  # A key that looks like the end of a message.
-        path = ""
-    names = list(getattr(kind, "__struct_fields__", ()))
-    above = f"{path}." if path else ""
-    if key := re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL):
-        word = shown(key[1])
-        return f"{above}{word[1:-1]}: expected a known key, found {word}; {nearest(key[1], names)}"
-    if key := re.fullmatch(r"Object missing required field `(.*)`", what):
-        return f"{above}{key[1]}: expected this key, found none; add it."
-    expected = re.match(r"Expected `(\w+)", what)
-    of_keys = f"a table of {', '.join(names)}", "write such a table"
-    wanted, remedy = _KINDS.get(expected[1] if expected else "", of_keys)
-    return f"{path}: expected {wanted}, found {shown(found)}; {remedy}."
 
 
 def _line_of(text: str, place: str) -> int | None:
