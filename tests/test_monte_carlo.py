@@ -14,8 +14,7 @@ from fits.machining._design import Together, paper_design
 from fits.machining._gains import gain_model, gains_of_many
 from fits.machining._monte_carlo import monte_carlo
 from fits.machining._second_order import second_order
-from fits.machining._tolerances import copula_root
-from fits.machining._tolerances import drawn as errors_of
+from fits.machining._tolerances import copula_root, from_normal
 
 LAWS = {
     "normal": lambda half: stats.norm(0, half / 3),
@@ -121,7 +120,7 @@ def test_draws_keep_their_law_and_take_the_correlation(rng, law):
     stage = design((Together(("t1", "l1", "t2"), correlation), Together(("la1", "l3"), -0.7)))
     names = ("l1", "t1", "la1", "l2", "t2", "l3")
     count = 100_000
-    found = errors_of(rng.random((count, len(names))), copula_root(stage, names, law), law)
+    found = from_normal(copula_root(stage, names, law) @ rng.standard_normal((len(names), count)), law)
     assert found.shape == (6, count)
     for row in found:
         assert stats.kstest(row[:20_000], LAWS[law](1.0).cdf).pvalue > 1e-6

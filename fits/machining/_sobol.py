@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
+from scipy.special import ndtri
 
 from fits.io._errors import DataError
 from fits.machining._design import Design
 from fits.machining._gains import gain_model, gains_of_many, inputs_of, once_per_function, twin
-from fits.machining._tolerances import Distribution, check, check_independent, drawn, tolerances
+from fits.machining._tolerances import Distribution, check, check_independent, from_normal, tolerances
 from microid import AXES, Axis
 
 _FEWEST, _MOST = 256, 2**20
@@ -91,7 +92,7 @@ def sobol(
         model, scale = gain_model(design, voltage), tolerances(design, names)[:, None]
 
         def gain(points: np.ndarray) -> np.ndarray:
-            errors = scale * drawn(points, np.eye(len(names)), distribution)
+            errors = scale * from_normal(ndtri(points.T), distribution)
             return np.asarray(gains_of_many(model, errors, (twin(axis),), names)[0])
 
         outputs = outputs_of(gain, len(names), samples, seed)

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 from fits.io._errors import DataError
 from fits.machining._design import Design
@@ -76,15 +76,7 @@ def excess_fourth_moment(distribution: Distribution) -> float:
     return fourth - 3 * second**2
 
 
-def drawn(points: np.ndarray, root: np.ndarray, distribution: Distribution) -> np.ndarray:
-    """Errors of dimensions in tolerances, shape `(k, n)`.
-
-    They come from points that fill the unit cube, shape `(n, k)`, and from what `copula_root` gives, shape `(k, k)`.
-    """
-    return _from_normal(root @ ndtri(points).T, distribution)
-
-
-def _from_normal(standard: np.ndarray, distribution: Distribution) -> np.ndarray:
+def from_normal(standard: np.ndarray, distribution: Distribution) -> np.ndarray:
     """Turn standard normal numbers into those of a distribution with a tolerance of one."""
     if distribution == "normal":
         return standard / 3
@@ -109,11 +101,11 @@ def _copula(correlation: float, distribution: Distribution) -> float:
         return correlation
     node, weight = np.polynomial.hermite_e.hermegauss(_NODES)
     weight = weight / weight.sum()
-    first = _from_normal(node, distribution)
+    first = from_normal(node, distribution)
     variance = weight @ first**2
 
     def excess(copula: float) -> float:
-        second = _from_normal(copula * node[:, None] + np.sqrt(1 - copula**2) * node, distribution)
+        second = from_normal(copula * node[:, None] + np.sqrt(1 - copula**2) * node, distribution)
         return float((weight * first) @ second @ weight / variance - correlation)
 
     return float(brentq(excess, -1.0, 1.0, xtol=1e-12))
