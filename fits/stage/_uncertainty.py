@@ -15,7 +15,7 @@ from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Prediction
 from fits.stage._moments import Chain, RunSums, along
 from fits.stage._run import prepare_program, simulate_stage
-from fits.stage._solve import Solved, prior_precision, scale_free
+from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._noise import WHITE, correlation_samples, shared_square
 from microid import Preisach, Stage
 
@@ -84,22 +84,14 @@ class Precision:
     def __init__(self, solved: Solved):
         self.chain, self.solved = solved.problem.chain, solved
         total = solved.weighing.total(solved.sums)
-        size, count = self.chain.size, len(solved.z)
+        size = self.chain.size
         self.variance = solved.weighing.least_um**2
         self.gram = np.asarray(total.gram) / self.variance
         self.prior = np.zeros_like(self.gram)
         if solved.hyper is not None:
             prior = prior_precision(self.chain, solved.hyper, solved.problem.stroke_um)
             self.prior[:size, :size] = scale_free(prior, solved.columns_um)
-        rest = np.arange(size), np.arange(size, size + count)
-        self.information = self._marginal(*rest)
-
-    def _marginal(self, columns: np.ndarray, own: np.ndarray) -> np.ndarray:
-        whole = self.gram + self.prior
-        if len(columns) == 0:
-            return whole
-        half = np.linalg.solve(np.linalg.cholesky(whole[np.ix_(columns, columns)]), whole[np.ix_(columns, own)])
-        return np.asarray(whole[np.ix_(own, own)] - half.T @ half)
+        self.information = marginal_information(total, size, self.prior[:size, :size], self.variance)
 
     def answer(self) -> np.ndarray:
         """Columns of the covariance that belong to the coordinates, shape `(D + p, p)`."""
