@@ -131,7 +131,7 @@ def fit_baseline(
     remarks: tuple[str, ...] = ()
     try:
         stage = default_stage(hold) if hold != "first" else None
-        found = solve_stage(records, stage, None, holdout, initial, "squares", progress, _FINEST, anyway=True)
+        found = solve_stage(records, stage, None, holdout, initial, "squares", progress, _FINEST, accept_best=True)
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
         return _static(records, aside, range_V, holdout, initial, remarks, progress)

@@ -21,17 +21,17 @@ LADDER = (16, 23, 32, 45, 64, 90)
 # Refining goes on while it takes this fraction off the error of predicted blocks.
 _WORTH = 0.005
 # From so many levels on more, by the square of their number.
-_DEAR = 32
+_COSTLY = 32
 # Errors up to so many times what a last digit rounds off are rounding.
 _ROUNDED = 1.2
 # Rounds after which the weights of outliers have settled.
 _REWEIGHED = 8
 # Correlation of displacement with voltage below which there is no loop.
-_FOLLOWS = 0.3
+_CORRELATED = 0.3
 # Coherence from which on it follows all the same, and segments whose spectra are averaged.
 _COHERENT, _SEGMENTS = 0.3, 16
 # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
-_AHEAD = 0.5
+_LEADING = 0.5
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def _resolve(
             break
         trials.append(LevelTrial(n, finer.error_um))
         # A fit takes eight times as long for twice the levels, and must be worth it.
-        pays = finer.error_um < (1 - _WORTH * max(1.0, n / _DEAR) ** 2) * best.error_um
+        pays = finer.error_um < (1 - _WORTH * max(1.0, n / _COSTLY) ** 2) * best.error_um
         best = finer if finer.error_um <= best.error_um else best
         if not pays:
             break
@@ -112,7 +112,7 @@ def _stroke(run: Run) -> float:
     if np.ptp(displacement) == 0 or np.ptp(voltage) == 0:
         raise DataError(f"{run.record.source}: nothing moves in the samples to be fitted; hold out less")
     together = float(np.corrcoef(voltage, displacement)[0, 1])
-    if abs(together) < _FOLLOWS:
+    if abs(together) < _CORRELATED:
         _refuse_ringing(run)
         raise DataError(
             f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so "
@@ -123,7 +123,7 @@ def _stroke(run: Run) -> float:
             f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
             "change the sign of one of the two columns"
         )
-    if _leads(voltage, displacement) > _AHEAD:
+    if _leads(voltage, displacement) > _LEADING:
         raise DataError(
             f"{run.record.source}: the displacement runs ahead of the voltage round its loops, where a piezo stays "
             "behind: the two columns are exchanged; correct the header, or name them the other way with --columns"

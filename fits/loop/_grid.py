@@ -31,11 +31,11 @@ _SAME_NOISE = 0.02
 _ATOL = 1e-6
 _STEPS = 500
 # Steps per column where one column at a time is bounded or let go.
-_TURNS = 30
+_STEPS_PER_COLUMN = 30
 # More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
-_SLOWLY = 1100
+_MOST_COLUMNS = 1100
 # At least this many columns are bounded at first.
-_FEW = 64
+_FIRST_BOUNDED = 64
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     scale = np.sqrt(np.diagonal(belief.precision))
     lowest = np.asarray(belief.mean) * scale
     size = len(lowest)
-    bounded = _FEW
+    bounded = _FIRST_BOUNDED
     while True:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
@@ -125,14 +125,14 @@ def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
     precision = np.asarray(belief.precision)
     over: Any = RESULTS.nonlinear_max_steps_reached
-    if len(precision) > _SLOWLY:
+    if len(precision) > _MOST_COLUMNS:
         return jnp.maximum(belief.mean, 0), over
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
     done: Any = RESULTS.successful
     try:
-        columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_TURNS * len(scale))
+        columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_STEPS_PER_COLUMN * len(scale))
     except RuntimeError:
         return jnp.maximum(belief.mean, 0), over
     return jnp.asarray(columns / scale), done

@@ -33,7 +33,7 @@ _AGREE = 2.0
 # A fit ends where the optimum is closer than this, in standard deviations per parameter that the data determine.
 _STATIONARY = 0.2
 # Directions of the data that hold less than this fraction of its largest are rounding.
-_DUST = 1e-13
+_NEGLIGIBLE = 1e-13
 
 
 class _Problem(eqx.Module):
@@ -181,7 +181,7 @@ def solve_shape(
 def _square_root(moments: Moments) -> tuple[Float[Array, "D D"], Float[Array, " D"]]:
     """Factor the moments: `root' root` is the Gram matrix, `root' target` the cross products."""
     value, vector = jnp.linalg.eigh(moments.gram)
-    kept = value > _DUST * value[-1]
+    kept = value > _NEGLIGIBLE * value[-1]
     scale = jnp.sqrt(jnp.where(kept, value, 0))
     seen = vector.T @ moments.cross_um
     return scale[:, None] * vector.T, jnp.where(kept, seen / jnp.where(kept, scale, 1), 0)

@@ -75,7 +75,7 @@ def fit_without_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Alterna
     runs = [replace(run, fitted=run.fitted & ~one) for run, one in zip(solved.runs, bad, strict=True)]
     plan.progress(f"fitting without the outliers of {', '.join(sources)}")
     try:
-        found = solve_chain(solved.onward, runs, plan.loss, plan.progress, anyway=True)
+        found = solve_chain(solved.onward, runs, plan.loss, plan.progress, accept_best=True)
     except (FitError, np.linalg.LinAlgError):
         return None
     return sources, Alternative.of(Precision(found))

@@ -70,14 +70,14 @@ def _not_one_rig(one: str, other: str, ratio: float) -> str:
 
 
 def refuse_unidentifiable(
-    solved: Solved, drives: Sequence[np.ndarray], fast: bool, spare: bool = False
+    solved: Solved, drives: Sequence[np.ndarray], fast: bool, may_drop: bool = False
 ) -> str | None:
     """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with.
 
     The solution is that of the poles that explain the runs best, the hysteresis being given; `drives` are what it
     alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the others. Where a
-    mechanics may be left out (`spare`) that the runs do not show, though they are sampled finely enough, its name is
-    returned instead.
+    mechanics may be left out (`may_drop`) that the runs do not show, though they are sampled finely enough, its name
+    is returned instead.
     """
     stage = solved.stage
     information = marginal_information(
@@ -91,7 +91,7 @@ def refuse_unidentifiable(
         return None
     spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     # At a bound the slope vanishes, however far the coordinate may run.
-    blurred = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > _LOST]
+    unidentified = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > _LOST]
     sources = ", ".join(run.record.source for run in solved.runs)
     fastest = max(solved.runs, key=lambda run: run.rate_Hz)
     mechanics = [
@@ -101,16 +101,16 @@ def refuse_unidentifiable(
     ]
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST * fastest.rate_Hz]
     seen = likelihood_ratio(solved, drives) >= WORTH
-    some = bool(blurred) and (len(blurred) == len(poles) or not fast)
+    some = bool(unidentified) and (len(unidentified) == len(poles) or not fast)
     driven = any(isinstance(part, Driver) for part in stage.parts)
-    if spare and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
+    if may_drop and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
         return (beyond or mechanics)[0][0]
-    if blurred and not fast and len(blurred) < len(poles):
+    if unidentified and not fast and len(unidentified) < len(poles):
         raise DataError(
-            f"{sources}: these runs are all about as slow, and do not show {', '.join(blurred)}; add a run with "
+            f"{sources}: these runs are all about as slow, and do not show {', '.join(unidentified)}; add a run with "
             "steps, a chirp or a multisine that goes beyond the resonance"
         )
-    if len(blurred) == len(poles) or not seen:
+    if len(unidentified) == len(poles) or not seen:
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
         if noise[loudest] > _LOUD * min(noise):

@@ -36,7 +36,7 @@ _BETTER = 0.7
 # Where more than so many times the noise is left, a delay counts if it takes all but this part away.
 _NEAR, _MUCH = 2.0, 0.4
 # Precision, in scaled coordinates, that stands in for none.
-_FAINT = 1e-8
+_WEAK = 1e-8
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
 _REMEDY = (
@@ -103,7 +103,7 @@ def fit_without_delays(
     if plan.hold == "zero":
         return None
     start = solved.onward
-    if start.even:
+    if start.least_noise_share:
         # Unless much is left, which may hide the resonance that was not found.
         gross = max(one.share_pct for one in left) > GROSS_PCT
         return fit_without_delays(plan, start.full, None, left) if gross and start.full is not None else None
@@ -162,7 +162,7 @@ def fit_without_delays(
 def _solved_with(plan: Plan, start: Problem, stride: int, shifts_s: np.ndarray) -> tuple[Solved, Precision] | None:
     """Fit again with the command of each run that much later, as well as can be; None where that fails."""
     try:
-        found = solve_chain(start, plan.shifted(shifts_s).runs(stride), plan.loss, plan.progress, anyway=True)
+        found = solve_chain(start, plan.shifted(shifts_s).runs(stride), plan.loss, plan.progress, accept_best=True)
     except (FitError, np.linalg.LinAlgError):
         return None
     return found, Precision(found)
@@ -191,7 +191,7 @@ def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray
     here, stage = (jnp.asarray(solved.z), jnp.asarray(solved.columns_um)), solved.stage
     whole = precision.gram + precision.prior
     # What nothing is known of must not spoil the rest.
-    whole = whole + _FAINT * np.eye(len(whole))
+    whole = whole + _WEAK * np.eye(len(whole))
     out = []
     for k, (run, one) in enumerate(zip(solved.runs, solved.sums, strict=True)):
         n, step, weight = len(run.record), _STEP / run.rate_Hz, run.fit_weight

@@ -102,18 +102,18 @@ def fit_stage(
     """
     found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
     solved, runs = found.solved, found.solved.runs
-    left, even = misfits(runs, solved.residuals_um), solved.problem.even
+    left, simplified = misfits(runs, solved.residuals_um), solved.problem.least_noise_share > 0
     progress("looking for delays")
     undelayed = fit_without_delays(found.plan, solved, found.precision, left)
     # What is sampled too slowly may look late; a delay is believed that leaves little else.
     if undelayed is None or any(one.far for one in undelayed.left()):
         refuse_undersampled(solved.stage, runs, left)
-    if found.failure is not None or even:
+    if found.failure is not None or simplified:
         refuse_delays(undelayed)
     if found.failure is not None:
         raise found.failure
     gross = worst(left)
-    if even and gross.share_pct > GROSS_PCT:
+    if simplified and gross.share_pct > GROSS_PCT:
         raise DataError(
             f"{gross.source}: neither a lag nor a resonance explains what moves in it: {gross.share_pct:.3g} % of "
             f"its stroke stay unexplained, {gross.times_noise:.3g} times the sensor's noise; check columns, time "
@@ -164,11 +164,11 @@ def solve_stage(
     loss: str,
     progress: Callable[[str], None],
     finest: int = LADDER[-1],
-    anyway: bool = False,
+    accept_best: bool = False,
 ) -> Solution:
     """Fit a stage, on a grid of at most the finest levels; other arguments and errors are those of `fit_stage`.
 
-    `anyway` takes the best place for an answer where the fit does not become stationary.
+    `accept_best` takes the best place for an answer where the fit does not become stationary.
     """
     fraction, _, range_V = check_fit(records, holdout, loss)
     for record in records:
@@ -184,13 +184,13 @@ def solve_stage(
             "insert one, or use hold='first'"
         )
     plan = Plan(
-        tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, anyway
+        tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, accept_best
     )
     problem = start_problem(plan, stage, levels, finest)
     try:
         return Solution(*refine_problem(plan, problem), plan)
     except FitError as failure:
-        if anyway:
+        if accept_best:
             raise
         # What the best place leaves may show why.
-        return Solution(*refine_problem(replace(plan, anyway=True), problem), plan, failure)
+        return Solution(*refine_problem(replace(plan, accept_best=True), problem), plan, failure)

@@ -33,9 +33,9 @@ class Problem:
     """A stage to be fitted, where its fit begins, and what the user should know.
 
     The unit of the columns is `stroke_um`; `hyper` is their smoothness and noise to start from, None to leave them as
-    they are. No run counts as quieter than the part `even` of the loudest: where more than noise is left, one run
-    would otherwise be fitted ever better, and so count for ever more, at the cost of the others. Where a part was
-    left out, `full` is the stage with it, roughly fitted.
+    they are. No run counts as quieter than the part `least_noise_share` of the loudest: where more than noise is
+    left, one run would otherwise be fitted ever better, and so count for ever more, at the cost of the others. Where
+    a part was left out, `full` is the stage with it, roughly fitted.
     """
 
     stage: Stage
@@ -45,7 +45,7 @@ class Problem:
     hyper: Hyper | None
     stroke_um: float
     remarks: tuple[str, ...] = ()
-    even: float = 0.0
+    least_noise_share: float = 0.0
     full: "Solved | None" = None
 
     @classmethod
@@ -113,7 +113,7 @@ def solve_chain(
     loss: str,
     progress: Callable[[str], None],
     rough: bool = False,
-    anyway: bool = False,
+    accept_best: bool = False,
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
@@ -122,15 +122,15 @@ def solve_chain(
     projection; Golub & Pereyra 2003). Without columns these are Levenberg and Marquardt's steps. A library's solver
     would hold the smoothness, the weights of the runs and the columns at zero fixed, which change with every step.
 
-    A `rough` place is only a start for another fit, and need not be stationary. `anyway` takes the best place for an
-    answer, too, for those who go on from there; otherwise a `FitError` says that it did not become stationary.
+    A `rough` place is only a start for another fit, and need not be stationary. `accept_best` takes the best place
+    for an answer, too, for those who go on from there; otherwise a `FitError` says that it did not become stationary.
     """
-    chain, stroke_um, even = problem.chain, problem.stroke_um, problem.even
+    chain, stroke_um = problem.chain, problem.stroke_um
     z, columns_um, hyper = problem.z, problem.columns_um, problem.hyper
     damping = _DAMPING
     counted: tuple[float, ...] = ()
     for number in range(_ROUGH if rough else _ROUNDS):
-        runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
+        runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
@@ -146,7 +146,7 @@ def solve_chain(
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
-                if damping > _HIGHEST and not (anyway and number):
+                if damping > _HIGHEST and not (accept_best and number):
                     raise
                 if damping > _HIGHEST:
                     return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
@@ -165,7 +165,7 @@ def solve_chain(
             damping *= _FACTOR
             if damping > _HIGHEST:
                 break
-        if damping > _HIGHEST and anyway:
+        if damping > _HIGHEST and accept_best:
             break
         if damping > _HIGHEST and not rough:
             raise FitError(FitStatus.NOT_STATIONARY)
@@ -174,9 +174,9 @@ def solve_chain(
             counted = weighing.correlation
             continue
         if distance < _STATIONARY:
-            runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
+            runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
             return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
-    if rough or anyway:
+    if rough or accept_best:
         return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
     raise FitError(FitStatus.MAX_STEPS)
 
@@ -195,15 +195,15 @@ def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
 
 
 def _gather(
-    chain: Chain,
+    problem: Problem,
     z: np.ndarray,
     columns_um: np.ndarray,
     runs: Sequence[Run],
     loss: str,
     free: bool,
     counted: tuple[float, ...],
-    even: float,
 ) -> tuple[Sequence[Run], list[RunSums], Weighing]:
+    chain = problem.chain
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
         # Outliers count linearly (Huber).
@@ -211,7 +211,8 @@ def _gather(
             replace(run, weight=huber_weight(residual, run.fitted)) for run, residual in zip(runs, left, strict=True)
         ]
     sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
-    return runs, sums, replace(Weighing.of(runs, [one.residual_um for one in sums], *counted), even=even)
+    weighing = Weighing.of(runs, [one.residual_um for one in sums], *counted)
+    return runs, sums, replace(weighing, least_noise_share=problem.least_noise_share)
 
 
 def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[Run]) -> list[np.ndarray]:

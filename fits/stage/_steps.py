@@ -55,7 +55,7 @@ class Plan:
     progress: Callable[[str], None]
     gain: float | None
     hold: Hold
-    anyway: bool
+    accept_best: bool
     shifts_s: tuple[float, ...] = ()
 
     def runs(self, stride: int) -> list[Run]:
@@ -127,18 +127,18 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     solved = replace(solved, hyper=hyper)
     problem = solved.onward
     try:
-        spare = refuse_unidentifiable(solved, drives, fast=fast != slow, spare=not plan.anyway)
+        dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
     except DataError:
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
-        lagging = None if plan.anyway or fast != slow else _lagging(plan, problem, runs, drives)
+        lagging = None if plan.accept_best or fast != slow else _lagging(plan, problem, runs, drives)
         if lagging is None:
             raise
         return lagging
-    if spare is not None:
+    if dropped is not None:
         # Begin without a mechanics that the runs do not show.
-        simpler = start_problem(plan, asked.without(spare), levels, finest)
-        remarks = (_no_resonance(plan, spare), *simpler.remarks)
-        return replace(simpler, even=_EVEN, remarks=remarks, full=solved)
+        simpler = start_problem(plan, asked.without(dropped), levels, finest)
+        remarks = (_no_resonance(plan, dropped), *simpler.remarks)
+        return replace(simpler, least_noise_share=_EVEN, remarks=remarks, full=solved)
     return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
 
 
@@ -163,7 +163,7 @@ def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence
     old: Any = stage[drivers[0]]
     simple = stage.without(mechanics[0]).swap(drivers[0], Driver(jnp.asarray(_LAG * interval_s), old.gain))
     simpler = Problem.of(simple, grid, problem.columns_um, problem.hyper, problem.stroke_um)
-    simpler = replace(simpler, even=_EVEN, remarks=(_no_resonance(plan, mechanics[0]),))
+    simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, mechanics[0]),))
     plan.progress("a lag without a resonance")
     try:
         solved = solve_chain(simpler, runs, plan.loss, plan.progress)
@@ -189,7 +189,7 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
     stride = 1
     while True:
         runs = plan.runs(stride)
-        solved = solve_chain(problem, runs, plan.loss, plan.progress, anyway=plan.anyway)
+        solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
         precision = Precision(solved)
         if plan.gain is None or stride > 1:
             return solved, precision

@@ -15,7 +15,7 @@ from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Prediction
 from fits.stage._moments import Chain, RunSums, along
 from fits.stage._run import prepare_program, simulate_stage
-from fits.stage._solve import Solved, prior_precision, scale_free
+from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._noise import WHITE, correlation_samples, shared_square
 from microid import Preisach, Stage
 
@@ -24,7 +24,7 @@ _LEVELS = 16
 # Autocovariances are trusted up to so many correlation times.
 _LAGS = 6.0
 # Precision, in scaled coordinates, that stands in for none.
-_FAINT = 1e-8
+_WEAK = 1e-8
 
 
 class StageUncertainty(AbstractUncertainty):
@@ -84,29 +84,21 @@ class Precision:
     def __init__(self, solved: Solved):
         self.chain, self.solved = solved.problem.chain, solved
         total = solved.weighing.total(solved.sums)
-        size, count = self.chain.size, len(solved.z)
+        size = self.chain.size
         self.variance = solved.weighing.least_um**2
         self.gram = np.asarray(total.gram) / self.variance
         self.prior = np.zeros_like(self.gram)
         if solved.hyper is not None:
             prior = prior_precision(self.chain, solved.hyper, solved.problem.stroke_um)
             self.prior[:size, :size] = scale_free(prior, solved.columns_um)
-        rest = np.arange(size), np.arange(size, size + count)
-        self.information = self._marginal(*rest)
-
-    def _marginal(self, columns: np.ndarray, own: np.ndarray) -> np.ndarray:
-        whole = self.gram + self.prior
-        if len(columns) == 0:
-            return whole
-        half = np.linalg.solve(np.linalg.cholesky(whole[np.ix_(columns, columns)]), whole[np.ix_(columns, own)])
-        return np.asarray(whole[np.ix_(own, own)] - half.T @ half)
+        self.information = marginal_information(total, size, self.prior[:size, :size], self.variance)
 
     def answer(self) -> np.ndarray:
         """Columns of the covariance that belong to the coordinates, shape `(D + p, p)`."""
         size, count = self.chain.size, len(self.solved.z)
         whole = self.gram + self.prior
         # Coordinates that nothing is known of must not spoil those that something is known of.
-        whole[np.arange(size, size + count), np.arange(size, size + count)] += _FAINT
+        whole[np.arange(size, size + count), np.arange(size, size + count)] += _WEAK
         return np.linalg.solve(whole, np.eye(size + count)[:, size:])
 
     def influence(self) -> list[np.ndarray]:
@@ -131,7 +123,7 @@ class Precision:
         """
         size, answer = self.chain.size, self.answer()
         # What nothing is known of stays unknown, whatever the residual.
-        held = answer[:size].T @ self.prior[:size, :size] @ answer[:size] + _FAINT * answer[size:].T @ answer[size:]
+        held = answer[:size].T @ self.prior[:size, :size] @ answer[:size] + _WEAK * answer[size:].T @ answer[size:]
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
             held = held + sandwich(own, np.sqrt(run.fit_weight) * one.residual_um, run.fitted)
         return held
@@ -149,7 +141,7 @@ class Precision:
             basis = interpolation(_LEVELS, self.chain.levels)
         whole = np.zeros((size + count, basis.shape[1] + count))
         whole[:size, : basis.shape[1]], whole[size:, basis.shape[1] :] = basis, np.eye(count)
-        precision = whole.T @ (self.gram + self.prior) @ whole + _FAINT * np.eye(whole.shape[1])
+        precision = whole.T @ (self.gram + self.prior) @ whole + _WEAK * np.eye(whole.shape[1])
         root = np.linalg.cholesky(precision)
         factor = np.linalg.solve(root, np.eye(len(root)))
         shared = float(np.mean([shared_square(one.residual_um[run.fitted]) for one, run in self._pairs()]))

@@ -16,13 +16,13 @@ class Weighing:
     """How much a sample of each run counts, by the standard deviation of the run's residual.
 
     So many samples as `correlation` are worth one independent one; `counted` is the same as the samples are counted.
-    No run counts as quieter than the part `even` of the loudest.
+    No run counts as quieter than the part `least_noise_share` of the loudest.
     """
 
     noise_um: tuple[float, ...]
     correlation: tuple[float, ...]
     counted: tuple[float, ...]
-    even: float = 0.0
+    least_noise_share: float = 0.0
 
     @classmethod
     def of(cls, runs: Sequence[Run], residuals: Sequence[np.ndarray], *counted: float) -> "Weighing":
@@ -43,7 +43,7 @@ class Weighing:
     @property
     def least_um(self) -> float:
         """The smallest noise, in which the joint problem is measured."""
-        return max(min(self.noise_um), self.even * max(self.noise_um))
+        return max(min(self.noise_um), self.least_noise_share * max(self.noise_um))
 
     @property
     def shares(self) -> list[float]:

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 _SLOTS = 4
-_DUST = 1e-14
+_NEGLIGIBLE = 1e-14
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _square_root(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Factor `gram = root' root` and solve `root' target = cross`, dropping directions that hold nothing."""
     value, vector = np.linalg.eigh(gram)
-    kept = value > _DUST * value[:, -1:]
+    kept = value > _NEGLIGIBLE * value[:, -1:]
     scale = np.sqrt(np.where(kept, value, 0.0))
     root = scale[:, :, None] * np.swapaxes(vector, 1, 2)
     seen = np.einsum("gij,gi->gj", vector, cross)
