@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
     from fits.diagnosis._result import Diagnosis, EffectParameter
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import bar_to_stderr, fraction_or_files, keep_inputs
+from fits.cli._files import answer, bar_to_stderr, fraction_or_files, keep_inputs, put_in
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -95,15 +94,12 @@ def diagnose(given: Given) -> None:
 
     content = diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)
-    if given.as_json:
-        click.echo(json.dumps({"out": given.out, "files": places, **content}, indent=1, allow_nan=False))
-    else:
-        click.echo("\n".join([*_lines(diagnosis), "", *places]))
+    answer(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
 
 
 def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[str]:
     """Write all files, or none; their names come back."""
-    from fits.io._atomic import write_csv
+    from fits.io._atomic import finite_json, write_csv
     from fits.io._limits import ranges_json
     from fits.report._diagnosis import report_html
     from fits.stage._model_file import model_text
@@ -123,7 +119,7 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
     # All are composed before the first is written.
     texts = {
         _REPORT: report_html(diagnosis),
-        _JSON: json.dumps(content, indent=1, allow_nan=False) + "\n",
+        _JSON: f"{finite_json(content)}\n",
         _BASELINE: model("baseline"),
         _EXTENDED: model("extended"),
     }
@@ -138,7 +134,7 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
         else:
             # One of an earlier diagnosis would pass for this one's.
             files.absent(Path(out) / _PROGRAM)
-    return [str(Path(out) / name) for name in (*texts, *([_PROGRAM] if ahead is not None else []))]
+    return put_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
 
 
 def _lines(diagnosis: "Diagnosis") -> list[str]:
