@@ -80,7 +80,7 @@ def answer(task: tuple[str, int, dict[str, Any]]) -> dict[str, Any]:
     hidden, seed, settings = task
     import fits
     from fits import diagnose
-    from fits.diagnosis._comparison import best_of
+    from fits.diagnosis._score import best_of
 
     names = () if hidden == "none" else tuple(hidden.split("+"))
     bench = hide(names, seed, settings)

@@ -9,16 +9,15 @@ from scipy.signal import lsim
 
 from data_synth._mechanics import Mechanics, Mode
 from fits import Record
-from fits.diagnosis import _comparison, _select
+from fits.diagnosis import _comparison, _joint_fit, _select
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._candidates import Bench, probes_of, scales_of
-from fits.diagnosis._comparison import INEXACT, Rival, best_of, compare_rivals
-from fits.diagnosis._law import Law
+from fits.diagnosis._comparison import MODEL_ERROR, Rival, compare_rivals, model_error
+from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._regression import regress
-from fits.diagnosis._score import score
-from fits.diagnosis._select import _inexact, select
+from fits.diagnosis._score import best_of, probes_of, scales_of, score
+from fits.diagnosis._select import select
 from fits.loop._design import Grid
 from fits.loop._run import prepare_run
 from fits.stage._fit import default_stage
@@ -128,11 +127,11 @@ def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(m
     ends = {"transport_delay": (10804.0, 10793.0), "sensor_lowpass": (10995.0, 10713.0), "aging": (10995.0, 10000.0)}
     forms = {form.name: form for form in EFFECTS}
 
-    def settled(bench, projector, model):
+    def fit_jointly(bench, projector, model):
         cost = ends[model.laws[0].form.name][1]
         return bench, projector, SimpleNamespace(cost=cost, criterion=lambda _: cost, possible=lambda _: True)
 
-    monkeypatch.setattr(_comparison, "settled", settled)
+    monkeypatch.setattr(_comparison, "fit_jointly", fit_jointly)
     fitted = [
         Rival(name, SimpleNamespace(laws=[SimpleNamespace(form=forms[name])]), cost, 0.0, cost)
         for name, (cost, _) in ends.items()
@@ -179,7 +178,7 @@ def test_hum_raises_no_bar_for_what_the_command_makes(rng):
     found = select(case.bench, case.projector, probes, 0.01, rng, lambda _: None)
     print({name: one.z for name, one in plain.items()}, [(cause.name, cause.z) for cause in found.causes])
     assert [cause.name for cause in found.causes] == ["mains_hum", "transport_delay"]
-    assert found.causes[1].z < INEXACT * found.causes[0].z
+    assert found.causes[1].z < MODEL_ERROR * found.causes[0].z
 
 
 def test_a_density_is_smooth_again_beside_the_cause(rng, monkeypatch):
@@ -201,8 +200,8 @@ def test_a_density_is_smooth_again_beside_the_cause(rng, monkeypatch):
         return np.linalg.norm(moved.columns_um - truth_um), float(one.model.effects(1)[0].delay_s)
 
     off, found_s = found()
-    monkeypatch.setattr(_select, "renewed", lambda *_: None)
-    monkeypatch.setattr(_select, "resmoothed", lambda *settled: settled)
+    monkeypatch.setattr(_select, "relearn_noise", lambda *_: None)
+    monkeypatch.setattr(_joint_fit, "relearn_smoothness", lambda *state: state)
     off_before, found_before_s = found()
     print(off, off_before, delay_s, found_s, found_before_s)
     assert off < 0.8 * off_before
@@ -215,7 +214,7 @@ def test_a_further_column_must_explain_more_beside_a_cause():
         for form in EFFECTS
         if (form.name, form.form) in {("cross_coupling", ""), ("slew_limit", "")}
     )
-    assert _inexact(column, {"thermal_drift"}) > _inexact(plain, {"thermal_drift"})
+    assert model_error(column, {"thermal_drift"}) > model_error(plain, {"thermal_drift"})
 
 
 @pytest.mark.parametrize(("z", "there"), [(8.0, True), (1.0, False)])

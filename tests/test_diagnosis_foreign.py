@@ -10,9 +10,9 @@ from optimistix import RESULTS
 from scipy.signal import fftconvolve, lsim
 
 from fits import Record, diagnose
-from fits.diagnosis._floor import Floor, pooled
+from fits.diagnosis._noise import Floor, pooled
+from fits.diagnosis._protocol import held_gain
 from fits.diagnosis._regression import _alive
-from fits.diagnosis._regulated import held_creep
 from fits.loop import _grid as grid
 from fits.loop._evidence import Posterior
 from fits.loop._run import known_samples
@@ -114,11 +114,11 @@ def test_creep_under_a_controller(rng):
     place = np.r_[np.zeros(100), np.linspace(0, 10, 200), np.full(4000, 10.0)]
     place = place + 0.003 * rng.standard_normal(len(place))
     record = Record(np.arange(len(place)) / rate, voltage, place, source="held.csv")
-    held = held_creep([record])
+    held = held_gain([record])
     assert held.gain_per_decade == pytest.approx(gain, rel=0.05)
     still = replace(record, voltage_V=np.r_[voltage[:300], np.full(4000, step)])
-    assert held_creep([still]) is None
-    assert held_creep([Record(np.arange(2500) / 50, SLOW_V, plays(SLOW_V), source="free.csv")]) is None
+    assert held_gain([still]) is None
+    assert held_gain([Record(np.arange(2500) / 50, SLOW_V, plays(SLOW_V), source="free.csv")]) is None
 
 
 def test_an_unknown_that_has_died_away_is_none():

@@ -12,14 +12,14 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from fits import Record
-from fits.diagnosis import _evaluate
-from fits.diagnosis._candidates import Probe
-from fits.diagnosis._evaluate import drop_programs
-from fits.diagnosis._floor import band_of, floor_of, jitter_s, spikes
+from fits.diagnosis import _effects
+from fits.diagnosis._effects import drop_programs
+from fits.diagnosis._noise import floor_of, jitter_s, spikes
 from fits.diagnosis._projector import Projector, learn_roughness
-from fits.diagnosis._score import Family, evidence, score
+from fits.diagnosis._score import Family, Probe, evidence, score
 from fits.stage._motion import pass_signal
 from fits.stats._at_rest import quantum_um
+from fits.stats._narrow_band import band_of
 from fits.stats._whiten import Noise, learn_noise
 from microid import EFFECTS, AbstractPart, Scene, Signal
 
@@ -273,7 +273,7 @@ def test_evidence_beside_a_misfit_is_worth_less(rng):
 
 
 def test_programs_make_room_where_records_are_long_and_those_of_the_host_stay(monkeypatch):
-    monkeypatch.setattr(_evaluate, "_MANY", 10**6)
+    monkeypatch.setattr(_effects, "_MANY", 10**6)
     hosts = []
 
     @jax.jit

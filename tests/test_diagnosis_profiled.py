@@ -9,11 +9,9 @@ from scipy.signal import lfilter
 from test_diagnosis_comparison import NOISE_UM, stage_on
 
 from fits import Record
-from fits.diagnosis._candidates import Bench
-from fits.diagnosis._findings import _parameters
-from fits.diagnosis._joint_fit import released
-from fits.diagnosis._law import Law
-from fits.diagnosis._profiled import profiled
+from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._findings import _parameters, profile_likelihood
+from fits.diagnosis._joint_fit import leave_bounds
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
@@ -59,7 +57,7 @@ def replace_(record, displacement_um):
 def followed(case):
     law, x = case.model.laws[0], case.model.x[0]
     covariance = case.model.covariance()
-    along = profiled(case.bench, case.projector, case.model, 0, covariance)
+    along = profile_likelihood(case.bench, case.projector, case.model, 0, covariance)
     return covariance, along, [law.effect(there, 0) for _, there in along], law, x
 
 
@@ -132,7 +130,7 @@ def test_what_ended_at_its_bound_is_tried_weaker_where_the_baseline_follows(way,
     freed = at_slope(way * 0.7, way * 0.7)[:2]
     monkeypatch.setattr("fits.diagnosis._joint_fit._follow", lambda *_: freed)
     assert stuck[-1].laws[0].pinned(stuck[-1].x[0])
-    *at, model = released(*stuck, False)
+    *at, model = leave_bounds(*stuck, False)
     assert float(model.laws[0].effect(model.x[0], 0).slope) == pytest.approx(way * 0.7, abs=1e-3)
     assert tuple(at) == freed
 
@@ -141,10 +139,10 @@ def test_at_a_bound_where_weaker_is_worse_it_stays(monkeypatch):
     stuck = at_slope(0.9 - 1e-9, 1.0)
     worse = at_slope(0.9 - 1e-9, 5.0)[:2]
     monkeypatch.setattr("fits.diagnosis._joint_fit._follow", lambda *_: worse)
-    assert released(*stuck, False) == stuck
+    assert leave_bounds(*stuck, False) == stuck
 
 
 def test_what_is_not_at_its_bound_stays(monkeypatch):
     inside = at_slope(0.7, 2.0)
     monkeypatch.setattr("fits.diagnosis._joint_fit._follow", lambda *_: at_slope(0.5, 0.5)[:2])
-    assert released(*inside, False) == inside
+    assert leave_bounds(*inside, False) == inside

@@ -9,16 +9,13 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lsim
 
 from fits import Record
-from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._candidates import Bench
-from fits.diagnosis._evaluate import simulate, with_effects
-from fits.diagnosis._joint_fit import settled
-from fits.diagnosis._law import Law
+from fits.diagnosis._baseline import Baseline, simulate, with_effects
+from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._joint_fit import fit_jointly
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
-from fits.diagnosis._regression import regress
-from fits.diagnosis._tangent import passed
+from fits.diagnosis._regression import passed, regress
 from fits.loop._design import Grid
 from fits.loop._run import prepare_run
 from fits.stage._fit import default_stage
@@ -158,7 +155,7 @@ def test_a_driver_that_was_fitted_away_comes_back_beside_the_cause(rng):
 
     def from_(start):
         bench, projector = Bench(start), Projector(regress(start), [Noise(0.01, np.zeros(0))] * 2)
-        found, _, model = settled(bench, projector, refit(bench, projector, [law], [law.start], 4))
+        found, _, model = fit_jointly(bench, projector, refit(bench, projector, [law], [law.start], 4))
         print(truth.z, found.baseline.z, float(late.rate_ppm), float(model.effects(1)[0].rate_ppm), model.cost)
         return found.baseline.z[0], model.cost
 

@@ -8,8 +8,7 @@ import pytest
 from test_diagnosis_tangent import baseline_of
 
 from fits import FitError, Record, diagnose
-from fits.diagnosis._candidates import Bench
-from fits.diagnosis._law import Law
+from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress

@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import replace
+from typing import get_args
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ from _models import compiled
 from scipy import signal
 
 import microid as m
-from fits.diagnosis._candidates import without_drifts
+from fits.diagnosis._effects import without_drifts
 from microid import effects as fx
 from microid._part import Scene, Signal
 from microid.effects._base import host
@@ -200,6 +201,34 @@ def test_what_is_known_of_it_is_whole(effect):
     assert effect.fingerprint.endswith(".")
     fields = {info.path.rpartition(".")[2] for info in m.parameter_table(examples(effect)[0])}
     assert set(effect.strength) <= fields
+    assert effect.view in get_args(fx.View)
+    assert effect.statistic in get_args(fx.Statistic)
+    # What changes the mean is probed, and what does not is measured.
+    assert bool(effect.statistic) == (effect.place == "noise")
+    assert effect.delay in ("", *effect.strength)
+    # Forms of one effect are spoken of alike.
+    first = fx.card_of(effect.name)
+    for field in (
+        "fingerprint",
+        "confusions",
+        "experiment",
+        "view",
+        "column",
+        "statistic",
+        "independent",
+        "universal",
+    ):
+        assert getattr(effect, field) == getattr(first, field), field
+
+
+def test_a_card_is_found_by_the_name_of_its_effect():
+    assert {fx.card_of(name) for name, _ in BY_NAME} <= set(fx.EFFECTS)
+    with pytest.raises(LookupError, match="nothing"):
+        fx.card_of("nothing")
+    # Each statistic of the noise has one effect, and one of all is a pure delay.
+    measured = [effect.statistic for effect in fx.EFFECTS if effect.statistic]
+    assert sorted(measured) == sorted(set(get_args(fx.Statistic)) - {""})
+    assert len([effect for effect in fx.EFFECTS if effect.delay]) == 1
 
 
 def test_all_effects_together_stand_in_the_order_of_the_signal(rng):

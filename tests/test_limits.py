@@ -7,9 +7,8 @@ from _seed import seed_of
 import data_synth
 import fits
 from fits import DataError, Record
-from fits.diagnosis._inside import Guard, Model
-from fits.diagnosis._path import limits_of
-from fits.diagnosis._programs import menu
+from fits.diagnosis._programs import limits_of, menu
+from fits.diagnosis._safe import Guard, Model
 from fits.io._limits import (
     Extreme,
     allowed,

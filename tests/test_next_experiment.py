@@ -9,18 +9,16 @@ import pytest
 import data_synth
 from fits import Record
 from fits.diagnosis import _baseline
-from fits.diagnosis._candidates import Bench, probes_of, scales_of
 from fits.diagnosis._comparison import Rival
-from fits.diagnosis._experiment import Wish, _open, refine, suggest
-from fits.diagnosis._law import Law, law_of
-from fits.diagnosis._path import Limits, limits_of, paces
+from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._experiment import Request, open_question, refine, suggest
 from fits.diagnosis._predict import Hypothesis, Predictor
-from fits.diagnosis._programs import Program, menu
+from fits.diagnosis._programs import Limits, Program, limits_of, menu, paces
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._result import FoundCause
-from fits.diagnosis._score import score
+from fits.diagnosis._score import law_of, probes_of, scales_of, score
 from fits.diagnosis._select import Cause, select
 from fits.loop._run import prepare_run
 from fits.stats._whiten import Noise
@@ -214,7 +212,7 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     rival = Rival("thermal_drift", drift, drift.criterion(count), 0.0, drift.cost)
     ambiguous = replace(plain, causes=(Cause("creep", 9.0, 1e-9, (rival,), 81.0),), model=creep)
     told = []
-    experiment = suggest(made, ambiguous, (found_cause("creep", "thermal_drift"),), Wish(), told.append)
+    experiment = suggest(made, ambiguous, (found_cause("creep", "thermal_drift"),), Request(), told.append)
     assert experiment is not None
     assert experiment.separates == ("creep", "thermal_drift")
     assert "temperature" in experiment.extra_column
@@ -229,12 +227,12 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     assert predictor.predicted_z(*program) == pytest.approx(expected, rel=0.01)
     # Without a cause, what has the largest score is suspected, unless chance explains it.
     alone = replace(plain, causes=(), model=plain.plain, left=plain.scores)
-    names, (suspect, nothing), pairs = _open(made, alone, ())
+    names, (suspect, nothing), pairs = open_question(made, alone, ())
     assert names == suspect.names == (max(plain.scores, key=lambda one: one.z).name,)
     assert nothing.laws == ()
     assert pairs == ((0, 1),)
     quiet = tuple(replace(one, z=0.5) for one in plain.left)
-    assert _open(made, replace(alone, left=quiet), ()) is None
+    assert open_question(made, replace(alone, left=quiet), ()) is None
     # What it says on the bench.
     again = measured(bench.play(*program, np.random.default_rng(seed)))
     both = ready([first, again], noise_um)
@@ -242,4 +240,4 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     assert after.causes[0].name == "creep"
     assert not after.causes[0].rivals
     # Nothing is open any more.
-    assert suggest(both, after, (found_cause("creep", ""),), Wish(), told.append) is None
+    assert suggest(both, after, (found_cause("creep", ""),), Request(), told.append) is None

@@ -62,7 +62,7 @@ EFFECT = '''
     from jaxtyping import Array, Float
     from microid._param import param
     from microid._part import Signal
-    from microid.effects._base import AbstractEffect, Place, register
+    from microid.effects._base import AbstractEffect, Place, View, register
 
     @register
     class WrongGain(AbstractEffect):
@@ -76,6 +76,8 @@ EFFECT = '''
         confusions: ClassVar[tuple[str, ...]] = ()
         experiment: ClassVar[str] = "A reference sensor."
         source: ClassVar[str] = "a test"
+        view: ClassVar[View] = "position"
+        column: ClassVar[str] = "gauge_um: a second sensor."
         excess: Float[Array, ""] = param(unit="1", scale=1e-2)
 
         @classmethod
@@ -330,3 +332,32 @@ def test_a_kind_of_sweep_is_one_file(copy):
     (copy / "double.toml").write_text(text)
     python(copy, "-m", "fits", "sweep", "double.toml", "--out", "doubled")
     assert pd.read_parquet(copy / "doubled" / "results.parquet")["twice_um"].tolist() == [2, 4, 10]
+
+
+REPORT = """
+import numpy as np, fits
+from fits.diagnosis._experiment import further_column
+from fits.diagnosis._findings import described
+from fits.diagnosis._result import Diagnosis, Gain, RunView
+from fits.report._diagnosis import report_html
+from microid.effects import card_of
+cause = described(card_of("wrong_gain"), ("creep",), 9.0, 1e-9, (), 1.0, 0.1)
+time_s = 0.01 * np.arange(400)
+voltage_V = 50 - 50 * np.cos(time_s)
+run = RunView("run.csv", time_s, voltage_V, voltage_V / 5, voltage_V / 900, 0 * voltage_V, voltage_V < 99)
+stage = fits.default_stage()
+found = Diagnosis("effect_found", 0.01, "", 1.0, (cause,), 0.0, (), (), Gain(), None, (), stage, stage, (run,), 0.01)
+open("report.html", "w").write(report_html(found))
+print(fits.diagnosis_json(found)["causes"][0]["fingerprint"])
+print(further_column(("wrong_gain",), ()))
+"""
+
+
+def test_the_card_of_an_effect_reaches_the_report(copy):
+    said = python(copy, "-c", REPORT).splitlines()
+    assert said == ["The residual is proportional to the displacement.", "gauge_um: a second sensor."]
+    page = (copy / "report.html").read_text(encoding="utf-8")
+    assert "Wrong gain explains" in page
+    assert said[0] in page
+    assert "Residual against measured displacement" in page
+    assert "Source: a test." in page

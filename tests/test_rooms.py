@@ -5,6 +5,8 @@ import ast
 import pytest
 from test_architecture import ROOT, imports, relative
 
+import microid
+
 # The rooms of `fits`; each may import from those before it.
 ROOMS = (
     "io",
@@ -45,6 +47,21 @@ def test_rooms_of_fits_import_only_those_below(path):
     # Pictures are drawn in one room alone.
     drawn = "matplotlib" in {name for name, _ in imports(ast.parse(path.read_text(encoding="utf-8")))}
     assert room == "plots" or not drawn, f"{relative(path)} imports matplotlib"
+
+
+def test_no_effect_is_known_by_its_name_in_fits():
+    """What is known of an effect stands on its card, in its own file."""
+    names = {effect.name for effect in microid.EFFECTS}
+    # A name of one word may also be a word of a sentence.
+    compound = {name for name in names if "_" in name}
+    assert len(compound) > 10
+    for path in (ROOT / "fits").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found = {name for name in compound if name in node.value} | ({node.value} & names)
+                assert not found, f"{relative(path)}:{node.lineno} names {', '.join(found)}"
+            imported = getattr(node, "module", None) if isinstance(node, ast.ImportFrom) else None
+            assert not (imported or "").startswith("microid.effects."), f"{relative(path)} imports from {imported}"
 
 
 def test_rooms_are_what_the_folder_shows():

@@ -1,4 +1,4 @@
-"""The plain stage that a diagnosis starts from, fitted to all runs, and its regression."""
+"""The plain stage that a diagnosis starts from, fitted to all runs, and its simulation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,20 +8,19 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from fits.diagnosis._evaluate import simulate
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns.path import PATH
 from fits.loop._choose_grid import choose_grid
-from fits.loop._design import columns_of
 from fits.loop._prior import roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, prepare_run
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._moments import Chain
+from fits.stage._motion import prepare, signals
 from fits.stage._solve import prior_precision
 from fits.stats._whiten import rough_noise_um
-from microid import Hold, Preisach, Stage
+from microid import AbstractEffect, Hold, Stage, extend, host
 
 # What a finer grid would follow has a prior of its own in the projection.
 _FINEST = 32
@@ -33,7 +32,7 @@ _FINE, _FINE_STEPS, _OFF = 16, 64, 1.0
 
 
 class Fixed(eqx.Module):
-    """Coordinates of a stage of which nothing but the grid moves."""
+    """Coordinates of a stage of which only the grid is fitted."""
 
     stage: Stage
     size: int = eqx.field(static=True, default=0)
@@ -45,38 +44,14 @@ class Fixed(eqx.Module):
 
 @dataclass(frozen=True)
 class Baseline:
-    """A fitted plain stage.
+    """A fitted plain stage, and the runs prepared with several numbers of steps between samples.
 
-    Attributes
-    ----------
-    chain
-        The stage in the coordinates of its fit.
-    z, columns_um
-        Where that ended.
-    prior
-        Precision of the columns before the data, in 1/um^2, shape `(D, D)`.
-    stroke_um
-        Range of the displacement.
-    range_V
-        Range of the commands.
-    runs
-        Prepared; what is held out of each is not fitted.
-    aside
-        Whole runs that are held out.
-    coarse, coarse_aside
-        The same with few steps between the samples: what effects change is seen well enough there.
-    finest, finest_aside
-        The same with many steps, for effects that need them.
-    fine, fine_aside
-        The same with so many steps that the plain stage's own simulation is exact within the noise.
-    dynamic
-        Whether driver and mechanics were fitted.
-    remarks
-        What the user should know, one sentence each.
-    skewed
-        Whether the readings of a run may be late or early by a small part of the sampling interval.
-    blurred
-        Whether instants jitter, so that in the mean a run reads its second derivative, too.
+    `chain` holds its coordinates, `z` and `columns_um` (um) where the fit ended, and `prior` the precision of the
+    columns before the data (1/um^2, shape `(D, D)`). `aside` are whole runs that are held out; of `runs` a part is.
+    Of both there are copies: `coarse` with few steps, enough for what effects change; `finest` with many; `fine` with
+    so many that the plain stage is exact within the noise. `dynamic` says whether driver and mechanics were fitted,
+    `skewed` that the readings of a run may be late or early by a small part of the sampling interval, and `blurred`
+    that instants jitter, so that in the mean a run reads its second derivative, too.
     """
 
     chain: Chain
@@ -107,6 +82,32 @@ class Baseline:
         """The same at other coordinates and columns."""
         return replace(self, z=self.z + dz, columns_um=self.columns_um + dcolumns_um)
 
+    def alone(self, run: Run) -> "Baseline":
+        """The same with one run only; what is known of the columns beforehand counts with the others."""
+        made, none = (run,), ()
+        here = replace(self, prior=np.eye(1), runs=made, coarse=made, finest=made, fine=made)
+        return replace(here, aside=none, coarse_aside=none, finest_aside=none, fine_aside=none)
+
+
+def simulate(stage: Stage, run: Run) -> np.ndarray:
+    """Response of a stage to a run that is refined already, in um, shape `(n,)`."""
+    values = signals(stage.with_substeps(1), prepare(stage, run))[-1].values
+    return np.asarray(values)[:: run.samples.stride][: len(run.record)]
+
+
+def along_curves(run: Run) -> Run:
+    """The same run, its command along curves between the samples."""
+    return replace(run, hold="smooth")
+
+
+def with_effects(stage: Stage, effects: Sequence[AbstractEffect]) -> Stage:
+    """Put effects into a stage, those that act on a part around that part."""
+    for effect in effects:
+        place = host(type(effect), stage)
+        own = effect if place is None else replace(effect, inner=stage.parts[place])  # type: ignore[call-arg]
+        stage = extend(stage, own)
+    return stage
+
 
 def fit_baseline(
     records: Sequence[Record],
@@ -118,7 +119,7 @@ def fit_baseline(
 ) -> Baseline:
     """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
 
-    The command runs in lines between samples, or with another `hold` in steps or curves, as in `Stage`.
+    `hold` says how the command runs between samples, as in `Stage`.
 
     Raises
     ------
@@ -140,30 +141,20 @@ def fit_baseline(
     stride = solved.runs[0].stride
 
     def prepared(many: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
-        return (
-            _prepared(records, range_V, initial, holdout, many, hold),
-            _prepared(aside, range_V, initial, 0.0, many, hold),
-        )
+        held = _prepared(aside, range_V, initial, 0.0, many, hold)
+        return _prepared(records, range_V, initial, holdout, many, hold), held
 
     # What a step starts is over soon, and slow runs sample it sparsely.
     many = _FINE_STEPS if hold == "zero" else _FINE
     (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, many))
     return Baseline(
-        chain,
-        solved.z,
-        solved.columns_um,
-        prior,
-        stroke_um,
-        range_V,
-        runs,
-        held,
+        *(chain, solved.z, solved.columns_um, prior, stroke_um, range_V, runs, held),
         *prepared(min(stride, _COARSE)),
-        finest,
-        finest_held,
-        tuple(map(partial(_finely, solved.stage), runs, finest)),
-        tuple(map(partial(_finely, solved.stage), held, finest_held)),
-        True,
-        solved.problem.remarks,
+        *(finest, finest_held),
+        tuple(map(partial(_with_enough_steps, solved.stage), runs, finest)),
+        tuple(map(partial(_with_enough_steps, solved.stage), held, finest_held)),
+        dynamic=True,
+        remarks=solved.problem.remarks,
     )
 
 
@@ -190,7 +181,7 @@ def _prepared(
     return tuple(prepare_run(record, range_V, initial, holdout, stride, hold=hold) for record in records)
 
 
-def _finely(stage: Stage, run: Run, finer: Run) -> Run:
+def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:
     """Divide intervals into many steps where a simulation with those of the fit is off by more than chance."""
     if run.samples.stride >= finer.samples.stride:
         return run
@@ -209,28 +200,13 @@ def _static(
     remarks: tuple[str, ...],
     progress: Callable[[str], None],
 ) -> Baseline:
-    runs = [prepare_run(record, range_V, initial, holdout) for record in records]
-    stroke, tried, _ = choose_grid(runs, None, progress, _FINEST)
+    loops = [prepare_run(record, range_V, initial, holdout) for record in records]
+    stroke, tried, _ = choose_grid(loops, None, progress, _FINEST)
     grid = tried.data.grid
     columns = np.asarray(tried.solution.columns) * stroke
     stage = Stage.of(hysteresis=grid.model(columns, np.zeros(())))
     chain = Chain(Fixed(stage), 0, grid)  # type: ignore[arg-type]
     prior = np.asarray(roughness(grid.levels).precision(tried.solution.hyper)) / stroke**2
     ready, held = _prepared(records, range_V, initial, holdout, 1), _prepared(aside, range_V, initial, 0.0, 1)
-    return Baseline(
-        chain,
-        np.zeros(0),
-        columns,
-        prior,
-        stroke,
-        range_V,
-        *(ready, held) * 4,
-        False,
-        remarks,
-    )
-
-
-def columns_in(stage: Stage) -> np.ndarray:
-    """Columns of the grid of a stage, in um."""
-    law = next(part for part in stage.parts if isinstance(part, Preisach))
-    return np.asarray(columns_of(law))
+    same = (ready, held) * 4
+    return Baseline(chain, np.zeros(0), columns, prior, stroke, range_V, *same, dynamic=False, remarks=remarks)

@@ -1,20 +1,21 @@
-"""Which of the effects that explain most explains the records best, each fitted."""
+"""Which of the effects that explain most explains the records best, each fitted, and what is not told from it."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits.diagnosis._candidates import Bench
-from fits.diagnosis._joint_fit import settled
+from fits.diagnosis._effects import Bench
+from fits.diagnosis._joint_fit import State, fit_jointly
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
-from fits.diagnosis._score import Scored, rescore
+from fits.diagnosis._score import Probe, Scored, best_of, rescore, score
+from microid import EFFECTS, AbstractEffect
 
 # Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
 _LEADERS, _FORMS = 5, 2
 # Scores below this share of the best are not worth a fit, or below that of an effect that the best is mistaken for.
-WORTH, _CONFUSED = 0.4, 0.2
+WORTH, _OF_CONFUSED = 0.4, 0.2
 # Differences of the criterion, and standard deviations after projecting one effect off another, within which two
 # effects are not told apart.
 SAME, _APART = 10.0, 4.0
@@ -22,13 +23,20 @@ SAME, _APART = 10.0, 4.0
 # mistaken for may be behind before: the plain stage has already given way to the one and not to the other.
 _NEAREST, _BEHIND = 4, 0.1
 # Part of a cause's signature by which its model may be off.
-INEXACT = 0.06
+MODEL_ERROR = 0.06
 # An effect that makes the square of the errors in what was held out so many times larger is none, and one with
 # little evidence against the rest of the misfit is one if it makes it so much smaller.
 _WORSE, _BETTER, _SHOWN = 1.2, 0.85, 1.0
 # Evidence that a cause must have against what else is left, in standard deviations; and what is beyond doubt: so
 # many of them, and so much of what there is to be explained. A second cause may show in what was held out most.
 _SURE, _PLAIN, _MOST = 3.0, 30.0, 0.5
+# Standard deviations beyond which effects are told apart if one of them leaves no more than noise.
+_CLEAR = 5.0
+# Part of a cause's signature by which its model may be off along its confusions, and along any column of the records:
+# what is slow in both agrees by chance.
+_CONFUSED_ERROR, _COLUMN_ERROR = 0.6, 0.15
+# Scores above this share of the best may be those of the cause, if so much of what it explains is left for another.
+_NEAR, _FURTHER = 0.95, 0.15
 
 
 @dataclass(frozen=True)
@@ -41,13 +49,10 @@ class Rival:
     apart: float
     cost: float
 
-
-def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
-    """The highest score of each effect, the highest first."""
-    found: dict[str, Scored] = {}
-    for one in sorted(scores, key=lambda s: -s.z):
-        found.setdefault(one.name, one)
-    return found
+    @property
+    def form(self) -> type[AbstractEffect]:
+        """Which model of it."""
+        return self.refit.laws[-1].form
 
 
 def compare_rivals(
@@ -57,12 +62,11 @@ def compare_rivals(
     best = best_of(scores)
     top = max(one.z for one in scores)
     first = next(iter(best.values())).form
-    names = [name for name, one in best.items() if one.z > (_CONFUSED if name in first.confusions else WORTH) * top][
-        :_LEADERS
-    ]
+    worth = {name: (_OF_CONFUSED if name in first.confusions else WORTH) * top for name in best}
+    names = [name for name, one in best.items() if one.z > worth[name]][:_LEADERS]
     fitted: dict[str, Refit] = {}
     bare = Projector(projector.regression, projector.noise)
-    before = bare.ahead(model.change_um)
+    before = bare.held_out_error(model.change_um)
     for name in names:
         own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
         tried: dict[type, int] = {}
@@ -75,7 +79,7 @@ def compare_rivals(
             if not all(np.all(np.isfinite(change)) for change in found.change_um):
                 continue
             # What does not stand out of the rest of the misfit must show in what was kept aside.
-            plain = one.sure > (_SURE if one.z > 2 * INEXACT * explained else 2 * _SURE)
+            plain = one.sure > (_SURE if one.z > 2 * MODEL_ERROR * explained else 2 * _SURE)
             most = _WORSE if plain else _BETTER
             if one.sure > _PLAIN and model.cost - found.cost > _MOST * (model.cost - projector.count):
                 most = np.inf
@@ -83,26 +87,25 @@ def compare_rivals(
             if not found.determined(alone=alone):
                 # Of what is only there, what was kept aside must show something, too.
                 most = _SHOWN
-            ahead = bare.ahead(found.change_um)
-            if ahead > most * before or not found.determined(False, alone) or not _whole(bench, found):
+            if (
+                bare.held_out_error(found.change_um) > most * before
+                or not found.determined(False, alone)
+                or not _has_occurred(bench, found)
+            ):
                 continue
-            found = _counted(bench, projector, found, own, len(model.laws) + laws)
+            found = _add_occurrences(bench, projector, found, own, len(model.laws) + laws)
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
-    return _ranked(
-        bench,
-        projector,
-        [Rival(name, one, one.criterion(projector.count), 0.0, one.cost) for name, one in fitted.items()],
-        model.cost,
-    )
+    rivals = [Rival(name, one, one.criterion(projector.count), 0.0, one.cost) for name, one in fitted.items()]
+    return _ranked(bench, projector, rivals, model.cost)
 
 
-def _counted(bench: Bench, projector: Projector, found: Refit, own: Sequence[Scored], most: int) -> Refit:
-    """Add what happens one at a time, as a loss of samples, for as long as that pays: several look like a drift."""
+def _add_occurrences(bench: Bench, projector: Projector, found: Refit, own: Sequence[Scored], most: int) -> Refit:
+    """Add occurrences of what is counted, as a loss of samples, while that pays: several look like a drift."""
     first = len(found.laws) - 1
     while found.laws[-1].form.counted and len(found.laws) < most:
         more = _one_more(bench, projector, found, own)
-        if not (more.determined() and _whole(bench, more)):
+        if not (more.determined() and _has_occurred(bench, more)):
             break
         if more.criterion(projector.count) > found.criterion(projector.count) - SAME:
             break
@@ -137,7 +140,7 @@ def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: flo
     if len(near) < 2:
         return order
     for one in near:
-        end = settled(bench, projector, one.refit)[-1]
+        end = fit_jointly(bench, projector, one.refit)[-1]
         if not end.possible(bench):
             order.remove(one)
             continue
@@ -145,12 +148,7 @@ def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: flo
     return sorted(order, key=lambda one: one.criterion)
 
 
-def tolerance(drop: float) -> float:
-    """Standard deviations within which an effect is another that takes so much off the sum of squares."""
-    return max(_APART, 2 * INEXACT * max(drop, 0.0) ** 0.5)
-
-
-def _whole(bench: Bench, model: Refit) -> bool:
+def _has_occurred(bench: Bench, model: Refit) -> bool:
     """Whether what is counted in sampling intervals is nearer to one than to none in some run, for the last law."""
     law, x = model.laws[-1], model.x[-1]
     found = not law.form.counted
@@ -159,3 +157,72 @@ def _whole(bench: Bench, model: Refit) -> bool:
         effect = law.effect(x, run)
         found = found or any(abs(float(getattr(effect, name))) > interval_s / 2 for name in law.form.counted)
     return found
+
+
+def choose_cause(
+    bench: Bench,
+    projector: Projector,
+    probes: Sequence[Probe],
+    model: Refit,
+    fitted: Sequence[Rival],
+    scores: Mapping[str, Scored],
+    closed: Collection[str],
+) -> tuple[Rival, State]:
+    """Choose the cause: the best, or among those about as good the one beside which another explains most.
+
+    Where two causes act, one that is neither may follow part of each and come first. None comes twice of those that
+    are `closed`.
+    """
+    best, chosen = fitted[0], fit_jointly(bench, projector, fitted[0].refit)
+    highest = max(scores[one.name].z for one in fitted)
+    near = [one for one in fitted if scores[one.name].z > _NEAR * highest]
+
+    def further(one: Rival, at: State) -> tuple[float, float]:
+        there, beside, own = at
+        basis = own.basis()
+        left = rescore(score(beside, probes, own.residual), basis, own.residual)
+        others = [other for other in left if other.name != one.name and other.name not in closed]
+        if not others:
+            return 0.0, own.cost
+        next_ = max(others, key=lambda other: other.z)
+        _, _, pair = fit_jointly(there, beside, refit_beside(there, beside, own, next_))
+        return next_.z, min(own.cost, pair.cost)
+
+    if len(near) < 2 or best not in near:
+        return best, chosen
+    left, cost = further(best, chosen)
+    if left < _FURTHER * max(model.cost - chosen[-1].cost, 0.0) ** 0.5:
+        return best, chosen
+    for one in near:
+        if one is best:
+            continue
+        trial = fit_jointly(bench, projector, one.refit)
+        _, pair = further(one, trial)
+        if pair < cost - SAME:
+            best, chosen, cost = one, trial, pair
+    return best, chosen
+
+
+def indistinguishable(first: Rival, fitted: Sequence[Rival], drop: float, exact: bool) -> tuple[Rival, ...]:
+    """Effects that explain the same about as well as the cause, which takes so much off the sum of squares."""
+    found = []
+    # A model that leaves no more than noise is off by little.
+    most = min(tolerance(drop), _CLEAR) if exact else tolerance(drop)
+    for other in fitted:
+        # What the cause explains beyond the other: no more than models of effects are off by.
+        apart = max(other.cost - first.cost, 0.0) ** 0.5
+        if other is not first and (other.criterion - first.criterion < SAME or apart < most):
+            found.append(replace(other, apart=apart))
+    return tuple(found)
+
+
+def tolerance(drop: float) -> float:
+    """Standard deviations within which an effect is another that takes so much off the sum of squares."""
+    return max(_APART, 2 * MODEL_ERROR * max(drop, 0.0) ** 0.5)
+
+
+def model_error(one: Scored, causes: Collection[str]) -> float:
+    """Part of what some causes explain that an effect beside them must exceed, by what it is mistaken for."""
+    if any(f.name in causes and (one.name in f.confusions or f.name in one.form.confusions) for f in EFFECTS):
+        return _CONFUSED_ERROR
+    return _COLUMN_ERROR if one.form.needs else MODEL_ERROR

@@ -1,19 +1,19 @@
 """From records to a diagnosis: what is wrong, why, and what is gained by adding it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import jax
 import numpy as np
 
 from fits.diagnosis._conclude import conclude
-from fits.diagnosis._experiment import Wish
-from fits.diagnosis._prepare import HOLDS, Prepared, prepare_diagnosis
+from fits.diagnosis._experiment import Request
+from fits.diagnosis._prepare import HOLDS, Prepared, Reading, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis
 from fits.diagnosis._select import Selection, select
 from fits.diagnosis._steps import Step
-from fits.diagnosis._virgin import VirginCurveError
 from fits.io._errors import DataError
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import Record, refuse_repeats
@@ -29,6 +29,71 @@ _ALL = (
     "what was held out is predicted far worse than noise allows, and the causes show only there: it was used to find "
     "them, so that the gain is not measured on new data"
 )
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What a selection found in one reading of the records; None where runs begin on an initial curve."""
+
+    ready: Prepared
+    found: Selection | None
+
+
+@dataclass(frozen=True)
+class _Question:
+    """A doubt about the reading of the records: when it arises, how they are read instead, and which is kept."""
+
+    said: str
+    arises: Callable[[_Answer], bool]
+    changes: Mapping[str, Any]
+    is_better: Callable[[_Answer, _Answer], bool]
+    remark: str = ""
+
+
+def _not_in_lines(answer: _Answer) -> bool:
+    found = answer.found
+    return found is not None and answer.ready.doubted and not found.model.is_noise(found.projector)
+
+
+def _leaves_less(other: _Answer, answer: _Answer) -> bool:
+    return other.found is not None and answer.found is not None and other.found.left_um < answer.found.left_um
+
+
+def _held_out_is_unlike(answer: _Answer) -> bool:
+    found, ready = answer.found, answer.ready
+    if found is None or found.causes or ready.reading.aside:
+        return False
+    return ready.projector.held_out_error(found.model.change_um) > _UNLIKE
+
+
+def _finds_a_cause(other: _Answer, _: _Answer) -> bool:
+    causes = other.found.causes if other.found is not None else ()
+    return max((cause.z for cause in causes), default=0.0) > _STRONG
+
+
+def _questions() -> tuple[_Question, ...]:
+    """What is asked of each answer, in this order."""
+    return (
+        _Question(
+            "asking again without the initial curve of each run",
+            lambda answer: answer.found is None,
+            {"initial": VIRGIN, "guessed": False},
+            lambda *_: True,
+        ),
+        _Question(
+            "asking again with the command in lines between samples",
+            _not_in_lines,
+            {"holds": HOLDS[:1]},
+            _leaves_less,
+        ),
+        _Question(
+            "asking again with what was held out, which noise does not explain",
+            _held_out_is_unlike,
+            {"aside": (), "fraction": 0.0, "guessed": False, "holds": HOLDS},
+            _finds_a_cause,
+            _ALL,
+        ),
+    )
 
 
 def diagnose(
@@ -101,31 +166,23 @@ def diagnose(
         raise DataError(f"expected limits of {', '.join(UNITS)} and a margin of 0 or more; correct them")
     refuse_repeats([*records, *aside])
     rng = np.random.default_rng(seed)
-    ready = prepare_diagnosis(records, aside, fraction, initial, progress)
 
-    def selected(ready: Prepared, guessed: bool) -> Selection:
+    def answer(reading: Reading) -> _Answer:
+        ready = prepare_diagnosis(reading, progress)
         progress(Step.SELECTION)
-        return select(ready.bench, ready.projector, ready.probes, false_alarm, rng, progress, guessed)
+        stage = ready.bench, ready.projector, ready.probes
+        return _Answer(ready, select(*stage, false_alarm, rng, progress, reading.guessed))
 
-    try:
-        found = selected(ready, initial == "unknown")
-    except VirginCurveError:
-        initial = VIRGIN
-        ready = prepare_diagnosis(records, aside, fraction, initial, progress)
-        found = selected(ready, False)
-    if ready.doubted and not found.model.is_noise(found.projector):
-        progress("asking again with the command in lines between samples")
-        lines = prepare_diagnosis(records, aside, fraction, initial, progress, HOLDS[:1])
-        try:
-            beside = selected(lines, initial == "unknown")
-            ready, found = (lines, beside) if beside.left_um < found.left_um else (ready, found)
-        except VirginCurveError:
-            progress("a first way from an unknown state explains what is left then")
-    if not found.causes and not aside and ready.projector.ahead(found.model.change_um) > _UNLIKE:
-        progress("asking again with what was held out, which noise does not explain")
-        whole = prepare_diagnosis(records, (), 0.0, initial, progress)
-        beside = selected(whole, False)
-        if max((cause.z for cause in beside.causes), default=0.0) > _STRONG:
-            said = (*whole.baseline.remarks, _ALL)
-            ready, found = replace(whole, baseline=replace(whole.baseline, remarks=said)), beside
-    return conclude(ready, found, [*records, *aside], false_alarm, progress, Wish(duration_s, limits, margin))
+    best = answer(Reading(records, aside, fraction, initial, guessed=initial == "unknown"))
+    for question in _questions():
+        if not question.arises(best):
+            continue
+        progress(question.said)
+        other = answer(replace(best.ready.reading, **question.changes))
+        if question.is_better(other, best):
+            baseline = other.ready.baseline
+            said = (*baseline.remarks, question.remark) if question.remark else baseline.remarks
+            best = replace(other, ready=replace(other.ready, baseline=replace(baseline, remarks=said)))
+    assert best.found is not None
+    request = Request(duration_s, limits, margin)
+    return conclude(best.ready, best.found, [*records, *aside], false_alarm, progress, request)

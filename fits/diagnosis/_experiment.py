@@ -1,24 +1,22 @@
 """The next experiment: the voltage program that would tell apart best what the records leave open."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TypeAlias
 
 import numpy as np
 
-from fits.diagnosis._comparison import best_of
-from fits.diagnosis._inside import guard_of
-from fits.diagnosis._path import limits_of, repeated
 from fits.diagnosis._predict import Hypothesis, Predictor
-from fits.diagnosis._programs import Program
-from fits.diagnosis._refit import Refit, law_of
+from fits.diagnosis._prepare import Prepared
+from fits.diagnosis._programs import Program, limits_of, repeated
+from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import Experiment, FoundCause
+from fits.diagnosis._safe import guard_of
+from fits.diagnosis._score import best_of, law_of
 from fits.diagnosis._select import Selection
 from fits.io._limits import MARGIN
 from microid import Mechanics
-
-if TYPE_CHECKING:
-    from fits.diagnosis._prepare import Prepared
+from microid.effects import card_of
 
 # Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
 # is repeated if it is short, so often at most, until it tells by so many standard deviations: by chance it may be
@@ -34,50 +32,30 @@ _ALIKE, _WORTH = 0.95, 1.02
 _PROBE, _LENGTHS = 0.05, (0.4, 0.15)
 _ROUNDS = 2
 # Below so many standard deviations effects are not told apart.
-_APART = 3.0
-
+_TOLD_APART = 3.0
 _OVER = {2: "twice", 3: "three times", 4: "four times"}
+# Names, hypotheses, and which is compared with which.
+Question: TypeAlias = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
 
-_COLUMNS = (
-    (
-        ("creep", "thermal_drift", "mount_relaxation", "aging", "thermal_gain"),
-        "temperature_degC: the temperature of the stage's body, which what the room does follows and what the "
-        "command does ignores.",
-    ),
-    (
-        (
-            "transport_delay",
-            "sensor_lowpass",
-            "slew_limit",
-            "driver_saturation",
-            "voltage_dependent_capacitance",
-            "rate_dependence",
-        ),
-        "monitor_V: the voltage at the piezo, sampled with the displacement, which shows what the driver does and "
-        "nothing of the sensor.",
-    ),
-    (
-        ("cross_coupling", "floor_vibration"),
-        "other_um: the position of the second axis, without which its share of this one looks like a drift.",
-    ),
-    (
-        ("dropped_samples", "clock_mismatch", "timestamp_jitter"),
-        "raw time stamps of both clocks, which show a lost sample or a wrong rate at once.",
-    ),
-)
+# Further columns by the names that effects know, the most telling first, and what is said of them.
+_COLUMNS = {
+    "temperature_degC": "temperature_degC: the temperature of the stage's body, which what the room does follows and "
+    "what the command does ignores.",
+    "monitor_V": "monitor_V: the voltage at the piezo, sampled with the displacement, which shows what the driver "
+    "does and nothing of the sensor.",
+    "other_um": "other_um: the position of the second axis, without which its share of this one looks like a drift.",
+    "time_stamps": "raw time stamps of both clocks, which show a lost sample or a wrong rate at once.",
+}
+# How a record's own name of such a column begins, or what is in it.
+_PRESENT = {"temperature_degC": "temp", "monitor_V": "monitor", "other_um": "other"}
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What is asked of the next experiment.
+class Request:
+    """What is asked of the next experiment: its duration, that of the longest run if None, and the limits of the rig.
 
-    Attributes
-    ----------
-    duration_s
-        Of the program; that of the longest run if None.
-    limits, margin
-        Limits of the rig, by name, and by how much of its range a predicted quantity may otherwise go beyond what the
-        records reached; see `fits.io._limits.allowed`.
+    `limits` are given by name; a quantity without one may go beyond what the records reached by the part `margin` of
+    its range, see `fits.io._limits.allowed`.
     """
 
     duration_s: float | None = None
@@ -86,10 +64,10 @@ class Wish:
 
 
 def suggest(
-    ready: "Prepared",
+    ready: Prepared,
     found: Selection,
     causes: tuple[FoundCause, ...],
-    wish: Wish,
+    request: Request,
     progress: Callable[[str], None],
 ) -> Experiment | None:
     """Choose and refine the program that decides best what is open.
@@ -98,33 +76,20 @@ def suggest(
     what the rivals change in all of them is projected off what the stage and the other rival can follow. Only those
     count that keep the rig inside its limits, whichever of the rivals is true.
 
-    Parameters
-    ----------
-    ready, found
-        All that the diagnosis of the runs at hand knows.
-    causes
-        What it names; the first of them that has rivals is asked about. If there is none at all, what is suspected.
-    wish
-        What was asked of the program.
-    progress
-        Told what is being done.
-
-    Returns
-    -------
-    Experiment
-        None where every cause is told from all others or nothing is suspected, and where no program inside the limits
-        and no further column would help.
+    The first of the `causes` that has rivals is asked about, or what is suspected where there is none at all. None
+    where every cause is told from all others or nothing is suspected, and where no program inside the limits and no
+    further column would help.
     """
-    question = _open(ready, found, causes)
+    question = open_question(ready, found, causes)
     if question is None:
         return None
     names, hypotheses, pairs = question
     progress("looking for the experiment that tells " + (" from ".join(names) if len(names) > 1 else names[0]))
     baseline = ready.baseline
     resonance = next((float(p.natural_frequency_Hz) for p in baseline.stage.parts if isinstance(p, Mechanics)), None)
-    guard = guard_of(ready, found, hypotheses, wish.limits, wish.margin)
+    guard = guard_of(ready, found, hypotheses, request.limits, request.margin)
     limits = guard.narrowed(
-        limits_of([run.record for run in baseline.runs], baseline.range_V, resonance, wish.duration_s)
+        limits_of([run.record for run in baseline.runs], baseline.range_V, resonance, request.duration_s)
     )
     if limits is None:
         return None
@@ -134,7 +99,7 @@ def suggest(
     if not programs:
         return None
     scores = [predictor.predicted_z(*program.samples(program.start)) for program in programs]
-    column = _column(names, ready)
+    column = further_column(names, {name for run in baseline.runs for name in run.record.extra})
     asked = predictor
     if column and max(scores) < 1.0:
         # Only the column tells: what shows the first of them best is played with it.
@@ -171,10 +136,7 @@ def suggest(
     return Experiment(time_s, voltage_V, words, purpose, names, z, present, column, extremes)
 
 
-Question = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
-
-
-def _open(ready: "Prepared", found: Selection, causes: tuple[FoundCause, ...]) -> Question | None:
+def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, ...]) -> Question | None:
     """What is to be decided: names, hypotheses, and which is compared with which."""
     named = {cause.name for cause in causes}
     best = Hypothesis(found.model.laws, found.model.x, _covariances(found.model))
@@ -219,16 +181,10 @@ def _covariances(model: Refit) -> tuple[np.ndarray, ...]:
 
 
 def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) -> tuple[np.ndarray, float]:
-    """Climb the logarithm of a gain in a program's parameters, by finite differences, and keep the best.
+    """Climb the logarithm of a gain in a program's parameters by finite differences, and keep the best.
 
-    Parameters
-    ----------
-    program
-        Where to begin, and the limits of its parameters.
-    gain
-        Of parameters, shape `(k,)`; NaN where they are not allowed.
-    first
-        The gain at the program's start.
+    The `gain` of parameters of shape `(k,)` is NaN where they are not allowed, and `first` that at the program's
+    start.
     """
     span = program.upper - program.lower
     best, top = program.start.copy(), first
@@ -263,9 +219,9 @@ def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> s
             f"records at hand show it by {present:.1f}."
         )
     listed = " and ".join([", ".join(words[:-1]), words[-1]])
-    if z < _APART and column:
+    if z < _TOLD_APART and column:
         return f"No program within the limits tells {listed} apart by itself: record this one with a further column."
-    if z < _APART:
+    if z < _TOLD_APART:
         return (
             f"No program within the rig's limits would tell {listed} apart for sure; this one comes nearest, with "
             f"{z:.1f} standard deviations where the records at hand have {present:.1f}."
@@ -276,15 +232,12 @@ def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> s
     )
 
 
-def _column(names: tuple[str, ...], ready: "Prepared") -> str:
-    """Which further column helps most of the suspects, and why; empty if none does, or it is there already."""
-    present = {name for run in ready.baseline.runs for name in run.record.extra}
-    counts = [sum(name in group for name in names) for group, _ in _COLUMNS]
-    k = int(np.argmax(counts))
-    if counts[k] == 0:
+def further_column(names: tuple[str, ...], present: Collection[str]) -> str:
+    """Which further column helps most of the suspects, and why; empty if none does, or it is `present` already."""
+    wanted = [card_of(name).column for name in names]
+    known = [*_COLUMNS, *(column for column in wanted if column and column not in _COLUMNS)]
+    column = max(known, key=wanted.count)
+    there = _PRESENT.get(column)
+    if column not in wanted or (there is not None and any(there in name.lower() for name in present)):
         return ""
-    wanted = _COLUMNS[k][1]
-    there = {"temperature_degC": "temp", "monitor_V": "monitor", "other_um": "other"}.get(wanted.split(":")[0])
-    if there is not None and any(there in name.lower() for name in present):
-        return ""
-    return wanted
+    return _COLUMNS.get(column, column)

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -10,26 +9,29 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import stats
 
-from fits.diagnosis._candidates import Bench
-from fits.diagnosis._comparison import best_of
-from fits.diagnosis._faults import Fault, Faults
-from fits.diagnosis._law import Law
-from fits.diagnosis._profiled import profiled
+from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._noise import Fault, Faults
+from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit
+from fits.diagnosis._refit import Refit, refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
-from fits.diagnosis._score import Scored
+from fits.diagnosis._score import Scored, best_of
 from fits.diagnosis._select import Cause, Selection
-from microid import EFFECTS
-
-if TYPE_CHECKING:
-    from fits.diagnosis._prepare import Prepared
+from microid import EFFECTS, AbstractEffect
+from microid.effects import Statistic
 
 _TWO_SIDED = 1.96
 # Standard deviations from zero beyond which a run shows an effect.
 _SHOWS = 2.0
 # A class of effects that cannot be told apart names at most so many others.
 _OTHERS = 2
+# A parameter that a standard deviation of its coordinate moves so many times as far to one side as to the other is
+# followed: by steps that double, from the first on, until it costs too much, and then between the last two; in so
+# many steps at most, and coordinates no larger than this. All others are fitted again in so many rounds.
+_NONLINEAR, _STEP, _STEPS, _LARGEST, _ROUNDS = 1.3, 0.5, 10, 30.0, 3
+# Standard deviations up to which the sum of squares may do what it likes: a place that costs less is as far away.
+# Where that is off by less than this factor, it is far enough known.
+_FAR, _ABOUT = 3.0, 1.4
 
 
 def causes_of(
@@ -42,69 +44,54 @@ def causes_of(
     noise: Faults,
 ) -> tuple[FoundCause, ...]:
     """Describe the causes, the most important first: by the misfit that each removes."""
-    found: list[FoundCause] = []
+    found: dict[str, FoundCause] = {}
     weight: dict[str, float] = {}
-    told: dict[str, int] = {}
+    occurrences: dict[str, int] = {}
     covariance, at = model.covariance(), 0
     total = float(np.mean([n.total_um**2 for n in projector.noise]))
-    runs = len(bench.prepared)
     for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
         own = covariance[at : at + law.size, at : at + law.size]
         at += law.size
-        form = law.form
-        changed = [[law.effect(x, run)] for run in range(runs)]
+        changed = [[law.effect(x, run)] for run in range(len(bench.prepared))]
         alone = [a - b for a, b in zip(bench.respond(changed), bench.plain, strict=True)]
         joined = projector.join(alone)
         seen = float(np.linalg.norm(projector.off(joined)) / max(float(np.linalg.norm(joined)), 1e-300))
-        rms = seen * _rms(alone, projector)
-        told[cause.name] = count = told.get(cause.name, 0) + 1
+        rms_um, share = seen * _rms(alone, projector), cause.drop / misfit
+        occurrences[cause.name] = count = occurrences.get(cause.name, 0) + 1
         weight[cause.name] = weight.get(cause.name, 0.0) + cause.drop / projector.count * total
-        along = profiled(bench, projector, model, number, own)
-        parameters = _parameters(law, x, own, along)
+        parameters = _parameters(law, x, own, profile_likelihood(bench, projector, model, number, own))
         if count > 1:
-            again = next(k for k, one in enumerate(found) if one.name == cause.name)
-            found[again] = _joined(found[again], parameters, count, cause.drop / misfit, rms)
+            found[cause.name] = _with_occurrence(found[cause.name], parameters, count, share, rms_um)
             continue
-        found.append(
-            FoundCause(
-                cause.name,
-                form.form,
-                tuple(rival.name for rival in cause.rivals[:_OTHERS]),
-                cause.z,
-                cause.p_family,
-                parameters,
-                float(min(1.0, cause.drop / misfit)),
-                rms,
-                form.fingerprint,
-                form.experiment,
-                form.source,
-            )
-        )
-    by_name = {form.name: form for form in EFFECTS}
+        rivals = tuple(rival.name for rival in cause.rivals[:_OTHERS])
+        found[cause.name] = described(law.form, rivals, cause.z, cause.p_family, parameters, share, rms_um)
+    forms: dict[Statistic, type[AbstractEffect]] = {form.statistic: form for form in EFFECTS if form.statistic}
     total = float(np.mean([n.total_um**2 for n in noise.noise]))
     for fault in faults:
-        form = by_name[fault.name]
-        weight[fault.name] = fault.variance_um2
+        form = forms[fault.statistic]
+        weight[form.name] = fault.variance_um2
         parameters = tuple(
             EffectParameter(name, value, sd, unit, value - _TWO_SIDED * sd, value + _TWO_SIDED * sd)
             for name, value, sd, unit in fault.parameters
         )
-        found.append(
-            FoundCause(
-                fault.name,
-                form.form,
-                (),
-                float(fault.z),
-                float(2 * stats.norm.sf(fault.z)),
-                parameters,
-                float(min(1.0, fault.variance_um2 / max(total, fault.variance_um2, 1e-300))),
-                fault.variance_um2**0.5,
-                form.fingerprint,
-                form.experiment,
-                form.source,
-            )
-        )
-    return tuple(sorted(found, key=lambda cause: -weight[cause.name]))
+        chance, share = float(2 * stats.norm.sf(fault.z)), fault.variance_um2 / max(total, fault.variance_um2, 1e-300)
+        found[form.name] = described(form, (), fault.z, chance, parameters, share, fault.variance_um2**0.5)
+    return tuple(sorted(found.values(), key=lambda cause: -weight[cause.name]))
+
+
+def described(
+    form: type[AbstractEffect],
+    rivals: tuple[str, ...],
+    z: float,
+    p: float,
+    parameters: tuple[EffectParameter, ...],
+    share: float,
+    rms_um: float,
+) -> FoundCause:
+    """A cause with what its effect's card says of it."""
+    card = form.fingerprint, form.experiment, form.source
+    share = float(min(1.0, share))
+    return FoundCause(form.name, form.form, rivals, float(z), p, parameters, share, rms_um, *card)
 
 
 def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:
@@ -113,7 +100,7 @@ def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:
     return (square / projector.count) ** 0.5
 
 
-def _joined(
+def _with_occurrence(
     first: FoundCause, more: Sequence[EffectParameter], count: int, share: float, rms_um: float
 ) -> FoundCause:
     """One cause for several of its kind."""
@@ -130,7 +117,7 @@ def _parameters(
 ) -> tuple[EffectParameter, ...]:
     """Values in their units: of each run in which the effect shows where runs differ, the others by their place.
 
-    They reach as far, to either side, as the coordinates `along` which the law was followed, each so many standard
+    Intervals reach as far to either side as the profile, coordinates `along` which each is so many standard
     deviations away.
     """
     runs = len(law.maps) if law.form.per_run and law.each.any() else 1
@@ -181,7 +168,75 @@ def _vector(law: Law, x: Float[Array, " k"], run: int) -> Float[Array, " c"]:
     return full.at[np.flatnonzero(law.each)].set(x[shared + run * own : shared + (run + 1) * own])
 
 
-def bounds(found: Selection, ready: "Prepared", left: Sequence[Scored], named: Collection[str]) -> tuple[Bound, ...]:
+def profile_likelihood(
+    bench: Bench, projector: Projector, model: Refit, which: int, covariance: np.ndarray
+) -> list[tuple[float, np.ndarray]]:
+    """Profile of the likelihood over the nonlinear parameters of a law: coordinates, and how many deviations away.
+
+    Where records hardly show a parameter, or one is near its bound, the sum of squares is no parabola, and the
+    standard deviations of its curvature, `covariance` of shape `(size, size)`, promise too much. A distance is the
+    root of what the place costs (Wilks, Annals of Mathematical Statistics 9 (1938) 60), but 3 if that is less.
+    `which` numbers the law.
+    """
+    law, x = model.laws[which], model.x[which]
+    sd = np.sqrt(np.diagonal(covariance))
+    found: list[tuple[float, np.ndarray]] = []
+    for path, at in law.common.items():
+        if _is_nonlinear(law, x, at, float(sd[at])):
+            for way in (-1, 1):
+                found += _profile_to(bench, projector, model, which, path, at, way)
+    lowest = min([model.cost, *(cost for cost, _ in found)])
+    return [(max((cost - lowest) ** 0.5, _FAR), there) for cost, there in found]
+
+
+def _is_nonlinear(law: Law, x: np.ndarray, at: int, sd: float) -> bool:
+    """Whether a parameter is far from proportional to its coordinate, within a standard deviation."""
+    ends = [np.array(x), np.array(x), np.array(x)]
+    for end, way in zip(ends, (-1, 0, 1), strict=True):
+        end[at] += way * sd
+    below, here, above = (np.asarray(law.maps[0].values(jnp.asarray(law.vector(end, 0)))) for end in ends)
+    less, more = float(np.abs(here - below).max()), float(np.abs(above - here).max())
+    return max(less, more) > _NONLINEAR * min(less, more)
+
+
+def _profile_to(
+    bench: Bench, projector: Projector, model: Refit, which: int, path: str, at: int, way: int
+) -> list[tuple[float, np.ndarray]]:
+    """Costs and coordinates of a law with one held farther and farther to one side, and then less far again."""
+    law, runs = model.laws[which], range(len(model.laws[which].maps))
+    found: list[tuple[float, np.ndarray]] = []
+    step, last, outside = _STEP, model, None
+    inside = float(_law_of_model(model, which, law).start[at])
+    for _ in range(_STEPS):
+        place = inside + way * step if outside is None else (inside + outside) / 2
+        moved = np.array(_law_of_model(last, which, law).start)
+        moved[at] = place
+        # One by itself has nothing beside it that is fitted again.
+        only = sum(one.size for one in model.laws) == 1
+        held = Law([law.effect(moved, run) for run in runs], law.remembers, () if only else (path,))
+        laws, starts = list(last.laws), list(last.x)
+        laws[which], starts[which] = held, held.start
+        there = refit(bench, projector, laws, starts, 0 if only else _ROUNDS)
+        found.append((there.cost, _law_of_model(there, which, law).start))
+        away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR
+        if 1 / _ABOUT < away < _ABOUT:
+            break
+        if away > 1:
+            outside = place
+        elif abs(place) > _LARGEST:
+            break
+        else:
+            inside, last, step = place, there, 2 * step
+    return found
+
+
+def _law_of_model(model: Refit, which: int, like: Law) -> Law:
+    """One law of a model in the coordinates of another."""
+    law, x = model.laws[which], model.x[which]
+    return Law([law.effect(x, run) for run in range(len(law.maps))], like.remembers)
+
+
+def bounds(found: Selection, ready: Prepared, left: Sequence[Scored], named: Collection[str]) -> tuple[Bound, ...]:
     """How large each effect that was not named may still be, by the scores that are left."""
     out = []
     for name, one in best_of(left).items():
@@ -190,7 +245,7 @@ def bounds(found: Selection, ready: "Prepared", left: Sequence[Scored], named: C
         size = float(np.linalg.norm(one.columns))
         if size == 0:
             reason = "the plain stage follows all of it in these runs, so that they cannot show it"
-            out.append(Bound(name, 0.0, 1.0, float("nan"), reason))
+            out.append(Bound(name, 0.0, 1.0, np.nan, reason))
             continue
         # The largest multiple that would not have been noticed, by the size that it has in the displacement.
         raw = float(np.linalg.norm([_rms(column, found.first) for column in one.probe.signatures]))
@@ -199,5 +254,5 @@ def bounds(found: Selection, ready: "Prepared", left: Sequence[Scored], named: C
     asked = {bound.name for bound in out} | set(named)
     for name, reason in dict(ready.skipped).items():
         if name not in asked:
-            out.append(Bound(name, float("nan"), float("nan"), float("nan"), reason))
+            out.append(Bound(name, np.nan, np.nan, np.nan, reason))
     return tuple(sorted(out, key=lambda bound: -bound.z if np.isfinite(bound.z) else 1e9))

@@ -1,4 +1,4 @@
-"""Causes and the baseline fitted to each other: where both belong, beside what noise and roughness there is."""
+"""Causes and the baseline fitted to each other by turns, beside what noise and roughness there is."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,16 +6,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._candidates import Bench
-from fits.diagnosis._evaluate import simulate
-from fits.diagnosis._faults import find_faults
-from fits.diagnosis._law import Law
-from fits.diagnosis._projector import Projector, learn_roughness
+from fits.diagnosis._baseline import Baseline, simulate
+from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._noise import find_faults
+from fits.diagnosis._projector import Projector, learn_roughness, smoothed
 from fits.diagnosis._refit import Refit, refit, relocate
-from fits.diagnosis._regression import regress
-from fits.diagnosis._smoothness import smoothed
-from fits.diagnosis._tangent import passed
+from fits.diagnosis._regression import passed, regress
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _OFF = 1.0
@@ -29,27 +25,26 @@ _AGAIN = 8
 _BOUNDED, _MOVED = 4, 0.1
 # Derivative of all samples along a coordinate, in noise, that does not show, and what a change must change in them to
 # be seen; the distance to its scale is halved at most so often for that.
-_ASLEEP, _AWAKE, _HALVES = 1.0, 5.0, 16
+_INSENSITIVE, _SEEN, _HALVES = 1.0, 5.0, 16
 # A sum of squares that grows by this factor there is that of a fit gone astray.
 _ASTRAY = 1.5
 # Noise or roughness that falls by less than this factor is the same.
 _LESS = 0.8
 # Factor of the prior's precision from which on what a cause does was taken for roughness of the density.
 _SMOOTHER = 1000.0
+State: TypeAlias = tuple[Bench, Projector, Refit]
 
-Settled: TypeAlias = tuple[Bench, Projector, Refit]
 
-
-def settled(bench: Bench, projector: Projector, model: Refit) -> Settled:
+def fit_jointly(bench: Bench, projector: Projector, model: Refit) -> State:
     """Let baseline and causes follow each other, unless that makes it worse by more than what is next to nothing.
 
-    Where the baseline has to move far, what its tangent says of an effect that it nearly follows is better than true.
+    Where the baseline has to move far, its tangent says too much of an effect that it nearly follows.
     """
-    moved = settle(bench, projector, relocate(bench, projector, model))
-    awake = _awoken(projector, moved[-1])
-    if awake is not None:
-        there = _at(awake, projector, moved[-1])
-        trial = settle(*there, refit(*there, moved[-1].laws, moved[-1].x, 4))
+    moved = alternate(bench, projector, relocate(bench, projector, model))
+    sensitive = _made_sensitive(projector, moved[-1])
+    if sensitive is not None:
+        there = _linearised_at(sensitive, projector, moved[-1])
+        trial = alternate(*there, refit(*there, moved[-1].laws, moved[-1].x, 4))
         moved = trial if trial[-1].cost < moved[-1].cost else moved
     if moved[-1].cost > model.cost + _BETTER:
         # A baseline that moved without the roughness beyond its grid may have moved away.
@@ -58,13 +53,11 @@ def settled(bench: Bench, projector: Projector, model: Refit) -> Settled:
     return moved
 
 
-def settle(
-    bench: Bench, projector: Projector, model: Refit, rounds: Sequence[int] = (4, 2)
-) -> tuple[Bench, Projector, Refit]:
-    """Let the baseline follow what effects leave, and fit those again beside it.
+def alternate(bench: Bench, projector: Projector, model: Refit, rounds: Sequence[int] = (4, 2)) -> State:
+    """Fit the baseline to what effects leave, and effects beside it, by turns.
 
-    A baseline fitted without them may be far from where it belongs, farther than its tangent reaches: it goes on
-    following for as long as that pays.
+    A baseline fitted without them may be far from where it belongs, farther than its linearisation reaches: it goes
+    on for as long as that pays.
     """
     for count in rounds:
         bench, projector = _follow(bench, projector, model)
@@ -78,8 +71,21 @@ def settle(
     return bench, projector, model
 
 
-def stronger(bench: Bench, projector: Projector, model: Refit) -> Settled:
-    """Try effects that level off at larger strengths, from where a baseline that has taken part of one lets it go."""
+def refine(bench: Bench, projector: Projector, model: Refit) -> tuple[Bench, Projector, Refit, bool]:
+    """Refit the causes that were selected where the fits on the way were coarse, and say whether steps are many now.
+
+    In turn: larger strengths, a density as rough and as smooth as it is beside the causes, many steps between
+    samples, strengths that ended at a bound, and a density that is nowhere negative.
+    """
+    state = relearn_smoothness(*relearn_roughness(*try_larger_strengths(bench, projector, model)))
+    model, finest = refine_steps(*state)
+    # What is asked of the causes from here on is asked as they were fitted.
+    bench, projector = Bench(state[0].baseline, finest=True) if finest else state[0], state[1]
+    return *keep_density_positive(*leave_bounds(bench, projector, model, finest), finest), finest
+
+
+def try_larger_strengths(bench: Bench, projector: Projector, model: Refit) -> State:
+    """Try effects that saturate at larger strengths: a baseline that has taken part of one hardly gives it up."""
     for k in range(len(model.laws)):
         while (form := model.laws[k].form).finite and form.strength:
             here = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
@@ -87,20 +93,60 @@ def stronger(bench: Bench, projector: Projector, model: Refit) -> Settled:
             law = Law(more, model.laws[k].remembers)
             laws, x = list(model.laws), list(model.x)
             laws[k], x[k] = law, law.start
-            trial = settle(bench, projector, refit(bench, projector, laws, x, 0))
+            trial = alternate(bench, projector, refit(bench, projector, laws, x, 0))
             if trial[-1].cost > model.cost - _BETTER:
                 break
             bench, projector, model = trial
     return bench, projector, model
 
 
-def released(bench: Bench, projector: Projector, model: Refit, finest: bool) -> Settled:
-    """Try weaker what is as strong as can be, the baseline following before it is fitted, unless that is worse.
+def relearn_roughness(bench: Bench, projector: Projector, model: Refit) -> State:
+    """Fit the causes again where beside them the density is less rough than was learnt without them."""
+    if not model.laws or not any(projector.roughness):
+        return bench, projector, model
+    bare = Projector(projector.regression, projector.noise)
+    rough = learn_roughness(bare, (), model.change_um)
+    if not any(new < _LESS * old for new, old in zip(rough, projector.roughness, strict=True)):
+        return bench, projector, model
+    less = tuple(map(min, rough, projector.roughness))
+    return fit_jointly(bench, Projector(projector.regression, projector.noise, less), model)
+
+
+def relearn_smoothness(bench: Bench, projector: Projector, model: Refit) -> State:
+    """Fit the causes again beside a density as smooth as it is beside them, unless that predicts worse."""
+    if not model.laws:
+        return bench, projector, model
+    afresh = smoothed(projector, model.change_um)
+    if not _prior_precision(afresh) > _SMOOTHER * _prior_precision(projector):
+        # What the causes leave is no roughness.
+        return bench, projector, model
+    moved = fit_jointly(Bench(afresh.regression.baseline), afresh, model)
+    before, after = (
+        Projector(there.regression, there.noise).held_out_error(one.change_um)
+        for there, one in ((projector, model), moved[1:])
+    )
+    return (bench, projector, model) if after > before else moved
+
+
+def refine_steps(bench: Bench, projector: Projector, model: Refit) -> tuple[Refit, bool]:
+    """Fit the causes again with many steps between samples, where few are off by more than chance."""
+    if not model.laws:
+        return model, False
+    finer = Bench(bench.baseline, finest=True)
+    better = refit(finer, projector, model.laws, model.x, 0)
+    off = [a - b for a, b in zip(better.change_um, model.change_um, strict=True)]
+    if float(np.linalg.norm(projector.join(off))) < _OFF:
+        return model, False
+    return refit(finer, projector, model.laws, model.x, 4), True
+
+
+def leave_bounds(bench: Bench, projector: Projector, model: Refit, finest: bool) -> State:
+    """Try weaker what ended at a bound, the baseline following before it is fitted, unless that is worse.
 
     Along a valley that a driver and its capacitance share, a fit may run into the bound, where it has no derivative.
     """
     for k, law in enumerate(model.laws):
-        if not (law.form.strength and law.pinned(model.x[k])):
+        if not (law.form.strength and law.at_bound(model.x[k])):
             continue
         effects = [law.effect(model.x[k], run) for run in range(len(law.maps))]
         less = [replace(one, **{name: _WEAKER * getattr(one, name) for name in law.form.strength}) for one in effects]
@@ -117,11 +163,11 @@ def released(bench: Bench, projector: Projector, model: Refit, finest: bool) -> 
     return bench, projector, model
 
 
-def bounded(bench: Bench, projector: Projector, model: Refit, finest: bool) -> Settled:
+def keep_density_positive(bench: Bench, projector: Projector, model: Refit, finest: bool) -> State:
     """Fit the causes again beside a density that is nowhere negative.
 
-    A tangent takes for free what cannot become less than nothing, and there a cause may hide: a play in relays
-    without width, a rail in those beyond it.
+    A linearised density may take less than nothing, and there a cause may hide: a play in relays without width, a
+    rail in those beyond it.
     """
     for _ in range(_BOUNDED if model.laws else 0):
         moved = _follow(bench, projector, model, finest)
@@ -142,88 +188,13 @@ def bounded(bench: Bench, projector: Projector, model: Refit, finest: bool) -> S
     return bench, projector, model
 
 
-def _follow(bench: Bench, projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
-    """Move the baseline to where the causes leave it."""
-    # What roughness beyond the grid would explain is not put into the grid.
-    bare = Projector(projector.regression, projector.noise)
-    return _at(bare.move(bare.residual - bare.join(model.change_um)), projector, model, finest)
-
-
-def _at(baseline: Baseline, projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
-    effects = [model.effects(run) for run in range(len(baseline.runs))]
-    # What is finer than the grid hardly changes, but where derivatives go through effects.
-    plain = not any(projector.regression.through) and not any(map(passed, effects))
-    regression = regress(baseline, projector.regression.finer if plain else None, effects)
-    return Bench(regression.baseline, finest=finest), Projector(regression, projector.noise, projector.roughness)
-
-
-def _awoken(projector: Projector, model: Refit) -> Baseline | None:
-    """The baseline with coordinates that no longer show, as of a driver without delay, brought back until they do.
-
-    An effect that is not simulated may drive them there, and no tangent leads back.
-    """
-    regression = projector.regression
-    baseline, columns = regression.baseline, regression.baseline.chain.size
-    shown = np.linalg.norm(projector.join([rows[:, columns:] for rows in regression.rows]), axis=0)
-    if not model.laws or np.all(shown > _ASLEEP):
-        return None
-    back = np.where(shown > _ASLEEP, 0.0, -baseline.z)
-    plain = [run.displacement_um - left for run, left in zip(baseline.runs, regression.residuals, strict=True)]
-    for k in range(1, _HALVES):
-        there = baseline.moved(back * (1 - 0.5**k), 0.0)
-        off = [simulate(there.stage, run) - one for run, one in zip(baseline.fine, plain, strict=True)]
-        if float(np.linalg.norm(projector.join(off))) > _AWAKE:
-            return there
-    return None
-
-
-def smoother(bench: Bench, projector: Projector, model: Refit) -> Settled:
-    """Fit the causes again where beside them the density is smoother than was thought without them."""
-    if not model.laws or not any(projector.roughness):
-        return bench, projector, model
-    bare = Projector(projector.regression, projector.noise)
-    rough = learn_roughness(bare, (), model.change_um)
-    if not any(new < _LESS * old for new, old in zip(rough, projector.roughness, strict=True)):
-        return bench, projector, model
-    less = tuple(map(min, rough, projector.roughness))
-    return settled(bench, Projector(projector.regression, projector.noise, less), model)
-
-
-def resmoothed(bench: Bench, projector: Projector, model: Refit) -> Settled:
-    """Fit the causes again beside a density as smooth as it is beside them, unless that predicts worse."""
-    if not model.laws:
-        return bench, projector, model
-    afresh = smoothed(projector, model.change_um)
-    if not _stiffness(afresh) > _SMOOTHER * _stiffness(projector):
-        # What the causes leave is no roughness.
-        return bench, projector, model
-    moved = settled(Bench(afresh.regression.baseline), afresh, model)
-    before, after = (
-        Projector(there.regression, there.noise).ahead(one.change_um)
-        for there, one in ((projector, model), moved[1:])
-    )
-    return (bench, projector, model) if after > before else moved
-
-
-def finely(bench: Bench, projector: Projector, model: Refit) -> tuple[Refit, bool]:
-    """Fit the causes again with many steps between samples, where few are off by more than chance."""
-    if not model.laws:
-        return model, False
-    finer = Bench(bench.baseline, finest=True)
-    better = refit(finer, projector, model.laws, model.x, 0)
-    off = [a - b for a, b in zip(better.change_um, model.change_um, strict=True)]
-    if float(np.linalg.norm(projector.join(off))) < _OFF:
-        return model, False
-    return refit(finer, projector, model.laws, model.x, 4), True
-
-
-def renewed(first: Projector, projector: Projector, model: Refit) -> Projector | None:
+def relearn_noise(first: Projector, projector: Projector, model: Refit) -> Projector | None:
     """The projector without causes, with noise and smoothness as they are beside them, where either was misjudged."""
     found = find_faults(projector.regression, model.change_um).noise
     less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
     noise = tuple(found) if any(less) else projector.noise
     beside = smoothed(Projector(projector.regression, noise, projector.roughness), model.change_um)
-    is_smoother = _stiffness(beside) > _SMOOTHER * _stiffness(first)
+    is_smoother = _prior_precision(beside) > _SMOOTHER * _prior_precision(first)
     if not is_smoother:
         return Projector(first.regression, noise, first.roughness) if any(less) else None
     smooth = beside.regression
@@ -231,13 +202,50 @@ def renewed(first: Projector, projector: Projector, model: Refit) -> Projector |
     return Projector(replace(first.regression, baseline=baseline, root=smooth.root), noise, first.roughness)
 
 
-def confirmed(projector: Projector, model: Refit) -> bool:
+def is_smoothness_confirmed(projector: Projector, model: Refit) -> bool:
     """Whether beside the causes that a smoother density led to, the density is as smooth."""
-    return bool(_SMOOTHER * _stiffness(smoothed(projector, model.change_um)) > _stiffness(projector))
+    return bool(_SMOOTHER * _prior_precision(smoothed(projector, model.change_um)) > _prior_precision(projector))
 
 
-def _stiffness(projector: Projector) -> float:
-    """Of the density alone: the reversible slope, in other units, would drown it."""
+def _follow(bench: Bench, projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
+    """Move the baseline to where the causes leave it."""
+    # What roughness beyond the grid would explain is not put into the grid.
+    bare = Projector(projector.regression, projector.noise)
+    return _linearised_at(bare.move(bare.residual - bare.join(model.change_um)), projector, model, finest)
+
+
+def _linearised_at(
+    baseline: Baseline, projector: Projector, model: Refit, finest: bool = False
+) -> tuple[Bench, Projector]:
+    effects = [model.effects(run) for run in range(len(baseline.runs))]
+    # What is finer than the grid hardly changes, but where derivatives go through effects.
+    plain = not any(projector.regression.through) and not any(map(passed, effects))
+    regression = regress(baseline, projector.regression.finer if plain else None, effects)
+    return Bench(regression.baseline, finest=finest), Projector(regression, projector.noise, projector.roughness)
+
+
+def _made_sensitive(projector: Projector, model: Refit) -> Baseline | None:
+    """The baseline with coordinates that no longer matter, as of a driver without delay, moved until they do.
+
+    An effect that is not simulated may drive them there, and no derivative leads back.
+    """
+    regression = projector.regression
+    baseline, columns = regression.baseline, regression.baseline.chain.size
+    shown = np.linalg.norm(projector.join([rows[:, columns:] for rows in regression.rows]), axis=0)
+    if not model.laws or np.all(shown > _INSENSITIVE):
+        return None
+    back = np.where(shown > _INSENSITIVE, 0.0, -baseline.z)
+    plain = [run.displacement_um - left for run, left in zip(baseline.runs, regression.residuals, strict=True)]
+    for k in range(1, _HALVES):
+        there = baseline.moved(back * (1 - 0.5**k), 0.0)
+        off = [simulate(there.stage, run) - one for run, one in zip(baseline.fine, plain, strict=True)]
+        if float(np.linalg.norm(projector.join(off))) > _SEEN:
+            return there
+    return None
+
+
+def _prior_precision(projector: Projector) -> float:
+    """Of the density alone: the reversible slope, in other units, would outweigh it."""
     baseline = projector.regression.baseline
     weights = baseline.chain.size - baseline.chain.levels
     return float(np.trace(baseline.prior[:weights, :weights]))

@@ -7,11 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
-from fits.diagnosis._candidates import Bench
-from fits.diagnosis._law import Law
+from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._regression import Kinds, Regression, regress
-from fits.diagnosis._tangent import passed
+from fits.diagnosis._regression import Kinds, Regression, passed, regress
 from fits.io._record import Record
 from fits.loop._run import prepare_run
 from fits.stats._whiten import Noise
@@ -30,12 +28,8 @@ _LIKE = 1.5
 class Hypothesis:
     """Effects that the stage may have, none for the plain stage.
 
-    Attributes
-    ----------
-    laws, x
-        The effects, and their coordinates in all runs.
-    covariances
-        Of the coordinates of each; empty where they are not known.
+    `x` are the coordinates of the `laws` in all runs, and `covariances` those of the coordinates of each, empty where
+    they are not known.
     """
 
     laws: tuple[Law, ...]
@@ -72,22 +66,12 @@ class Hypothesis:
 class Predictor:
     """Predicts how well hypotheses are told apart after one more run.
 
-    Parameters
-    ----------
-    bench, projector
-        Of the runs at hand, beside the first hypothesis.
-    hypotheses
-        Of what the stage has.
-    pairs
-        Which are compared: the one that is true, and the one that is fitted.
+    `bench` and `projector` are of the runs at hand, beside the first hypothesis. The `pairs` that are compared are of
+    the one that is true, and the one that is fitted.
     """
 
     def __init__(
-        self,
-        bench: Bench,
-        projector: Projector,
-        hypotheses: Sequence[Hypothesis],
-        pairs: Sequence[tuple[int, int]],
+        self, bench: Bench, projector: Projector, hypotheses: Sequence[Hypothesis], pairs: Sequence[tuple[int, int]]
     ):
         self.bench, self.projector = bench, projector
         self.hypotheses, self.pairs = tuple(hypotheses), tuple(pairs)
@@ -159,28 +143,11 @@ class Predictor:
         """The same of a run with this command alone, beside each hypothesis that is fitted."""
         baseline = self.bench.baseline
         n = len(time_s)
-        share = np.linspace(0, 1, n)
-        extra = {
-            name: np.interp(share, np.linspace(0, 1, len(values)), values) for name, values in self._extra.items()
-        }
-        record = Record(time_s, voltage_V, np.zeros(n), extra, source="the next run")
+        record = next_record(time_s, voltage_V, self._extra, np.zeros(n))
         # With steps between the samples that are too long, a lag and a delay differ by what both are off.
         stride = baseline.finest[self._like].samples.stride
         run = prepare_run(record, baseline.range_V, "unknown", 0.0, stride, hold=baseline.stage.hold)
-        # What is known of the columns beforehand counts with the old runs.
-        only, none = (run,), ()
-        alone = replace(
-            baseline,
-            prior=np.eye(1),
-            runs=only,
-            coarse=only,
-            finest=only,
-            fine=only,
-            aside=none,
-            coarse_aside=none,
-            finest_aside=none,
-            fine_aside=none,
-        )
+        alone = baseline.alone(run)
         bench, noise = Bench(alone), self._noise(float(time_s[1] - time_s[0]))
         columns = []
         for h, vectors in zip(self.hypotheses, self._vectors, strict=True):
@@ -235,6 +202,18 @@ class Predictor:
             small = pick.T @ left @ pick
             found.append(float(_eliminated(small, np.arange(1))[0, 0]))
         return max(min(found), 0.0) ** 0.5
+
+
+def next_record(
+    time_s: np.ndarray,
+    voltage_V: np.ndarray,
+    extra: Mapping[str, np.ndarray],
+    displacement_um: np.ndarray | None = None,
+) -> Record:
+    """A run that was not measured yet, whose further columns run as in another record, stretched to its duration."""
+    share = np.linspace(0, 1, len(time_s))
+    stretched = {name: np.interp(share, np.linspace(0, 1, len(values)), values) for name, values in extra.items()}
+    return Record(time_s, voltage_V, displacement_um, stretched, source="the next run")
 
 
 def _same(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -> Kinds | None:

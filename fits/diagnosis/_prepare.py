@@ -7,20 +7,17 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import qr
 
-from fits.diagnosis._baseline import Baseline, fit_baseline
-from fits.diagnosis._candidates import Bench, Probe, applicable, probes_of, scales_of
-from fits.diagnosis._evaluate import along_curves, drop_programs, simulate
-from fits.diagnosis._faults import SINGLE, Faults, find_faults
+from fits.diagnosis._baseline import Baseline, along_curves, fit_baseline, simulate
+from fits.diagnosis._effects import Bench, drop_programs
+from fits.diagnosis._noise import Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness
+from fits.diagnosis._protocol import held_gain, is_virgin, virgin_columns
 from fits.diagnosis._regression import Regression, regress
-from fits.diagnosis._regulated import held_creep
-from fits.diagnosis._score import rescore, score
+from fits.diagnosis._score import Probe, applicable, probes_of, rescore, scales_of, score
 from fits.diagnosis._steps import Step
-from fits.diagnosis._virgin import is_virgin, virgin_columns
 from fits.io._record import Record
 from fits.loop._run import VIRGIN
 from microid import EFFECTS, Hold, Scales, Stage
-from microid.effects.transport_delay import TransportDelay
 
 # Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
 # command held in steps must explain to be taken for it: then what looked like a delay is half a sample. Or steps
@@ -35,7 +32,7 @@ _SKEWED = (
 # Part of a direction that must be its own.
 _SEEN = 1e-6
 # Part of the difference between curves and lines that must be there for it to be looked into.
-_LEAST = 0.2
+_NOTICEABLE = 0.2
 HOLDS: tuple[Hold, ...] = ("first", "smooth", "zero")
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
@@ -50,27 +47,43 @@ _CLOSED = (
     "only along the way that it took"
 )
 _FIRST = (
-    "the voltage's first way through its range differs from later ones, as after a rest or a demagnetisation, and "
-    "was not used"
+    "the voltage's first way through its range differs from later ones, as an initial magnetisation curve does after "
+    "a rest or a demagnetisation, and was not used"
 )
 # Part of its range through which the voltage goes up, and down, in what is fitted.
-_BOTH_WAYS = 0.5
+_HALF = 0.5
 ONE_WAY = (
     "nothing was held out, since the voltage goes through its range both ways only in what would have been: the gain "
     "is not measured"
 )
-
-
 _RUNS = {"smooth": ("along curves", _CURVES), "zero": ("held in steps", _STEPS)}
 
 
 @dataclass(frozen=True)
+class Reading:
+    """How the records are read.
+
+    The last `fraction` of each of the `records` is held out, and all of `aside`. `initial` is the memory before each
+    run, which is `guessed` until something says otherwise. `holds` are the ways in which the command may run between
+    samples, of which lines are the first.
+    """
+
+    records: Sequence[Record]
+    aside: Sequence[Record]
+    fraction: float
+    initial: str
+    guessed: bool
+    holds: Sequence[Hold] = HOLDS
+
+
+@dataclass(frozen=True)
 class Prepared:
-    """All that scores and fits need: the fitted baseline, its regression, noise and probes.
+    """The fitted baseline of a `reading`, its regression, noise and probes, and why some effects were `skipped`.
 
     `doubted` says that the command was not taken for lines, by less evidence than there was of some effect.
     """
 
+    reading: Reading
     baseline: Baseline
     regression: Regression
     bench: Bench
@@ -82,7 +95,7 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class _Fitted:
+class _Fit:
     """The plain stage, fitted to runs in one way."""
 
     regression: Regression
@@ -106,7 +119,7 @@ class _Fitted:
 
     @cached_property
     def beside(self) -> np.ndarray:
-        """Orthonormal columns along which the first ways may differ from later ones."""
+        """Orthonormal columns along which initial curves may differ from loops."""
         joined = self.projector.off(virgin_columns(self.projector))
         if joined.shape[1] == 0:
             return joined
@@ -114,21 +127,20 @@ class _Fitted:
         return q[:, np.abs(np.diagonal(r)) > _SEEN]
 
     def left(self) -> float:
-        """Sum of squares that is left, whatever the first ways are."""
+        """Sum of squares that is left, whatever the initial curves are."""
         left = self.projector.off(self.projector.residual)
         return float(left @ left) - float(np.sum((self.beside.T @ left) ** 2))
 
     def late(self) -> tuple[float, float]:
         """Decrease of that by a delay, and the delay in s."""
         left = self.projector.off(self.projector.residual)
-        probes = list(probes_of(self.bench, TransportDelay, self.scales))
+        form = next(form for form in EFFECTS if form.delay)
+        probes = list(probes_of(self.bench, form, self.scales))
         scores = rescore(score(self.projector, probes, left), self.beside, left)
         if not scores:
             return 0.0, 0.0
         best = max(scores, key=lambda one: one.drop)
-        first = best.probe.effects[0]
-        assert isinstance(first, TransportDelay)
-        return best.drop, float(best.coefficients[0] * first.delay_s)
+        return best.drop, float(best.coefficients[0] * getattr(best.probe.effects[0], form.delay))
 
     def behind(self) -> float:
         """The same decrease, if that is a delay and no lead."""
@@ -147,7 +159,7 @@ class _Fitted:
         column, left = (one - self.beside @ (self.beside.T @ one) for one in (column, left))
         size = float(column @ column)
         along = float(column @ left)
-        return along**2 / size if size > 0 and _LEAST * size < along else 0.0
+        return along**2 / size if size > 0 and _NOTICEABLE * size < along else 0.0
 
     def highest(self) -> float:
         """Evidence of the effect that has most."""
@@ -155,38 +167,30 @@ class _Fitted:
         return max((one.z for one in scores), default=0.0)
 
 
-def prepare_diagnosis(
-    records: Sequence[Record],
-    aside: Sequence[Record],
-    fraction: float,
-    initial: str,
-    progress: Callable[[str], None],
-    holds: Sequence[Hold] = HOLDS,
-) -> Prepared:
-    """Fit the plain stage, learn the noise, and simulate every probe of every effect.
-
-    How the command runs between samples is chosen among `holds`, of which lines are the first.
-    """
+def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prepared:
+    """Fit the plain stage, learn the noise, and simulate every probe of every effect."""
+    records, initial, fraction = reading.records, reading.initial, reading.fraction
     said: tuple[str, ...] = (_FIRST,) if initial == VIRGIN else ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, ONE_WAY)
 
-    def fitted(hold: Hold) -> _Fitted:
-        regression = regress(fit_baseline(records, aside, fraction, initial, progress, hold))
+    def fitted(hold: Hold, initial: str) -> _Fit:
+        regression = regress(fit_baseline(records, reading.aside, fraction, initial, progress, hold))
         faults = find_faults(regression)
         if not faults.repaired:
-            return _Fitted(regression, faults)
+            return _Fit(regression, faults)
         progress("fitting the plain stage again, without single bad samples")
-        regression = regress(fit_baseline(faults.clean(records), aside, fraction, initial, progress, hold))
+        clean = faults.clean(records)
+        regression = regress(fit_baseline(clean, reading.aside, fraction, initial, progress, hold))
         found = find_faults(regression)
-        return _Fitted(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
+        return _Fit(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
 
     progress(Step.BASELINE)
-    here = fitted("first")
+    here = fitted("first", initial)
     drop_programs(records)
     progress(Step.PROBES)
     doubted = False
-    for hold in holds:
+    for hold in reading.holds:
         if hold != "first":
             if not here.regression.baseline.dynamic:
                 break
@@ -195,30 +199,28 @@ def prepare_diagnosis(
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
             drop_programs(records)
-            other = fitted(hold)
+            other = fitted(hold, initial)
             drop_programs(records)
             if not (_curved(here, other) if hold == "smooth" else _held(here, other, drop)):
                 continue
             doubted = doubted or drop < here.highest() ** 2
             here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
         if initial == "unknown" and is_virgin(here.projector, here.highest()):
-            progress("fitting the plain stage again, without the first way of each run")
+            progress("fitting the plain stage again, without the initial curve of each run")
             initial = VIRGIN
-            here, said = fitted(hold), (*said, _FIRST)
+            here, said = fitted(hold, initial), (*said, _FIRST)
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
         if drop > max(_LATE, (_ABOUT * here.highest()) ** 2) and late_s < _SKEW * here.scales.interval_s:
-            here = _Fitted(regress(replace(here.regression.baseline, skewed=True)), here.faults)
+            here = _Fit(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
     if here.faults.jitter_s > 0:
-        here = _Fitted(regress(replace(here.regression.baseline, blurred=True)), here.faults)
+        here = _Fit(regress(replace(here.regression.baseline, blurred=True)), here.faults)
     regression, bench, faults, (probes, skipped) = here.regression, here.bench, here.faults, here.probed
-    if all(held_creep([record]) is not None for record in records):
-        skipped = [
-            *skipped,
-            *((name, _CLOSED) for name in dict.fromkeys(one.name for one in probes) if name != "creep"),
-        ]
-        probes = [one for one in probes if one.name == "creep"]
+    if all(held_gain([record]) is not None for record in records):
+        shut = dict.fromkeys(one.name for one in probes if not one.form.held)
+        skipped = [*skipped, *((name, _CLOSED) for name in shut)]
+        probes = [one for one in probes if one.form.held]
     baseline = replace(regression.baseline, remarks=(*regression.baseline.remarks, *said))
     progress(Step.ROUGHNESS)
     rough = learn_roughness(here.projector, [column for probe in probes for column in probe.signatures])
@@ -226,21 +228,21 @@ def prepare_diagnosis(
     del here
     drop_programs(records)
     projector = Projector(regression, faults.noise, rough)
-    return Prepared(baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped), doubted)
+    return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped), doubted)
 
 
-def _curved(lines: _Fitted, curves: _Fitted) -> bool:
+def _curved(lines: _Fit, curves: _Fit) -> bool:
     """Whether a command along curves leaves less than one in lines, beyond chance and beside the best effect, too."""
     # With the same noise, they compare.
-    same = _Fitted(curves.regression, lines.faults)
+    same = _Fit(curves.regression, lines.faults)
     beside = (lines.left() - lines.highest() ** 2) - (same.left() - same.highest() ** 2)
     return lines.left() - same.left() > _LATE and beside > 0
 
 
-def _held(lines: _Fitted, steps: _Fitted, late: float) -> bool:
+def _held(lines: _Fit, steps: _Fit, late: float) -> bool:
     """Whether a command held in steps explains what a delay, behind lines, takes so much off."""
     # With the same noise, they compare: by themselves, and with a delay beside each.
-    same = _Fitted(steps.regression, lines.faults)
+    same = _Fit(steps.regression, lines.faults)
     gained = lines.left() - same.left()
     return gained > _AS_WELL * late or gained - late + same.behind() > _BETTER * late
 
@@ -250,7 +252,7 @@ def _covered(records: Sequence[Record], fraction: float) -> bool:
     parts = [record.voltage_V[: len(record) - round(fraction * len(record))] for record in records]
     span_V = float(np.ptp(np.concatenate([record.voltage_V for record in records])))
     moves_V = np.concatenate([np.diff(part) for part in parts])
-    return min(float(moves_V[moves_V > 0].sum()), -float(moves_V[moves_V < 0].sum())) > _BOTH_WAYS * span_V
+    return min(float(moves_V[moves_V > 0].sum()), -float(moves_V[moves_V < 0].sum())) > _HALF * span_V
 
 
 def _probed(bench: Bench, scales: Scales) -> tuple[list[Probe], list[tuple[str, str]]]:
@@ -265,6 +267,6 @@ def _probed(bench: Bench, scales: Scales) -> tuple[list[Probe], list[tuple[str, 
         own = list(probes_of(bench, form, scales))
         if not own:
             why = "the runs are too short or too plain to show it"
-            skipped.append((form.name, "nothing of it was found, sample by sample" if form.name in SINGLE else why))
+            skipped.append((form.name, "nothing of it was found, sample by sample" if form.statistic else why))
         probes += own
     return probes, skipped

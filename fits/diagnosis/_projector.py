@@ -1,6 +1,7 @@
-"""What a re-fitted baseline leaves of a signal: projection off its whole tangent, in units of the noise."""
+"""What a re-fitted baseline leaves of a signal: projection off its tangent space, in units of the noise."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +10,13 @@ from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
 
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._regression import Regression
-from fits.loop._evidence import Posterior
-from fits.loop._grid import non_negative
+from fits.diagnosis._regression import Regression, root_of
+from fits.loop._evidence import Posterior, maximise_evidence
+from fits.loop._grid import EVIDENCE_LEVELS, non_negative
+from fits.loop._moments import Moments
+from fits.loop._prior import Hyper, interpolation, roughness
 from fits.loop._result import FitError, FitStatus
+from fits.stage._solve import prior_precision
 from fits.stats._whiten import Noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
@@ -26,29 +30,12 @@ _FARTHEST = 3.0
 class Projector:
     """Takes off signals what the baseline can follow.
 
-    Signals are given per run, for all samples; inside they are whitened, joined, and followed by one entry for each
-    unknown that has a prior, by which that counts.
-
-    Parameters
-    ----------
-    regression
-        Of the baseline on all runs.
-    noise
-        Of each run.
-    roughness
-        Standard deviation of the relative roughness of the density that its grid cannot follow, of each kind in
-        `Regression.finer`.
-    more
-        Further signals that count as part of the baseline: per column, a list over runs.
+    Signals are given per run, for all samples; inside they are whitened by the `noise` of each run, joined, and
+    followed by one entry for each unknown that has a prior. `roughness` is the standard deviation of the relative
+    roughness of the density that its grid cannot follow, of each kind in `Regression.finer`.
     """
 
-    def __init__(
-        self,
-        regression: Regression,
-        noise: Sequence[Noise],
-        roughness: Sequence[float] = (),
-        more: Sequence[Sequence[np.ndarray]] = (),
-    ):
+    def __init__(self, regression: Regression, noise: Sequence[Noise], roughness: Sequence[float] = ()):
         self.regression, self.noise, self.roughness = regression, tuple(noise), tuple(roughness)
         self.masks = regression.masks
         self.count = sum(int(mask.sum()) for mask in self.masks)
@@ -57,13 +44,10 @@ class Projector:
         sizes = [size for size in roughness if size > 0]
         priors = grid + sum(kind[0].shape[1] for kind in rough)
         self._priors = priors
-        shared = self._joined_rows(
+        shared = self.join(
             [np.concatenate([rows, *(k[i] for k in rough)], axis=1) for i, rows in enumerate(regression.rows)]
         )
-        blocks = [shared, self.own_rows]
-        if more:
-            blocks.append(np.stack([self.join(column) for column in more], axis=1))
-        matrix = np.concatenate(blocks, axis=1)
+        matrix = np.concatenate([shared, self.own_rows], axis=1)
         root = regression.root
         matrix[self.count : self.count + grid, :grid] = root
         at, row = regression.size, self.count + grid
@@ -103,9 +87,6 @@ class Projector:
     def root(self) -> np.ndarray:
         """The tangent's columns in terms of `orthonormal`, shape `(k, unknowns)`."""
         return self._root * self._scale
-
-    def _joined_rows(self, signals: Sequence[np.ndarray]) -> np.ndarray:
-        return self.join(signals)
 
     @property
     def own_rows(self) -> np.ndarray:
@@ -154,7 +135,7 @@ class Projector:
         along = self.orthonormal.T @ joined if self._matrix is None else self._inverse.T @ (self._matrix.T @ joined)
         return (self._inverse @ along) / self._scale
 
-    def ahead(self, change_um: Sequence[np.ndarray]) -> float:
+    def held_out_error(self, change_um: Sequence[np.ndarray]) -> float:
         """Mean square of the errors in what is held out of the runs, in noise variances, under effects.
 
         The baseline and the runs' nuisance parameters follow what was fitted. NaN where nothing is held out.
@@ -213,9 +194,9 @@ def learn_roughness(
 ) -> tuple[float, ...]:
     """Find how rough the density is beyond its grid, from what neither the baseline nor any candidate explains.
 
-    Maximises the probability of the residual (the evidence) over the standard deviations of the relative roughness
-    of all kinds; a kind without which the residual is as probable is left out. What known effects change in each run,
-    `change_um`, of shape `(n,)`, is taken off before.
+    Maximises the evidence over the standard deviations of the relative roughness of all kinds; a kind without which
+    the residual is as probable is left out. What known effects change in each run, `change_um` of shape `(n,)`, is
+    taken off before.
     """
     finer = projector.regression.finer
     joined = [projector.join(kind) for kind in finer]
@@ -244,3 +225,31 @@ def learn_roughness(
         if found.fun < best - 0.5:
             best, at = float(found.fun), found.x
     return tuple(float(min(np.exp(a), _ROUGHEST)) if a > -12 else 0.0 for a in at)
+
+
+def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector:
+    """The same beside the most probable density under what causes change in each run, shape `(n,)`.
+
+    Maximises the evidence for the columns as `solve_grid` does, from the noise as it was found, with coordinates and
+    nuisance parameters free (MacKay, Neural Computation 4 (1992) 415).
+    """
+    regression = projector.regression
+    baseline, count = regression.baseline, projector.count
+    size, stroke_um = len(baseline.columns_um), baseline.stroke_um
+    joined = projector.join(list(regression.rows))[:count]
+    target = (projector.residual - projector.join(change_um))[:count] + joined[:, :size] @ baseline.columns_um
+    others = np.concatenate([joined[:, size:], projector.own_rows[:count]], axis=1)
+    scale = np.linalg.norm(others, axis=0)
+    basis, _ = qr(others[:, scale > 0] / scale[scale > 0], mode="economic")
+    columns = joined[:, :size] * stroke_um
+    columns, target = (one - basis @ (basis.T @ one) for one in (columns, target))
+    left = np.asarray(float(count - basis.shape[1]))
+    moments = Moments(columns.T @ columns, columns.T @ target, np.asarray(target @ target), left)
+    rough, levels = roughness(baseline.chain.levels), baseline.chain.levels
+    if levels > EVIDENCE_LEVELS:
+        fewer = interpolation(EVIDENCE_LEVELS, levels)
+        moments, rough = moments.project(fewer), rough.project(fewer)
+    start = replace(Hyper.start(), log_variance=jnp.zeros(()))
+    prior = prior_precision(baseline.chain, maximise_evidence(moments, rough, start), stroke_um)
+    moved = replace(regression, baseline=replace(baseline, prior=prior), root=root_of(prior))
+    return Projector(moved, projector.noise, projector.roughness)

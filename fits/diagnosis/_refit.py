@@ -1,4 +1,4 @@
-"""Effects fitted to what the baseline leaves, the baseline following along its tangent."""
+"""Effects fitted to what the baseline leaves, the baseline following along its tangent space."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
-from fits.diagnosis._candidates import Bench
-from fits.diagnosis._law import Law, law_of, remembering, strength_of
+from fits.diagnosis._effects import Bench, Law, remembering, strength_of
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._score import Scored
+from fits.diagnosis._score import Scored, law_of
 from fits.io.columns import columns_beside
 from microid import AbstractEffect
 
@@ -43,18 +42,10 @@ _MORE = (1.0, 3.0, 9.0)
 class Refit:
     """A set of effects, fitted together.
 
-    Attributes
-    ----------
-    laws, x
-        The effects, and their coordinates.
-    change_um
-        What they change in the plain stage's response, shape `(n,)` per run.
-    residual
-        What is left, whitened and joined, off the baseline's tangent.
-    tangent
-        Derivatives of the response along all coordinates, off the baseline's tangent, shape `(rows, k)`.
-    cost
-        Sum of squares of the residual, in noise variances.
+    `x` are the coordinates of the `laws`; `change_um` what they change in the plain stage's response, shape `(n,)`
+    per run; `residual` what is left, whitened and joined, off the baseline's tangent space, and `cost` its sum of
+    squares in noise variances; `tangent` the derivatives of the response along all coordinates, off the same, shape
+    `(rows, k)`.
     """
 
     laws: tuple[Law, ...]
@@ -107,13 +98,13 @@ class Refit:
         """Whether the data determine the strength of the last effect, in some run at least, within its bounds.
 
         Marginally, whatever its other coordinates are, as its time constant, or else beside them as they were found:
-        where an effect is weak, the records may show no more than that it is there. An effect that is as strong as
-        can be stands in for another, unless it `alone` leaves nothing but noise of what was more.
+        where an effect is weak, the records may show no more than that it is there. At its bound it counts only where
+        it `alone` leaves nothing but noise of what was more.
         """
         law, x = self.laws[-1], self.x[-1]
-        if not law.form.strength or (alone and law.pinned(x)):
+        if not law.form.strength or (alone and law.at_bound(x)):
             return True
-        if law.pinned(x):
+        if law.at_bound(x):
             return False
         varied = np.arange(law.size) if marginally else np.flatnonzero(law.strengths)
         before = self.tangent.shape[1] - law.size
@@ -162,28 +153,22 @@ def _strength(
 def nothing(bench: Bench, projector: Projector) -> Refit:
     """The baseline without any effect."""
     residual = projector.off(projector.residual)
-    return Refit(
-        (),
-        (),
-        tuple(np.zeros_like(plain) for plain in bench.plain),
-        residual,
-        np.zeros((len(residual), 0)),
-        float(residual @ residual),
-    )
+    change_um = tuple(np.zeros_like(plain) for plain in bench.plain)
+    return Refit((), (), change_um, residual, np.zeros((len(residual), 0)), float(residual @ residual))
 
 
 def refit(
     bench: Bench, projector: Projector, laws: Sequence[Law], x: Sequence[np.ndarray], rounds: int = _ROUNDS
 ) -> Refit:
-    """Fit effects together: Levenberg and Marquardt's steps, the baseline projected out (variable projection)."""
+    """Fit effects together by Levenberg and Marquardt's steps, the baseline projected out (variable projection)."""
     return _fit(bench, projector, laws, x, 0, np.zeros((len(projector.residual), 0)), rounds)
 
 
 def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Scored) -> Refit:
     """Fit one more effect, those that are there following along their tangent.
 
-    It starts from the multiple of the linearised answer that explains most: effects level off as they grow, and
-    from too weak a start a fit ends beside the truth.
+    It starts from the multiple of the linearised answer that explains most: effects saturate as they grow, and from
+    too weak a start a fit ends in another minimum.
     """
     basis, runs = model.basis(), len(bench.prepared)
 
@@ -201,7 +186,7 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
 
 
 def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -> Refit:
-    """Look for better instants of what happened at one, farther than a fit's steps see, in laws from the `first` on.
+    """Search for better instants of what happened at one, beyond a fit's steps, in laws from the `first` on.
 
     The sum of squares over the instant is jagged where the stage rings: better ones are tried on both sides, nearer
     and nearer.
@@ -228,7 +213,8 @@ def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: floa
     """Fit a law at another instant; all others stay, and follow along their tangent."""
     laws, x = list(model.laws), list(model.x)
     here = [laws[k].effect(x[k], run) for run in range(len(bench.prepared))]
-    laws[k] = Law([_later(one, way_s, least_s) for one in here], laws[k].remembers)
+    later = [replace(one, after_s=jnp.maximum(one.after_s + way_s, least_s)) for one in here]  # type: ignore[attr-defined,call-arg]
+    laws[k] = Law(later, laws[k].remembers)
     x[k] = laws[k].start
     order = [*(i for i in range(len(laws)) if i != k), k]
     owner = np.repeat(np.arange(len(laws)), [law.size for law in model.laws])
@@ -236,10 +222,6 @@ def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: floa
     found = _fit(bench, projector, [laws[i] for i in order], [x[i] for i in order], len(laws) - 1, basis, 2)
     back = np.argsort(order)
     return replace(found, laws=tuple(found.laws[i] for i in back), x=tuple(found.x[i] for i in back))
-
-
-def _later(effect: AbstractEffect, more_s: float, least_s: float) -> AbstractEffect:
-    return replace(effect, after_s=jnp.maximum(effect.after_s + more_s, least_s))  # type: ignore[attr-defined,call-arg]
 
 
 def _fit(
@@ -254,7 +236,6 @@ def _fit(
     """Fit all laws but the first so many, which follow along `basis`."""
     runs = len(bench.prepared)
     sizes = [law.size for law in laws[held:]]
-
     target = projector.off(projector.residual)
 
     def parts(flat: np.ndarray) -> list[np.ndarray]:
@@ -316,11 +297,5 @@ def _fit(
             break
         jacobian = slope(flat, at)
     cut = parts(flat)
-    return Refit(
-        tuple(laws),
-        (*x[:held], *cut),
-        tuple(change(flat)),
-        residual,
-        -jacobian,
-        float(residual @ residual),
-    )
+    found = tuple(laws), (*x[:held], *cut), tuple(change(flat))
+    return Refit(*found, residual, -jacobian, float(residual @ residual))

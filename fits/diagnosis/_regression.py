@@ -1,21 +1,23 @@
-"""All runs as one regression: derivatives of the baseline, and finer structure of the density than its grid has."""
+"""All runs as one regression: Jacobian of the baseline, and structure of the density finer than its grid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.linalg import cholesky
 
-from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._evaluate import simulate, with_effects
-from fits.diagnosis._tangent import answering, behind, dressed, passed
+from fits.diagnosis._baseline import Baseline, simulate, with_effects
 from fits.loop._design import Grid
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
 from fits.stage._moments import Chain, linearise, pieces
-from microid import AbstractEffect
+from fits.stage._run import joined, place_of_hysteresis
+from microid import PLACES, AbstractEffect, Coordinates, Signal, Stage
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
 _FINE = 64
@@ -24,35 +26,24 @@ _EXAMPLES = 120
 _STEP = 1e-4
 # Part of an unknown of a run that must be left in the samples that count.
 _DEAD = 1e-3
-
-
 # By kind, per run.
 Kinds: TypeAlias = tuple[tuple[np.ndarray, ...], ...]
+# Directions that are passed on at a time.
+_AT_ONCE = 64
+# Places of effects that are added to whatever the stage does.
+_ADDED = ("environment", "noise")
 
 
 @dataclass(frozen=True)
 class Regression:
-    """Derivatives of a baseline in all runs, for all samples.
+    """Jacobian of a baseline in all runs, for all samples, and what it leaves.
 
-    Attributes
-    ----------
-    baseline
-        Where it is linearised.
-    masks
-        Samples of each run that are fitted, shape `(n,)`.
-    rows
-        Derivatives along columns and coordinates, shape `(n, D + p)` per run.
-    own
-        Each run's nuisance parameters, shape `(n, k)`.
-    finer
-        By kind, per run, what relative roughness of the density changes that the grid cannot follow, shape `(n, k)`:
-        of loops of one width at all biases, as play operators are, and at single places of the half-plane.
-    residuals
-        Measurement less simulation, in um, shape `(n,)` per run.
-    root
-        Root of the prior precision of the columns, shape `(D, D)`.
-    through
-        Per run, the effects that the derivatives go through; the residuals are those without them.
+    Per run: `masks` of the samples that are fitted, shape `(n,)`; `rows`, derivatives along columns and coordinates,
+    shape `(n, D + p)`; `own`, signals of the run's nuisance parameters, shape `(n, k)`; `residuals`, measurement less
+    simulation without effects, in um, shape `(n,)`; `through`, the effects that the derivatives go through. By kind
+    and run, `finer` is what relative roughness of the density changes that the grid cannot follow, shape `(n, k)`: of
+    loops of one width at all biases, as play operators are, and at single places of the half-plane. `root` is the
+    root of the prior precision of the columns, shape `(D, D)`.
     """
 
     baseline: Baseline
@@ -75,15 +66,9 @@ def regress(
 ) -> Regression:
     """Linearise a baseline in all its runs.
 
-    Parameters
-    ----------
-    baseline
-        The plain stage.
-    finer
-        Structure finer than its grid, from a baseline nearby and under the same effects; computed by default.
-    effects
-        Per run, those beside which the baseline moves: the derivatives along coordinates go through all that answer
-        to the stage, those along columns where that matters.
+    `finer` is the structure finer than its grid, from a baseline nearby and under the same effects; it is computed by
+    default. `effects` are those of each run beside which the baseline moves: derivatives along coordinates go through
+    all that depend on the stage, those along columns through those that saturate.
     """
     chain, runs, z = baseline.chain, baseline.runs, jnp.asarray(baseline.z)
     assert chain.grid is not None
@@ -115,16 +100,9 @@ def regress(
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
             for kind, part in zip(kinds, _along(fine, baseline, run, bases, around), strict=True):
                 kind.append(part)
-    return Regression(
-        baseline,
-        tuple(run.fitted for run in runs),
-        tuple(rows),
-        tuple(own),
-        tuple(tuple(kind) for kind in kinds) if finer is None else finer,
-        tuple(residuals),
-        root_of(baseline.prior),
-        through,
-    )
+    masks, structure = tuple(run.fitted for run in runs), tuple(map(tuple, kinds)) if finer is None else finer
+    data = tuple(rows), tuple(own), structure, tuple(residuals)
+    return Regression(baseline, masks, *data, root_of(baseline.prior), through)
 
 
 def root_of(prior: np.ndarray) -> np.ndarray:
@@ -133,7 +111,7 @@ def root_of(prior: np.ndarray) -> np.ndarray:
 
 
 def _alive(own: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """A run's nuisance parameters without those that have died away before the samples that count.
+    """A run's nuisance parameters without those whose signals have decayed before the samples that count.
 
     They would be fitted to noise there, and reach far beyond it where they begin.
     """
@@ -178,3 +156,87 @@ def _along(
     parts = [columns @ joined for _, columns in pieces(finer, jnp.asarray(baseline.z), run, True)]
     moved = behind(finer, baseline.z, run, around_um, np.concatenate(parts)[: len(run.record)])
     return np.split(moved, np.cumsum([base.shape[1] for base in bases])[:-1], axis=1)
+
+
+def passed(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
+    """Those that derivatives along the density go through: a rail, say, beyond which nothing moves any more.
+
+    They saturate, stand by themselves, and act before the mechanics has answered.
+    """
+    last = PLACES.index("mechanics")
+    return tuple(
+        one for one in effects if one.finite and not hasattr(one, "inner") and PLACES.index(one.place) <= last
+    )
+
+
+def answering(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
+    """Those whose change depends on driver and mechanics.
+
+    A lag of the sensor and one of the driver do nearly the same, so that telling them apart takes exact derivatives.
+    """
+    return tuple(one for one in effects if one.place not in _ADDED)
+
+
+class _Dressed(eqx.Module):
+    """Coordinates of a plain stage, of which a stage with effects is made."""
+
+    plain: Coordinates[Stage]
+    effects: tuple[AbstractEffect, ...]
+
+    def __call__(self, z: Float[Array, " p"]) -> Stage:
+        """The stage with the effects."""
+        return with_effects(self.plain(z), self.effects)
+
+
+def dressed(chain: Chain, z: np.ndarray, effects: tuple[AbstractEffect, ...]) -> Chain:
+    """The chain of a stage with effects, in the same coordinates and columns."""
+    if not effects:
+        return chain
+    coordinates = _Dressed(chain.coordinates, effects)
+    return Chain(coordinates, place_of_hysteresis(coordinates(jnp.asarray(z))), chain.grid)  # type: ignore[arg-type]
+
+
+def behind(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
+    """Pass changes of the hysteresis, shape `(n, k)`, on through what follows it, to first order.
+
+    Where all that follows is linear, they have been passed on already. `around_um` is what comes out of the
+    hysteresis, shape `(n,)`.
+    """
+    assert chain.place is not None
+    stage = chain.coordinates(jnp.asarray(z))
+    after = stage.parts[chain.place + 1 :]
+    if not after or joined(after) is not None:
+        return moved_um
+    n, samples = len(run.record), run.samples
+    pad = len(samples.weight) - n
+    time_s = samples.time_s * samples.stride if samples.time_s.ndim == 0 else samples.time_s[:: samples.stride]
+    signal = jnp.asarray(np.pad(around_um, (0, pad), mode="edge"))
+    out = np.empty_like(moved_um)
+    for first in range(0, moved_um.shape[1], _AT_ONCE):
+        part = moved_um[:, first : first + _AT_ONCE].T
+        more = _AT_ONCE - len(part)
+        full = np.pad(part, ((0, more), (0, pad)))
+        answer = _behind(chain.coordinates, chain.place, jnp.asarray(z), time_s, signal, jnp.asarray(full))
+        out[:, first : first + _AT_ONCE] = np.asarray(answer)[: len(part), :n].T
+    return out
+
+
+@eqx.filter_jit
+def _behind(
+    coordinates: Coordinates[Stage],
+    place: int,
+    z: Float[Array, " p"],
+    time_s: Float[Array, " n"] | Float[Array, ""],
+    around_um: Float[Array, " n"],
+    moved_um: Float[Array, "k n"],
+) -> Float[Array, "k n"]:
+    stage = coordinates(z)
+
+    def follow(values: Float[Array, " n"]) -> Float[Array, " n"]:
+        signal = Signal(values, values[0], "first")
+        for part in stage.parts[place + 1 :]:
+            signal = part.run(time_s, signal)
+        return signal.values
+
+    _, push = jax.linearize(follow, around_um)
+    return jax.vmap(push)(moved_um)

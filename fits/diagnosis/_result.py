@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from microid import Stage
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]
 SCHEMA = "microid.diagnosis/1"
+# The residual depends on something below this probability by chance.
+_SIGNIFICANT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -64,19 +66,16 @@ class FoundCause:
 
 @dataclass(frozen=True)
 class Bound:
-    """An effect that was not found, and how large it may still be.
+    """An effect that was not found, and how large it may still be; numbers are NaN where it was not asked about.
 
     Attributes
     ----------
-    name
-        Of the effect.
-    z
-        Evidence for it beside the causes, in standard deviations.
+    name, z
+        Of the effect, and evidence for it beside the causes, in standard deviations.
     absorbed_fraction
-        Part of its size that the plain stage follows, so that the records cannot show it; NaN where not asked.
+        Part of its size that the plain stage follows, so that the records cannot show it.
     bound_um
-        Size in the displacement, root mean square before anything follows, that it does not exceed at 95 %; NaN
-        where not asked.
+        Size in the displacement, root mean square before anything follows, that it does not exceed at 95 %.
     reason
         Why it was not asked about; empty where it was.
     """
@@ -90,18 +89,10 @@ class Bound:
 
 @dataclass(frozen=True)
 class Test:
-    """One way of looking at the residual of the plain stage.
+    """One test of the residual of the plain stage, against something such as `time`, `velocity` or `whiteness`.
 
-    Attributes
-    ----------
-    name
-        Such as `time`, `voltage`, `velocity`, `frequency`, `whiteness`.
-    statistic, p
-        Evidence in standard deviations, and the probability of as much by chance.
-    share
-        Part of the residual's variance that is explained by looking at it this way.
-    sentence
-        What it says.
+    `statistic` is the evidence in standard deviations, `p` the probability of as much by chance, and `share` the part
+    of the residual's variance that it explains.
     """
 
     name: str
@@ -110,6 +101,11 @@ class Test:
     share: float
     sentence: str
 
+    @classmethod
+    def of(cls, name: str, z: float, p: float, share: float, sentence: str) -> Self:
+        """A test with the sentence that says what its significance means."""
+        return cls(name, z, p, share, sentence if p < _SIGNIFICANT else f"no sign of this: {sentence}")
+
 
 @dataclass(frozen=True)
 class Gain:
@@ -117,17 +113,15 @@ class Gain:
 
     Attributes
     ----------
-    heldout_rms_before_um, heldout_rms_after_um
-        Root mean square errors of plain and extended stage.
-    sd_of_difference_um
-        Standard deviation of their difference.
+    heldout_rms_before_um, heldout_rms_after_um, sd_of_difference_um
+        Root mean square errors of plain and extended stage, and the standard deviation of their difference.
     heldout_max_before_um, heldout_max_after_um
         Largest errors.
     noise_um
         Noise floor.
     feedforward_before_um, feedforward_after_um
-        Root mean square errors of the displacement of the extended stage under voltages from the inverse of the
-        plain one and from its own.
+        Root mean square errors of the displacement of the extended stage under voltages from the inverse of the plain
+        one and from its own.
     source
         What was held out, in words.
     """
@@ -147,16 +141,8 @@ class Gain:
 class RunView:
     """One run, for pictures: shape `(n,)` each.
 
-    Attributes
-    ----------
-    source
-        Name of its file.
-    time_s, voltage_V, measured_um
-        As recorded.
-    before_um, after_um
-        Measurement less the plain and the extended stage, offset and start taken off.
-    fitted
-        Samples that were used.
+    `before_um` and `after_um` are measurement less the plain and the extended stage, offset and start taken off;
+    `fitted` are the samples that were used.
     """
 
     source: str
@@ -170,22 +156,16 @@ class RunView:
 
 @dataclass(frozen=True)
 class Experiment:
-    """The next experiment: a voltage program, and what it would tell apart.
+    """The next experiment: a voltage program of shape `(n,)`, and what it would tell apart.
 
     Attributes
     ----------
-    time_s, voltage_V
-        The program, shape `(n,)`.
-    kind
-        What it is made of, in words.
-    purpose
-        What it decides, one sentence.
+    kind, purpose
+        What it is made of, in words, and what it decides, one sentence.
     separates
         Names of the effects.
-    predicted_z
-        Standard deviations by which they would differ, at the smallest.
-    present_z
-        The same in the records at hand.
+    predicted_z, present_z
+        Standard deviations by which they would differ, at the smallest, and by which they do in the records at hand.
     extra_column
         Which further column would help, and why; empty if none would.
     extremes

@@ -1,15 +1,21 @@
 """Score tests: how much of what the baseline leaves lies along each effect that it lacks."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from fits.diagnosis._candidates import Probe
+from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._effects import Bench, Law, _without_host
 from fits.diagnosis._projector import Projector
-from microid import AbstractEffect
+from fits.io.columns import columns_beside
+from fits.stage._encode import spec_of
+from microid import AbstractEffect, Coordinates, Mechanics, Scales, host
 
+# Strength at which an effect's derivative is taken, as a share of that of its probe.
+_SHARE = 1e-2
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
@@ -23,26 +29,114 @@ _LARGEST = 300.0
 
 
 @dataclass(frozen=True)
+class Probe:
+    """A group of effects, of the size probed, that the data are asked about together.
+
+    `signatures` are what each changes in all runs, in um: per column, a list over runs, where an effect that differs
+    from run to run has one column per run. They are `positive` where the strength cannot be negative.
+    """
+
+    effects: tuple[AbstractEffect, ...]
+    signatures: tuple[tuple[np.ndarray, ...], ...]
+    positive: bool
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.effects[0].name
+
+    @property
+    def form(self) -> type[AbstractEffect]:
+        """Which model of it."""
+        return type(self.effects[0])
+
+
+def scales_of(bench: Bench, noise_um: float) -> Scales:
+    """Measure how large things are in the runs."""
+    baseline, plain = bench.baseline, bench.plain
+    records = [run.record for run in baseline.runs]
+    stage = baseline.stage
+    mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
+    fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
+    columns: dict[str, tuple[float, float]] = {}
+    for run in baseline.runs:
+        for name, values in columns_beside(run.record).items():
+            columns.setdefault(name, (float(np.mean(values)), float(np.ptp(values))))
+    return Scales(
+        lower_V=baseline.range_V[0],
+        upper_V=baseline.range_V[1],
+        fastest_V_per_s=fastest,
+        stroke_um=float(max(p.max() for p in plain) - min(p.min() for p in plain)),
+        middle_um=float(max(p.max() for p in plain) + min(p.min() for p in plain)) / 2,
+        interval_s=min(float(np.median(np.diff(r.time_s))) for r in records),
+        duration_s=max(r.duration_s for r in records),
+        shortest_s=min(r.duration_s for r in records),
+        noise_um=noise_um,
+        resonance_Hz=float(mechanics[0].natural_frequency_Hz) if mechanics else None,
+        columns=tuple((name, *value) for name, value in columns.items()),
+    )
+
+
+def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
+    """Why an effect cannot be asked about, as the end of a sentence; None where it can."""
+    stage = baseline.stage
+    if form.fast and not baseline.dynamic:
+        return "the runs do not show the dynamics"
+    beside = [columns_beside(run.record) for run in (*baseline.runs, *baseline.aside)]
+    for name in form.needs:
+        if not all(name in columns for columns in beside):
+            return f"not all runs, those held out included, have a column {name} that varies"
+    for name in form.unless:
+        if all(name in columns for columns in beside):
+            return f"the column {name} says what it would be, and that is asked about instead"
+    try:
+        host(form, stage)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Iterator[Probe]:
+    """Simulate all probes of an effect."""
+    stage = bench.stage
+    place = host(form, stage)
+    inner = None if place is None else stage.parts[place]
+    for group in form.probes(scales, inner):
+        columns: list[tuple[np.ndarray, ...]] = []
+        for effect in group:
+            share = 1.0 if form.finite else _SHARE
+            change = [c / share for c in bench.change([_scaled(effect, share)])]
+            if form.per_run and len(change) > 1:
+                for k in range(len(change)):
+                    columns.append(tuple(c if i == k else np.zeros_like(c) for i, c in enumerate(change)))
+            else:
+                columns.append(tuple(change))
+        if all(np.all(np.isfinite(c)) for column in columns for c in column):
+            yield Probe(tuple(group), tuple(columns), one_sided(form))
+
+
+def _scaled(effect: AbstractEffect, share: float) -> AbstractEffect:
+    if share == 1.0 or not effect.strength:
+        return effect
+    return replace(effect, **{name: share * getattr(effect, name) for name in effect.strength})
+
+
+def one_sided(form: type[AbstractEffect]) -> bool:
+    """Whether the strength of an effect cannot be negative."""
+    fields = form.__dataclass_fields__
+    specs = [spec_of(fields[name]) for name in form.strength]
+    return not specs or all(spec is not None and spec.lower >= 0 for spec in specs)
+
+
+@dataclass(frozen=True)
 class Scored:
     """One probe, asked.
 
-    Attributes
-    ----------
-    probe
-        What was asked about.
-    columns
-        Its signatures off the baseline's tangent, whitened and joined, shape `(rows, k)`.
-    z
-        Evidence, in standard deviations.
-    sure
-        The same if what is left counts as noise that stays alike for a while, as large as it is where it is: little
-        for an effect that only comes nearest to a misfit of another shape.
-    coefficients
-        Best multiples of the signatures, shape `(k,)`.
-    drop
-        Decrease of the sum of squares, in noise variances.
-    share_left
-        Norm of the projected signatures over that of the raw ones.
+    `columns` are its signatures off the baseline's tangent space, whitened and joined, shape `(rows, k)`, and
+    `coefficients` their best multiples, shape `(k,)`; `share_left` is the norm of the columns over that of the raw
+    signatures. `z` is the evidence in standard deviations, `drop` the decrease of the sum of squares in noise
+    variances. `sure` is the evidence where what is left counts as noise that stays alike for a while, as large as it
+    is where it is: little for an effect that only comes nearest to a misfit of another shape.
     """
 
     probe: Probe
@@ -61,7 +155,7 @@ class Scored:
     @property
     def form(self) -> type[AbstractEffect]:
         """Which model of it."""
-        return type(self.probe.effects[0])
+        return self.probe.form
 
 
 def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -> tuple[Scored, ...]:
@@ -85,6 +179,14 @@ def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -
         columns[:, _squares(columns) <= _BLIND**2 * raw[own]] = 0.0
         found.append(_scored(probe, columns, residual, float(np.sum(raw[own])) ** 0.5))
     return tuple(found)
+
+
+def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
+    """The highest score of each effect, the highest first."""
+    found: dict[str, Scored] = {}
+    for one in sorted(scores, key=lambda s: -s.z):
+        found.setdefault(one.name, one)
+    return found
 
 
 def rescore(scores: Sequence[Scored], basis: np.ndarray, residual: np.ndarray) -> tuple[Scored, ...]:
@@ -188,3 +290,22 @@ class Family:
         edge = float(self.largest[-20])
         tests = 20 / _DRAWS / (2 * stats.norm.sf(edge))
         return float(min(1.0, tests * 2 * stats.norm.sf(z)))
+
+
+def law_of(scored: Scored, runs: int, more: float = 1.0) -> Law:
+    """Start from a probe and the multiples of its signatures that the data ask for, or more of them."""
+    form = scored.form
+    effects: list[AbstractEffect] = []
+    per_run = form.per_run and runs > 1
+    for run in range(runs):
+        first = scored.probe.effects[0]
+        values = {}
+        for name in form.strength:
+            spec = next(i.spec for i in Coordinates(_without_host(first)).table if i.path == name)
+            total = np.zeros(np.shape(getattr(first, name)))
+            for k, effect in enumerate(scored.probe.effects):
+                share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]
+                total = total + more * float(share) * np.asarray(getattr(effect, name))
+            values[name] = jnp.asarray(np.clip(total, spec.lower, spec.upper))
+        effects.append(replace(first, **values) if values else first)
+    return Law(effects)

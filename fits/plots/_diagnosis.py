@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from fits.diagnosis._result import Diagnosis, Experiment, RunView
-from fits.diagnosis._views import VIEWS
-from fits.diagnosis._words import Lengths
+from fits.plots._residual_views import VIEWS
 from fits.plots._style import figure, label, verbatim
+from microid.effects import card_of
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
 BEFORE, AFTER = "#d55e00", "#0072b2"
@@ -96,8 +96,8 @@ def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
     return [runs[k] for k in keep]
 
 
-def residuals(diagnosis: Diagnosis, length: Lengths) -> Picture | None:
-    """Residual of the plain and the extended stage over time; None where there are no runs."""
+def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
+    """Residual of the plain and the extended stage over time, in a unit; None where there are no runs."""
     runs = shown_runs(diagnosis.runs)
     if not runs:
         return None
@@ -109,20 +109,20 @@ def residuals(diagnosis: Diagnosis, length: Lengths) -> Picture | None:
         panels = picture.subplots(len(runs), 1, sharey=True, squeeze=False)[:, 0]
         for axes, run in zip(panels, runs, strict=True):
             _set_aside(axes, run)
-            band = _BAND * diagnosis.noise_um * length.per_um
+            band = _BAND * diagnosis.noise_um * per_um
             if np.isfinite(band):
                 axes.axhspan(-band, band, color=NOISE, linewidth=0)
             curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if extended else [])
             for values, colour, line in curves:
                 keep = _envelope(values, points)
-                axes.plot(run.time_s[keep], length.per_um * values[keep], color=colour, linewidth=line)
+                axes.plot(run.time_s[keep], per_um * values[keep], color=colour, linewidth=line)
             if np.isfinite(band):
                 # Over the curves, which else hide the band.
                 for edge in (-band, band):
                     axes.axhline(edge, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=3)
             axes.set_xlim(run.time_s[0], run.time_s[-1])
             axes.set_title(verbatim(run.source, int(12 * width_in)), loc="left")
-            label(axes, y=f"residual ({length.unit})" if len(runs) < 3 or width_in == _WIDE_in else length.unit)
+            label(axes, y=f"residual ({unit})" if len(runs) < 3 or width_in == _WIDE_in else unit)
         label(panels[-1], "time (s)")
         return picture
 
@@ -139,17 +139,16 @@ def _set_aside(axes: Axes, run: RunView) -> None:
             axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
 
 
-def fingerprint(diagnosis: Diagnosis, name: str, length: Lengths, number: int) -> tuple[Picture, str] | None:
-    """The residual against the variable that shows an effect, and what is drawn in words; None without runs."""
-    found = next((view for view in VIEWS if name in view.effects), VIEWS[-1])
-    try:
-        seen = found.look(diagnosis.runs, length.per_um)
-    except ValueError:
-        found = VIEWS[-1]
+def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, unit: str) -> tuple[Picture, str] | None:
+    """The residual against the variable that shows an effect, and what is drawn in words; None where runs do not."""
+    for found in (VIEWS[card_of(name).view if name else "voltage"], VIEWS["voltage"]):
         try:
-            seen = found.look(diagnosis.runs, length.per_um)
+            seen = found.look(diagnosis.runs, per_um)
+            break
         except ValueError:
-            return None
+            continue
+    else:
+        return None
     view, extended = found, bool(diagnosis.causes)
 
     def draw(width_in: float) -> Figure:
@@ -169,7 +168,7 @@ def fingerprint(diagnosis: Diagnosis, name: str, length: Lengths, number: int) -
             axes.set_xscale("log")
         if view.spectrum:
             axes.set_yscale("log")
-        label(axes, view.x_label, f"{view.y_label} ({length.unit}{view.per})")
+        label(axes, view.x_label, f"{view.y_label} ({unit}{view.per})")
         return picture
 
     words = f"{view.y_label.capitalize()} against {view.x_label}, before and after the extension"

@@ -1,40 +1,29 @@
 """A diagnosis as one page that needs nothing else: pictures are in it, and it opens without a network."""
 
 import math
-from collections.abc import Sequence
-from html import escape
 from importlib.resources import files
+from typing import Any
 
-from fits.diagnosis._result import Diagnosis
-from fits.diagnosis._words import (
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from fits.diagnosis._result import Diagnosis, EffectParameter, Experiment
+from fits.io._version import written_by
+from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
+from fits.report import _words
+from fits.report._words import (
     SIGMA,
     Lengths,
     chance,
-    headline,
+    estimate,
+    listed,
     number,
+    parameter_name,
     percent,
     plain,
-    rms_um,
     sigmas,
-    verdict_sentence,
-)
-from fits.io._version import written_by
-from fits.plots._diagnosis import Picture, fingerprint, program, residuals, shown_runs
-from fits.report._diagnosis_tables import (
-    bounds_section,
-    causes_section,
-    experiment_facts,
-    experiment_limits,
-    gain_section,
-    section,
-    tests_section,
 )
 
-_KINDS = {
-    "no_effect": "no effect found",
-    "effect_found": "effect found",
-    "unexplained": "unexplained error",
-}
+_KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
 
 
 def report_html(diagnosis: Diagnosis) -> str:
@@ -50,176 +39,153 @@ def report_html(diagnosis: Diagnosis) -> str:
     str
         HTML, with style and pictures in it. The same diagnosis gives the same text.
     """
-    length = Lengths(diagnosis)
-    style = files("fits.report").joinpath("report.css").read_text(encoding="utf-8")
-    sections = [
-        _verdict(diagnosis, length),
-        _main_picture(diagnosis, length),
-        causes_section(diagnosis, length),
-        _why(diagnosis, length),
-        gain_section(diagnosis, length),
-        bounds_section(diagnosis, length),
-        tests_section(diagnosis),
-        _next(diagnosis),
-        _remarks(diagnosis),
-        _how_to_read(diagnosis, length),
-    ]
-    return "\n".join(
-        [
-            "<!DOCTYPE html>",
-            '<html lang="en">',
-            "<head>",
-            '<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<link rel="icon" href="data:,">',
-            f"<title>Diagnosis: {escape(headline(diagnosis))}</title>",
-            f"<style>\n{style}</style>",
-            "</head>",
-            "<body>",
-            "<main>",
-            *filter(None, sections),
-            f"<footer>Written by {escape(written_by())}.</footer>",
-            "</main>",
-            "</body>",
-            "</html>",
-            "",
-        ]
+    length, causes, ahead = Lengths(diagnosis), diagnosis.causes, diagnosis.next_experiment
+    named = [cause.name for cause in causes] or [""]
+    sources = list(dict.fromkeys(run.source for run in diagnosis.runs if run.source))
+    asked = [one for one in diagnosis.upper_bounds if not one.reason]
+    asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
+    template = _environment().get_template("diagnosis.html")
+    return template.render(
+        diagnosis=diagnosis,
+        length=length,
+        ahead=ahead,
+        style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
+        kind=_KINDS[diagnosis.verdict],
+        sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
+        tiles=_tiles(diagnosis, length),
+        residuals=residuals(diagnosis, length.per_um, length.unit),
+        some_aside=any((~run.fitted).any() for run in diagnosis.runs),
+        left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
+        views=[fingerprint(diagnosis, name, k, length.per_um, length.unit) for k, name in enumerate(named)],
+        gained=_gained(diagnosis, length),
+        bars=_bars(diagnosis),
+        further=_further(diagnosis, length),
+        bounds=[
+            (
+                plain(one.name).capitalize(),
+                sigmas(one.z),
+                percent(one.absorbed_fraction),
+                length.bare(one.bound_um),
+            )
+            for one in asked
+        ],
+        tests=[
+            (
+                plain(one.name).capitalize(),
+                sigmas(one.statistic),
+                chance(one.p),
+                percent(one.share),
+                one.sentence,
+            )
+            for one in diagnosis.tests
+        ],
+        program=None if ahead is None else program(ahead),
+        ahead_facts=() if ahead is None else _facts(ahead),
+        extremes=[
+            (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
+            for one in (ahead.extremes if ahead is not None else ())
+        ],
+        weakest=max((cause.p_family for cause in causes), default=math.nan),
+        written_by=written_by(),
     )
 
 
-def _paragraph(text: str, kind: str = "") -> str:
-    if not text:
-        return ""
-    return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
-
-
-def _figure(picture: Picture | None, caption: str = "", above: str = "") -> str:
-    if picture is None:
-        return ""
-    under = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return (
-        f'<figure>{above}<div class="wide">{picture.wide}</div><div class="narrow">{picture.narrow}</div>'
-        f"{under}</figure>"
+def _environment() -> Environment:
+    """Templates of this room, which escape whatever they are given."""
+    made = Environment(
+        loader=PackageLoader("fits.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
+    for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number"):
+        made.filters[name] = getattr(_words, name)
+    made.filters["without_dot"] = lambda text: text.rstrip(".")
+    made.filters["parameter_row"] = _parameter_row
+    made.tests["finite"] = math.isfinite
+    made.globals["SIGMA"] = SIGMA
+    return made
 
 
-def _key(entries: Sequence[tuple[str, str]]) -> str:
-    items = "".join(f'<li class="{kind}">{escape(words)}</li>' for kind, words in entries)
-    return f'<ul class="key">{items}</ul>'
+def _parameter_row(parameter: EffectParameter) -> tuple[str, ...]:
+    return (parameter_name(parameter), *estimate(parameter), _words.shown_unit(parameter.unit) or "1")
 
 
-def _verdict(diagnosis: Diagnosis, length: Lengths) -> str:
+def _tiles(diagnosis: Diagnosis, length: Lengths) -> list[tuple[str, str]]:
+    """The first numbers to be read."""
     gain, tiles = diagnosis.gain, []
     if diagnosis.causes:
         first = diagnosis.causes[0]
         tiles.append((f"Evidence for {plain(first.name)}", f"{sigmas(first.z)} {SIGMA}"))
         tiles.append(("Share of the misfit it explains", percent(first.share_of_misfit)))
-        if math.isfinite(gain.heldout_rms_before_um) and math.isfinite(gain.heldout_rms_after_um):
-            before, after = length.bare(gain.heldout_rms_before_um), length.bare(gain.heldout_rms_after_um)
-            tiles.append(("Error on unused data, before → after", f"{before} → {after} {length.unit}"))
+        before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
+        tiles += _arrow("Error on unused data, before → after", before, after, length)
     else:
-        tiles.append(("Residual of the plain stage, rms", length(rms_um(diagnosis.runs, "before_um"))))
+        tiles.append(("Residual of the plain stage, rms", length(_words.rms_um(diagnosis.runs, "before_um"))))
     if diagnosis.verdict == "unexplained":
         tiles.append(("Unexplained, rms", length(diagnosis.unexplained_rms_um)))
-    tiles.append(("Noise floor, rms", length(diagnosis.noise_um)))
-    shown = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in tiles)
-    sources = list(dict.fromkeys(run.source for run in diagnosis.runs if run.source))
-    told = ", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else "")
-    return "\n".join(
-        [
-            "<header>",
-            _paragraph(f"Diagnosis of a stage · {_KINDS[diagnosis.verdict]}{f' · {told}' if told else ''}", "kind"),
-            f"<h1>{escape(headline(diagnosis))}</h1>",
-            _paragraph(verdict_sentence(diagnosis), "lead"),
-            f'<dl class="tiles">{shown}</dl>',
-            "</header>",
-        ]
-    )
+    return [*tiles, ("Noise floor, rms", length(diagnosis.noise_um))]
 
 
-def _main_picture(diagnosis: Diagnosis, length: Lengths) -> str:
-    picture = residuals(diagnosis, length)
-    if picture is None:
-        return ""
-    entries = [("before stroke", "plain stage")]
-    if diagnosis.causes:
-        entries.append(("after stroke", "with what was found"))
-    if math.isfinite(diagnosis.noise_um):
-        entries.append(("noise", "noise, ± 2 standard deviations"))
-    if any((~run.fitted).any() for run in diagnosis.runs):
-        entries.append(("aside", "not used for the fit"))
-    left_out = len(diagnosis.runs) - len(shown_runs(diagnosis.runs))
-    caption = "Measurement less model. Dense curves are drawn by the extremes of short stretches."
-    if left_out:
-        caption += f" The runs with the largest residuals are shown; {left_out} more are not."
-    return section("What the model leaves over", _figure(picture, caption, _key(entries)))
+def _arrow(name: str, before_um: float, after_um: float, length: Lengths) -> list[tuple[str, str]]:
+    """How a size changes; nothing where one of the two is not known."""
+    if not (math.isfinite(before_um) and math.isfinite(after_um)):
+        return []
+    return [(name, f"{length.bare(before_um)} → {length.bare(after_um)} {length.unit}")]
 
 
-def _why(diagnosis: Diagnosis, length: Lengths) -> str:
+def _further(diagnosis: Diagnosis, length: Lengths) -> list[tuple[str, str]]:
+    gain = diagnosis.gain
+    driven = gain.feedforward_before_um, gain.feedforward_after_um
+    return [
+        *_arrow("Largest error, before → after", gain.heldout_max_before_um, gain.heldout_max_after_um, length),
+        *_arrow("Error under feedforward, rms, before → after", *driven, length),
+    ]
+
+
+def _gained(diagnosis: Diagnosis, length: Lengths) -> str:
+    """What the extension is worth on data that were not used."""
+    gain = diagnosis.gain
+    before = gain.heldout_rms_before_um
     if not diagnosis.causes:
-        seen = fingerprint(diagnosis, "", length, 0)
-        if seen is None:
-            return ""
-        words = "Over the voltage, an effect of hysteresis or driver would stand out as a loop or a curve."
-        return section("How the residual looks", _paragraph(words), _figure(seen[0], seen[1], _key(_curves(False))))
-    content = []
-    for place, cause in enumerate(diagnosis.causes):
-        if len(diagnosis.causes) > 1:
-            content.append(f"<h3>{escape(plain(cause.name).capitalize())}</h3>")
-        content.append(_paragraph(cause.fingerprint))
-        seen = fingerprint(diagnosis, cause.name, length, place)
-        if seen is not None:
-            content.append(_figure(seen[0], seen[1], _key(_curves(True))))
-        content.append(_paragraph(f"Source: {cause.source.rstrip('.')}." if cause.source else "", "small"))
-    return section("Why this cause" if len(diagnosis.causes) == 1 else "Why these causes", *content)
+        return f"On data that were not used, the plain stage errs by {length(before)}, root mean square."
+    difference = before - gain.heldout_rms_after_um
+    size = length.bare(abs(difference))
+    if math.isfinite(gain.sd_of_difference_um):
+        size += f" ± {number(length.per_um * gain.sd_of_difference_um, 2)}"
+    way, part = ("falls", f": by {percent(difference / before)}") if difference > 0 else ("rises", "")
+    return f"On data that were not used, the error {way} by {size} {length.unit}, root mean square{part}."
 
 
-def _curves(extended: bool) -> list[tuple[str, str]]:
-    return [("before stroke", "plain stage"), *([("after stroke", "with what was found")] if extended else [])]
+def _bars(diagnosis: Diagnosis) -> list[tuple[str, str, float, float]]:
+    """Kind, words, size and width in percent of each bar; none where nothing was held out."""
+    gain = diagnosis.gain
+    if not math.isfinite(gain.heldout_rms_before_um):
+        return []
+    entries = [("before", "plain stage", gain.heldout_rms_before_um)]
+    if diagnosis.causes:
+        entries.append(("after", "with what was found", gain.heldout_rms_after_um))
+    known = [one for one in (*entries, ("noise", "noise floor", gain.noise_um)) if math.isfinite(one[2])]
+    longest = max(size for _, _, size in known) or 1.0
+    return [(*one, 100 * one[2] / longest) for one in known]
 
 
-def _next(diagnosis: Diagnosis) -> str:
-    ahead = diagnosis.next_experiment
-    if ahead is None:
-        words = "No further experiment is proposed."
-        return section("What to measure next", _paragraph(words))
-    return section(
-        "What to measure next",
-        _paragraph(ahead.purpose),
-        _figure(program(ahead), ahead.kind),
-        experiment_facts(ahead),
-        experiment_limits(ahead),
-        _paragraph(f"A further column would help: {ahead.extra_column}" if ahead.extra_column else ""),
-    )
+def _span(low: float, high: float, unit: str) -> str:
+    return f"{number(low)} to {number(high)} {unit}"
 
 
-def _remarks(diagnosis: Diagnosis) -> str:
-    if not diagnosis.remarks:
-        return ""
-    items = "".join(f"<li>{escape(remark)}</li>" for remark in diagnosis.remarks)
-    return section("Remarks", f'<ul class="plain">{items}</ul>')
-
-
-def _how_to_read(diagnosis: Diagnosis, length: Lengths) -> str:
-    sentences = (
-        "A plain stage, with driver, hysteresis and mechanics, was fitted to the runs, and its residual is what is "
-        "asked about here.",
-        "Each effect of a library of physical effects was simulated; what the plain stage can follow of it by "
-        "changing its own parameters was taken away, and only the rest counts as evidence.",
-        "Evidence is in standard deviations of the noise, and the probability beside it allows for having asked "
-        "about all effects at once.",
-        "What was found was fitted together with the stage, and both were judged on data that the fit did not see.",
-        f"The threshold is set so that {percent(diagnosis.false_alarm)} of records that hold no effect are given a "
-        "cause by chance; an effect that is not named is bounded, not excluded.",
-    )
-    terms = (
-        f"The noise floor is {escape(length(diagnosis.noise_um))}"
-        f"{f', from {escape(diagnosis.noise_source)}' if diagnosis.noise_source else ''}"
-    )
-    worth = diagnosis.noise_samples
-    if math.isfinite(worth) and worth > 1.05:
-        terms += f"; {escape(number(worth))} samples are worth one independent one"
-    strongest = max((cause.p_family for cause in diagnosis.causes), default=math.nan)
-    if math.isfinite(strongest):
-        terms += f"; the least certain cause has a probability by chance that is {escape(chance(strongest))}"
-    return section("How to read this", _paragraph(" ".join(sentences)), f'<p class="small">{terms}.</p>')
+def _facts(ahead: Experiment) -> list[tuple[str, Any]]:
+    """What the next experiment would tell apart, and by how much."""
+    pairs = []
+    if ahead.time_s.size > 1:
+        pairs.append(("Duration", f"{number(float(ahead.time_s[-1] - ahead.time_s[0]))} s"))
+        pairs.append(("Voltage", _span(float(ahead.voltage_V.min()), float(ahead.voltage_V.max()), "V")))
+    if ahead.separates:
+        pairs.append(("Tells apart", listed(ahead.separates)))
+    if math.isfinite(ahead.predicted_z):
+        pairs.append(("Predicted separation", f"{sigmas(ahead.predicted_z)} {SIGMA}"))
+    if math.isfinite(ahead.present_z):
+        pairs.append(("In the records at hand", f"{sigmas(ahead.present_z)} {SIGMA}"))
+    return pairs

@@ -9,6 +9,9 @@ from microid.effects._base import PLACES as PLACES
 from microid.effects._base import AbstractEffect as AbstractEffect
 from microid.effects._base import Place as Place
 from microid.effects._base import Scales as Scales
+from microid.effects._base import Statistic as Statistic
+from microid.effects._base import View as View
+from microid.effects._base import card_of as card_of
 from microid.effects._base import extend as extend
 from microid.effects._base import host as host
 from microid.effects._base import register as register

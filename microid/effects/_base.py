@@ -16,6 +16,10 @@ from microid._stage import Stage
 Place = Literal["driver", "hysteresis", "mechanics", "environment", "sensor", "time", "noise"]
 # In the order of the signal.
 PLACES: tuple[Place, ...] = ("driver", "hysteresis", "mechanics", "environment", "sensor", "time", "noise")
+# What a residual is drawn against: the last is the time since the voltage last started, stopped or turned.
+View = Literal["voltage", "position", "velocity", "frequency", "time", "since_move"]
+# What is measured of single samples and of the noise.
+Statistic = Literal["", "spikes", "rounding", "jitter", "band"]
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,9 @@ class Scales:
 class AbstractEffect(AbstractPart):
     """One physical effect: a part of a stage that does nothing where its strength is zero.
 
-    To add an effect, put one file with one final, registered subclass into `microid/effects/`.
+    To add an effect, put one file with one final, registered subclass into `microid/effects/`. Its class variables
+    are all that the diagnosis and its report know of it; several forms of one effect agree in those from
+    `fingerprint` on, but for `source`.
 
     Attributes
     ----------
@@ -102,6 +108,23 @@ class AbstractEffect(AbstractPart):
         What tells it from those, one sentence.
     source
         Where the model comes from.
+    view
+        What the residual is drawn against in a report, so that the effect shows best.
+    column
+        A further column that would tell it from others: `temperature_degC`, `monitor_V` (the voltage at the piezo),
+        `other_um` (the second axis), `time_stamps` of both clocks, or a sentence that names another. Empty for none.
+    statistic
+        For a fault of single samples or of the noise, which no model holds: what is measured of it. Empty for an
+        effect that changes the mean.
+    independent
+        Whether it goes on whatever the command does, and looks like nothing that depends on the command.
+    universal
+        Whether every piezo has it: where records cannot tell it from others, it is named first.
+    held
+        The strength that the voltage shows while a controller holds the displacement; empty where it shows none.
+    delay
+        For a pure delay of the readings, the strength that is its time in s, as steps of a held command resemble one;
+        empty for all others.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -123,6 +146,13 @@ class AbstractEffect(AbstractPart):
     counted: ClassVar[tuple[str, ...]] = ()
     lines_Hz: ClassVar[tuple[float, ...]] = ()
     tolerance: ClassVar[float] = 0.0
+    view: ClassVar[View] = "voltage"
+    column: ClassVar[str] = ""
+    statistic: ClassVar[Statistic] = ""
+    independent: ClassVar[bool] = False
+    universal: ClassVar[bool] = False
+    held: ClassVar[str] = ""
+    delay: ClassVar[str] = ""
 
     @classmethod
     @abc.abstractmethod
@@ -158,6 +188,20 @@ def register(effect: _Effect) -> _Effect:
     """Make a form of an effect known."""
     EFFECTS.append(effect)
     return effect
+
+
+def card_of(name: str) -> type[AbstractEffect]:
+    """What is known of the effect of a name: its first form.
+
+    Raises
+    ------
+    LookupError
+        If no effect has that name.
+    """
+    for effect in EFFECTS:
+        if effect.name == name:
+            return effect
+    raise LookupError(f"no effect is called {name!r}")
 
 
 def host(effect: type[AbstractEffect], stage: Stage) -> int | None:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import _as_inexact, param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, register
 
 
 @register
@@ -44,6 +44,8 @@ class Aging(AbstractEffect):
     source: ClassVar[str] = (
         "PI piezo tutorial: negligible in actuators, which are poled again in use; 0.1 to 2 % per decade (estimate)"
     )
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     gain_per_decade: Float[Array, ""] = param(unit="1", scale=1e-3)
     cycle_V: Float[Array, ""] = param(unit="V", scale=100.0, lower=1e-3)
     zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
@@ -85,6 +87,8 @@ class AgingOverRecords(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = Aging.confusions
     experiment: ClassVar[str] = Aging.experiment
     source: ClassVar[str] = Aging.source
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     gain_per_decade: Float[Array, ""] = param(unit="1", scale=1e-3)
     cycle_V: Float[Array, ""] = param(unit="V", scale=100.0, lower=1e-3)
     zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)

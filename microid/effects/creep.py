@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _lowpass, _times_of, register
 from microid.effects._grids import _decades
 
 # Relaxations per decade of time constants, and the decades ahead of the onset and behind it that they cover.
@@ -55,6 +55,10 @@ class Creep(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("thermal_drift", "mount_relaxation", "rate_dependence")
     experiment: ClassVar[str] = "Steps up and down, each held for three decades of time."
     source: ClassVar[str] = "PI piezo tutorial: dL (1 + gamma lg(t / 0.1 s)), gamma of 0.01 to 0.02"
+    view: ClassVar[View] = "since_move"
+    column: ClassVar[str] = "temperature_degC"
+    universal: ClassVar[bool] = True
+    held: ClassVar[str] = "gain_per_decade"
     gain_per_decade: Float[Array, ""] = param(unit="1", lower=0.0, upper=_MOST)
     onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
     recent_um: Float[Array, ""] = param(default=0.0, unit="um")
@@ -104,6 +108,10 @@ class VoltageCreep(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
     experiment: ClassVar[str] = Creep.experiment
     source: ClassVar[str] = "Neel's fluctuation field; see Bertotti, Hysteresis in Magnetism (1998), ch. 14"
+    view: ClassVar[View] = "since_move"
+    column: ClassVar[str] = "temperature_degC"
+    universal: ClassVar[bool] = True
+    held: ClassVar[str] = "gain_per_decade"
     gain_per_decade: Float[Array, ""] = param(unit="1", lower=0.0, upper=_MOST)
     onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
     recent_V: Float[Array, ""] = param(default=0.0, unit="V")
@@ -149,6 +157,10 @@ class KelvinVoigtCreep(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
     experiment: ClassVar[str] = Creep.experiment
     source: ClassVar[str] = "Kelvin-Voigt element; see Jung & Gweon, Rev. Sci. Instrum. 71 (2000) 1896"
+    view: ClassVar[View] = "since_move"
+    column: ClassVar[str] = "temperature_degC"
+    universal: ClassVar[bool] = True
+    held: ClassVar[str] = "gain_per_decade"
     gain: Float[Array, ""] = param(unit="1", lower=0.0, upper=_MOST_IN_ALL)
     time_constant_s: Float[Array, ""] = param(unit="s", lower=0.02, upper=1e5)
     before_um: Float[Array, ""] = param(default=0.0, unit="um")

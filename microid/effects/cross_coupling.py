@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, register
 
 
 @register
@@ -31,6 +31,8 @@ class CrossCoupling(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("thermal_drift", "creep", "floor_vibration")
     experiment: ClassVar[str] = "The other axis driven alone, with its position as a column other_um."
     source: ClassVar[str] = "doi 10.1177/16878140211014061: 0.98 % of full travel; doi 10.1177/1687814016638301: 1 %"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "other_um"
     gain: Float[Array, ""] = param(unit="1", scale=1e-3)
 
     @classmethod
@@ -66,6 +68,8 @@ class QuadraticCrossCoupling(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = CrossCoupling.confusions
     experiment: ClassVar[str] = CrossCoupling.experiment
     source: ClassVar[str] = "kinematic shortening x^2 / 2 L of a guiding beam: 0.16 um for 40 um on 10 mm"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "other_um"
     curvature_per_um: Float[Array, ""] = param(unit="1/um", scale=1e-5)
 
     @classmethod

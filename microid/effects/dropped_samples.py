@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
 from microid.effects._resample import _read_at
 
 _INSTANTS = 12
@@ -43,6 +43,8 @@ class DroppedSamples(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("clock_mismatch", "transport_delay", "timestamp_jitter")
     experiment: ClassVar[str] = "Raw time stamps or a counter of samples, and a fast ramp throughout."
     source: ClassVar[str] = "losses of up to 0.1 % of the samples under load (estimate)"
+    view: ClassVar[View] = "velocity"
+    column: ClassVar[str] = "time_stamps"
     dropped_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
     after_s: Float[Array, ""] = param(unit="s", scale=1.0, lower=0.0)
 

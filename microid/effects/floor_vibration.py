@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, Statistic, View, register
 
 
 @register
@@ -38,6 +38,9 @@ class FloorVibration(AbstractEffect):
     source: ClassVar[str] = (
         "Acentech note on VC curves: 3 to 50 um/s rms on the floor, of which 1 to 10 nm reach the sensor (estimate)"
     )
+    view: ClassVar[View] = "frequency"
+    column: ClassVar[str] = "other_um"
+    statistic: ClassVar[Statistic] = "band"
     amplitude_um: Float[Array, ""] = param(unit="um", scale=0.01, lower=0.0)
     frequency_Hz: Float[Array, ""] = param(unit="Hz", scale=10.0, lower=1e-3)
     quality: Float[Array, ""] = param(unit="1", scale=10.0, lower=0.5)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, register
 
 
 @register
@@ -38,6 +38,7 @@ class InitialState(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("creep", "aging", "accommodation")
     experiment: ClassVar[str] = "A sweep over the whole range before every record."
     source: ClassVar[str] = "wiping-out property of the Preisach operator: Mayergoyz 1991"
+    view: ClassVar[View] = "time"
     inner: AbstractPart
     excess_V: Float[Array, ""] = param(unit="V", scale=10.0, lower=0.0)
 

@@ -10,7 +10,7 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal, innermost
 from microid._plant import Mechanics
-from microid.effects._base import AbstractEffect, Place, Scales, _rate_of, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _rate_of, _times_of, register
 
 
 @register
@@ -40,6 +40,7 @@ class LoadChange(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("stiffness_hardening", "second_resonance", "friction")
     experiment: ClassVar[str] = "A short small chirp at the start and the end of every record."
     source: ClassVar[str] = "natural frequency sqrt(k / m); payloads of 1 to 200 % of the moving mass (estimate)"
+    view: ClassVar[View] = "frequency"
     inner: AbstractPart
     mass_ratio: Float[Array, ""] = param(unit="1", scale=0.1, lower=-0.9)
 
@@ -81,6 +82,7 @@ class LoadChangeWithin(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = LoadChange.confusions
     experiment: ClassVar[str] = LoadChange.experiment
     source: ClassVar[str] = LoadChange.source
+    view: ClassVar[View] = "frequency"
     inner: AbstractPart
     mass_ratio: Float[Array, ""] = param(unit="1", scale=0.1, lower=-0.9)
     after_s: Float[Array, ""] = param(unit="s", lower=0.0)

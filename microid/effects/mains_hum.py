@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
 
 _HARMONICS, _MOST = 3, 11
 # By which the mains may run fast or slow.
@@ -47,6 +47,8 @@ class MainsHum(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("floor_vibration",)
     experiment: ClassVar[str] = "A record at rest, as long as can be."
     source: ClassVar[str] = "ripple of piezo amplifiers of 20 to 40 mV, 7 to 13 nm; 1 to 50 nm in sensors (estimate)"
+    view: ClassVar[View] = "frequency"
+    independent: ClassVar[bool] = True
     cosine_um: Float[Array, " 3"] = param(unit="um", scale=0.01)
     sine_um: Float[Array, " 3"] = param(unit="um", scale=0.01)
     frequency_Hz: Float[Array, ""] = param(unit="Hz", lower=50 * (1 - _TOLERANCE), upper=50 * (1 + _TOLERANCE))
@@ -88,6 +90,8 @@ class MainsHum60(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = MainsHum.confusions
     experiment: ClassVar[str] = MainsHum.experiment
     source: ClassVar[str] = MainsHum.source
+    view: ClassVar[View] = "frequency"
+    independent: ClassVar[bool] = True
     cosine_um: Float[Array, " 3"] = param(unit="um", scale=0.01)
     sine_um: Float[Array, " 3"] = param(unit="um", scale=0.01)
     frequency_Hz: Float[Array, ""] = param(unit="Hz", lower=60 * (1 - _TOLERANCE), upper=60 * (1 + _TOLERANCE))

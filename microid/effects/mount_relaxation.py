@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
 from microid.effects._grids import _decades
 
 
@@ -37,6 +37,8 @@ class MountRelaxation(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("thermal_drift", "creep", "aging")
     experiment: ClassVar[str] = "A record at rest right after the set-up was touched, with the temperature."
     source: ClassVar[str] = "Applied Optics 63 (2024) 8359, adhesive gaps; 5 to 500 nm, minutes to days (estimate)"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     change_um: Float[Array, ""] = param(unit="um", scale=0.1)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
 
@@ -76,6 +78,8 @@ class LogarithmicMountRelaxation(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = MountRelaxation.confusions
     experiment: ClassVar[str] = MountRelaxation.experiment
     source: ClassVar[str] = MountRelaxation.source
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     change_per_decade_um: Float[Array, ""] = param(unit="um", scale=0.1)
     age_s: Float[Array, ""] = param(unit="s", scale=10.0, lower=1e-3, upper=1e7)
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, Statistic, View, register
 
 
 @register
@@ -34,6 +34,8 @@ class Outliers(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("dropped_samples", "mains_hum")
     experiment: ClassVar[str] = "The same record twice."
     source: ClassVar[str] = "Tukey 1960, contaminated normal distribution; up to 0.1 % of the samples (estimate)"
+    view: ClassVar[View] = "time"
+    statistic: ClassVar[Statistic] = "spikes"
     fraction: Float[Array, ""] = param(unit="1", scale=1e-3, lower=0.0, upper=1.0)
     size_um: Float[Array, ""] = param(unit="um", lower=0.0)
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, Statistic, View, register
 
 
 @register
@@ -34,6 +34,8 @@ class Quantisation(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("backlash", "friction")
     experiment: ClassVar[str] = "A slow ramp, and the same offset by half a step."
     source: ClassVar[str] = "Widrow & Kollar, Quantization Noise, 2008; 16 bits of 5 mm are 76 nm"
+    view: ClassVar[View] = "position"
+    statistic: ClassVar[Statistic] = "rounding"
     step_um: Float[Array, ""] = param(unit="um", scale=0.1, lower=0.0)
 
     @classmethod

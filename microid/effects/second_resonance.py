@@ -10,7 +10,7 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal, innermost
 from microid._plant import Mechanics
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, register
 
 
 @register
@@ -46,6 +46,7 @@ class SecondResonance(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("transport_delay", "sensor_lowpass", "stiffness_hardening")
     experiment: ClassVar[str] = "Chirps of two small amplitudes to three times the first resonance or more."
     source: ClassVar[str] = "modal superposition; shares of 0.01 to 0.3 at 1.3 to 6 times the first (estimate)"
+    view: ClassVar[View] = "frequency"
     inner: AbstractPart
     share: Float[Array, ""] = param(unit="1", scale=0.01)
     frequency_Hz: Float[Array, ""] = param(unit="Hz", scale=100.0, lower=1e-3)
@@ -98,6 +99,7 @@ class AddedResonance(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = SecondResonance.confusions
     experiment: ClassVar[str] = SecondResonance.experiment
     source: ClassVar[str] = SecondResonance.source
+    view: ClassVar[View] = "frequency"
     inner: AbstractPart
     share: Float[Array, ""] = param(unit="1", scale=0.01)
     frequency_Hz: Float[Array, ""] = param(unit="Hz", scale=100.0, lower=1e-3)

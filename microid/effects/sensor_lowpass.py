@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times, _bend, recur
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
 
 # Of the interval: of what is faster nothing is left after one sample.
 _INSTANT = 0.01
@@ -41,6 +41,8 @@ class SensorLowpass(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("transport_delay", "rate_dependence", "second_resonance")
     experiment: ClassVar[str] = "A broadband signal beyond the corner, and a monitor of the piezo's voltage."
     source: ClassVar[str] = "first-order lag; corners of 10 Hz to 10 kHz in capacitive controllers (estimate)"
+    view: ClassVar[View] = "velocity"
+    column: ClassVar[str] = "monitor_V"
     time_constant_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
 
     @classmethod

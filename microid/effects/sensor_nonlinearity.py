@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import array, param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, register
 
 
 @register
@@ -39,6 +39,7 @@ class SensorNonlinearity(AbstractEffect):
         "Small chirps or minor loops at four biases, each reached from above and below, or a reference sensor."
     )
     source: ClassVar[str] = "polynomial calibration curve; 0.01 to 0.2 % of the sensor's range (estimate)"
+    view: ClassVar[View] = "position"
     quadratic: Float[Array, ""] = param(unit="1", scale=1e-3)
     cubic: Float[Array, ""] = param(unit="1", scale=1e-3)
     centre_um: Float[Array, ""] = array()

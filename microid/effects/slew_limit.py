@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal, innermost
-from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
 
 
 @register
@@ -45,6 +45,8 @@ class SlewLimit(AbstractEffect):
     )
     experiment: ClassVar[str] = "Steps of three heights, and a small chirp up to the same frequencies."
     source: ClassVar[str] = "Thorlabs piezo driver bandwidth tutorial: slew rate I_max / C, 5 to 150 V/ms"
+    view: ClassVar[View] = "velocity"
+    column: ClassVar[str] = "monitor_V"
     limit_V_per_s: Float[Array, ""] = param(unit="V/s", scale=1e4, lower=0.0)
 
     @classmethod
@@ -95,6 +97,8 @@ class CurrentLimit(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = SlewLimit.confusions
     experiment: ClassVar[str] = SlewLimit.experiment
     source: ClassVar[str] = SlewLimit.source
+    view: ClassVar[View] = "velocity"
+    column: ClassVar[str] = "monitor_V"
     inner: AbstractPart
     limit_V_per_s: Float[Array, ""] = param(unit="V/s", scale=1e4, lower=0.0)
 

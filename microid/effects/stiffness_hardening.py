@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import array, param
 from microid._part import AbstractPart, Signal, innermost
-from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, register
 from microid.effects._oscillator import _forces_um
 
 _AT_REST = 8
@@ -51,6 +51,7 @@ class StiffnessHardening(AbstractEffect):
         "Duffing; J. Dyn. Sys. Meas. Control 139 (2017) 101001: large above 5 % of the beam's length; 0.01 to 2 % at "
         "full stroke (estimate)"
     )
+    view: ClassVar[View] = "frequency"
     inner: AbstractPart
     hardening: Float[Array, ""] = param(unit="1", scale=0.01)
     centre_um: Float[Array, ""] = param(unit="um", scale=10.0)

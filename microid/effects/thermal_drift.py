@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _lowpass, _times_of, register
 from microid.effects._grids import _decades
 
 
@@ -38,6 +38,8 @@ class ThermalDrift(AbstractEffect):
         "The same pattern again after a wait, a record at rest, and a temperature_degC column of the stage's body."
     )
     source: ClassVar[str] = "PI piezo tutorial, thermal expansion: piezo stack -3.5e-6/K, steel 11e-6/K to 12e-6/K"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     rate_um_per_s: Float[Array, ""] = param(unit="um/s", scale=1e-3)
 
     @classmethod
@@ -75,6 +77,8 @@ class ExponentialThermalDrift(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ThermalDrift.confusions
     experiment: ClassVar[str] = ThermalDrift.experiment
     source: ClassVar[str] = "Newton's law of cooling; time constants of 2 to 60 min are an engineering estimate"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     change_um: Float[Array, ""] = param(unit="um", scale=0.1)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
 
@@ -118,6 +122,8 @@ class TemperatureDrift(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ThermalDrift.confusions
     experiment: ClassVar[str] = ThermalDrift.experiment
     source: ClassVar[str] = ThermalDrift.source
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     expansion_um_per_K: Float[Array, ""] = param(unit="um/K", scale=0.1)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
     before_um: Float[Array, ""] = param(default=0.0, unit="um")

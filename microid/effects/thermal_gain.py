@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import _as_inexact, array, param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _lowpass, _rate_of, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _lowpass, _rate_of, _times_of, register
 from microid.effects._grids import _decades
 
 
@@ -48,6 +48,8 @@ class ThermalGain(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("aging", "accommodation", "creep", "thermal_drift")
     experiment: ClassVar[str] = "A slow loop, a burst of heavy driving, the same loop, a pause, and the same loop."
     source: ClassVar[str] = "PI piezo tutorial, temperature effects; 0.1 to 0.5 % per K (estimate)"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     gain_per_K: Float[Array, ""] = param(unit="1/K", scale=1e-3)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
     reference_degC: Float[Array, ""] = array()
@@ -103,6 +105,8 @@ class SelfHeating(AbstractEffect):
     source: ClassVar[str] = (
         "Noliac tutorial on heat dissipation: 30 to 70 K; Actuators 10 (2021) 297: amplitude 15 % more at 10 kHz"
     )
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     gain: Float[Array, ""] = param(unit="1", scale=0.01)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
     reference_V2_per_s: Float[Array, ""] = array()

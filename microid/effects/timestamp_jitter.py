@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _rate_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, Statistic, View, _rate_of, register
 
 
 @register
@@ -31,6 +31,9 @@ class TimestampJitter(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("transport_delay", "rate_dependence", "friction")
     experiment: ClassVar[str] = "Raw time stamps, and ramps at three rates."
     source: ClassVar[str] = "1 us with hardware timing to 1 ms with software timing (estimate)"
+    view: ClassVar[View] = "velocity"
+    column: ClassVar[str] = "time_stamps"
+    statistic: ClassVar[Statistic] = "jitter"
     jitter_s: Float[Array, ""] = param(unit="s", scale=1e-4, lower=0.0)
 
     @classmethod

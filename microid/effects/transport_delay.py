@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
 from microid.effects._resample import _read_at
 
 
@@ -34,6 +34,9 @@ class TransportDelay(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("sensor_lowpass", "rate_dependence", "second_resonance")
     experiment: ClassVar[str] = "A small broadband signal up to several times the first resonance."
     source: ClassVar[str] = "dead time exp(-s d); 0.05 to 5 ms in controllers, 1 to 20 ms in polled loops (estimate)"
+    view: ClassVar[View] = "velocity"
+    column: ClassVar[str] = "monitor_V"
+    delay: ClassVar[str] = "delay_s"
     delay_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
 
     @classmethod

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times, _bend
 from microid._param import array, param
 from microid._part import AbstractPart, Signal, innermost
-from microid.effects._base import AbstractEffect, Place, Scales, _times_of, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
 
 _CORRECTIONS = 2
 
@@ -42,6 +42,8 @@ class VoltageDependentCapacitance(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("rate_dependence", "slew_limit", "stiffness_hardening")
     experiment: ClassVar[str] = "Small chirps at four biases, and a monitor of the piezo's voltage."
     source: ClassVar[str] = "Noliac tutorial on heat dissipation; 20 to 50 % over the unipolar range (estimate)"
+    view: ClassVar[View] = "velocity"
+    column: ClassVar[str] = "monitor_V"
     inner: AbstractPart
     slope: Float[Array, ""] = param(unit="1", scale=0.1, lower=-0.9, upper=0.9)
     middle_V: Float[Array, ""] = array()

@@ -1,4 +1,4 @@
-"""Ways of looking at a residual: what is left in it that noise is not, whatever its cause."""
+"""Tests of a residual without any effect in mind: what it depends on, and whether it is noise."""
 
 import itertools
 from collections.abc import Sequence
@@ -8,18 +8,38 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._projector import Projector
+from fits.diagnosis._result import Test
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import Run
+from fits.stats._whiten import learn_noise
 
 _WAVES, _POWERS = 12, 4
-_CYCLES = 240
+_PERIODS = 1920
 # Bands of the command, from two periods in a run to half the sampling rate, and the part of its energy that counts.
 _BANDS, _PLAYED = 12, 1e-8
+_SENTENCES = {
+    "time": "the residual wanders along the run",
+    "position": "the residual depends on the position and the branch",
+    "velocity": "the residual depends on the speed",
+    "reversal": "the residual depends on the time since the command last turned",
+    "cycles": "the residual repeats itself with the position",
+    "jumps": "the residual jumps",
+    "voltage": "the residual depends on the command and its direction",
+    "frequency": "the residual goes with the command, by another factor and phase at each frequency",
+    "gain": "the residual is in proportion to the displacement, by a factor that changes along the run",
+}
+# Lags of neighbours, stretches of a run, and samples that a stretch needs at least.
+_LAGS, _STRETCHES, _FEWEST = 20, 24, 20
+# Bursts: so much more spread of the stretches' sizes than chance, about their mean, and so heavy tails of what is new
+# in every sample (excess kurtosis).
+_SPREAD, _HEAVY = 0.4, 1.5
+# Evidence is counted up to so many standard deviations.
+_MOST = 37.0
 
 
 @dataclass(frozen=True)
 class View:
-    """One way of looking: signals along which structure would lie, per column a list over runs."""
+    """Regressors along which structure would lie, per column a list over runs, and what that would mean."""
 
     name: str
     columns: tuple[tuple[np.ndarray, ...], ...]
@@ -28,16 +48,9 @@ class View:
 
 @dataclass(frozen=True)
 class Seen:
-    """What one way of looking shows.
+    """What regressors explain: the decrease of the sum of squares in noise variances, and the columns that it takes.
 
-    Attributes
-    ----------
-    view
-        The way.
-    drop, freedom
-        Decrease of the sum of squares, in noise variances, and columns that it took.
-    z, p
-        Evidence in standard deviations, and probability of as much by chance, for this way alone.
+    `z` is the evidence in standard deviations, `p` the probability of as much by chance.
     """
 
     view: View
@@ -48,12 +61,12 @@ class Seen:
 
 
 def views(runs: Sequence[Run], plain_um: Sequence[np.ndarray]) -> list[View]:
-    """The ways of looking in which structure counts as left over, each run by itself."""
+    """Regressors whose structure counts as left over, each run by itself."""
     return _joined(runs, [_of_run(run, plain) for run, plain in zip(runs, plain_um, strict=True)])
 
 
 def further_views(runs: Sequence[Run]) -> list[View]:
-    """Ways of looking that say more of the cause: along the command and along what was measured besides."""
+    """Regressors that say more of the cause: along the command and along what was measured besides."""
     return _joined(runs, [_beside(run) for run in runs])
 
 
@@ -71,19 +84,6 @@ def _joined(runs: Sequence[Run], found: Sequence[dict[str, list[np.ndarray]]]) -
         View(name, tuple(tuple(c) for c in columns), _SENTENCES.get(name, f"the residual goes with the {name}"))
         for name, columns in kinds.items()
     ]
-
-
-_SENTENCES = {
-    "time": "the residual wanders along the run",
-    "position": "the residual depends on the position and the branch",
-    "velocity": "the residual depends on the speed",
-    "reversal": "the residual depends on the time since the command last turned",
-    "cycles": "the residual repeats itself with the position",
-    "jumps": "the residual jumps",
-    "voltage": "the residual depends on the command and its direction",
-    "frequency": "the residual goes with the command, by another factor and phase at each frequency",
-    "gain": "the residual is in proportion to the displacement, by a factor that changes along the run",
-}
 
 
 def _of_run(run: Run, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
@@ -155,7 +155,7 @@ def _bands(values: np.ndarray) -> list[np.ndarray]:
 
 
 def look(projector: Projector, basis: np.ndarray, residual: np.ndarray, ways: Sequence[View]) -> list[Seen]:
-    """Look at a residual, in each way, beside effects whose tangent `basis` spans."""
+    """Regress a residual on each, beside effects whose tangent `basis` spans."""
     found = []
     for view in ways:
         joined = projector.off(np.stack([projector.join(column) for column in view.columns], axis=1))
@@ -175,28 +175,82 @@ def look(projector: Projector, basis: np.ndarray, residual: np.ndarray, ways: Se
 def together(
     projector: Projector, basis: np.ndarray, residual: np.ndarray, ways: Sequence[View]
 ) -> tuple[float, int]:
-    """Decrease of the sum of squares by all ways of looking together, and the columns that it takes."""
+    """Decrease of the sum of squares by all regressors together, and the columns that it takes."""
     columns = [column for view in ways for column in view.columns]
     seen = look(projector, basis, residual, [View("together", tuple(columns), "")])[0]
     return seen.drop, seen.freedom
 
 
-def cycles(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """Strongest period of the residual in the position: period in um, evidence, decrease of the sum of squares."""
-    parts = projector.split(residual)
-    masks = projector.masks
-    span = max(float(np.ptp(p)) for p in plain_um)
-    # From a dozen periods in the stroke to some thousand: what is slower lies in the density.
-    best = (0.0, 0.0, 0.0)
-    for count in np.geomspace(16, 2000, _CYCLES * 8):
-        drop = 0.0
-        for part, mask, plain in zip(parts, masks, plain_um, strict=True):
-            phase = 2 * np.pi * count * plain[mask] / span
-            wave = np.exp(1j * phase)
-            n = len(part)
-            drop += 2 * float(np.abs(part @ wave) ** 2) / n
-        if drop > best[2]:
-            best = (span / count, 0.0, drop)
-    freedom = 2 * len(parts)
-    logs = stats.chi2.logsf(best[2], freedom) + np.log(_CYCLES * 8)
-    return best[0], float(-logs), best[2]
+@dataclass(frozen=True)
+class Cycles:
+    """The strongest period of a residual in the position: its evidence in e-folds, and the decrease that it takes."""
+
+    period_um: float
+    z: float
+    drop: float
+
+
+def cycles(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.ndarray]) -> Cycles:
+    """Search a joined residual for a period in the position, from 16 in the stroke to 2,000.
+
+    What is slower lies in the density.
+    """
+    span_um = max(float(np.ptp(p)) for p in plain_um)
+    parts = [
+        (part, 2 * np.pi * plain[mask] / span_um)
+        for part, mask, plain in zip(projector.split(residual), projector.masks, plain_um, strict=True)
+    ]
+    counts = np.geomspace(16, 2000, _PERIODS)
+    drops = [
+        sum(2 * float(np.abs(part @ np.exp(1j * k * turn)) ** 2) / len(part) for part, turn in parts) for k in counts
+    ]
+    best = int(np.argmax(drops))
+    logs = stats.chi2.logsf(drops[best], 2 * len(parts)) + np.log(_PERIODS)
+    return Cycles(span_um / float(counts[best]), float(-logs), drops[best])
+
+
+def irregular(projector: Projector, residual: np.ndarray) -> tuple[tuple[Test, ...], bool]:
+    """Test a residual, whitened and joined, run by run; and say whether it comes in bursts.
+
+    Neighbours are compared with white noise (Ljung and Box), sizes of stretches with one another (Brown and Forsythe)
+    and the tails with a normal distribution's (Anscombe and Glynn). The last two are asked of what is new in every
+    sample, so that a correlation that was not learnt is not mistaken for them.
+    """
+    runs = len(projector.masks)
+    white, even, tails = np.zeros(runs), np.zeros(runs), np.zeros(runs)
+    bursts = False
+    for k, part in enumerate(projector.split(residual)):
+        if len(part) < _STRETCHES * _FEWEST:
+            continue
+        part = part - part.mean()
+        n, lags = len(part), np.arange(1, _LAGS + 1)
+        energy = float(part @ part)
+        correlation = np.array([part[lag:] @ part[:-lag] for lag in lags]) / energy
+        white[k] = stats.chi2.logsf(n * (n + 2) * np.sum(correlation**2 / (n - lags)), _LAGS)
+        new = learn_noise(part, 0.0).whiten(part)[_LAGS:]
+        size = np.abs(new)
+        pieces = np.array_split(size, _STRETCHES)
+        means = np.array([piece.mean() for piece in pieces])
+        within = sum(float(np.sum((piece - mean) ** 2)) for piece, mean in zip(pieces, means, strict=True))
+        between = sum(len(piece) * (mean - size.mean()) ** 2 for piece, mean in zip(pieces, means, strict=True))
+        freedom = _STRETCHES - 1, len(size) - _STRETCHES
+        even[k] = stats.f.logsf(between / freedom[0] / (within / freedom[1]), *freedom)
+        heavy = float(stats.kurtosis(new))
+        tails[k] = stats.norm.logsf(stats.kurtosistest(new).statistic) if heavy > 0 else 0.0
+        stretches = np.array([np.sqrt(np.mean(piece**2)) for piece in np.array_split(part, _STRETCHES)])
+        bursts |= bool(heavy > _HEAVY and stretches.std() > _SPREAD * stretches.mean())
+    asked = (
+        ("whiteness", "neighbouring residuals agree", white),
+        ("evenness", "the residual is larger in some stretches of a run than in others", even),
+        ("tails", "large residuals are more frequent than in normal noise", tails),
+    )
+    return tuple(
+        Test.of(name, *_evidence(float(logs.min()), runs), 0.0, words) for name, words, logs in asked
+    ), bursts
+
+
+def _evidence(log_p: float, runs: int) -> tuple[float, float]:
+    """Evidence in standard deviations, and probability, where the worst of some runs was taken."""
+    log_p = min(log_p + float(np.log(runs)), 0.0)
+    p = float(np.exp(log_p))
+    return float(np.clip(stats.norm.isf(p), 0.0, _MOST)) if p > 0 else _MOST, p

@@ -1,12 +1,14 @@
-"""Which way of looking at a residual shows which effect."""
+"""A residual against the variable that shows an effect best."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 from scipy import signal
 
 from fits.diagnosis._result import RunView
+from microid.effects import View
 
 _BINS = 36
 # Fewer samples than this make no mean.
@@ -30,22 +32,13 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class View:
-    """One way of looking at a residual.
+class ResidualView:
+    """A residual against one variable.
 
-    Attributes
-    ----------
-    effects
-        Names of the effects that it shows best.
-    look
-        Makes curves from runs, with lengths times a factor; a `ValueError` where the runs do not allow it.
-    x_label, y_label, per, caption
-        In words; `per` follows the unit of the length.
-    logarithmic, spectrum
-        Whether the first axis is logarithmic, and whether both are.
+    `look` makes curves from runs, with lengths times a factor; a `ValueError` where the runs do not allow it. `per`
+    follows the unit of the length. The first axis is `logarithmic`, or both are where it is a `spectrum`.
     """
 
-    effects: tuple[str, ...]
     look: Callable[[Sequence[RunView], float], list[Curve]]
     x_label: str
     y_label: str
@@ -79,24 +72,16 @@ def _together(runs: Sequence[RunView], of: Callable[[RunView], np.ndarray]) -> n
     return np.concatenate([np.ravel(of(run)) for run in runs]) if runs else np.empty(0)
 
 
-def _velocity(run: RunView) -> np.ndarray:
-    return np.gradient(run.voltage_V, run.time_s)
+def _over(x: Callable[[RunView], np.ndarray], even: bool = True) -> Callable[[Sequence[RunView], float], list[Curve]]:
+    """Look at a residual against a variable of each sample."""
 
+    def look(runs: Sequence[RunView], factor: float) -> list[Curve]:
+        along, before, after = (
+            _together(runs, of) for of in (x, lambda run: run.before_um, lambda run: run.after_um)
+        )
+        return [_binned(along, factor * before, False, even=even), _binned(along, factor * after, True, even=even)]
 
-def _over_velocity(runs: Sequence[RunView], factor: float) -> list[Curve]:
-    x = _together(runs, _velocity)
-    return [
-        _binned(x, factor * _together(runs, lambda run: run.before_um), False, even=False),
-        _binned(x, factor * _together(runs, lambda run: run.after_um), True, even=False),
-    ]
-
-
-def _over_position(runs: Sequence[RunView], factor: float) -> list[Curve]:
-    x = _together(runs, lambda run: run.measured_um)
-    return [
-        _binned(x, factor * _together(runs, lambda run: run.before_um), False),
-        _binned(x, factor * _together(runs, lambda run: run.after_um), True),
-    ]
+    return look
 
 
 def _over_voltage(runs: Sequence[RunView], factor: float) -> list[Curve]:
@@ -183,35 +168,21 @@ def _spectrum(runs: Sequence[RunView], factor: float) -> list[Curve]:
 
 _BAND = "Lines are means, and the shaded bands hold the middle 80 % of the samples."
 
-# The last one is for all effects that no other names.
-VIEWS = (
-    View(
-        ("creep",),
-        _since_move,
-        "time since the last event (s)",
-        "change of the residual",
-        "How the residual changes after the voltage starts, stops or turns; positive in the direction of the last "
-        f"move. {_BAND}",
-        logarithmic=True,
+VIEWS: dict[View, ResidualView] = {
+    "voltage": ResidualView(
+        _over_voltage,
+        "voltage (V)",
+        "residual",
+        f"Solid while the voltage rises or last rose, dashed while it falls or last fell. {_BAND}",
     ),
-    View(
-        (
-            "transport_delay",
-            "sensor_lowpass",
-            "timestamp_jitter",
-            "clock_mismatch",
-            "dropped_samples",
-            "voltage_dependent_capacitance",
-            "slew_limit",
-        ),
-        _over_velocity,
+    "position": ResidualView(_over(attrgetter("measured_um")), "measured displacement (µm)", "residual", _BAND),
+    "velocity": ResidualView(
+        _over(lambda run: np.gradient(run.voltage_V, run.time_s), even=False),
         "rate of the voltage (V/s)",
         "residual",
         _BAND,
     ),
-    View(("sensor_nonlinearity", "quantisation"), _over_position, "measured displacement (µm)", "residual", _BAND),
-    View(
-        ("mains_hum", "floor_vibration", "second_resonance", "stiffness_hardening", "load_change"),
+    "frequency": ResidualView(
         _spectrum,
         "frequency (Hz)",
         "residual density",
@@ -220,18 +191,13 @@ VIEWS = (
         logarithmic=True,
         spectrum=True,
     ),
-    View(
-        ("thermal_drift", "thermal_gain", "mount_relaxation", "aging", "outliers", "cross_coupling", "initial_state"),
-        _over_time,
-        "time (s)",
-        "residual",
-        f"The longest run. {_BAND}",
+    "time": ResidualView(_over_time, "time (s)", "residual", f"The longest run. {_BAND}"),
+    "since_move": ResidualView(
+        _since_move,
+        "time since the last event (s)",
+        "change of the residual",
+        "How the residual changes after the voltage starts, stops or turns; positive in the direction of the last "
+        f"move. {_BAND}",
+        logarithmic=True,
     ),
-    View(
-        (),
-        _over_voltage,
-        "voltage (V)",
-        "residual",
-        f"Solid while the voltage rises or last rose, dashed while it falls or last fell. {_BAND}",
-    ),
-)
+}

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from fits.diagnosis._result import Diagnosis, EffectParameter, FoundCause, RunView
+from microid.effects import card_of
 
 # Below this, probabilities are those of tails that nobody has checked.
 _SMALLEST_P = 1e-9
 _UNITS = {"um": "µm", "degC": "°C"}
-# These are in no model: they are of single samples, or noise.
-_FAULTS = ("outliers", "quantisation", "timestamp_jitter", "floor_vibration")
 # What stands for a number that is not known.
 NONE = "\N{EN DASH}"
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
@@ -21,7 +20,7 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def plain(name: str) -> str:
-    """Turn a name such as `thermal_drift` into words."""
+    """Turn a name into words."""
     return name.replace("_", " ")
 
 
@@ -121,9 +120,10 @@ class Lengths:
         return f"{self.bare(size_um)} {self.unit}" if math.isfinite(size_um) else NONE
 
 
-def rms_um(runs: Sequence[RunView], name: str) -> float:
-    """Root mean square over all runs of a residual, `before_um` or `after_um`; NaN where there is none."""
-    values = np.concatenate([np.ravel(getattr(run, name)) for run in runs] or [np.empty(0)])
+def rms_um(runs: Sequence[RunView], name: str, fitted: bool = False) -> float:
+    """Root mean square of a residual, `before_um` or `after_um`, over all samples or those `fitted`; NaN for none."""
+    parts = [getattr(run, name)[run.fitted] if fitted else np.ravel(getattr(run, name)) for run in runs]
+    values = np.concatenate(parts or [np.empty(0)])
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
 
@@ -168,7 +168,7 @@ def _found(diagnosis: Diagnosis, length: Lengths) -> str:
         )
     sentences = []
     for cause in diagnosis.causes:
-        what = "noise" if cause.name in _FAULTS else "reproducible misfit of the plain stage"
+        what = "noise" if card_of(cause.name).statistic else "reproducible misfit of the plain stage"
         sentences.append(
             f"{plain(cause.name).capitalize()} explains {percent(cause.share_of_misfit)} of the {what} "
             f"({sigmas(cause.z)} standard deviations; probability by chance {chance(cause.p_family)})."
@@ -189,7 +189,7 @@ def _told_apart(diagnosis: Diagnosis) -> list[str]:
 
 def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
     gain = diagnosis.gain
-    modelled = [cause.name for cause in diagnosis.causes if cause.name not in _FAULTS]
+    modelled = [cause.name for cause in diagnosis.causes if not card_of(cause.name).statistic]
     if not modelled:
         return []
     if not math.isfinite(gain.heldout_rms_before_um) or not math.isfinite(gain.heldout_rms_after_um):

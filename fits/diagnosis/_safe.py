@@ -2,24 +2,19 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._evaluate import with_effects
-from fits.diagnosis._path import Limits, Path, Samples
-from fits.diagnosis._predict import Hypothesis
-from fits.diagnosis._programs import Program, menu
+from fits.diagnosis._baseline import Baseline, with_effects
+from fits.diagnosis._predict import Hypothesis, next_record
+from fits.diagnosis._prepare import Prepared
+from fits.diagnosis._programs import Limits, Path, Program, Samples, menu
 from fits.diagnosis._projector import Projector
+from fits.diagnosis._select import Selection
 from fits.io._limits import Extreme, Ranges, allowed, beyond, compared, joined
 from fits.io._record import Record
 from fits.stage._motion import motion, reached_by
 from microid import Stage
-
-if TYPE_CHECKING:
-    from fits.diagnosis._prepare import Prepared
-    from fits.diagnosis._select import Selection
 
 # Draws of the plain stage, and of the stage with each hypothesis.
 _DRAWS, _EACH = 4, 2
@@ -36,14 +31,8 @@ _ROUNDS, _MORE, _NARROW = 12, 1.1, 0.1
 class Model:
     """A stage that the records allow.
 
-    Attributes
-    ----------
-    stage
-        The stage.
-    zero_um
-        What the sensor reads where the stage's own displacement is zero.
-    left_um
-        What the stage leaves of the records, root mean square: it predicts no better than that.
+    `zero_um` is what the sensor reads where the stage's own displacement is zero. It predicts no better than
+    `left_um`, the root mean square of what it leaves of the records.
     """
 
     stage: Stage
@@ -54,16 +43,8 @@ class Model:
 class Guard:
     """Predicts what a program makes the rig do, and compares it with the limits.
 
-    Parameters
-    ----------
-    models
-        Stages that the records allow, the fitted one first.
-    limits
-        Of what is commanded and of what the rig does.
-    like
-        Record whose further columns the next run is taken to have.
-    range_V
-        Of the commands that the stages were fitted with.
+    The `models` are stages that the records allow, the fitted one first, `range_V` the range of the commands that
+    they were fitted with, and the next run is taken to have the further columns of the record that it is `like`.
     """
 
     def __init__(self, models: Sequence[Model], limits: Ranges, like: Record, range_V: tuple[float, float]):
@@ -79,9 +60,7 @@ class Guard:
 
     def _each(self, program: Samples) -> Iterable[Ranges]:
         time_s, voltage_V = program
-        share = np.linspace(0, 1, len(time_s))
-        extra = {k: np.interp(share, np.linspace(0, 1, len(v)), v) for k, v in self._like.extra.items()}
-        record = Record(time_s, voltage_V, None, extra, source="the next run")
+        record = next_record(time_s, voltage_V, self._like.extra)
         # Relays that the program does not reach may have been left in any state.
         whole = voltage_V[0] <= self._range_V[0]
         for model in self.models:
@@ -123,25 +102,16 @@ class Guard:
 
 
 def guard_of(
-    ready: "Prepared",
-    found: "Selection",
+    ready: Prepared,
+    found: Selection,
     hypotheses: Sequence[Hypothesis],
     stated: Mapping[str, tuple[float, float]],
     margin: float,
     seed: int = 0,
 ) -> Guard:
-    """Make a guard of what a diagnosis knows.
+    """Make a guard of what a diagnosis knows, with stages drawn from what the records leave open.
 
-    Parameters
-    ----------
-    ready, found
-        The plain stage and the selection.
-    hypotheses
-        Effects that the stage may have.
-    stated, margin
-        See `fits.io._limits.allowed`.
-    seed
-        Of the draws from what the records leave open.
+    See `fits.io._limits.allowed` for the limits that are `stated`, and `margin`.
     """
     baseline = ready.baseline
     records = [run.record for run in baseline.runs]

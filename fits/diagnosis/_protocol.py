@@ -1,36 +1,82 @@
-"""Holds by a controller: the displacement stands, and what the stage does by itself shows in the voltage."""
+"""How runs were taken: from an initial magnetisation curve on, or under a controller that held the displacement."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import EffectParameter, FoundCause
+from fits.diagnosis._score import evidence
 from fits.io._record import Record
+from fits.loop._run import VIRGIN, known_samples
+from microid.effects import card_of
 
+# Waves over an initial curve, evidence from which it counts, the share of that for the best effect from which it is
+# the likelier reason, and the part of the range through which the voltage goes up, and down, beside it.
+_WAVES, _EVIDENT, _NEARLY, _WHOLE_RANGE = 12, 5.5, 0.8, 1.0
 # A hold lasts so long and has so many samples; meanwhile the displacement keeps within this part of its range, and
 # the voltage moves by more than that part of its own.
-_LONG_s, _SAMPLES, _STANDS, _MOVES = 1.0, 200, 3e-3, 5e-3
+_LONG_s, _SAMPLES, _AT_REST, _MOVES = 1.0, 200, 3e-3, 5e-3
 # Times of a hold over which the voltage is read: from so many intervals after its beginning on, in blocks evenly
 # spaced in the logarithm of time, and two decades at least.
 _AFTER, _BLOCKS, _DECADES = 8, 24, 2.0
 # Part of the scatter about its mean that a line over the logarithm of time must explain.
 _STRAIGHT = 0.97
-_GAIN, _TWO_SIDED = "gain_per_decade", 1.96
+_TWO_SIDED = 1.96
+
+
+def is_virgin(projector: Projector, highest: float, model: Refit | None = None) -> bool:
+    """Whether an initial magnetisation curve at the start of the runs explains about as much as anything else.
+
+    A stage that was at rest since it was made, or demagnetised, begins on a curve of its own. What it lacks of a loop
+    depends on nothing but how far the voltage has come. The `projector` is of a baseline fitted to runs whose state
+    before is unknown, and taken for saturated where they begin at an end of the range; `highest` is the evidence for
+    the best of all effects in standard deviations, and `model` holds the causes that are known already.
+    """
+    columns = virgin_columns(projector)
+    if columns.shape[1] == 0:
+        return False
+    columns = projector.off(columns)
+    if model is None:
+        residual = projector.off(projector.residual)
+    else:
+        residual, basis = model.residual, model.basis()
+        columns = columns - basis @ (basis.T @ columns)
+    z, _, _ = evidence(columns, residual, False)
+    return z > max(_EVIDENT, _NEARLY * highest)
+
+
+def virgin_columns(projector: Projector) -> np.ndarray:
+    """Signals along which initial curves may differ from loops, joined; none where too little is beside them."""
+    runs, range_V = projector.regression.baseline.runs, projector.regression.baseline.range_V
+    columns: list[np.ndarray] = []
+    none = [np.zeros(len(run.record)) for run in runs]
+    up_V = down_V = 0.0
+    for k, run in enumerate(runs):
+        voltage = run.record.voltage_V
+        strict = known_samples(voltage, *range_V, VIRGIN)
+        moves_V = np.diff(voltage)[(run.fitted & strict)[1:]]
+        up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
+        first = run.fitted & ~strict
+        if first.any():
+            gone = np.maximum.accumulate(np.abs(voltage - voltage[0]))
+            share = gone / max(float(gone[first].max()), 1e-300)
+            columns += [
+                projector.join([*none[:k], first * np.cos(np.pi * wave * share), *none[k + 1 :]])
+                for wave in range(_WAVES)
+            ]
+    if not columns or min(up_V, down_V) < _WHOLE_RANGE * (range_V[1] - range_V[0]):
+        return np.zeros((len(projector.residual), 0))
+    return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True)
 class Held:
-    """What a controller took back while it held the displacement.
+    """What a controller took back while it held the displacement for `duration_s`.
 
-    Attributes
-    ----------
-    source
-        Of the record.
-    duration_s
-        Of the hold.
-    gain_per_decade, sd
-        Change of the voltage per decade of time over the step before, against it, and its standard deviation.
+    `gain_per_decade` is the change of the voltage per decade of time over the step before, against it.
     """
 
     source: str
@@ -48,31 +94,31 @@ class Held:
         )
 
 
-def told_by(held: Held, causes: Sequence[FoundCause]) -> tuple[FoundCause, ...]:
-    """Put the gain that a hold says into a cause that is creep, ahead of those of the fit."""
+def with_held_gain(held: Held, causes: Sequence[FoundCause]) -> tuple[FoundCause, ...]:
+    """Put the gain that a hold shows into the cause that shows there, ahead of the parameters of its fit."""
     out = []
     for cause in causes:
-        if cause.name == "creep":
+        if name := card_of(cause.name).held:
             low, high = (max(held.gain_per_decade + way * _TWO_SIDED * held.sd, 0.0) for way in (-1, 1))
-            told = EffectParameter(_GAIN, held.gain_per_decade, held.sd, "1", low, high)
+            shown = EffectParameter(name, held.gain_per_decade, held.sd, "1", low, high)
             fitted = (replace(one, name=f"{one.name}, of the fit") for one in cause.parameters)
-            cause = replace(cause, parameters=(told, *fitted))
+            cause = replace(cause, parameters=(shown, *fitted))
         out.append(cause)
     return tuple(out)
 
 
-def held_creep(records: Sequence[Record]) -> Held | None:
-    """Read creep off the hold that says most of it; None where no controller held the displacement."""
-    found = [held for record in records for held in _held(record)]
+def held_gain(records: Sequence[Record]) -> Held | None:
+    """Read the gain off the hold that shows it best; None where no controller held the displacement."""
+    found = [held for record in records for held in _holds(record)]
     return min(found, key=lambda held: held.sd / held.gain_per_decade, default=None)
 
 
-def _held(record: Record) -> list[Held]:
+def _holds(record: Record) -> list[Held]:
     assert record.displacement_um is not None
     time, voltage, place = record.time_s, record.voltage_V, record.displacement_um
-    close, apart = _STANDS * float(np.ptp(place)), _MOVES * float(np.ptp(voltage))
+    close, apart = _AT_REST * float(np.ptp(place)), _MOVES * float(np.ptp(voltage))
     out = []
-    for first, stop in _standing(place, close):
+    for first, stop in _stretches_at_rest(place, close):
         if stop - first < _SAMPLES or time[stop - 1] - time[first] < _LONG_s:
             continue
         if np.ptp(voltage[first:stop]) < apart or np.ptp(np.diff(voltage[first:stop])) == 0:
@@ -87,13 +133,13 @@ def _held(record: Record) -> list[Held]:
         decades = np.log10(age[late][-1] / age[late][0]) if late.any() else 0.0
         if step == 0 or decades < _DECADES:
             continue
-        slope, sd, straight = _line(np.log10(age[late]), voltage[first:stop][late])
+        slope, sd, straight = _regressed(np.log10(age[late]), voltage[first:stop][late])
         if straight > _STRAIGHT and -slope / step > 0:
             out.append(Held(record.source, float(age[-1]), -slope / step, sd / abs(step)))
     return out
 
 
-def _standing(place: np.ndarray, close: float) -> list[tuple[int, int]]:
+def _stretches_at_rest(place: np.ndarray, close: float) -> list[tuple[int, int]]:
     """Longest stretches within which values keep within a band, one after the other."""
     found, first = [], 0
     while first + _SAMPLES <= len(place):
@@ -111,7 +157,7 @@ def _standing(place: np.ndarray, close: float) -> list[tuple[int, int]]:
     return found
 
 
-def _line(along: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
+def _regressed(along: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
     """Slope over blocks that are evenly spaced, its standard deviation, and the part of the scatter explained."""
     edges = np.linspace(along[0], along[-1], _BLOCKS + 1)
     block = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, _BLOCKS - 1)

@@ -1,0 +1,210 @@
+"""Effects in the runs: their simulation beside the plain stage, and their coordinates."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.backend import get_backend
+from jaxtyping import Array, Float
+
+from fits.diagnosis._baseline import Baseline, with_effects
+from fits.io._record import Record
+from fits.stage._motion import Prepared, pass_signal, prepare, programs, signals
+from microid import AbstractEffect, Coordinates, Mechanics, ParameterInfo, Sensor, Signal, Stage
+
+# Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
+_LONG, _MANY = 20_000, 500
+# Part of a period of the resonance between samples, beyond which a run does not resolve it.
+_PERIOD = 0.25
+# Periods of a line in a record, as its samples show it, below which it is a drift as well.
+_PERIODS = 3
+# Part of a bound within which a coordinate is at it.
+_BOUND = 1e-2
+
+
+class Bench:
+    """A fitted stage and the runs, ready to be simulated with effects.
+
+    The runs are those held out whole where it is `aside`; intervals are divided into many steps where it is `finest`.
+    """
+
+    def __init__(self, baseline: Baseline, aside: bool = False, finest: bool = False):
+        self.baseline = baseline
+        stage = baseline.stage.with_substeps(1)
+        # What a fit may move is looked up anew for every stage that is built.
+        self.stage = stage.thaw(*stage.frozen)
+        few, many = (baseline.coarse_aside, baseline.finest_aside) if aside else (baseline.coarse, baseline.finest)
+        runs = many if finest else few
+        mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
+        self.resonance_Hz = float(mechanics[0].natural_frequency_Hz) if mechanics else 0.0
+        self.prepared = [prepare(self.stage, run) for run in runs]
+        self.known = [signals(self.stage, one) for one in self.prepared]
+        self.plain = [at_samples(known[-1], one) for known, one in zip(self.known, self.prepared, strict=True)]
+
+    def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
+        """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
+        return [
+            _respond(with_effects(self.stage, self._seen(own, one)), self.stage, known, one)
+            for own, known, one in zip(effects, self.known, self.prepared, strict=True)
+        ]
+
+    def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
+        """Those that a run may be asked about: none that is its own and too fast for its samples."""
+        record = prepared.run.record
+        interval_s = float(np.median(np.diff(record.time_s)))
+        effects = [without_drifts(effect, interval_s, record.duration_s) for effect in effects]
+        if not self.resonance_Hz * interval_s > _PERIOD:
+            return effects
+        return [effect for effect in effects if not (effect.fast and effect.per_run)]
+
+    def change(
+        self, effects: Sequence[AbstractEffect], before: Sequence[np.ndarray] | None = None
+    ) -> list[np.ndarray]:
+        """What effects that all runs share change in them, in um."""
+        out = self.respond([list(effects)] * len(self.prepared))
+        return [a - b for a, b in zip(out, self.plain if before is None else before, strict=True)]
+
+
+def _respond(stage: Stage, base: Stage, known: Sequence[Signal], prepared: Prepared) -> np.ndarray:
+    """Response of a stage that differs from a simulated one from some part on, in um, shape `(n,)`."""
+    same = 0
+    while same < min(len(stage.parts), len(base.parts)) and stage.parts[same] is base.parts[same]:
+        same += 1
+    signal = known[same]
+    for part in stage.parts[same:]:
+        signal = pass_signal(part, prepared.time_s, signal, prepared.scene)
+    return at_samples(signal, prepared)
+
+
+def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:
+    """Values of a refined signal at the samples of its run, shape `(n,)`."""
+    return np.asarray(signal.values)[:: prepared.run.samples.stride][: len(prepared.run.record)]
+
+
+def drop_programs(records: Sequence[Record]) -> None:
+    """Free the compiled programs that simulate parts, where records are long or programs are many.
+
+    A program is compiled for runs of one length, those of short runs serve the next diagnosis as well; and several
+    hundred of them take as much memory as long records do. What else the process has compiled stays.
+    """
+    if sum(len(record) for record in records) >= _LONG or len(get_backend().live_executables()) > _MANY:
+        programs.drop()
+
+
+def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float) -> AbstractEffect:
+    """An effect without the lines that samples so far apart may turn into a drift of a record of this duration."""
+    lines_Hz = np.array(effect.lines_Hz)
+    # Samples shift a frequency by a multiple of their rate.
+    shifted_Hz = np.abs(lines_Hz - np.round(lines_Hz * interval_s) / interval_s)
+    seen = (shifted_Hz - effect.tolerance * lines_Hz) * duration_s > _PERIODS
+    if seen.all():
+        return effect
+    return replace(effect, **{name: getattr(effect, name) * seen.astype(float) for name in effect.strength})
+
+
+class Law:
+    """The coordinates of one effect in all runs.
+
+    Those of an effect that differs from run to run are what the runs share, then what is its own in each: strengths,
+    and where it `remembers`, what went on before each run, which is nothing otherwise. Parameters that are `held`
+    stay.
+    """
+
+    def __init__(self, effects: Sequence[AbstractEffect], remembers: bool = False, held: Sequence[str] = ()):
+        self.form, self.remembers = type(effects[0]), remembers
+        closed = (*held, *(() if remembers else self.form.history))
+        # The part that an effect is put around is put in anew wherever it is simulated.
+        self.maps = [Coordinates(_without_host(effect), lambda info: _free(info, closed)) for effect in effects]
+        vectors = [np.asarray(one.of(_without_host(effect))) for one, effect in zip(self.maps, effects, strict=True)]
+        self.each = self.differs if len(effects) > 1 else np.zeros(len(vectors[0]), dtype=bool)
+        self.start = np.concatenate([vectors[0][~self.each], *(v[self.each] for v in vectors)])
+
+    @property
+    def differs(self) -> np.ndarray:
+        """Which coordinates differ from run to run if there are several, shape `(k,)`."""
+        return self._of((*(self.form.strength if self.form.per_run else ()), *self.form.history))
+
+    @property
+    def strengths(self) -> np.ndarray:
+        """Which coordinates are strengths, shape `(size,)`."""
+        strong = self._of(self.form.strength)
+        if not self.each.any():
+            return strong
+        return np.concatenate([strong[~self.each], np.tile(strong[self.each], len(self.maps))])
+
+    @property
+    def common(self) -> dict[str, int]:
+        """Numbers of the coordinates that all runs share, by parameter; without what went on before the runs."""
+        found, at, own = {}, 0, self.each.any()
+        for info in self.maps[0].table:
+            differs = info.path in self.form.history or (info.path in self.form.strength and self.form.per_run)
+            if own and differs:
+                continue
+            size = math.prod(info.shape)
+            if size == 1 and info.path not in self.form.history:
+                found[info.path] = at
+            at += size
+        return found
+
+    def _of(self, paths: Sequence[str]) -> np.ndarray:
+        return np.concatenate([np.full(math.prod(info.shape), info.path in paths) for info in self.maps[0].table])
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.start)
+
+    def vector(self, x: np.ndarray, run: int) -> np.ndarray:
+        """Coordinates of the effect in one run."""
+        if not self.each.any():
+            return x
+        shared, own = int(np.sum(~self.each)), int(np.sum(self.each))
+        full = np.empty(len(self.each))
+        full[~self.each] = x[:shared]
+        full[self.each] = x[shared + run * own : shared + (run + 1) * own]
+        return full
+
+    def at_bound(self, x: np.ndarray) -> bool:
+        """Whether a strength is at its bound, or a time constant at its lower one: another effect may look so."""
+        values, at = np.asarray(self.maps[0].values(jnp.asarray(self.vector(x, 0)))), 0
+        for info in self.maps[0].table:
+            size, spec = math.prod(info.shape), info.spec
+            here = values[at : at + size]
+            at += size
+            below = spec.lower * (1 - _BOUND) if spec.lower < 0 else -np.inf
+            if info.path in self.form.strength and np.any((here > spec.upper * (1 - _BOUND)) | (here < below)):
+                return True
+            if info.path == "time_constant_s" and np.any(here < (1 + _BOUND) * spec.lower):
+                return True
+        return False
+
+    def effect(self, x: np.ndarray, run: int) -> AbstractEffect:
+        """The effect in one run."""
+        return _at(self.maps[run], jnp.asarray(self.vector(x, run)))
+
+
+def _without_host(effect: AbstractEffect) -> AbstractEffect:
+    anything = Sensor(jnp.ones(()), jnp.zeros(()))
+    return replace(effect, inner=anything) if hasattr(effect, "inner") else effect  # type: ignore[call-arg]
+
+
+def _free(info: ParameterInfo, closed: Sequence[str]) -> bool:
+    return not info.path.startswith("inner") and info.path not in closed
+
+
+@eqx.filter_jit
+def _at(coordinates: Coordinates[AbstractEffect], vector: Float[Array, " k"]) -> AbstractEffect:
+    return coordinates(vector)
+
+
+def strength_of(law: Law, x: np.ndarray, run: int) -> np.ndarray:
+    effect = law.effect(x, run)
+    return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
+
+
+def remembering(law: Law, x: np.ndarray) -> Law:
+    """The same effects, what went on before the runs being unknown."""
+    return Law([law.effect(x, run) for run in range(len(law.maps))], True)

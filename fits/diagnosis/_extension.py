@@ -1,0 +1,188 @@
+"""The stage with its causes: fitted anew, and what it is worth on data that were not used."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.diagnosis._baseline import simulate, with_effects
+from fits.diagnosis._effects import Bench, at_samples
+from fits.diagnosis._prepare import Prepared
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import Refit
+from fits.diagnosis._regression import Regression, regress
+from fits.diagnosis._result import Gain
+from fits.diagnosis._select import Selection
+from fits.loop._run import Run
+from fits.stage._motion import signals
+from fits.stage._run import project_out
+from microid import AbstractEffect, Stage
+
+_BLOCKS = 24
+_ROUNDS = 6
+# Relative spread of strengths that are the same in all runs.
+_ALIKE = 0.3
+# What was kept aside must not be predicted so many times worse, in squares; or not worse beyond chance by causes with
+# less evidence than this, in standard deviations: what else is not simulated may lend them as much.
+_WORSE, _WEAK = 1.1, 8.0
+# Standard deviations from which on a difference counts, and samples that are taken to err alike.
+_SURELY, _BLOCK = 1.5, 25
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Residuals of the plain and the extended stage in one run, shape `(n,)`, and which samples were held out."""
+
+    run: Run
+    before_um: np.ndarray
+    after_um: np.ndarray
+    held_out: np.ndarray
+
+
+@dataclass(frozen=True)
+class Extension:
+    """A stage with effects, and its residuals in all runs beside the plain stage's, those held out whole last."""
+
+    stage: Stage
+    compared: tuple[Compared, ...]
+    effects: tuple[AbstractEffect, ...]
+
+
+def plain_steps(ready: Prepared) -> int:
+    """Steps between samples that the plain stage needs."""
+    return max(run.samples.stride for run in ready.baseline.fine)
+
+
+def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Extension:
+    """Let the plain stage follow what the effects of a model leave, and compare the two; none for the plain stage."""
+    baseline = ready.baseline
+    if model is None or not model.laws:
+        stage = baseline.stage.with_substeps(plain_steps(ready))
+        return Extension(stage, _compare(ready, ready.bench, None, ready.regression, (), False), ())
+    # What followed along the tangent is put into the stage itself.
+    bare = Projector(found.projector.regression, found.projector.noise)
+    regression = regress(bare.move(bare.residual - bare.join(model.change_um)), ())
+    effects = shared_effects(model, len(baseline.runs))
+    steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))
+    stage = with_effects(regression.baseline.stage, effects).with_substeps(steps)
+    compared = _compare(ready, Bench(regression.baseline), model, regression, effects, found.finest)
+    return Extension(stage, compared, tuple(effects))
+
+
+def shared_effects(model: Refit, runs: int) -> list[AbstractEffect]:
+    """The effects as a model holds them: strengths that every run has by their mean, and others not at all."""
+    found = []
+    for law, x in zip(model.laws, model.x, strict=True):
+        # What went on before one run says nothing of the next.
+        nothing = {name: jnp.zeros(()) for name in law.form.history}
+        each = [replace(law.effect(x, run), **nothing) for run in range(runs)]
+        if hasattr(each[0], "after_s"):
+            # What happened at one instant does not happen again.
+            found.append(replace(each[0], **{name: 0 * getattr(each[0], name) for name in law.form.strength}))
+        elif law.form.per_run and law.each.any():
+            found.append(replace(each[0], **{name: _common(each, name) for name in law.form.strength}))
+        else:
+            found.append(each[0])
+    return found
+
+
+def _common(each: Sequence[AbstractEffect], name: str) -> Float[Array, "..."]:
+    values = jnp.stack([getattr(effect, name) for effect in each])
+    mean = jnp.mean(values, axis=0)
+    # What one run had says nothing of the next.
+    return jnp.where(jnp.std(values, axis=0) < _ALIKE * jnp.abs(mean), mean, 0.0)
+
+
+def _compare(
+    ready: Prepared,
+    bench: Bench,
+    model: Refit | None,
+    regression: Regression,
+    effects: Sequence[AbstractEffect],
+    finest: bool,
+) -> tuple[Compared, ...]:
+    """Residuals of the plain stage and of the extended one in all runs, those held out whole last."""
+    change = [np.zeros_like(plain) for plain in bench.plain] if model is None else model.change_um
+    found = []
+    for k, run in enumerate(ready.baseline.runs):
+        plain = run.displacement_um - ready.regression.residuals[k]
+        better = run.displacement_um - regression.residuals[k] + change[k]
+        own, using = ready.regression.own[k], run.fitted
+        found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), run.held_out))
+    if ready.baseline.aside:
+        behind = Bench(bench.baseline, aside=True, finest=finest)
+        for run, change_um in zip(ready.baseline.fine_aside, behind.change(effects), strict=True):
+            plain = simulate(ready.baseline.stage, run)
+            better = simulate(bench.baseline.stage, run) + change_um
+            own, using = np.ones((len(run.record), 1)), run.known
+            found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), using))
+    return tuple(found)
+
+
+def left_of(run: Run, own: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
+    """Measurement less response, less the run's nuisance parameters fitted to the samples in use, shape `(n,)`."""
+    off = run.displacement_um - response_um
+    weight = jnp.asarray(using.astype(float))
+    return np.asarray(_without(jnp.asarray(own), weight, jnp.asarray(off)))
+
+
+_without = eqx.filter_jit(project_out)
+
+
+def predicts_worse(compared: Sequence[Compared], weak: bool) -> bool:
+    """Whether the extended stage predicts what was kept aside of the fitted runs worse than the plain one."""
+    held = [one for one in compared if one.held_out.any()]
+    if not held:
+        return False
+    before, after = (
+        np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)]) ** 2
+        for pick in ([one.before_um for one in held], [one.after_um for one in held])
+    )
+    if np.sum(after) > _WORSE * np.sum(before):
+        return True
+    sums = np.add.reduceat(after - before, np.arange(0, len(before), _BLOCK))
+    return bool(weak and np.sum(sums) > _SURELY * np.linalg.norm(sums - np.mean(sums)))
+
+
+def gain_of(compared: Sequence[Compared], noise_um: float, source: str) -> Gain:
+    """Errors on held-out data before and after, and how sure their difference is."""
+    before = [one.before_um[one.held_out] for one in compared if one.held_out.any()]
+    after = [one.after_um[one.held_out] for one in compared if one.held_out.any()]
+    if not before:
+        return Gain(noise_um=noise_um, source="nothing was held out")
+    r0, r1 = np.concatenate(before), np.concatenate(after)
+    rms0, rms1 = float(np.sqrt(np.mean(r0**2))), float(np.sqrt(np.mean(r1**2)))
+    # The difference of the two, linearised, over blocks longer than errors stay alike.
+    influence = r0**2 / (2 * max(rms0, 1e-300)) - r1**2 / (2 * max(rms1, 1e-300))
+    blocks = np.array([block.mean() for block in np.array_split(influence, _BLOCKS)])
+    sd = float(np.std(blocks, ddof=1) / len(blocks) ** 0.5)
+    return Gain(rms0, rms1, sd, float(np.max(np.abs(r0))), float(np.max(np.abs(r1))), noise_um, source=source)
+
+
+def feedforward(bench: Bench, effects: Sequence[AbstractEffect]) -> tuple[float, float]:
+    """Errors that the voltage of the plain stage's inverse leaves on the extended one, and its own inverse's.
+
+    The reference is what the plain stage does under the slowest run's command, whose inverse is that command.
+    """
+    slowest = int(np.argmax([one.run.record.duration_s for one in bench.prepared]))
+    one = bench.prepared[slowest]
+    stage = with_effects(bench.stage, effects)
+    wanted = bench.plain[slowest]
+    samples = one.run.samples
+    n, stride = len(one.run.record), samples.stride
+    command = np.asarray(samples.voltage_V)
+    slope = float(np.ptp(wanted) / max(np.ptp(command), 1e-300))
+    low, high = bench.baseline.range_V
+    errors = []
+    for _ in range(_ROUNDS):
+        signal = eqx.tree_at(lambda s: s.values, one.scene.command, jnp.asarray(command))
+        moved = replace(one, scene=eqx.tree_at(lambda s: s.command, one.scene, signal))
+        off = wanted - at_samples(signals(stage, moved)[-1], moved)
+        off = off - np.mean(off)
+        errors.append(float(np.sqrt(np.mean(off**2))))
+        fine = np.interp(np.arange(len(command)) / stride, np.arange(n), off)
+        command = np.clip(command + fine / slope, low, high)
+    return errors[0], min(errors)

@@ -1,0 +1,314 @@
+"""The noise of each run, and faults of single samples: spikes, the last digit, jitter and narrow bands."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import median_filter, rank_filter
+
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._regression import Regression
+from fits.io._record import Record
+from fits.loop._run import Run
+from fits.stats._at_rest import idle_stretches, quantum_um
+from fits.stats._narrow_band import DRIFT, Band, MAINS_Hz, band_of
+from fits.stats._whiten import Noise, learn_noise, rough_noise_um
+from microid.effects import Statistic
+
+# So many idle samples are a floor.
+_IDLE = 150
+# Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
+_COLOURED = 4.0
+# Standard deviations by which noise of runs may differ that is the same.
+_ALIKE = 4.0
+# Lines of mains are looked for in stretches of so many samples, and count where no more than this part of the
+# variance is left without them.
+_LONG, _MOSTLY = 60, 0.7
+# Lines drift out of step with their frequency after so many s.
+_STEADY_s = 1.5
+# A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
+# so far away are much smaller.
+SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
+# A command that moves, or turns, by more than these parts of its range at one of some samples may cause what looks
+# like a spike.
+_EDGE, _TURN, _NEAR = 0.02, 0.004, 6
+# Jitter beside rounding has at least so many times its variance.
+_ROUNDING = 10.0
+# Standard deviations beyond which the variance that a jitter makes is not.
+_SURE = 4.0
+# It is one all the same beyond such a multiple of what nearly all of these samples are off by.
+_MOSTLY_NEAR, _BEYOND = 0.98, 4.0
+# So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
+_SPIKES, _SHARE = 3, 0.3
+_JITTER_Z, _BAND_Z = 8.0, 8.0
+# A band is one of a resonance from this quality on; what is broader wanders, or jumps.
+_NARROW = 1.5
+# E-folds after which a motion has settled.
+_SETTLED = 8.0
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What a run's noise is, whatever a model leaves, and how many `idle` samples it was read off; 0 for none."""
+
+    noise: Noise
+    idle: int
+
+
+def floor_of(run: Run, residual_um: np.ndarray, settling_s: float) -> Floor:
+    """Read the noise of a run off its idle stretches, or off the fastest changes of the residual.
+
+    A stretch is idle once the stage has settled, which takes it `settling_s`.
+    """
+    pieces = []
+    for stretch in idle_stretches(run.record.voltage_V, round(settling_s * run.rate_Hz)):
+        piece = residual_um[stretch]
+        time = np.linspace(-1, 1, len(piece))
+        order = min(3, len(piece) // 12)
+        # What settles is no noise.
+        pieces.append(piece - np.polyval(np.polyfit(time, piece, order), time))
+    count = sum(len(piece) for piece in pieces)
+    if count >= _IDLE:
+        pieces = _without_mains(pieces, 1 / run.rate_Hz)
+        count = sum(len(piece) for piece in pieces)
+        joined = np.concatenate(pieces)
+        if (rough_um := rough_noise_um(joined)) > 0:
+            joined = joined[np.abs(joined) < 8 * rough_um + 1e-300]
+        freedom = 4.0 * len(pieces)
+        level = float(np.std(joined)) * (len(joined) / max(len(joined) - freedom, 1)) ** 0.5
+        correlation = float(np.mean(joined[1:] * joined[:-1]) / max(np.mean(joined**2), 1e-300))
+        if abs(correlation) * len(joined) ** 0.5 > _COLOURED and level > 0:
+            return Floor(learn_noise(joined, freedom), len(joined))
+        if level > 0:
+            return Floor(Noise(level, np.zeros(0)), len(joined))
+    used = residual_um[run.fitted]
+    return Floor(Noise(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um))), np.zeros(0)), 0)
+
+
+def pooled(floors: Sequence[Floor]) -> list[Floor]:
+    """Floors of one sensor: white noise that was read off idle stretches, and is the same in all runs by chance."""
+    white = [floor for floor in floors if floor.idle and len(floor.noise.past) == 0]
+    if len(white) < 2:
+        return list(floors)
+    counts = np.array([floor.idle for floor in white])
+    levels = np.array([floor.noise.innovation_um for floor in white])
+    level = float(np.sqrt(np.average(levels**2, weights=counts)))
+    if np.any(np.abs(levels / level - 1) > _ALIKE / np.sqrt(2 * counts)):
+        return list(floors)
+    return [
+        replace(one, noise=Noise(level, np.zeros(0))) if any(one is other for other in white) else one
+        for one in floors
+    ]
+
+
+def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarray]:
+    """Take the lines of mains out of stretches, where they are most of what is there: hum is a cause, not noise."""
+    most = max(round(_STEADY_s / interval_s), _LONG)
+    long = [
+        part for piece in pieces if len(piece) >= _LONG for part in np.array_split(piece, max(len(piece) // most, 1))
+    ]
+    if sum(len(piece) for piece in long) < _IDLE:
+        return pieces
+    before = sum(float(piece @ piece) for piece in long)
+    best, found = _MOSTLY * before, pieces
+    for mains in MAINS_Hz:
+        for frequency in mains * (1 + np.linspace(-DRIFT, DRIFT, 9)):
+            left = []
+            for piece in long:
+                phase = 2 * np.pi * frequency * interval_s * np.arange(len(piece))
+                lines = np.stack([wave(h * phase) for h in (1, 2, 3) for wave in (np.cos, np.sin)], axis=1)
+                left.append(piece - lines @ np.linalg.lstsq(lines, piece, rcond=None)[0])
+            rest = sum(float(piece @ piece) for piece in left)
+            if rest < best:
+                best, found = rest, left
+    return found
+
+
+def spikes(run: Run, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarray:
+    """Samples that stand alone, far off their neighbours, where the command gives no reason; shape `(n,)`."""
+    off = residual_um - median_filter(residual_um, 7, mode="nearest")
+    spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")
+    spread = np.maximum(spread, 1.4826 * float(np.median(np.abs(off))))
+    far = np.abs(off) > np.maximum(SPIKE * spread, least_um + 1e-300)
+    # What rings has neighbours as large; what is alone has none, or one of its kind by chance.
+    size = np.abs(off)
+    # In two dimensions: in one, SciPy 1.17 takes a footprint with a gap for one without.
+    beside = np.abs(np.arange(-_ALONE, _ALONE + 1))[None] > _TOGETHER
+    far &= size > 3 * rank_filter(size[None], -2, footprint=beside, mode="nearest")[0]
+    voltage = run.record.voltage_V
+    change = np.diff(voltage, prepend=voltage[0])
+    turned = np.abs(np.diff(change, append=change[-1])) > _TURN * float(np.ptp(voltage))
+    moved = (np.abs(change) > _EDGE * float(np.ptp(voltage))) | turned
+    near = np.convolve(moved, np.ones(2 * _NEAR + 1), mode="same") > 0.5
+    # Where it may, others do so, too.
+    usual = float(np.quantile(size[near], _MOSTLY_NEAR)) if near.any() else 0.0
+    far &= ~near | (size > _BEYOND * usual)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
+    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+        if stop - first > _TOGETHER:
+            far[first:stop] = False
+    return far
+
+
+def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float = 0.0) -> tuple[float, float, float]:
+    """Jitter of the instants of sampling, its evidence in standard deviations, and the most that it may be.
+
+    Noise that grows with the speed, from sample to sample: the variance of the residual about its neighbours is
+    compared with the square of the speed.
+    """
+    bent = residual_um[1:-1] - (residual_um[2:] + residual_um[:-2]) / 2
+    square = bent**2 / 1.5
+    speed = rate_um_per_s[1:-1] ** 2
+    order = np.argsort(speed)
+    slow, quick = order[: len(order) // 2], order[-len(order) // 10 :]
+    base = max(float(np.median(square[slow])) / 0.4549, least_um**2)
+    more = float(np.median(square[quick])) / 0.4549 - base
+    # The slower half jitters, too.
+    faster = float(np.median(speed[quick]) - np.median(speed[slow]))
+    if base <= 0 or faster <= 0:
+        return 0.0, 0.0, float("inf")
+    # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
+    error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
+    most = float((max(more + _SURE * error, 0.0) / faster) ** 0.5)
+    # Rounding is less where nothing moves, and there its median is not that of normal noise.
+    if more <= _ROUNDING * least_um**2:
+        return 0.0, 0.0, most
+    return float((more / faster) ** 0.5), float(more / error), most
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What is wrong with samples, and what the noise of each run is, learnt from `source`, in words.
+
+    Bad samples of each run are `spikes`, and `heights_um` how far off they are, shape `(n,)`. `quantum_um` is the
+    last digit of the sensor, the largest of all runs, 0 for none; `jitter_um` what the jitter of the instants of
+    sampling makes in the readings; `band` the strongest narrow band of all runs.
+    """
+
+    noise: tuple[Noise, ...]
+    source: str
+    spikes: tuple[np.ndarray, ...]
+    heights_um: tuple[np.ndarray, ...]
+    quantum_um: float
+    jitter_s: float
+    jitter_um: float
+    jitter_z: float
+    band: Band
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def repaired(self) -> bool:
+        """Whether there are enough spikes to be taken out."""
+        return sum(int(s.sum()) for s in self.spikes) >= _SPIKES
+
+    def clean(self, records: Sequence[Record]) -> list[Record]:
+        """Take the spikes out of records."""
+        if not self.repaired:
+            return list(records)
+        out = []
+        for record, height in zip(records, self.heights_um, strict=True):
+            assert record.displacement_um is not None
+            out.append(replace(record, displacement_um=record.displacement_um - height, extra=dict(record.extra)))
+        return out
+
+
+def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None = None) -> Faults:
+    """Look at what a fitted plain stage leaves of each run, sample by sample.
+
+    Where effects are known, `change_um` is what they change in each run, shape `(n,)`, and is taken off before.
+    """
+    if change_um is not None:
+        left = tuple(r - change for r, change in zip(regression.residuals, change_um, strict=True))
+        regression = replace(regression, residuals=left)
+    baseline = regression.baseline
+    guess = [
+        Noise(max(rough_noise_um(r[m]), 1e-9 * baseline.stroke_um), np.zeros(0))
+        for r, m in zip(regression.residuals, regression.masks, strict=True)
+    ]
+    projector = Projector(regression, guess)
+    dz, dw = projector.step(projector.residual)
+    quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
+    # Rounding is noise that a command at rest does not show.
+    least = quantum / 12**0.5
+    floors, found, heights, jitters, bands = [], [], [], [], []
+    poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
+    settling_s = float(_SETTLED / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
+    for run, rows, own, residual in zip(
+        baseline.runs, regression.rows, regression.own, regression.residuals, strict=True
+    ):
+        moved = residual - rows @ np.concatenate([dw, dz])
+        mask = run.fitted
+        free = np.linalg.lstsq(own[mask], moved[mask], rcond=None)[0]
+        left = moved - own @ free
+        bad = spikes(run, left, 2 * quantum)
+        smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
+        found.append(bad)
+        heights.append(np.where(bad, left - smooth, 0.0))
+        floors.append(floor_of(run, smooth, settling_s))
+        rate = np.gradient(run.displacement_um - left, run.record.time_s)
+        size, z, most = jitter_s(smooth[mask], rate[mask], least)
+        jitters.append((z, size, np.abs(rate), most))
+        interval = float(np.median(np.diff(run.record.time_s)))
+        bands.append(band_of(smooth[mask], interval, run.record.voltage_V[mask]))
+    floors = pooled(floors)
+    idle = [floor.idle > 0 for floor in floors]
+    noise = [one.noise if one.noise.total_um > least else Noise(least, np.zeros(0)) for one in floors]
+    z, size, _, _ = max(jitters, key=lambda j: j[0])
+    # One recorder took all runs: what only one of them shows is something else.
+    z = z if size / 2 < min(most for _, _, _, most in jitters) else 0.0
+    if z > _JITTER_Z:
+        noise = [
+            replace(n, spread=np.sqrt(1 + (size * rate / n.innovation_um) ** 2))
+            for n, (_, _, rate, _) in zip(noise, jitters, strict=True)
+        ]
+    # What may be hum in one run may be told from it in another.
+    band = max(bands, key=lambda one: (not one.mains, one.z))
+    source = (
+        "idle stretches of the runs"
+        if all(idle)
+        else "the fastest changes of the residual, as if it were white"
+        if not any(idle)
+        else "idle stretches where there are any, and the fastest changes of the residual elsewhere"
+    )
+    size = size if z > _JITTER_Z else 0.0
+    made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
+    return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of samples or noise that is a cause of its own, and its parameters with standard deviations."""
+
+    statistic: Statistic
+    z: float
+    parameters: tuple[tuple[str, float, float, str], ...]
+    variance_um2: float
+
+
+def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
+    """Which of them explain enough of what is left; what repeats itself with the position (`cyclic`) is no jitter."""
+    found = []
+    total = float(np.mean([n.total_um**2 for n in faults.noise]))
+    count = sum(int(s.sum()) for s in faults.spikes)
+    samples = sum(len(s) for s in faults.spikes)
+    if count >= _SPIKES:
+        heights = np.concatenate([h[s] for h, s in zip(faults.heights_um, faults.spikes, strict=True)])
+        size = float(np.sqrt(np.mean(heights**2)))
+        share, z = count / samples, float(np.max(np.abs(heights)) / total**0.5)
+        known = ("fraction", share, count**0.5 / samples, "1"), ("size_um", size, size / (2 * count) ** 0.5, "um")
+        found.append(Fault("spikes", z, known, share * size**2))
+    step = faults.quantum_um
+    if step**2 / 12 > _SHARE * total:
+        z = (samples * step**2 / 12 / total) ** 0.5
+        found.append(Fault("rounding", z, (("step_um", step, 1e-6 * step, "um"),), step**2 / 12))
+    if faults.jitter_s > 0 and not cyclic:
+        sd = faults.jitter_s / (2 * max(faults.jitter_z, 1e-9))
+        jitter = Fault("jitter", faults.jitter_z, (("jitter_s", faults.jitter_s, sd, "s"),), faults.jitter_um**2)
+        found.append(jitter)
+    band = faults.band
+    narrow = band.z > _BAND_Z and band.quality > _NARROW
+    if narrow and band.size_um**2 > _SHARE / 3 * total and not band.mains:
+        middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"
+        size_of_band = "amplitude_um", band.size_um, band.sd_um, "um"
+        found.append(Fault("band", band.z, (size_of_band, middle), band.size_um**2))
+    return found

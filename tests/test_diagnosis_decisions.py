@@ -1,0 +1,218 @@
+"""What decides in a diagnosis, by itself: on constructed residuals and answers, against closed forms and SciPy."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import fits
+from fits import Record
+from fits.diagnosis import _diagnose
+from fits.diagnosis._conclude import Misfit
+from fits.diagnosis._effects import Law
+from fits.diagnosis._extension import Compared, gain_of, predicts_worse, shared_effects
+from fits.diagnosis._prepare import HOLDS, _covered
+from fits.diagnosis._protocol import _regressed, _stretches_at_rest
+from fits.loop._run import VIRGIN
+from microid.effects import EFFECTS
+
+
+def misfit(explained, rest, freedom=40, count=10_000):
+    return Misfit(explained, rest, freedom, count)
+
+
+def test_chance_is_nothing_to_be_explained(rng):
+    rests = stats.chi2.rvs(40, size=20_000, random_state=rng)
+    found = [misfit(500.0, rest) for rest in rests]
+    # Beyond three standard deviations of a chi-square variable, one in some hundreds.
+    assert np.mean([one.total > 500.0 for one in found]) < 0.01
+    assert not any(one.is_left_over for one in found)
+    assert np.median([one.share for one in found]) == 1.0
+
+
+def test_structure_of_a_size_counts_as_left_over(rng):
+    # A signal of half the noise in 10,000 samples, seen along 40 columns.
+    energy = 10_000 * 0.5**2
+    rests = stats.ncx2.rvs(40, energy, size=500, random_state=rng)
+    found = [misfit(0.0, rest) for rest in rests]
+    assert np.mean([one.rest_noise for one in found]) == pytest.approx(0.5, rel=0.01)
+    assert all(one.is_left_over for one in found)
+    small = [misfit(0.0, rest) for rest in stats.ncx2.rvs(40, 10_000 * 0.1**2, size=500, random_state=rng)]
+    # It is no chance, but too small to matter.
+    assert np.mean([stats.chi2.sf(one.rest, 40) < 1e-6 for one in small]) > 0.9
+    assert not any(one.is_left_over for one in small)
+
+
+def test_causes_share_what_is_beyond_chance():
+    half = misfit(1000.0, 1000.0 + 40 + 3 * 80**0.5)
+    assert half.share == pytest.approx(0.5)
+    rest, counts = misfit(0.0, 40.0 + 2500.0).unnamed(weak=True)
+    assert (rest, counts) == (pytest.approx(0.5), True)
+    # What a strong suspect explains nearly nothing of is of another kind, and what it explains most of is there.
+    assert misfit(9.0, 39.0).unnamed(weak=False) == (pytest.approx(0.03), True)
+    assert not misfit(1.0, 300.0).unnamed(weak=False)[1]
+    assert not misfit(9.0, 39.0).unnamed(weak=True)[1]
+
+
+def compared(before, after):
+    return [Compared(None, before, after, np.ones(len(before), dtype=bool))]
+
+
+def test_an_extension_is_worse_only_beyond_chance(rng):
+    before = rng.standard_normal(5000)
+    assert predicts_worse(compared(before, 1.1 * before), weak=False)
+    assert not predicts_worse(compared(before, 0.9 * before), weak=True)
+    # A little worse everywhere is no chance; it is held against weak causes alone.
+    little = before * 1.03
+    assert predicts_worse(compared(before, little), weak=True)
+    assert not predicts_worse(compared(before, little), weak=False)
+    assert not predicts_worse([Compared(None, before, 2 * before, np.zeros(5000, dtype=bool))], weak=True)
+
+
+def test_the_gain_and_its_uncertainty_are_those_of_many_records(rng):
+    def drawn():
+        before, after = 0.2 * rng.standard_normal((2, 4800)) + [[0.1], [0.0]]
+        return gain_of(compared(before, after), 0.2, "whole runs")
+
+    found = [drawn() for _ in range(200)]
+    differences = [one.heldout_rms_before_um - one.heldout_rms_after_um for one in found]
+    assert np.mean(differences) == pytest.approx(np.hypot(0.2, 0.1) - 0.2, abs=0.001)
+    # 24 blocks know a standard deviation to 15 %.
+    assert np.median([one.sd_of_difference_um for one in found]) == pytest.approx(np.std(differences), rel=0.2)
+    nothing = gain_of([Compared(None, np.ones(3), np.ones(3), np.zeros(3, dtype=bool))], 0.2, "")
+    assert np.isnan(nothing.heldout_rms_before_um)
+
+
+def form(name):
+    return next(effect for effect in EFFECTS if effect.name == name)
+
+
+def test_an_extended_stage_has_what_all_runs_share():
+    hum = form("mains_hum")
+    alike, apart = (
+        [hum(np.array([a, 0.1, 0.0]), np.zeros(3), jnp.asarray(50.0)) for a in pair]
+        for pair in ((1.0, 1.1), (1.0, -1.0))
+    )
+    for pair, expected in ((alike, 1.05), (apart, 0.0)):
+        law = Law(pair)
+        model = SimpleNamespace(laws=(law,), x=(law.start,))
+        (shared,) = shared_effects(model, 2)
+        np.testing.assert_allclose(shared.cosine_um, [expected, 0.1, 0.0], atol=1e-9)
+    # What happened once does not happen again, and what went on before a run is no part of the rig.
+    lost, creep = form("dropped_samples"), form("creep")
+    once = Law([lost(jnp.asarray(1e-3), jnp.asarray(0.5))])
+    slow = Law([creep(jnp.asarray(0.01), jnp.asarray(0.1), jnp.asarray(0.3))], True)
+    model = SimpleNamespace(laws=(once, slow), x=(once.start, slow.start))
+    dropped, crept = shared_effects(model, 1)
+    assert float(dropped.dropped_s) == 0
+    assert (float(crept.gain_per_decade), float(crept.recent_um)) == (pytest.approx(0.01), 0.0)
+
+
+def test_what_is_fitted_must_go_both_ways():
+    there = np.linspace(0, 10, 500)
+    loop = Record(np.arange(1000.0), np.r_[there, there[::-1]], np.zeros(1000))
+    assert _covered([loop], 0.2)
+    assert not _covered([loop], 0.5)
+    assert not _covered([Record(np.arange(500.0), there, np.zeros(500))], 0.0)
+    # The other way may be in another run.
+    back = Record(np.arange(500.0), there[::-1], np.zeros(500))
+    assert _covered([Record(np.arange(500.0), there, np.zeros(500)), back], 0.0)
+
+
+def test_a_slope_is_that_of_scipy(rng):
+    x = np.sort(rng.uniform(0, 3, 24 * 50))
+    y = 2.0 - 0.7 * x + 0.05 * rng.standard_normal(len(x))
+    slope, sd, straight = _regressed(x, y)
+    plain = stats.linregress(x, y)
+    assert slope == pytest.approx(plain.slope, abs=3 * plain.stderr)
+    # Only every other block is taken to be of its own.
+    assert sd == pytest.approx(2**0.5 * plain.stderr, rel=0.6)
+    assert straight > 0.99
+    assert _regressed(x, rng.standard_normal(len(x)))[2] < 0.6
+
+
+def test_stretches_at_rest_are_whole():
+    place = np.r_[np.linspace(0, 10, 300), np.full(517, 10.0), np.linspace(10, 3, 300), np.full(905, 3.0)]
+    (first, stop), (begin, end) = _stretches_at_rest(place, 0.03)
+    assert (first, stop) == (pytest.approx(300, abs=2), pytest.approx(817, abs=2))
+    assert (begin, end) == (pytest.approx(1117, abs=2), len(place))
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """How records were read, in order; the answers are made by hand."""
+    log = SimpleNamespace(readings=[], answers=[])
+
+    def prepare(reading, progress):
+        log.readings.append(reading)
+        answer = log.answers[len(log.readings) - 1]
+        projector = SimpleNamespace(held_out_error=lambda change: answer.get("error", 1.0))
+        baseline = fits.diagnosis._baseline.Baseline(*(None,) * 14, True, ("said",))
+        parts = {"bench": None, "regression": None, "probes": (), "faults": None, "skipped": ()}
+        from fits.diagnosis._prepare import Prepared
+
+        return Prepared(reading, baseline, projector=projector, doubted=answer.get("doubted", False), **parts)
+
+    def select(bench, projector, probes, false_alarm, rng, progress, guessed):
+        answer = log.answers[len(log.readings) - 1]
+        if answer.get("virgin"):
+            assert guessed
+            return None
+        model = SimpleNamespace(is_noise=lambda _: answer.get("noise", False), change_um=())
+        causes = [SimpleNamespace(z=z) for z in answer.get("z", ())]
+        return SimpleNamespace(causes=causes, model=model, projector=None, left_um=answer.get("left", 1.0), of=answer)
+
+    monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
+    monkeypatch.setattr(_diagnose, "select", select)
+    monkeypatch.setattr(_diagnose, "conclude", lambda ready, found, *_: (ready, found))
+    record = Record(np.arange(5.0), np.arange(5.0), np.zeros(5))
+
+    def ask(*answers, **options):
+        log.answers, log.readings = list(answers), []
+        ready, found = fits.diagnose([record], **options)
+        assert len(log.readings) == len(answers)
+        return ready, found.of, log.readings
+
+    return ask
+
+
+def test_a_plain_answer_is_taken(asked):
+    answer = {"z": (9.0,)}
+    ready, kept, (reading,) = asked(answer)
+    assert kept is answer
+    assert (reading.fraction, reading.initial, reading.guessed, reading.holds) == (0.2, "unknown", True, HOLDS)
+    assert ready.baseline.remarks == ("said",)
+
+
+def test_an_initial_curve_is_left_out(asked):
+    last = {"z": (9.0,)}
+    _, kept, (first, second) = asked({"virgin": True}, last)
+    assert kept is last
+    assert (first.initial, second.initial, second.guessed) == ("unknown", VIRGIN, False)
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_steps_and_curves_are_doubted_where_they_leave_more(asked, better):
+    first, lines = {"doubted": True, "z": (9.0,)}, {"left": 0.5 if better else 2.0, "z": (8.0,)}
+    _, kept, (_, reading) = asked(first, lines)
+    assert reading.holds == HOLDS[:1]
+    assert kept is (lines if better else first)
+    # Noise leaves no doubt, nor is any left where lines begin on an initial curve.
+    assert asked(first | {"noise": True})[1]["doubted"]
+    assert asked(first, {"virgin": True})[1] is first
+
+
+@pytest.mark.parametrize("z", [20.0, 5.0])
+def test_what_was_held_out_is_used_where_only_it_shows_a_cause(asked, z):
+    first, whole = {"error": 3.0}, {"z": (z,)}
+    ready, kept, (_, reading) = asked(first, whole)
+    assert (reading.fraction, reading.guessed) == (0.0, False)
+    assert kept is (whole if z > 8 else first)
+    assert any("not measured on new data" in words for words in ready.baseline.remarks) == (z > 8)
+    # It is not where noise explains it, a cause was found, or whole runs are held out.
+    assert asked({"error": 1.2})[1] == {"error": 1.2}
+    asked({"error": 3.0, "z": (9.0,)})
+    aside = Record(np.arange(6.0), np.arange(6.0), np.zeros(6))
+    assert asked({"error": 3.0}, holdout=[aside])[2][0].fraction == 0.12
