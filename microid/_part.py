@@ -129,6 +129,18 @@ class AbstractHysteresis(AbstractPart):
         return Signal(displacement_um[1:], displacement_um[0], signal.hold)
 
 
+class AbstractStepper(eqx.Module):
+    """A law of hysteresis one sample at a time, with a state of fixed size, as a feedback loop needs it."""
+
+    @abc.abstractmethod
+    def init(self, before_V: Float[Array, ""], start: Any = None) -> tuple[Any, Float[Array, ""]]:
+        """State and displacement in um once the voltage has come from a `start`, that of the law, to rest."""
+
+    @abc.abstractmethod
+    def step(self, state: Any, voltage_V: Float[Array, ""]) -> tuple[Any, Float[Array, ""]]:
+        """State and displacement in um at the next sample."""
+
+
 def _run_linear(system: LinearSystem, time_s: Times, signal: Signal) -> Signal:
     """Pass a signal through a linear system that was at rest."""
     values = system.respond(time_s, signal.values, signal.before, signal.hold)
