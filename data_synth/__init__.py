@@ -10,6 +10,10 @@ held from sample to sample with `hold = "zero"`, and is at rest before the first
 from data_synth._bench import Bench as Bench
 from data_synth._bench import Record as Record
 from data_synth._bench import simulate as simulate
+from data_synth._bouc_wen import BoucWenOscillator as BoucWenOscillator
+from data_synth._bouc_wen import boucwen_multisine as boucwen_multisine
+from data_synth._bouc_wen import boucwen_response as boucwen_response
+from data_synth._bouc_wen import boucwen_sweep as boucwen_sweep
 from data_synth._environment import OtherAxisSettings as OtherAxisSettings
 from data_synth._environment import TemperatureSettings as TemperatureSettings
 from data_synth._errors import ScenarioError as ScenarioError
@@ -71,6 +75,7 @@ __all__ = [
     "PAPER_AXES",
     "PAPER_BIAS_V",
     "Bench",
+    "BoucWenOscillator",
     "Bump",
     "Density",
     "EffectSettings",
@@ -99,6 +104,9 @@ __all__ = [
     "Segment",
     "Sensor",
     "TemperatureSettings",
+    "boucwen_multisine",
+    "boucwen_response",
+    "boucwen_sweep",
     "chirp",
     "files",
     "forc",

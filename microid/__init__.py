@@ -4,6 +4,7 @@ from microid._batch import respond_all as respond_all
 from microid._everett import Everett as Everett
 from microid._everett import everett as everett
 from microid._forest import forest_sum as forest_sum
+from microid._hysteretic_mechanics import HystereticMechanics as HystereticMechanics
 from microid._inverse import Inversion as Inversion
 from microid._inverse import invert as invert
 from microid._inverse_stage import StageInversion as StageInversion
@@ -32,6 +33,7 @@ from microid._param import static as static
 from microid._part import AbstractHysteresis as AbstractHysteresis
 from microid._part import AbstractLinear as AbstractLinear
 from microid._part import AbstractPart as AbstractPart
+from microid._part import AbstractStepper as AbstractStepper
 from microid._part import Scene as Scene
 from microid._part import Signal as Signal
 from microid._part import innermost as innermost

@@ -131,6 +131,18 @@ class AbstractHysteresis(AbstractPart):
         return Signal(displacement_um[1:], displacement_um[0], signal.hold)
 
 
+class AbstractStepper(eqx.Module):
+    """A law of hysteresis one sample at a time, with a state of fixed size, as a feedback loop needs it."""
+
+    @abc.abstractmethod
+    def init(self, before_V: Float[Array, ""], start: Any = None) -> tuple[Any, Float[Array, ""]]:
+        """State and displacement in um once the voltage has come from a `start`, that of the law, to rest."""
+
+    @abc.abstractmethod
+    def step(self, state: Any, voltage_V: Float[Array, ""]) -> tuple[Any, Float[Array, ""]]:
+        """State and displacement in um at the next sample."""
+
+
 def _joined(parts: Iterable[AbstractLinear]) -> LinearSystem:
     """Neighbouring linear parts as one system."""
     return reduce(LinearSystem.then, (part.system() for part in parts))

@@ -1,7 +1,5 @@
 """Hysteresis laws sample by sample, with a state of fixed size, as a closed loop needs them."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
@@ -9,9 +7,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from microid._everett import Everett, _window
 from microid._memory import Staircase, _filled, negative_saturation
-from microid._part import AbstractHysteresis
+from microid._part import AbstractHysteresis, AbstractStepper
 from microid._preisach import Preisach
-from microid.hysteresis import PrandtlIshlinskii
 
 
 class _Branch(eqx.Module):
@@ -25,7 +22,7 @@ class _Branch(eqx.Module):
     total_um: Float[Array, ""]
 
 
-class _PreisachStep(eqx.Module):
+class _PreisachStep(AbstractStepper):
     """The Preisach operator one sample at a time, as exact as the operator along a whole record.
 
     Minima stand at even places and maxima at odd ones, each kind in order. So how many are left once a new voltage
@@ -36,7 +33,7 @@ class _PreisachStep(eqx.Module):
     everett: Everett
     offset_um: Float[Array, ""]
 
-    def init(self, before_V: Float[Array, ""], start: Staircase | None) -> tuple[_Branch, Float[Array, ""]]:
+    def init(self, before_V: Float[Array, ""], start: Staircase | None = None) -> tuple[_Branch, Float[Array, ""]]:
         """State and output after the voltage has come from a memory to where it rested."""
         start = negative_saturation(self.everett.lower_V) if start is None else start
         path = _filled(start)
@@ -73,34 +70,19 @@ class _PreisachStep(eqx.Module):
         return _Branch(extremes, totals, top, up, x, total), displacement
 
 
-class _PlaysStep(eqx.Module):
-    """A sum of plays; its state is their positions."""
+def _step_form(name: str, law: AbstractHysteresis) -> AbstractStepper:
+    """The law one sample at a time.
 
-    law: PrandtlIshlinskii
-
-    def init(
-        self, before_V: Float[Array, ""], start: Float[Array, " K"] | None
-    ) -> tuple[Float[Array, " K"], Float[Array, ""]]:
-        """State and output after the voltage has come from some positions to where it rested."""
-        return self.step(jnp.zeros_like(self.law.threshold_V) if start is None else start, before_V)
-
-    def step(
-        self, state: Float[Array, " K"], voltage_V: Float[Array, ""]
-    ) -> tuple[Float[Array, " K"], Float[Array, ""]]:
-        """Follow the voltage to its next sample."""
-        law = self.law
-        position = jnp.clip(state, voltage_V - law.threshold_V, voltage_V + law.threshold_V)
-        hidden = jnp.sum(law.weight_um_per_V * position)
-        return position, law.offset_um + law.slope_um_per_V * voltage_V + hidden
-
-
-def _step_form(name: str, law: AbstractHysteresis) -> Any:
-    """The law as something with `init(before_V, start)` and `step(state, voltage_V)`."""
+    Raises
+    ------
+    ValueError
+        If it has no such form.
+    """
     if isinstance(law, Preisach):
         return _PreisachStep(law.everett, law.offset_um)
-    if isinstance(law, PrandtlIshlinskii):
-        return _PlaysStep(law)
+    if isinstance(law, AbstractStepper):
+        return law
     raise ValueError(
         f"{name!r} is a {type(law).__name__}, which has no form for single samples: "
-        "put a Preisach or a PrandtlIshlinskii in its place"
+        "give it `init` and `step`, or put a Preisach in its place"
     )

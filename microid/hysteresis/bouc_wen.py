@@ -6,12 +6,12 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from microid._param import param
-from microid._part import AbstractHysteresis
+from microid._part import AbstractHysteresis, AbstractStepper
 from microid.hysteresis._base import register
 
 
 @register
-class BoucWen(AbstractHysteresis):
+class BoucWen(AbstractHysteresis, AbstractStepper):
     r"""A proportional part less the state of Bouc and Wen.
 
     .. math:: w = w_0 + b u - h, \qquad
@@ -65,26 +65,43 @@ class BoucWen(AbstractHysteresis):
         """
         voltage = jnp.asarray(voltage_V)
         before, state = (voltage[0], jnp.zeros_like(voltage[0])) if start is None else (start[0], start[1])
-        moves = jnp.diff(voltage, prepend=before[None]) / self.substeps
+        moves = jnp.diff(voltage, prepend=before[None])
 
-        def rate(h: Array, sign: Array) -> Array:
+        def visit(h: Array, move: Array) -> tuple[Array, Array]:
+            h = self._follow(h, move)
+            return h, h
+
+        state = lax.scan(visit, state, moves)[1]
+        return self.offset_um + self.slope_um_per_V * voltage - state
+
+    def init(
+        self, before_V: Float[Array, ""], start: Float[Array, " 2"] | None = None
+    ) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
+        """Voltage in V and state `h` in um, shape `(2,)`, and displacement in um, once the voltage has come to rest."""
+        return self.step(jnp.stack([before_V, jnp.zeros_like(before_V)]) if start is None else start, before_V)
+
+    def step(
+        self, state: Float[Array, " 2"], voltage_V: Float[Array, ""]
+    ) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
+        """Voltage in V and state `h` in um, shape `(2,)`, and displacement in um, at the next sample."""
+        h = self._follow(state[1], voltage_V - state[0])
+        return jnp.stack([voltage_V, h]), self.offset_um + self.slope_um_per_V * voltage_V - h
+
+    def _follow(self, h: Float[Array, ""], move_V: Float[Array, ""]) -> Float[Array, ""]:
+        """The state `h` in um after the voltage has moved."""
+        move, sign = move_V / self.substeps, jnp.sign(move_V)
+
+        def rate(h: Array) -> Array:
             size = jnp.abs(h)
             # The logarithm has no derivative at zero, where the power has.
             at_zero = size == 0
             power = jnp.where(at_zero, 0, jnp.exp(self.exponent * jnp.log(jnp.where(at_zero, 1, size))))
             return self.stiffness_um_per_V - power * (self.gamma + self.beta * jnp.sign(h) * sign)
 
-        def visit(h: Array, move: Array) -> tuple[Array, Array]:
-            sign = jnp.sign(move)
+        def step(_: Array, h: Array) -> Array:
+            k1 = rate(h)
+            k2 = rate(h + move * k1 / 2)
+            k3 = rate(h + move * k2 / 2)
+            return h + move * (k1 + 2 * k2 + 2 * k3 + rate(h + move * k3)) / 6
 
-            def step(_: Array, h: Array) -> Array:
-                k1 = rate(h, sign)
-                k2 = rate(h + move * k1 / 2, sign)
-                k3 = rate(h + move * k2 / 2, sign)
-                return h + move * (k1 + 2 * k2 + 2 * k3 + rate(h + move * k3, sign)) / 6
-
-            h = lax.fori_loop(0, self.substeps, step, h)
-            return h, h
-
-        state = lax.scan(visit, state, moves)[1]
-        return self.offset_um + self.slope_um_per_V * voltage - state
+        return lax.fori_loop(0, self.substeps, step, h)

@@ -4,13 +4,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from microid._param import param
-from microid._part import AbstractHysteresis
+from microid._part import AbstractHysteresis, AbstractStepper
 from microid.hysteresis._base import register
 from microid.hysteresis._rates import _direction, _mean_decay, _relax
 
 
 @register
-class Dahl(AbstractHysteresis):
+class Dahl(AbstractHysteresis, AbstractStepper):
     r"""A proportional part less Dahl's friction of exponent one.
 
     .. math:: w = w_0 + b u - c z, \qquad \frac{dz}{du} = \frac{1 - z\, \mathrm{sgn}\, \dot u}{v}
@@ -57,3 +57,19 @@ class Dahl(AbstractHysteresis):
         steps = sign * move / self.length_V
         state = _relax(jnp.exp(-steps), move / self.length_V * _mean_decay(steps), state)
         return self.offset_um + self.slope_um_per_V * voltage - self.amplitude_um * state
+
+    def init(
+        self, before_V: Float[Array, ""], start: Float[Array, " 2"] | None = None
+    ) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
+        """Voltage in V and state `z`, shape `(2,)`, and displacement in um, after the voltage has come to rest."""
+        return self.step(jnp.stack([before_V, jnp.zeros_like(before_V)]) if start is None else start, before_V)
+
+    def step(
+        self, state: Float[Array, " 2"], voltage_V: Float[Array, ""]
+    ) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
+        """Voltage in V and state `z`, shape `(2,)`, and displacement in um, at the next sample."""
+        move = voltage_V - state[0]
+        steps = jnp.abs(move) / self.length_V
+        z = jnp.exp(-steps) * state[1] + move / self.length_V * _mean_decay(steps)
+        displacement = self.offset_um + self.slope_um_per_V * voltage_V - self.amplitude_um * z
+        return jnp.stack([voltage_V, z]), displacement

@@ -4,13 +4,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from microid._param import param
-from microid._part import AbstractHysteresis
+from microid._part import AbstractHysteresis, AbstractStepper
 from microid.hysteresis._base import register
 from microid.hysteresis._rates import _direction, _mean_decay, _mean_ramp, _relax
 
 
 @register
-class Duhem(AbstractHysteresis):
+class Duhem(AbstractHysteresis, AbstractStepper):
     r"""Pursuit of an anhysteretic curve `f`.
 
     .. math:: \frac{dw}{du} = \alpha\, (f(u) - w)\, \mathrm{sgn}\, \dot u + g, \qquad f(u) = w_0 + b u + a u^2
@@ -65,3 +65,21 @@ class Duhem(AbstractHysteresis):
         push = move * (lead * _mean_decay(steps) - bend * _mean_ramp(steps))
         curve = self.offset_um + voltage * (self.slope_um_per_V + self.curvature_um_per_V2 * voltage)
         return curve + _relax(jnp.exp(-steps), push, distance)
+
+    def init(
+        self, before_V: Float[Array, ""], start: Float[Array, " 2"] | None = None
+    ) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
+        """Voltage in V and distance from the curve in um, shape `(2,)`, and displacement in um, once at rest."""
+        return self.step(jnp.stack([before_V, jnp.zeros_like(before_V)]) if start is None else start, before_V)
+
+    def step(
+        self, state: Float[Array, " 2"], voltage_V: Float[Array, ""]
+    ) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
+        """Voltage in V and distance from the curve in um, shape `(2,)`, and displacement, at the next sample."""
+        move = voltage_V - state[0]
+        steps = self.pursuit_per_V * jnp.abs(move)
+        lead = self.local_um_per_V - self.slope_um_per_V - 2 * self.curvature_um_per_V2 * state[0]
+        push = move * (lead * _mean_decay(steps) - 2 * self.curvature_um_per_V2 * move * _mean_ramp(steps))
+        distance = jnp.exp(-steps) * state[1] + push
+        curve = self.offset_um + voltage_V * (self.slope_um_per_V + self.curvature_um_per_V2 * voltage_V)
+        return jnp.stack([voltage_V, distance]), curve + distance

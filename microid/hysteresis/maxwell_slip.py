@@ -4,13 +4,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from microid._param import param
-from microid._part import AbstractHysteresis
+from microid._part import AbstractHysteresis, AbstractStepper
 from microid.hysteresis._base import register
 from microid.hysteresis._play import _plays
 
 
 @register
-class MaxwellSlip(AbstractHysteresis):
+class MaxwellSlip(AbstractHysteresis, AbstractStepper):
     r"""A proportional part less a sum of elements that stick, then slip.
 
     .. math:: w = w_0 + b u - \sum_k s_k, \qquad \dot s_k = b_k \dot u \text{ while } |s_k| < c_k
@@ -62,3 +62,18 @@ class MaxwellSlip(AbstractHysteresis):
         # An element is stretched by as much as its play lags behind.
         stretch = voltage[:, None] - _plays(voltage, self.limit_um / self.stiffness_um_per_V, start)
         return self.offset_um + self.slope_um_per_V * voltage - stretch @ self.stiffness_um_per_V
+
+    def init(
+        self, before_V: Float[Array, ""], start: Float[Array, " K"] | None = None
+    ) -> tuple[Float[Array, " K"], Float[Array, ""]]:
+        """What the elements are relaxed at, in V, shape `(K,)`, and displacement in um, once at rest."""
+        return self.step(jnp.zeros_like(self.limit_um) if start is None else start, before_V)
+
+    def step(
+        self, state: Float[Array, " K"], voltage_V: Float[Array, ""]
+    ) -> tuple[Float[Array, " K"], Float[Array, ""]]:
+        """What the elements are relaxed at, in V, shape `(K,)`, and displacement in um, at the next sample."""
+        reach = self.limit_um / self.stiffness_um_per_V
+        relaxed = jnp.clip(state, voltage_V - reach, voltage_V + reach)
+        held = jnp.sum(self.stiffness_um_per_V * (voltage_V - relaxed))
+        return relaxed, self.offset_um + self.slope_um_per_V * voltage_V - held

@@ -4,13 +4,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from microid._param import param
-from microid._part import AbstractHysteresis
+from microid._part import AbstractHysteresis, AbstractStepper
 from microid.hysteresis._base import register
 from microid.hysteresis._play import _plays
 
 
 @register
-class PrandtlIshlinskii(AbstractHysteresis):
+class PrandtlIshlinskii(AbstractHysteresis, AbstractStepper):
     r"""A proportional part and a weighted sum of plays.
 
     .. math:: w(t) = w_0 + b u(t) + \sum_k b_k\, p_k(t), \qquad p_k = \max(u - r_k, \min(u + r_k, p_k^{before}))
@@ -61,6 +61,20 @@ class PrandtlIshlinskii(AbstractHysteresis):
         voltage = jnp.asarray(voltage_V)
         hidden = _plays(voltage, self.threshold_V, start) @ self.weight_um_per_V
         return self.offset_um + self.slope_um_per_V * voltage + hidden
+
+    def init(
+        self, before_V: Float[Array, ""], start: Float[Array, " K"] | None = None
+    ) -> tuple[Float[Array, " K"], Float[Array, ""]]:
+        """Positions of the plays in V, shape `(K,)`, and displacement in um, after the voltage has come to rest."""
+        return self.step(jnp.zeros_like(self.threshold_V) if start is None else start, before_V)
+
+    def step(
+        self, state: Float[Array, " K"], voltage_V: Float[Array, ""]
+    ) -> tuple[Float[Array, " K"], Float[Array, ""]]:
+        """Positions of the plays in V, shape `(K,)`, and displacement in um, at the next sample."""
+        position = jnp.clip(state, voltage_V - self.threshold_V, voltage_V + self.threshold_V)
+        hidden = jnp.sum(self.weight_um_per_V * position)
+        return position, self.offset_um + self.slope_um_per_V * voltage_V + hidden
 
     def invert(
         self, displacement_um: Float[Array, " t"], start: Float[Array, " K"] | None = None
