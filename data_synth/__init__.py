@@ -10,6 +10,7 @@ held from sample to sample with `hold = "zero"`, and is at rest before the first
 from data_synth._bench import Bench as Bench
 from data_synth._bench import Record as Record
 from data_synth._bench import simulate as simulate
+from data_synth._bouc_wen import BOUCWEN_RATE_HZ as BOUCWEN_RATE_HZ
 from data_synth._bouc_wen import BoucWenOscillator as BoucWenOscillator
 from data_synth._bouc_wen import boucwen_multisine as boucwen_multisine
 from data_synth._bouc_wen import boucwen_response as boucwen_response
@@ -70,6 +71,7 @@ from data_synth.effects import EFFECTS as EFFECTS
 from data_synth.effects import OUTSIDE as OUTSIDE
 
 __all__ = [
+    "BOUCWEN_RATE_HZ",
     "EFFECTS",
     "OUTSIDE",
     "PAPER_AXES",

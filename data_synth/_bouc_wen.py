@@ -11,8 +11,11 @@ from scipy import signal
 
 from data_synth._types import FloatArray
 
-RATE_Hz, FINE = 750.0, 20
-"""Sampling rate of the records, and steps of integration per sample."""
+BOUCWEN_RATE_HZ = 750.0
+"""Sampling rate of the records, in Hz."""
+
+# Steps of integration per sample: 15 kHz.
+_FINE = 20
 
 _PERIOD, _SETTLING = 8192, 2
 _LOWEST_Hz, _HIGHEST_Hz = 5.0, 150.0
@@ -88,16 +91,16 @@ def boucwen_response(force_N: FloatArray, oscillator: BoucWenOscillator = BoucWe
     spectrum = np.fft.rfft(force_N)
     # The line at half the sampling rate has no phase of its own.
     spectrum[half] = 0
-    fine = np.fft.irfft(np.pad(spectrum, (0, (FINE - 1) * half)), 2 * FINE * half) * FINE
-    moved = oscillator.respond_m(np.tile(fine, 1 + _SETTLING), 1 / (FINE * RATE_Hz))[-len(fine) :]
-    kept = np.fft.rfft(moved)[: half + 1] / FINE
+    fine = np.fft.irfft(np.pad(spectrum, (0, (_FINE - 1) * half)), 2 * _FINE * half) * _FINE
+    moved = oscillator.respond_m(np.tile(fine, 1 + _SETTLING), 1 / (_FINE * BOUCWEN_RATE_HZ))[-len(fine) :]
+    kept = np.fft.rfft(moved)[: half + 1] / _FINE
     kept[half] = 0
     return np.fft.irfft(kept, 2 * half)
 
 
 def boucwen_multisine(rms_N: float, rng: np.random.Generator) -> FloatArray:
     """One period of 8,192 samples at 750 Hz of a random-phase multisine from 5 to 150 Hz, in N, shape (8192,)."""
-    line_Hz = np.fft.rfftfreq(_PERIOD, 1 / RATE_Hz)
+    line_Hz = np.fft.rfftfreq(_PERIOD, 1 / BOUCWEN_RATE_HZ)
     excited = (line_Hz >= _LOWEST_Hz) & (line_Hz <= _HIGHEST_Hz)
     force = np.fft.irfft(np.where(excited, np.exp(2j * np.pi * rng.random(len(line_Hz))), 0), _PERIOD)
     return np.asarray(rms_N / np.sqrt(np.mean(force**2)) * force)
@@ -117,10 +120,10 @@ def boucwen_sweep(
     force_N, displacement_m
         Shape (n,) each, with `n` of 750 Hz times the duration.
     """
-    count = round((stop_Hz - start_Hz) / rate_Hz_per_s * RATE_Hz)
-    time_s = np.arange(FINE * count) / (FINE * RATE_Hz)
+    count = round((stop_Hz - start_Hz) / rate_Hz_per_s * BOUCWEN_RATE_HZ)
+    time_s = np.arange(_FINE * count) / (_FINE * BOUCWEN_RATE_HZ)
     fine = amplitude_N * np.sin(2 * np.pi * (start_Hz * time_s + rate_Hz_per_s * time_s**2 / 2))
     moved = oscillator.respond_m(fine, time_s[1])
     for factor in (2, 2, 5):
         moved = signal.decimate(moved, factor, ftype="fir", zero_phase=True)
-    return fine[::FINE], np.asarray(moved)
+    return fine[::_FINE], np.asarray(moved)

@@ -77,7 +77,7 @@ class BoucWen(AbstractHysteresis, AbstractStepper):
     def init(
         self, before_V: Float[Array, ""], start: Float[Array, " 2"] | None = None
     ) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
-        """Voltage in V and state `h` in um, shape `(2,)`, and displacement in um, once the voltage has come to rest."""
+        """Voltage in V and state `h` in um, shape `(2,)`, and displacement in um, once at rest."""
         return self.step(jnp.stack([before_V, jnp.zeros_like(before_V)]) if start is None else start, before_V)
 
     def step(
