@@ -110,7 +110,7 @@ class Bench:
         Raises
         ------
         ScenarioError
-            If the times are not even, or a voltage is out of the rig's range.
+            If the times are not even or too far apart for the mass, or a voltage is out of the rig's range.
         """
         time_s, voltage_V = np.asarray(time_s, dtype=float), np.asarray(voltage_V, dtype=float)
         if time_s.ndim != 1 or time_s.shape != voltage_V.shape or len(time_s) < 2:
@@ -123,6 +123,7 @@ class Bench:
         if not (sample_rate_Hz > 0 and np.abs(time_s - even_s).max() < 1e-3 / sample_rate_Hz):
             raise ScenarioError("time_s must rise in even steps")
         rig = self.rig
+        _require_samples(self.scenario.file, self.plant, name, sample_rate_Hz)
         if not (rig.lower_V <= voltage_V.min() and voltage_V.max() <= rig.upper_V):
             raise ScenarioError(
                 f"voltage_V must lie in {rig.lower_V:g} to {rig.upper_V:g} V, "
@@ -159,8 +160,8 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Bench:
     Raises
     ------
     ScenarioError
-        If the seed is negative, the rig cannot have the loop width the scenario asks for, or an effect cannot be on
-        this stage.
+        If the seed is negative, the rig cannot have the loop width the scenario asks for, a run is sampled too
+        slowly for the mass, or an effect cannot be on this stage.
     """
     if seed is None:
         seed = secrets.randbelow(2**32) if scenario.seed is None else scenario.seed
@@ -178,6 +179,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Bench:
     runs: list[tuple[_Played, np.random.Generator]] = []
     clock = _Clock()
     for index, (run, rng) in enumerate(zip(scenario.runs, run_rngs, strict=True)):
+        _require_samples(scenario.file, plant, run.name, run.sample_rate_Hz)
         history_rng, program_rng, sensor_rng = rng.spawn(3)
         history_V = initial_history(run.initial, rig.lower_V, rig.upper_V, history_rng)
         if run.start_V is not None:
@@ -195,6 +197,13 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Bench:
         stage.measure(played, players.get(played.name), acting, sensor_rng) for played, sensor_rng in runs
     )
     return Bench(scenario, seed, rig, records, plant, tuple(truths))
+
+
+def _require_samples(file: str, plant: Plant | None, name: str, sample_rate_Hz: float) -> None:
+    try:
+        (plant or Plant()).require_samples(sample_rate_Hz)
+    except ValueError as error:
+        raise ScenarioError(f"{file}: run {name}: {error}") from error
 
 
 def _hide(scenario: Scenario, stage: "_Stage", players: dict[str, Player]) -> tuple[list[Acting], list[HiddenEffect]]:

@@ -1,6 +1,7 @@
 """What an effect is, and the registry that its function enters by being defined."""
 
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias, TypeVar
@@ -27,6 +28,11 @@ Place: TypeAlias = Literal[
 """Where in the chain an effect acts: the order of these names is the order of the chain."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+POSITIVE = (0.0, math.inf)
+
+# Of anything that an effect counts.
+_MOST = 1000
 
 Range: TypeAlias = tuple[float, float] | tuple[str, ...]
 
@@ -111,6 +117,8 @@ class Effect:
         Whether a library of effects to diagnose does not hold it.
     needs
         What must be there: `driver`, `mass` or `other_axis`.
+    between
+        What arguments must lie between, ends excluded, where not every finite number makes sense.
     """
 
     name: str
@@ -122,6 +130,7 @@ class Effect:
     draws: Mapping[str, Range]
     outside: bool
     needs: str | None
+    between: Mapping[str, tuple[float, float]]
 
     def signals(self) -> tuple[str, ...]:
         """Names of the function's arguments that are no settings: the signal and the situation."""
@@ -131,6 +140,16 @@ class Effect:
         """The settings that have a usual value, with it."""
         found = inspect.signature(self.function).parameters.items()
         return {name: value.default for name, value in found if value.default is not value.empty}
+
+    def require_sense(self, settings: Mapping[str, Any]) -> None:
+        """Raise ValueError for a setting beyond what it must lie between; whole numbers are counts."""
+        for name, value in settings.items():
+            low, high = self.between.get(name, (-math.inf, math.inf))
+            if not isinstance(value, str) and not low < value < high:
+                within = f"above {low:g}" if high == math.inf else f"between {low:g} and {high:g}"
+                raise ValueError(f"{name} must be {within}, got {value:g}")
+            if type(value) is int and not 0 <= value <= _MOST:
+                raise ValueError(f"{name} must be 0 to {_MOST}, got {value}")
 
     def require(self, plant: Plant | None, where: str) -> None:
         """Raise ScenarioError where the stage lacks what the effect acts on."""
@@ -153,12 +172,15 @@ def effect(
     *,
     outside: bool = False,
     needs: str | None = None,
+    between: Mapping[str, tuple[float, float]] | None = None,
 ) -> Callable[[Function], Function]:
     """Enter a function into the registry under its own name; the arguments are those of `Effect`."""
 
     def enter(function: Function) -> Function:
         name = function.__name__
-        REGISTRY[name] = Effect(name, place, function, size, usual, limit, dict(draws or {}), outside, needs)
+        REGISTRY[name] = Effect(
+            name, place, function, size, usual, limit, dict(draws or {}), outside, needs, dict(between or {})
+        )
         return function
 
     return enter

@@ -16,6 +16,8 @@ Hold: TypeAlias = Literal["first", "zero"]
 
 # Longest time constant and highest resonance of any stage: beyond it a number stands in another unit.
 _LARGEST = {"time_constant_s": 1e6, "natural_frequency_Hz": 1e9, "damping_ratio": 1e3}
+# Times of the fastest motion of a stage between two samples: each is integrated over.
+_MOST_TURNS = 500
 _BLOCK = 2048
 _NODES = 4
 
@@ -61,6 +63,18 @@ class Plant:
                 f"got {self.natural_frequency_Hz} and {self.damping_ratio}"
             )
 
+    def require_samples(self, sample_rate_Hz: float) -> None:
+        """Raise ValueError where the mass moves so often between two samples that a simulation does not end."""
+        if self.natural_frequency_Hz is None or self.damping_ratio is None:
+            return
+        fastest_Hz = self.natural_frequency_Hz * max(1.0, self.damping_ratio)
+        if fastest_Hz > _MOST_TURNS * sample_rate_Hz:
+            raise ValueError(
+                f"sampled at {sample_rate_Hz:g} Hz, a mass of {self.natural_frequency_Hz:g} Hz with a damping ratio "
+                f"of {self.damping_ratio:g} moves {fastest_Hz / sample_rate_Hz:.4g} times between two samples, and "
+                f"at most {_MOST_TURNS} are simulated: sample faster, or leave the mass out"
+            )
+
     def respond(
         self,
         command_V: FloatArray,
@@ -85,7 +99,13 @@ class Plant:
             remembers what it was called with.
         refinement
             Into how many each panel is cut: 1 is fine enough, a larger number shows it.
+
+        Raises
+        ------
+        ValueError
+            As `require_samples` does.
         """
+        self.require_samples(sample_rate_Hz)
         period_s = 1 / sample_rate_Hz
         slope_V_per_s = np.diff(command_V) * sample_rate_Hz if self.hold == "first" else np.zeros(len(command_V) - 1)
         start_V, end_V = self._driver_at_samples(command_V, slope_V_per_s, period_s)

@@ -47,6 +47,7 @@ class EffectSettings:
         if self.name not in REGISTRY:
             raise ValueError(f"unknown effect {self.name!r}, {nearest(self.name, (*EFFECTS, *OUTSIDE))}")
         size = REGISTRY[self.name].size
+        REGISTRY[self.name].require_sense(self.settings)
         if self.rms_per_noise is not None:
             if size in self.settings:
                 raise ValueError(f"state {size} or rms_per_noise and not both")

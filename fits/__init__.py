@@ -36,9 +36,10 @@ if TYPE_CHECKING:
     from fits.loop._result import FitResult as FitResult
     from fits.loop._result import FitStatus as FitStatus
     from fits.loop._result import LevelTrial as LevelTrial
-    from fits.loop._result import Prediction as Prediction
+    from fits.loop._result import ParameterEstimate as ParameterEstimate
     from fits.loop._result import RunReport as RunReport
-    from fits.loop._result import predict as predict
+    from fits.loop._uncertainty import AbstractUncertainty as AbstractUncertainty
+    from fits.loop._uncertainty import Prediction as Prediction
     from fits.loop._uncertainty import Uncertainty as Uncertainty
     from fits.machining._allocate import Allocation as Allocation
     from fits.machining._allocate import AllocationError as AllocationError
@@ -78,17 +79,15 @@ if TYPE_CHECKING:
     from fits.plots._sensitivity import plot_sensitivity as plot_sensitivity
     from fits.plots._stage import plot_stage as plot_stage
     from fits.plots._sweep import plot_sweep as plot_sweep
-    from fits.report._budget import budget_json as budget_json
-    from fits.report._budget import describe_budget as describe_budget
     from fits.report._diagnosis import report_html as report_html
     from fits.report._diagnosis_json import diagnosis_json as diagnosis_json
     from fits.report._diagnosis_json import diagnosis_schema as diagnosis_schema
-    from fits.report._loop import describe as describe
-    from fits.report._loop import fit_report as fit_report
-    from fits.report._sensitivity import describe_sensitivity as describe_sensitivity
-    from fits.report._sensitivity import sensitivity_json as sensitivity_json
-    from fits.report._stage import describe_stage as describe_stage
-    from fits.report._stage import stage_report as stage_report
+    from fits.report._fit import describe as describe
+    from fits.report._fit import fit_report as fit_report
+    from fits.report._machining import budget_json as budget_json
+    from fits.report._machining import describe_budget as describe_budget
+    from fits.report._machining import describe_sensitivity as describe_sensitivity
+    from fits.report._machining import sensitivity_json as sensitivity_json
     from fits.stage._draw_plants import draw_plants as draw_plants
     from fits.stage._fit import default_stage as default_stage
     from fits.stage._fit import fit_stage as fit_stage
@@ -105,12 +104,10 @@ if TYPE_CHECKING:
     from fits.stage._model_file import save_model as save_model
     from fits.stage._posterior import Draws as Draws
     from fits.stage._posterior import sample_posterior as sample_posterior
+    from fits.stage._predict import predict as predict
     from fits.stage._profile import Profile as Profile
     from fits.stage._profile import profile_stage as profile_stage
     from fits.stage._read_response import read_response as read_response
-    from fits.stage._result import ParameterEstimate as ParameterEstimate
-    from fits.stage._result import StageFit as StageFit
-    from fits.stage._result import predict_stage as predict_stage
     from fits.stage._uncertainty import StageUncertainty as StageUncertainty
     from fits.stats._metrics import Errors as Errors
     from fits.stats._metrics import errors as errors
@@ -125,6 +122,7 @@ if TYPE_CHECKING:
 
 # Names are looked up when first used, so that the command's help does not wait for JAX and pandas.
 _HOMES = {
+    "AbstractUncertainty": "loop._uncertainty",
     "Allocation": "machining._allocate",
     "AllocationError": "machining._allocate",
     "AxisBudget": "machining._budget",
@@ -161,8 +159,8 @@ _HOMES = {
     "NoiseBand": "stats._noise_spectrum",
     "NoiseLine": "stats._noise_spectrum",
     "Outcome": "sweeps._run",
-    "ParameterEstimate": "stage._result",
-    "Prediction": "loop._result",
+    "ParameterEstimate": "loop._result",
+    "Prediction": "loop._uncertainty",
     "Profile": "stage._profile",
     "Record": "io._record",
     "Reference": "io._record",
@@ -171,7 +169,6 @@ _HOMES = {
     "SecondOrder": "machining._second_order",
     "SensitivityReport": "machining._sensitivity",
     "SobolIndices": "machining._sobol",
-    "StageFit": "stage._result",
     "StageUncertainty": "stage._uncertainty",
     "Sweep": "sweeps._spec",
     "Together": "machining._design",
@@ -180,14 +177,13 @@ _HOMES = {
     "Uncertainty": "loop._uncertainty",
     "allocate": "machining._allocate",
     "budget": "machining._budget",
-    "budget_json": "report._budget",
+    "budget_json": "report._machining",
     "compensate": "control._compensate",
     "default_stage": "stage._fit",
-    "describe": "report._loop",
-    "describe_budget": "report._budget",
+    "describe": "report._fit",
+    "describe_budget": "report._machining",
     "describe_claims": "machining._claims",
-    "describe_sensitivity": "report._sensitivity",
-    "describe_stage": "report._stage",
+    "describe_sensitivity": "report._machining",
     "diagnose": "diagnosis._diagnose",
     "diagnosis_json": "report._diagnosis_json",
     "diagnosis_schema": "report._diagnosis_json",
@@ -198,7 +194,7 @@ _HOMES = {
     "fit": "loop._fit",
     "fit_hysteresis": "stage._modal_fit",
     "fit_network_inverse": "control._network_inverse",
-    "fit_report": "report._loop",
+    "fit_report": "report._fit",
     "fit_response": "stage._modal_fit",
     "fit_stage": "stage._fit",
     "idle_noise": "machining._idle",
@@ -216,8 +212,7 @@ _HOMES = {
     "plot_sensitivity": "plots._sensitivity",
     "plot_stage": "plots._stage",
     "plot_sweep": "plots._sweep",
-    "predict": "loop._result",
-    "predict_stage": "stage._result",
+    "predict": "stage._predict",
     "profile_stage": "stage._profile",
     "read_csv": "io._read_csv",
     "read_design": "machining._design_file",
@@ -235,10 +230,9 @@ _HOMES = {
     "save_model": "stage._model_file",
     "second_order": "machining._second_order",
     "sensitivities": "machining._sensitivity",
-    "sensitivity_json": "report._sensitivity",
+    "sensitivity_json": "report._machining",
     "sign_change_guides": "machining._claims",
     "sobol": "machining._sobol",
-    "stage_report": "report._stage",
     "steepest_slope": "control._tune_start",
     "tune_controller": "control._tune",
     "ultimate_point": "control._tune_start",

@@ -9,7 +9,7 @@ from _command import files, refused, run
 from matplotlib.image import imread
 from test_cli_refusals import bad_csv, write_csv
 
-from fits import FitError, FitStatus, StageUncertainty, describe_stage, load_model
+from fits import FitError, FitStatus, StageUncertainty, describe, load_model
 from microid import Stage
 
 SCENARIO = """
@@ -117,7 +117,7 @@ def test_the_fit_finds_the_plant_of_the_bench(bench):
 
 def test_the_words_name_every_parameter_with_its_interval(bench):
     _, _, _, report = bench
-    lines = describe_stage(report).splitlines()
+    lines = describe(report).splitlines()
     for each in report["parameters"]:
         (line,) = [line for line in lines if line.startswith(each["name"])]
         value, sd = (float(part) for part in line.split(" (95 %")[0].removeprefix(each["name"]).split("±"))
@@ -136,7 +136,7 @@ def test_parameters_that_go_together_and_remarks_are_said(bench):
     names = [each["name"] for each in report["parameters"]]
     correlation = [[1.0, -0.7, 0.4], [-0.7, 1.0, None], [0.4, None, 1.0]]
     parameter = report["parameters"][0] | {"sd": None, "lower": None, "upper": None}
-    told = describe_stage(
+    told = describe(
         report
         | {"correlation": correlation, "remarks": ["Mind this"], "unseen": ["a and b"]}
         | {"parameters": [parameter, *report["parameters"][1:]]}
@@ -167,7 +167,7 @@ def test_info_names_the_parameters_of_the_parts(bench):
     assert told["fit"] == {key: value for key, value in report.items() if key not in ("out", "plots")}
     words = run("info", out).stdout
     assert words.startswith("Stage, written by microid")
-    assert describe_stage(told["fit"]) in words
+    assert describe(told["fit"]) in words
 
 
 def test_simulate_predicts_the_bench_within_its_noise(bench, tmp_path):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import fits
-from fits.io._columns import columns_beside
+from fits.io.columns import columns_beside
 from microid import Dahl, Driver, Mechanics, Sensor, Stage
 from microid.effects import EFFECTS, extend
 
@@ -34,6 +34,15 @@ def test_columns_are_known_by_their_names_and_other_readings_are_not_taken(rng):
     assert columns_beside(record(rng, **others)) == {}
 
 
+def test_columns_come_in_the_units_that_effects_know(rng):
+    other = np.sin(np.arange(400) / 7)
+    taken = columns_beside(record(rng, y_nm=other, chamber_temperature_K=np.linspace(290.0, 291.0, 400)))
+    np.testing.assert_allclose(taken["other_um"], other / 1e3, rtol=1e-15)
+    np.testing.assert_allclose(taken["temperature_degC"][1:], np.linspace(16.85, 17.85, 400)[1:], rtol=1e-12)
+    travelled = np.full(400, 900.0)
+    assert columns_beside(record(rng, path_V=travelled))["path_V"].tolist() == travelled.tolist()
+
+
 def test_the_noise_of_the_first_temperature_is_no_step(rng):
     # The end of a line through n readings is off by 2 / sqrt(n) of their noise (ordinary least squares).
     time_s = np.arange(100_000) / 100
@@ -53,10 +62,7 @@ def test_a_stage_with_an_effect_of_a_column_asks_for_it(rng):
     )
     stage = extend(plain, coupling(jnp.asarray(0.01)))
     given = record(rng, y_um=np.sin(np.arange(400) / 7))
-    moved = (
-        fits.predict_stage(stage, None, given).displacement_um
-        - fits.predict_stage(plain, None, given).displacement_um
-    )
+    moved = fits.predict(stage, None, given).displacement_um - fits.predict(plain, None, given).displacement_um
     assert np.ptp(moved) > 1e-3
     with pytest.raises(fits.DataError, match="other_um"):
-        fits.predict_stage(stage, None, record(rng))
+        fits.predict(stage, None, record(rng))

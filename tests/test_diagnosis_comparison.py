@@ -20,10 +20,10 @@ from fits.diagnosis._regression import regress
 from fits.diagnosis._score import score
 from fits.diagnosis._select import _inexact, select
 from fits.loop._design import Grid
+from fits.loop._run import prepare_run
 from fits.stage._fit import default_stage
-from fits.stage._moments import Chain
-from fits.stage._run import place_of_hysteresis, prepare_stage_run
-from fits.stage._uncertainty import offsets_out
+from fits.stage._moments import Chain, offsets_out
+from fits.stage._run import place_of_hysteresis
 from fits.stats._whiten import Noise
 from microid import EFFECTS, Sensor
 from microid.effects.aging import Aging
@@ -47,7 +47,7 @@ def stage_on(rng, records, smooth):
         # As rough as a misfit makes it believed.
         prior *= 1e-4
     runs, fine = (
-        tuple(prepare_stage_run(record, RANGE_V, "negative", 0.0, stride) for record in records) for stride in (4, 16)
+        tuple(prepare_run(record, RANGE_V, "negative", 0.0, stride) for record in records) for stride in (4, 16)
     )
     z = np.asarray(chain.coordinates.of(stage))
     return Baseline(chain, z, columns_um, prior, 10.0, RANGE_V, runs, (), runs, (), fine, (), fine, (), True, ())

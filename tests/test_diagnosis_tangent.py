@@ -20,10 +20,10 @@ from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._tangent import passed
 from fits.loop._design import Grid
+from fits.loop._run import prepare_run
 from fits.stage._fit import default_stage
-from fits.stage._moments import Chain
-from fits.stage._run import place_of_hysteresis, prepare_stage_run
-from fits.stage._uncertainty import offsets_out
+from fits.stage._moments import Chain, offsets_out
+from fits.stage._run import place_of_hysteresis
 from fits.stats._whiten import Noise
 from microid.effects.backlash import Backlash
 from microid.effects.clock_mismatch import ClockMismatch
@@ -54,8 +54,7 @@ def baseline_of(rng):
     chain = Chain(offsets_out(stage, True), place_of_hysteresis(stage), grid)
     z = np.asarray(chain.coordinates.of(stage))
     runs, fine = (
-        tuple(prepare_stage_run(record, RANGE_V, "negative", 0.0, stride) for record in two_runs())
-        for stride in (4, 16)
+        tuple(prepare_run(record, RANGE_V, "negative", 0.0, stride) for record in two_runs()) for stride in (4, 16)
     )
     prior = np.eye(grid.columns)
     return Baseline(chain, z, columns_um, prior, 10.0, RANGE_V, runs, (), runs, (), fine, (), fine, (), True, ())
@@ -151,7 +150,7 @@ def test_a_driver_that_was_fitted_away_comes_back_beside_the_cause(rng):
         for run in truth.fine
     ]
     runs, fine = (
-        tuple(prepare_stage_run(record, RANGE_V, "negative", 0.0, stride) for record in records) for stride in (4, 16)
+        tuple(prepare_run(record, RANGE_V, "negative", 0.0, stride) for record in records) for stride in (4, 16)
     )
     here = replace(truth, runs=runs, coarse=runs, finest=fine, fine=fine)
     asleep = here.moved(np.array([-14.0, *np.zeros(len(here.z) - 1)]), 0.0)
@@ -186,7 +185,7 @@ def test_a_delay_and_a_lag_are_told_apart_by_as_much_as_is_predicted(rng):
     grid = base.chain.grid
     columns_um = np.r_[np.zeros(grid.columns - LEVELS), np.full(LEVELS, 10.0)]
     rest = Record(interval_s * np.arange(300), np.zeros(300), np.zeros(300), source="rest")
-    coarse, fine = ((prepare_stage_run(rest, RANGE_V, "negative", 0.0, stride),) for stride in (4, 16))
+    coarse, fine = ((prepare_run(rest, RANGE_V, "negative", 0.0, stride),) for stride in (4, 16))
     prior = 1e9 * np.eye(grid.columns)
     known = Baseline(
         base.chain, base.z, columns_um, prior, 10.0, RANGE_V, coarse, (), coarse, (), fine, (), fine, (), True, ()

@@ -141,6 +141,9 @@ def test_motion_that_was_not_fitted_is_predicted(rig, fitted):
 
 def test_the_joint_fit_beats_the_hysteresis_alone(rig, fitted):
     alone = fits.fit([rig.records["slow"]], levels=16, holdout=0.0, initial="negative")
+    assert type(alone) is type(fitted) is fits.FitResult
+    assert alone.weights_um.shape == fitted.weights_um.shape == (16, 16)
+    assert [run.source for run in fitted.fitted_runs] == ["slow.csv", "fast.csv"]
     off = alone.predict(rig.records["check"]).displacement_um - rig.true_um["check"]
     assert np.std(off) > 5 * np.std(fitted.predict(rig.records["check"]).displacement_um - rig.true_um["check"])
 

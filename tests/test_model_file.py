@@ -73,7 +73,7 @@ def test_every_family_comes_back_bit_by_bit(tmp_path, rng, family):
 
     lower, upper = float(model.density.lower_V), float(model.density.upper_V)
     voltage = rng.uniform(lower, upper, 100)
-    run = prepare_run(fits.Record(np.arange(100.0), voltage, None), lower, upper, "negative", holdout=1.0)
+    run = prepare_run(fits.Record(np.arange(100.0), voltage, None), (lower, upper), "negative", holdout=1.0)
     assert simulate_run(back.model, run).tobytes() == simulate_run(model, run).tobytes()
 
     save_model(tmp_path / "b.json", back.model, back.uncertainty, back.report)

@@ -3,12 +3,13 @@
 import json
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from _models import random_model
 from test_model_file import REPORT, bits, hashed, refusal
 
 import microid
-from fits import DataError, StageUncertainty, Uncertainty, load_model, save_model
+from fits import DataError, Record, StageUncertainty, Uncertainty, load_model, predict, save_model
 from fits.loop._design import Grid
 
 PARAMETERS, LEVELS, PERTURBATIONS = 3, 5, 6
@@ -52,6 +53,16 @@ def test_a_stage_comes_back_bit_by_bit(tmp_path, rng, grid):
     assert [type(part) for part in back.model.parts] == [type(part) for part in stage.parts]
     save_model(tmp_path / "b.json", back.model, back.uncertainty, back.report)
     assert (tmp_path / "b.json").read_bytes() == (tmp_path / "a.json").read_bytes()
+
+
+def test_an_uncertainty_of_another_kind_of_model_is_refused(rng):
+    stage, uncertainty = draw(rng)
+    program = Record(np.arange(3.0), np.zeros(3), None)
+    with pytest.raises(DataError, match="the uncertainty is that of a stage"):
+        predict(stage["piezo"], uncertainty, program)
+    other = Uncertainty(uncertainty.columns_um, uncertainty.mean_um, uncertainty.discrepancy_um, uncertainty.grid)
+    with pytest.raises(DataError, match="the uncertainty is that of a hysteresis"):
+        predict(stage, other, program)
 
 
 @pytest.fixture

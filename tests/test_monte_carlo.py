@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from _gain_formulas import ARGUMENTS, TABLE_1, TWINS, curvatures, gains, sizes, slopes
@@ -11,18 +10,17 @@ from scipy.optimize import brentq
 
 import microid as m
 from fits.io._errors import DataError
-from fits.machining import _second_order
 from fits.machining._design import Together, paper_design
-from fits.machining._monte_carlo import draw, gains_of, mixing, monte_carlo
+from fits.machining._gains import gain_model, gains_of_many
+from fits.machining._monte_carlo import monte_carlo
 from fits.machining._second_order import second_order
+from fits.machining._tolerances import copula_root, from_normal
 
 LAWS = {
     "normal": lambda half: stats.norm(0, half / 3),
     "uniform": lambda half: stats.uniform(-half, 2 * half),
     "triangular": lambda half: stats.triang(0.5, -half, 2 * half),
 }
-# Laws of what `draw` returns.
-RAW = {"normal": stats.norm(), "uniform": stats.uniform(), "triangular": stats.triang(0.5, 0, 2)}
 ALL = ("x", "z", "alpha", "gamma")
 
 
@@ -59,14 +57,7 @@ def test_gains_are_those_of_the_formulas(rng, level, voltage):
     noise = rng.uniform(-1, 1, (len(names), 500))
     centre = np.array([TABLE_1[name] for name in names])
     values = dict(zip(names, centre[:, None] * (1 + 0.05 * noise), strict=True))
-    found = gains_of(
-        jnp.asarray(noise),
-        jnp.asarray(centre),
-        jnp.asarray(0.05 * centre),
-        ALL,
-        names,
-        *_second_order.setting(stage, voltage),
-    )
+    found = gains_of_many(gain_model(stage, voltage), 0.05 * centre[:, None] * noise, ALL, names)
     for axis, ours in zip(ALL, found, strict=True):
         expected = gains(axis, TABLE_1 | values, level, stage.guides, 50.0 if voltage else None)
         np.testing.assert_allclose(ours, expected, rtol=1e-11)
@@ -129,10 +120,10 @@ def test_draws_keep_their_law_and_take_the_correlation(rng, law):
     stage = design((Together(("t1", "l1", "t2"), correlation), Together(("la1", "l3"), -0.7)))
     names = ("l1", "t1", "la1", "l2", "t2", "l3")
     count = 100_000
-    found = draw(rng, law, mixing(stage, names, law), len(names), count)
+    found = from_normal(copula_root(stage, names, law) @ rng.standard_normal((len(names), count)), law)
     assert found.shape == (6, count)
     for row in found:
-        assert stats.kstest(row[:20_000], RAW[law].cdf).pvalue > 1e-6
+        assert stats.kstest(row[:20_000], LAWS[law](1.0).cdf).pvalue > 1e-6
     wanted = np.eye(6)
     for group, value in (((1, 0, 4), correlation), ((2, 5), -0.7)):
         for i in group:
@@ -145,9 +136,10 @@ def test_draws_keep_their_law_and_take_the_correlation(rng, law):
 
 def test_the_copula_of_uniform_numbers_is_known():
     stage = design((Together(("t1", "t2"), 0.6),))
-    _, root = mixing(stage, ("t1", "t2"), "uniform")
+    root = copula_root(stage, ("t1", "t2", "l1"), "uniform")
     assert (root @ root.T)[0, 1] == pytest.approx(2 * np.sin(np.pi * 0.6 / 6), abs=1e-5)
-    assert mixing(design(), ("t1", "t2"), "uniform")[0] == []
+    np.testing.assert_allclose(root[2], [0, 0, 1], atol=1e-15)
+    np.testing.assert_array_equal(copula_root(design(), ("t1", "t2"), "uniform"), np.eye(2))
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -210,7 +202,7 @@ def test_new_designs_are_not_compiled_again(monkeypatch, seed):
     def fail(*_):
         raise AssertionError("traced again")
 
-    monkeypatch.setattr(_second_order, "gain", fail)
+    monkeypatch.setattr(m, "gain", fail)
     other = replace(paper_design(0.03), geometry=m.Geometry(t4_mm=0.9, alpha2_rad=0.07), guides=6)
     told = []
     study = monte_carlo(other, 150_000, "normal", seed=seed, axes=("z",), progress=told.append)

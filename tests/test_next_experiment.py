@@ -22,7 +22,7 @@ from fits.diagnosis._regression import regress
 from fits.diagnosis._result import FoundCause
 from fits.diagnosis._score import score
 from fits.diagnosis._select import Cause, select
-from fits.stage._run import prepare_stage_run
+from fits.loop._run import prepare_run
 from fits.stats._whiten import Noise
 from microid import EFFECTS
 
@@ -163,7 +163,7 @@ def by_least_squares(made, true, other, time_s, voltage_V):
     """The difference of two changes off all that can follow, of both runs as one dense regression."""
     again = Record(time_s, voltage_V, np.zeros(len(time_s)))
     both = [made.bench.prepared[0].run.record, again]
-    runs = tuple(prepare_stage_run(one, made.baseline.range_V, "unknown", 0.0, 1) for one in both)
+    runs = tuple(prepare_run(one, made.baseline.range_V, "unknown", 0.0, 1) for one in both)
     baseline = replace(made.baseline, runs=runs, coarse=runs, fine=runs)
     bench, regression = Bench(baseline), regress(baseline)
     noise = made.projector.noise[0].innovation_um

@@ -37,13 +37,13 @@ def result_of(model, reports, rng):
     columns = jnp.asarray(rng.normal(scale=1e-3, size=(2, grid.columns)))
     uncertainty = Uncertainty(columns, jnp.zeros(2), jnp.asarray(0.01), grid)
     trial = LevelTrial(LEVELS, 0.05)
-    return FitResult(model, uncertainty, FitStatus.CONVERGED, (), 0.05, 1.0, 1.0, (trial,), tuple(reports))
+    return FitResult(model, uncertainty, FitStatus.CONVERGED, (), tuple(reports), None, 1.0, (trial,))
 
 
 def report(source, offset_um=3.0, held_out=True, start=None):
     errors = fits.errors(np.array([0.0, 1.0]), np.array([0.1, 1.0]))
     start = microid.negative_saturation(LOWER_V) if start is None else start
-    return RunReport(source, offset_um, errors, errors if held_out else None, 0, start, 10.0, 10.0)
+    return RunReport(source, offset_um, errors, errors if held_out else None, 0, start, 10.0, 10.0, {}, 0.05, 1.0, 1)
 
 
 def waves(samples, cycles):

@@ -1,4 +1,4 @@
-"""A new density, hysteresis law, effect, controller, command or kind of sweep is one new file, and works at once."""
+"""Each new law, density, effect, column, controller, command or kind of sweep is one file, and works at once."""
 
 import json
 import os
@@ -86,6 +86,25 @@ EFFECT = '''
             grow = 1 + self.excess
             return Signal(grow * signal.values, grow * signal.before, signal.hold)
 '''
+COLUMN = '''
+    """Humidity of the air."""
+    from fits.io._quantity import Quantity
+    from fits.io.columns._base import Column, register
+
+    def recognised(name, values, record):
+        return name.lower().startswith("hum")
+
+    def cleaned(values, record):
+        return values - values[0]
+
+    register(Column(Quantity("humidity", "pct", {"pct": 0, "permille": -1}), "", recognised, cleaned))
+'''
+SWELLING = (
+    EFFECT.replace("WrongGain", "Swelling")
+    .replace('"wrong_gain"', '"swelling"')
+    .replace("excess: Float", 'needs: ClassVar[tuple[str, ...]] = ("humidity_pct",)\n        excess: Float')
+)
+SWELLING = SWELLING.replace("1 + self.excess", "1 + self.excess * start.columns['humidity_pct']")
 COMMAND = '''
     """Say hello."""
     import click
@@ -111,6 +130,8 @@ def copy(tmp_path_factory):
         "microid/densities/flat.py": DENSITY,
         "microid/hysteresis/spring.py": LAW,
         "microid/effects/wrong_gain.py": EFFECT,
+        "microid/effects/swelling.py": SWELLING,
+        "fits/io/columns/humidity.py": COLUMN,
         "fits/cli/hello.py": COMMAND,
     }.items():
         (folder / place).write_text(textwrap.dedent(text).lstrip())
@@ -127,7 +148,7 @@ def python(folder, *arguments, code=0):
         env=os.environ | {"PYTHONPATH": str(folder), "MICROID_CACHE": os.environ["JAX_COMPILATION_CACHE_DIR"]},
     )
     assert done.returncode == code, done.stderr
-    return done.stdout
+    return done.stderr if code else done.stdout
 
 
 def test_a_command_is_one_file(copy):
@@ -161,6 +182,31 @@ def test_a_hysteresis_law_and_an_effect_are_one_file_each_and_are_saved_and_read
     python(copy, "-m", "fits", "simulate", "spring.json", "program.csv", "--out", "moved.csv")
     rows = [line.split(",") for line in (copy / "moved.csv").read_text().splitlines()[1:]]
     assert [float(row[2]) for row in rows] == pytest.approx([1.5, 4.5, 3.0])
+
+
+def test_a_column_is_one_file_and_an_effect_uses_it(copy):
+    save = SAVE.replace("wrong_gain", "swelling").replace("spring.json", "swelling.json")
+    python(copy, "-c", save)
+    rows = "time_s,voltage_V,{}\n0,0,30\n1,8,40\n2,4,50\n"
+    # Of its own name, converted; of a name that its file recognises; chosen by the user.
+    for header, columns, factor in (
+        ("humidity_permille", "", 0.1),
+        ("hum_lab", "", 1.0),
+        ("rh", "humidity_pct=rh[permille]", 0.1),
+    ):
+        (copy / "damp.csv").write_text(rows.format(header))
+        python(
+            copy, "-m", "fits", "simulate", "swelling.json", "damp.csv", "--columns", columns, "--out", "swollen.csv"
+        )
+        found = [float(line.split(",")[2]) for line in (copy / "swollen.csv").read_text().splitlines()[1:]]
+        # The spring, 0.25 um/V and 1 um, times 1 + 0.5 per percent beyond the first reading.
+        damp = [factor * more for more in (0, 10, 20)]
+        expected = [(1 + 0.5 * each) * um for each, um in zip(damp, (1, 3, 2), strict=True)]
+        assert found == pytest.approx(expected)
+    arguments = ["simulate", "swelling.json", "program.csv", "--out", "not.csv"]
+    (copy / "program.csv").write_text("time_s,voltage_V\n0,0\n1,8\n2,4\n")
+    sentence = "program.csv: the model depends on humidity_pct: add a column of that name that varies.\n"
+    assert python(copy, "-m", "fits", *arguments, code=2) == sentence
 
 
 CONTROLLER = '''

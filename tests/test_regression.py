@@ -28,7 +28,7 @@ def _record(rng, n=700, lower_V=-10.0, upper_V=90.0):
 
 @pytest.fixture
 def problem(rng):
-    runs = [prepare_run(_record(rng), -10.0, 90.0, "negative", 0.0) for _ in range(2)]
+    runs = [prepare_run(_record(rng), (-10.0, 90.0), "negative", 0.0) for _ in range(2)]
     grid = Grid(jnp.asarray(-10.0), jnp.asarray(90.0), LEVELS)
     return grid, runs, gather(grid, runs)
 
@@ -69,7 +69,7 @@ def test_columns_are_read_back_from_a_model(rng):
 
 def test_evidence_is_the_density_of_the_data_under_the_prior(rng):
     grid = Grid(jnp.zeros(()), jnp.ones(()), 4)
-    run = prepare_run(_record(rng, 60, 0.0, 1.0), 0.0, 1.0, "negative", 0.0)
+    run = prepare_run(_record(rng, 60, 0.0, 1.0), (0.0, 1.0), "negative", 0.0)
     data = gather(grid, [run])
     design, target = _dense(grid, [run]), run.displacement_um - run.displacement_um.mean()
     rough = roughness(4)
@@ -128,7 +128,7 @@ def test_roughness_is_the_weighted_integral_of_squared_curvature():
 def test_interpolated_columns_respond_as_the_coarse_ones_where_the_grids_share_nodes(rng):
     coarse, fine = (Grid(jnp.zeros(()), jnp.ones(()), n) for n in (5, 9))
     columns = rng.uniform(0, 1, coarse.columns)
-    run = prepare_run(_record(rng, 300, 0.0, 1.0), 0.0, 1.0, "negative", 0.0)
+    run = prepare_run(_record(rng, 300, 0.0, 1.0), (0.0, 1.0), "negative", 0.0)
     one = simulate_run(coarse.model(columns, np.zeros(())), run)
     other = simulate_run(fine.model(interpolation(5, 9) @ columns, np.zeros(())), run)
     np.testing.assert_allclose(one, other, rtol=0, atol=0.02 * np.ptp(one))

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _gain_formulas import ARGUMENTS, TABLE_1, gains, slopes
-from scipy import stats
+from SALib.analyze import sobol as salib_analysis
+from SALib.sample import sobol as salib_sample
 from scipy.optimize import brentq
 
 from fits.io._errors import DataError
@@ -27,7 +28,7 @@ def ishigami_indices(a=7.0, b=0.1):
 
 
 def test_indices_of_a_known_function(seed):
-    outputs = outputs_of(ishigami, stats.uniform(-np.pi, 2 * np.pi).ppf, 3, 2**13, seed)
+    outputs = outputs_of(lambda points: ishigami(np.pi * (2 * points.T - 1)), 3, 2**13, seed)
     for found, wanted in zip(indices(*outputs), ishigami_indices(), strict=True):
         np.testing.assert_allclose(found, wanted, atol=0.02)
     for ends, wanted in zip(intervals(*outputs, 0.99, 300, seed), ishigami_indices(), strict=True):
@@ -107,6 +108,28 @@ def test_nearly_linear_gains_have_the_shares_of_first_order(seed):
     share = (slopes("z", TABLE_1, ARGUMENTS["z"]) * [stage.tolerance[n] for n in ARGUMENTS["z"]]) ** 2
     np.testing.assert_allclose(found.first, share / share.sum(), atol=0.01)
     np.testing.assert_allclose(found.total, share / share.sum(), atol=0.01)
+
+
+@pytest.mark.parametrize(("axis", "law"), [("x", "normal"), ("gamma", "uniform")])
+def test_indices_are_those_of_salib(seed, axis, law):
+    """SALib draws its own points and analyses gains in plain NumPy; tolerances so wide that dimensions interact."""
+    stage, names = paper_design(), ARGUMENTS[axis]
+    half = {name: 0.2 * TABLE_1[name] for name in names}
+    stage = replace(stage, tolerance=stage.tolerance | half)
+    found = sobol(stage, 2**13, law, seed=seed, axes=(axis,))[axis]
+    spread = [
+        [TABLE_1[n], half[n] / 3] if law == "normal" else [TABLE_1[n] - half[n], TABLE_1[n] + half[n]] for n in names
+    ]
+    kind = {"normal": "norm", "uniform": "unif"}[law]
+    problem = {"num_vars": len(names), "names": names, "bounds": spread, "dists": [kind] * len(names)}
+    drawn = salib_sample.sample(problem, 2**13, calc_second_order=False, seed=seed)
+    outputs = gains(axis, TABLE_1 | dict(zip(names, drawn.T, strict=True)))
+    peer = salib_analysis.analyze(problem, outputs, calc_second_order=False, seed=seed)
+    np.testing.assert_allclose(found.first, peer["S1"], atol=0.01)
+    np.testing.assert_allclose(found.total, peer["ST"], atol=0.01)
+    for ends, half_width in ((found.first_interval, peer["S1_conf"]), (found.total_interval, peer["ST_conf"])):
+        # Widths of two bootstraps of 400 and 100 resamples.
+        np.testing.assert_allclose(np.ptp(ends, axis=1) / 2, half_width, rtol=0.5, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def test_the_state_before_a_run_is_not_assumed(rng):
     result = fit_linear(later, initial="unknown")
     for name, value in zip(NAMES, TRUTH.values(), strict=True):
         assert abs(result[name].value - value) < 5 * result[name].sd
-    assert result.noise_um[0] == pytest.approx(0.02, rel=0.1)
+    assert result.runs[0].noise_um == pytest.approx(0.02, rel=0.1)
 
 
 def test_outliers_count_less_under_the_huber_loss(rng):
@@ -143,7 +143,7 @@ def test_a_profile_is_that_of_scipy_with_one_parameter_held(rng):
 
     costs = np.array([least(tau) for tau in profile.values])
     best = least(result[NAMES[0]].value)
-    expected = (costs - best) / result.noise_um[0] ** 2 / result.correlation_samples[0]
+    expected = (costs - best) / result.runs[0].noise_um ** 2 / result.runs[0].correlation_samples
     np.testing.assert_allclose(profile.deviance, expected, rtol=0.02, atol=0.02)
     assert profile.values[0] > 0
     assert profile.lower <= result[NAMES[0]].value <= profile.upper

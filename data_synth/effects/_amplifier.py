@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from data_synth._effect import Situation, effect
+from data_synth._effect import POSITIVE, Situation, effect
 from data_synth._types import FloatArray
 
 
-@effect("command", "rate_V_per_s", usual=3e4, limit=1.5e3)
+@effect("command", "rate_V_per_s", usual=3e4, limit=1.5e3, between={"rate_V_per_s": POSITIVE})
 def slew_limit(command_V: FloatArray, run: Situation, *, rate_V_per_s: float) -> FloatArray:
     """The amplifier's output goes no faster than `rate_V_per_s` (V/s): a hard limit, and it catches up later."""
     most_V = rate_V_per_s * run.step_s

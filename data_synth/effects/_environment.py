@@ -6,12 +6,19 @@ from typing import Literal
 import numpy as np
 from scipy.signal import lfilter
 
-from data_synth._effect import Situation, effect
+from data_synth._effect import POSITIVE, Situation, effect
 from data_synth._types import FloatArray
 from data_synth.effects._static import lag
 
 
-@effect("environment", "drift_um", usual=0.3, limit=6.0, draws={"time_constant_s": (5.0, 60.0)})
+@effect(
+    "environment",
+    "drift_um",
+    usual=0.3,
+    limit=6.0,
+    draws={"time_constant_s": (5.0, 60.0)},
+    between={"time_constant_s": POSITIVE},
+)
 def thermal_drift(
     displacement_um: FloatArray,
     run: Situation,
@@ -36,7 +43,14 @@ def thermal_drift(
     return displacement_um + drift_um * run.time_s / 60
 
 
-@effect("environment", "settling_um", usual=0.3, limit=5.0, draws={"time_constant_s": (10.0, 100.0)})
+@effect(
+    "environment",
+    "settling_um",
+    usual=0.3,
+    limit=5.0,
+    draws={"time_constant_s": (10.0, 100.0)},
+    between={"time_constant_s": POSITIVE},
+)
 def mount_relaxation(
     displacement_um: FloatArray,
     run: Situation,
@@ -62,7 +76,12 @@ def cross_coupling(displacement_um: FloatArray, run: Situation, *, share: float)
 
 
 @effect(
-    "environment", "amplitude_um", usual=0.05, limit=2.0, draws={"frequency_Hz": (6.0, 38.0), "quality": (5.0, 50.0)}
+    "environment",
+    "amplitude_um",
+    usual=0.05,
+    limit=2.0,
+    draws={"frequency_Hz": (6.0, 38.0), "quality": (5.0, 50.0)},
+    between={"frequency_Hz": POSITIVE, "quality": POSITIVE},
 )
 def floor_vibration(
     displacement_um: FloatArray,
@@ -90,6 +109,7 @@ def floor_vibration(
     limit=20.0,
     draws={"frequency_share": (0.3, 0.7), "damping_ratio": (0.01, 0.05)},
     outside=True,
+    between={"frequency_share": POSITIVE, "damping_ratio": POSITIVE},
 )
 def burst_disturbance(
     displacement_um: FloatArray,

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.signal import lfilter
 
-from data_synth._effect import Situation, effect
+from data_synth._effect import POSITIVE, Situation, effect
 from data_synth._types import FloatArray
 
 Operator: TypeAlias = Callable[[FloatArray], FloatArray]
@@ -28,7 +28,14 @@ def initial_state(history_V: FloatArray, run: Situation, *, depth: float, turns:
     return np.concatenate([history_V, start_V + depth * (wandering_V - start_V), [start_V]])
 
 
-@effect("hysteresis", "lag_V", usual=0.2, limit=3.0, draws={"rate_V_per_s": (2.0, 20.0)})
+@effect(
+    "hysteresis",
+    "lag_V",
+    usual=0.2,
+    limit=3.0,
+    draws={"rate_V_per_s": (2.0, 20.0)},
+    between={"rate_V_per_s": POSITIVE},
+)
 def rate_dependence(operate: Operator, run: Situation, *, lag_V: float, rate_V_per_s: float = 5.0) -> Operator:
     """Domain walls need an overvoltage `lag_V asinh(v' / rate_V_per_s)` to move as fast as the voltage v does.
 
@@ -67,7 +74,15 @@ def accommodation(operate: Operator, run: Situation, *, feedback_V_per_um: float
     return moving
 
 
-@effect("hysteresis", "share", usual=0.05, limit=1.0, draws={"time_constant_s": (0.5, 10.0)}, outside=True)
+@effect(
+    "hysteresis",
+    "share",
+    usual=0.05,
+    limit=1.0,
+    draws={"time_constant_s": (0.5, 10.0)},
+    outside=True,
+    between={"time_constant_s": POSITIVE},
+)
 def memory_loss(operate: Operator, run: Situation, *, share: float, time_constant_s: float = 3.0) -> Operator:
     """The hysteresis forgets: a `share` of it leaks away towards the middle of the loop, with a time constant (s)."""
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from scipy.optimize import brentq
 
-from data_synth._effect import Situation, effect
+from data_synth._effect import POSITIVE, Situation, effect
 from data_synth._mechanics import Mechanics, Mode
 
 
@@ -16,6 +16,7 @@ from data_synth._mechanics import Mechanics, Mode
     limit=0.4,
     draws={"frequency_ratio": (1.4, 2.5), "damping_ratio": (0.003, 0.05)},
     needs="mass",
+    between={"frequency_ratio": POSITIVE, "damping_ratio": POSITIVE},
 )
 def second_resonance(
     mechanics: Mechanics,
@@ -49,7 +50,15 @@ class _Hardening:
         return self._rise * away * away * displacement_um
 
 
-@effect("mechanics", "rise", usual=0.005, limit=0.1, draws={"centre_share": (0.01, 0.5)}, needs="mass")
+@effect(
+    "mechanics",
+    "rise",
+    usual=0.005,
+    limit=0.1,
+    draws={"centre_share": (0.01, 0.5)},
+    needs="mass",
+    between={"rise": (-1.0, math.inf)},
+)
 def stiffness_hardening(mechanics: Mechanics, run: Situation, *, rise: float, centre_share: float = 0.0) -> Mechanics:
     """Duffing's spring: the stiffness rises by `rise` at one stroke away from `centre_share` of the stroke."""
     stroke_um = run.rig.stroke_um
@@ -81,7 +90,15 @@ class _Dahl:
         return self._force_um
 
 
-@effect("mechanics", "force_um", usual=0.1, limit=1.0, draws={"length_um": (0.1, 1.0)}, needs="mass")
+@effect(
+    "mechanics",
+    "force_um",
+    usual=0.1,
+    limit=1.0,
+    draws={"length_um": (0.1, 1.0)},
+    needs="mass",
+    between={"length_um": POSITIVE},
+)
 def friction(mechanics: Mechanics, run: Situation, *, force_um: float, length_um: float = 0.3) -> Mechanics:
     """Dahl friction at the mass: its greatest force over the stiffness (um), and the travel it needs (um).
 
@@ -90,7 +107,15 @@ def friction(mechanics: Mechanics, run: Situation, *, force_um: float, length_um
     return replace(mechanics, resistances=(*mechanics.resistances, lambda: _Dahl(force_um, length_um)))
 
 
-@effect("mechanics", "mass_share", usual=0.1, limit=3.0, draws={"instant_share": (0.35, 0.65)}, needs="mass")
+@effect(
+    "mechanics",
+    "mass_share",
+    usual=0.1,
+    limit=3.0,
+    draws={"instant_share": (0.35, 0.65)},
+    needs="mass",
+    between={"mass_share": (-1.0, math.inf)},
+)
 def load_change(
     mechanics: Mechanics, run: Situation, *, mass_share: float, instant_share: float = 0.5, first_run: int = 0
 ) -> Mechanics:

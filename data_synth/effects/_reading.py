@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from data_synth._effect import Situation, effect
+from data_synth._effect import POSITIVE, Situation, effect
 from data_synth._types import FloatArray
 
 
-@effect("reading", "step_um", usual=0.1, limit=5.0)
+@effect("reading", "step_um", usual=0.1, limit=5.0, between={"step_um": POSITIVE})
 def quantisation(reading_um: FloatArray, run: Situation, *, step_um: float) -> FloatArray:
     """Readings are whole multiples of `step_um` (um)."""
     return np.round(np.round(reading_um / step_um) * step_um, 9) + 0.0

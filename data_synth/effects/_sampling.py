@@ -12,7 +12,7 @@ def clock_mismatch(instants_s: FloatArray, run: Situation, *, rate_share: float)
     return instants_s * (1 + rate_share)
 
 
-@effect("sampling", "lost", usual=2.0, limit=30.0)
+@effect("sampling", "lost", usual=2.0, limit=30.0, between={"lost": (0.0, 40.0)})
 def dropped_samples(instants_s: FloatArray, run: Situation, *, lost: float) -> FloatArray:
     """In each run `lost` samples are lost at random, and the time stamps go on evenly.
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from data_synth._effect import Situation, effect
+from data_synth._effect import POSITIVE, Situation, effect
 from data_synth._types import FloatArray
 from data_synth.effects._static import lag
 
@@ -16,7 +16,7 @@ def transport_delay(reading_um: FloatArray, run: Situation, *, delay_s: float) -
     return np.interp(run.time_s - delay_s, run.time_s, reading_um)
 
 
-@effect("sensor", "time_constant_s", usual=2e-4, limit=2e-2)
+@effect("sensor", "time_constant_s", usual=2e-4, limit=2e-2, between={"time_constant_s": POSITIVE})
 def sensor_lowpass(reading_um: FloatArray, run: Situation, *, time_constant_s: float) -> FloatArray:
     """The sensor's electronics are a first-order low-pass of `time_constant_s` (s)."""
     return lag(reading_um, time_constant_s, run.step_s)
@@ -32,7 +32,7 @@ def sensor_nonlinearity(
     return reading_um + amplitude_um * ((1 - cubic_share) * away**2 + cubic_share * away**3)
 
 
-@effect("sensor", "amplitude_um", usual=0.05, limit=1.0)
+@effect("sensor", "amplitude_um", usual=0.05, limit=1.0, between={"mains_Hz": POSITIVE})
 def mains_hum(reading_um: FloatArray, run: Situation, *, amplitude_um: float, mains_Hz: float = 50.0) -> FloatArray:
     """Lines at the mains' frequency, which is not quite `mains_Hz` (Hz), and at twice and three times it."""
     true_Hz = mains_Hz * (1 + run.rng.uniform(-1e-3, 1e-3))
@@ -44,7 +44,7 @@ def mains_hum(reading_um: FloatArray, run: Situation, *, amplitude_um: float, ma
     return reading_um + amplitude_um * hum
 
 
-@effect("sensor", "amplitude_um", usual=0.05, limit=2.0, outside=True)
+@effect("sensor", "amplitude_um", usual=0.05, limit=2.0, outside=True, between={"period_um": POSITIVE})
 def cyclic_error(
     reading_um: FloatArray, run: Situation, *, amplitude_um: float, period_um: float = 0.316
 ) -> FloatArray:
@@ -61,7 +61,7 @@ def offset_jumps(reading_um: FloatArray, run: Situation, *, height_um: float, ju
     return reading_um + levels_um[np.searchsorted(instants_s, run.time_s)]
 
 
-@effect("sensor", "gain", usual=0.01, limit=0.3, outside=True)
+@effect("sensor", "gain", usual=0.01, limit=0.3, outside=True, between={"correlations": POSITIVE})
 def wandering_gain(reading_um: FloatArray, run: Situation, *, gain: float, correlations: float = 10.0) -> FloatArray:
     """The sensor's gain wanders at random by `gain` rms, and forgets its value `correlations` times in a run."""
     decay = math.exp(-run.step_s * correlations / max(run.duration_s, run.step_s))

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from scipy.signal import fftconvolve, lfilter
 
-from data_synth._effect import Situation, effect
+from data_synth._effect import POSITIVE, Situation, effect
 from data_synth._types import FloatArray
 
 
@@ -23,6 +23,7 @@ def lag(signal: FloatArray, time_constant_s: float, step_s: float) -> FloatArray
     usual=0.012,
     limit=0.06,
     draws={"onset_s": (0.05, 0.2), "shortest_s": (0.1, 1.0), "ratio": (5.0, 15.0)},
+    between={"onset_s": POSITIVE, "shortest_s": POSITIVE, "ratio": POSITIVE},
 )
 def creep(
     static_um: FloatArray,
@@ -69,7 +70,14 @@ def aging(static_um: FloatArray, run: Situation, *, gain_per_decade: float) -> F
     return static_um * (1 + gain_per_decade * np.log10(1 + path_V / cycle_V))
 
 
-@effect("static", "gain_per_K", usual=0.003, limit=0.03, draws={"time_constant_s": (5.0, 30.0), "rise_K": (2.0, 8.0)})
+@effect(
+    "static",
+    "gain_per_K",
+    usual=0.003,
+    limit=0.03,
+    draws={"time_constant_s": (5.0, 30.0), "rise_K": (2.0, 8.0)},
+    between={"time_constant_s": POSITIVE},
+)
 def thermal_gain(
     static_um: FloatArray,
     run: Situation,

@@ -1,7 +1,6 @@
-"""What the commands share: options, and bad input in sentences.
+"""What the commands share: bad input and interruptions in sentences.
 
-Each command is one file of this folder, named after it, and declares its options once. Of other packages only click
-is imported before a command runs, so that help does not wait for JAX.
+Of other packages only click is imported before a command runs, so that help does not wait for JAX.
 """
 
 import errno
@@ -110,48 +109,3 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
             system_refuses(error)
 
     return run
-
-
-columns = click.option(
-    "--columns",
-    metavar="NAME=SOURCE,...",
-    default="",
-    help="Which columns to read, such as voltage_V=u1_V,displacement_um=-height[nm].",
-)
-limits = click.option("--limits", metavar="LOW,HIGH", help="Voltages allowed, in V; the model's range by default.")
-limit = click.option(
-    "--limit",
-    multiple=True,
-    metavar="NAME=LOW:HIGH",
-    help="What the rig may be asked for, such as displacement=0:40um or slew=2kV/s; again for more of voltage, slew, "
-    "displacement, velocity, acceleration and current (per farad of the piezo). By default what the runs reached.",
-)
-axis = click.option(
-    "--axis",
-    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
-    default="all",
-    show_default=True,
-    help="Which motion.",
-)
-margin = click.option(
-    "--margin",
-    type=float,
-    default=0.02,
-    show_default=True,
-    help="Share of its range by which what is predicted may go beyond what the runs reached.",
-)
-
-
-def initial(what: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make the option of the memory before a program or a reference."""
-    return click.option(
-        "--initial",
-        type=click.Choice(["negative", "positive", "demagnetised"]),
-        default="negative",
-        show_default=True,
-        help=f"Memory before the {what}.",
-    )
-
-
-json_output = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")

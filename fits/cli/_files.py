@@ -1,16 +1,21 @@
-"""What the commands share: the files they read and write, and what they tell meanwhile."""
+"""What the commands share: the places that they read and write, and what they tell."""
 
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
+from pathlib import Path
+from typing import Any
 
 import click
 
+from fits.cli._common import Given
 from fits.io._errors import DataError
 
 _DEFAULT_HOLDOUT = 0.2
+_LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*([a-zµμ]+)\s*")
 
 
 def progress_to_stderr(quiet: bool) -> Callable[[str], None]:
@@ -48,6 +53,24 @@ def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], Non
     return tell
 
 
+def answer(given: Given, content: Any, lines: Iterable[str]) -> None:
+    """Print a result: as JSON where that is asked for, else in lines."""
+    from fits.io._atomic import finite_json
+
+    click.echo(finite_json(content) if given.as_json else "\n".join(lines))
+
+
+def put_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
+    """Names of the files that were made for a folder, as the user named it."""
+    return [str(Path(folder or "") / Path(file).name) for file in made]
+
+
+def told_with_places(words: str, places: Iterable[tuple[str, str | None]]) -> str:
+    """Words, then what was written where; what was not has no place."""
+    written = [f"{what:5}  {place}" for what, place in places if place is not None]
+    return "\n".join([words, *([""] if written else []), *written])
+
+
 def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:
     """Tell a fraction from files."""
     numbers = []
@@ -65,6 +88,23 @@ def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:
     if not 0 <= numbers[0] <= 0.9:
         raise DataError(f"--holdout: expected a fraction between 0 and 0.9 or a file, found {given[0]}.")
     return numbers[0], []
+
+
+def length_mm(option: str, text: str, units: Sequence[str], example: str) -> float:
+    """Read a length with one of some units, such as `0.02mm`, in mm."""
+    from fits.io._quantity import Quantity
+
+    length = Quantity("length", "mm", {"mm": 0, "um": -3, "µm": -3, "μm": -3, "m": 3})
+    found = _LENGTH.fullmatch(text)
+    try:
+        number = float(found[1]) if found and found[2] in units else 0.0
+    except ValueError:
+        number = 0.0
+    if not (found and 0 < number < float("inf")):
+        raise DataError(
+            f"{option}: expected a length above 0 with its unit, found '{text}'; write one such as {example}."
+        )
+    return float(length.convert(number, found[2]))
 
 
 def keep_inputs(out: str, inputs: Iterable[str]) -> None:

@@ -5,7 +5,10 @@ from collections.abc import Sequence
 
 from fits.io._errors import DataError
 from fits.io._limits import Ranges, allowed, parse_limits
+from fits.io._record import Record
+from fits.loop._uncertainty import Prediction
 from fits.stage._model_file import ModelFile
+from fits.stage._predict import predict
 from microid import Preisach, Stage
 
 
@@ -19,6 +22,14 @@ def preisach_of(path: str, loaded: ModelFile) -> Preisach:
 def stage_or_preisach(path: str, loaded: ModelFile) -> Preisach | Stage:
     """Return the stage or the hysteresis that a model file holds; a `DataError` where it holds neither."""
     return loaded.model if isinstance(loaded.model, Stage) else preisach_of(path, loaded)
+
+
+def predicted_by(path: str, loaded: ModelFile, program: Record, initial: str) -> Prediction:
+    """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
+    model = stage_or_preisach(path, loaded)
+    if loaded.uncertainty is None and isinstance(model, Preisach):
+        raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
+    return predict(model, loaded.uncertainty, program, initial)
 
 
 def parse_rig_limits(

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import re
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, axis, columns, in_sentences
-from fits.cli._files import keep_apart
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import keep_apart, length_mm, put_in, told_with_places
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -19,14 +17,13 @@ if TYPE_CHECKING:
 
 # What stands for the paper's stage instead of a file.
 _PAPER = "paper"
-_ARM = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|m)\s*")
 
 
 @click.command()
 @click.argument("stage", metavar="STAGE.toml|paper")
-@click.argument("model", metavar="MODEL.json")
+@options.model
 @click.argument("idle", metavar="IDLE.csv")
-@axis
+@options.axis
 @click.option(
     "--model-measures",
     type=click.Choice(["pzt", "x", "y", "z", "alpha", "beta", "gamma"]),
@@ -38,9 +35,9 @@ _ARM = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|m)\s*")
     "--arm", metavar="LENGTH", help="Where the sensor reads a rotation: its distance from the axis, as 50mm."
 )
 @click.option("--not-zeroed", "zeroed", flag_value=False, default=True, help="Count the offset of IDLE.csv too.")
-@columns
-@click.option("--json", "json_file", metavar="FILE", help="JSON file to write; - prints it instead of the table.")
-@click.option("--plots", metavar="DIR", help="Folder for a plot; it is made if need be.")
+@options.columns
+@options.json_file("table")
+@options.plots("a plot")
 @in_sentences
 def budget(given: Given) -> None:
     """Add up what driving, machining and measuring do to each motion of a stage.
@@ -57,14 +54,14 @@ def budget(given: Given) -> None:
     from fits.machining._design import paper_design
     from fits.machining._design_file import read_design
     from fits.machining._idle import idle_noise, read_idle
-    from fits.report._budget import budget_json, describe_budget
+    from fits.report._machining import budget_json, describe_budget
 
     start_jax()
     printed = given.json_file == "-"
     out = None if printed else given.json_file
     for what, path in {"STAGE.toml": given.stage, "MODEL.json": given.model, "IDLE.csv": given.idle}.items():
         keep_apart({what: None if path == _PAPER else path, "--json": out})
-    arm_mm = None if given.arm is None else _arm_mm(given.arm)
+    arm_mm = None if given.arm is None else length_mm("--arm", given.arm, ("mm", "m"), "50mm")
     if arm_mm is None and given.model_measures in m.AXES and m.MOTIONS[given.model_measures].unit == "rad":
         raise DataError(
             f"--model-measures {given.model_measures}: expected the arm at which a displacement is a rotation, found "
@@ -80,7 +77,7 @@ def budget(given: Given) -> None:
         axes = tuple(name for name in m.AXES if given.axis in (name, "all"))
         found = budget(design, law, noise, axes, measures=given.model_measures, arm_mm=arm_mm, zeroed=given.zeroed)
         text = finite_json(budget_json(found))
-        drawn: list[Path] = []
+        drawn = []
         if drawings is not None:
             from fits.plots._budget import plot_budget
 
@@ -90,36 +87,19 @@ def budget(given: Given) -> None:
     if printed:
         click.echo(text)
         return
-    places = [("json", out), *(("plot", str(Path(given.plots or "") / path.name)) for path in drawn)]
-    written = [f"{what:5}  {place}" for what, place in places if place is not None]
-    click.echo("\n".join([describe_budget(found), *([""] if written else []), *written]))
+    places = [("json", out), *(("plot", place) for place in put_in(given.plots, drawn))]
+    click.echo(told_with_places(describe_budget(found), places))
 
 
 def _law(path: str) -> m.Preisach:
     """The hysteresis of a model file, as slow voltages see it."""
     import microid as m
-    from fits.cli._models import preisach_of
+    from fits.cli._models import stage_or_preisach
     from fits.control._compensate_stage import static_equivalent
     from fits.stage._model_file import load_model
 
-    loaded = load_model(path)
-    if not isinstance(loaded.model, m.Stage):
-        return preisach_of(path, loaded)
+    model = stage_or_preisach(path, load_model(path))
     try:
-        return static_equivalent(loaded.model)
+        return static_equivalent(model) if isinstance(model, m.Stage) else model
     except DataError as error:
-        if not error.of_model:
-            raise
-        raise DataError(f"{path}: {error}") from error
-
-
-def _arm_mm(text: str) -> float:
-    """Read an arm such as 50mm or 0.05m."""
-    found = _ARM.fullmatch(text)
-    try:
-        number = float(found[1]) if found else math.nan
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and number > 0):
-        raise DataError(f"--arm: expected a length above 0 with its unit, found '{text}'; write one such as 50mm.")
-    return number if found and found[2] == "mm" else 1e3 * number
+        raise DataError(f"{path}: {error}" if error.of_model else str(error)) from error

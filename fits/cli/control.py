@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, columns, in_sentences, initial, json_output, limit, limits, margin, quiet
-from fits.cli._files import keep_inputs, progress_to_stderr
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import keep_inputs, progress_to_stderr, put_in
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -22,8 +23,16 @@ if TYPE_CHECKING:
 _PLANTS = 4
 # Finer steps, of um or V, are none.
 _FINEST, _LARGEST = 1e-9, 1e9
-# In the order of the options that are looked at.
-_LIMITS = ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max", "overshoot_max_pct")
+# Fields of the goal by the options that state them.
+_LIMITS = {
+    "gain_margin": "gain_margin_min",
+    "phase_margin": "phase_margin_min_deg",
+    "peak": "sensitivity_peak_max",
+    "overshoot": "overshoot_max_pct",
+}
+# The least that options may be.
+_LEAST = dict.fromkeys(("noise", "effort", "rate", "skip"), 0.0)
+_LEAST |= {"gain_margin": 1.0, "phase_margin": 1.0, "peak": 1.0, "overshoot": 0.0}
 
 
 def _names() -> list[str]:
@@ -35,10 +44,10 @@ def _names() -> list[str]:
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.json")
-@click.argument("reference", metavar="REFERENCE.csv")
-@click.option("--out", required=True, metavar="RUN.csv", help="CSV to write; .gz is compressed.")
-@click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
+@options.model
+@options.reference
+@options.out_csv("RUN.csv")
+@options.plots("plots")
 @click.option(
     "--controller",
     type=click.Choice(_names()),
@@ -66,10 +75,10 @@ def _names() -> list[str]:
 @click.option("--delay", type=click.IntRange(0, 100), default=0, metavar="SAMPLES", help="Age of a reading.")
 @click.option("--resolution", type=float, metavar="UM", help="Steps of the sensor, in um.")
 @click.option("--resolution-voltage", type=float, metavar="V", help="Steps of the amplifier's command, in V.")
-@limits
-@limit
-@margin
-@initial("reference")
+@options.limits
+@options.limit
+@options.margin
+@options.initial("the reference")
 @click.option(
     "--plants",
     type=click.IntRange(1, 100),
@@ -83,10 +92,10 @@ def _names() -> list[str]:
 @click.option("--rate", type=float, default=0.0, metavar="UM/V", help="Weight of the command's steps in the cost.")
 @click.option("--skip", type=float, default=0.0, metavar="S", help="Time at the beginning that does not count, in s.")
 @click.option("--starts", type=click.IntRange(1, 100), default=2, show_default=True, help="Places to tune from.")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Of noise, plants and starts (default 0).")
-@columns
-@json_output
-@quiet
+@click.option("--seed", type=options.SEEDS, default=0, help="Of noise, plants and starts (default 0).")
+@options.columns
+@options.json_output
+@options.quiet
 @in_sentences
 def control(given: Given) -> None:
     """Tune a controller on a model, and run it along a reference.
@@ -116,27 +125,16 @@ def control(given: Given) -> None:
     from fits.stage._model_file import load_model
     from microid import CONTROLLERS, Stage
 
-    for option, value in {
-        "--noise": given.noise,
-        "--effort": given.effort,
-        "--rate": given.rate,
-        "--skip": given.skip,
-    }.items():
-        if not 0 <= value <= _LARGEST:
-            raise DataError(f"{option}: expected a number from 0 to {_LARGEST:g}, found {value:g}.")
-    for option, step in {"--resolution": given.resolution, "--resolution-voltage": given.resolution_voltage}.items():
+    for name, least in _LEAST.items():
+        value = getattr(given, name)
+        if value is not None and not least <= value <= _LARGEST:
+            raise DataError(f"{_option(name)}: expected a number from {least:g} to {_LARGEST:g}, found {value:g}.")
+    for name in ("resolution", "resolution_voltage"):
+        step = getattr(given, name)
         if step is not None and not _FINEST <= step <= _LARGEST:
-            raise DataError(f"{option}: expected {_FINEST:g} to {_LARGEST:g}, found {step:g}; leave it out for none.")
-    stated = {
-        "--gain-margin": given.gain_margin,
-        "--phase-margin": given.phase_margin,
-        "--peak": given.peak,
-        "--overshoot": given.overshoot,
-    }
-    for option, bound in stated.items():
-        least = 0.0 if option == "--overshoot" else 1.0
-        if bound is not None and not least <= bound <= _LARGEST:
-            raise DataError(f"{option}: expected a number from {least:g} to {_LARGEST:g}, found {bound:g}.")
+            allowed = f"{_FINEST:g} to {_LARGEST:g}"
+            raise DataError(f"{_option(name)}: expected {allowed}, found {step:g}; leave it out for none.")
+    stated = {_option(name): getattr(given, name) for name in _LIMITS}
     volts, allowed_here = parse_rig_limits(given.limits, given.limit, given.margin)
     start_jax()
     tuned_to = [name for name, each in CONTROLLERS.items() if "frequency_Hz" in each.own]
@@ -145,10 +143,7 @@ def control(given: Given) -> None:
             f"--frequency: expected --controller {' or '.join(tuned_to)} with it, found {given.controller}; leave it "
             "out."
         )
-    keep_inputs(
-        given.out,
-        [given.model, given.reference] if given.gains is None else [given.model, given.reference, given.gains],
-    )
+    keep_inputs(given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])])
     tell = progress_to_stderr(given.quiet)
     known_gains = None if given.gains is None else read_gains(given.gains)
     loaded = load_model(given.model)
@@ -168,7 +163,7 @@ def control(given: Given) -> None:
         count = given.plants or (_PLANTS if known else 1)
         held = _held(plant) if isinstance(plant, Stage) else plant
         stages = draw_plants(held, loaded.uncertainty, count, seed=given.seed)
-        limits_of = {name: x for name, x in zip(_LIMITS, stated.values(), strict=True) if x is not None}
+        limits_of = {field: bound for name, field in _LIMITS.items() if (bound := getattr(given, name)) is not None}
         goal = Goal(given.effort, given.rate, **limits_of)
         rng = np.random.default_rng(given.seed)
         loop = Loop(ready, [_held(one) for one in stages], given.noise, given.delay, given.resolution, skipped)
@@ -215,12 +210,15 @@ def control(given: Given) -> None:
             from fits.plots._control import plot_control
 
             drawn = plot_control(run, made.controller, loop.plants, drawings, delay=given.delay)
-        places = [str(Path(given.plots) / path.name) for path in drawn] if given.plots else []
-        about = {"controller": given.controller, "out": given.out, "plots": places}
+        about = {"controller": given.controller, "out": given.out, "plots": put_in(given.plots, drawn)}
         # Before the file is in its place: what cannot be told is not left behind either.
         summary = control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
         told = finite_json(summary) if given.as_json else describe_control(summary)
     click.echo(told)
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _judged(passed: dict[str, str], stated: dict[str, float | None], kind: str, given: bool) -> list[str]:

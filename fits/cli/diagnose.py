@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -12,8 +11,9 @@ import click
 
 if TYPE_CHECKING:
     from fits.diagnosis._result import Diagnosis, EffectParameter
-from fits.cli._common import Given, columns, in_sentences, json_output, limit, margin, quiet
-from fits.cli._files import bar_to_stderr, fraction_or_files, keep_inputs
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import answer, bar_to_stderr, fraction_or_files, keep_inputs, put_in
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -25,27 +25,19 @@ _FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
 
 
 @click.command()
-@click.argument("runs", metavar="RUN.csv [MORE.csv ...]", nargs=-1, required=True)
-@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
-@click.option(
-    "--holdout", multiple=True, metavar="FRACTION|FILE", help="What is only predicted, as for fit (default 0.2)."
-)
+@options.runs
+@options.out_folder
+@options.holdout("What is only predicted, as for fit (default 0.2).")
 @click.option(
     "--false-alarm", type=float, default=0.01, show_default=True, help="Chance of a cause where there is none."
 )
 @click.option("--duration", type=float, metavar="SECONDS", help="Of the next experiment, at most.")
-@click.option(
-    "--initial",
-    type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
-    default="unknown",
-    show_default=True,
-    help="Memory before all runs.",
-)
-@limit
-@margin
-@columns
-@json_output
-@quiet
+@options.initial("all runs", "unknown")
+@options.limit
+@options.margin
+@options.columns
+@options.json_output
+@options.quiet
 @in_sentences
 def diagnose(given: Given) -> None:
     """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.
@@ -102,15 +94,12 @@ def diagnose(given: Given) -> None:
 
     content = diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)
-    if given.as_json:
-        click.echo(json.dumps({"out": given.out, "files": places, **content}, indent=1, allow_nan=False))
-    else:
-        click.echo("\n".join([*_lines(diagnosis), "", *places]))
+    answer(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
 
 
 def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[str]:
     """Write all files, or none; their names come back."""
-    from fits.io._atomic import write_csv
+    from fits.io._atomic import finite_json, write_csv
     from fits.io._limits import ranges_json
     from fits.report._diagnosis import report_html
     from fits.stage._model_file import model_text
@@ -130,7 +119,7 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
     # All are composed before the first is written.
     texts = {
         _REPORT: report_html(diagnosis),
-        _JSON: json.dumps(content, indent=1, allow_nan=False) + "\n",
+        _JSON: f"{finite_json(content)}\n",
         _BASELINE: model("baseline"),
         _EXTENDED: model("extended"),
     }
@@ -145,7 +134,7 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
         else:
             # One of an earlier diagnosis would pass for this one's.
             files.absent(Path(out) / _PROGRAM)
-    return [str(Path(out) / name) for name in (*texts, *([_PROGRAM] if ahead is not None else []))]
+    return put_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
 
 
 def _lines(diagnosis: "Diagnosis") -> list[str]:

@@ -1,23 +1,21 @@
 """The command `microid export`: its options, and the work."""
 
-from __future__ import annotations
-
-import json
-
 import click
 
-from fits.cli._common import Given, in_sentences, json_output, limits
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import answer
 
 _STATIC_ONLY = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.json")
-@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+@options.model
+@options.out_folder
 @click.option("--name", default="compensator", show_default=True, help="Name of the files, before all names in them.")
 @click.option("--memory", type=int, default=128, show_default=True, help="Extremes remembered, two per nested loop.")
-@limits
-@json_output
+@options.limits
+@options.json_output
 @in_sentences
 def export(given: Given) -> None:
     """Write a model and its inverse as C99 for a controller.
@@ -32,13 +30,10 @@ def export(given: Given) -> None:
     from microid import Stage
 
     start_jax()
-    loaded = load_model(given.model)
-    stage = stage_or_preisach(given.model, loaded)
+    stage = stage_or_preisach(given.model, load_model(given.model))
     hysteresis = static_equivalent(stage) if isinstance(stage, Stage) else stage
-    files = export_c(hysteresis, given.out, given.name, size=given.memory, limits_V=parse_limits_V(given.limits))
+    made = export_c(hysteresis, given.out, given.name, size=given.memory, limits_V=parse_limits_V(given.limits))
+    files = [str(file) for file in made]
     # The inverse of mechanics needs the samples to come, which a controller does not have.
     remarks = [_STATIC_ONLY] if isinstance(stage, Stage) else []
-    if given.as_json:
-        click.echo(json.dumps({"files": [str(file) for file in files], "remarks": remarks}, indent=1))
-    else:
-        click.echo("\n".join([*(f"Note: {remark}" for remark in remarks), *map(str, files)]))
+    answer(given, {"files": files, "remarks": remarks}, [*(f"Note: {remark}" for remark in remarks), *files])

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-if TYPE_CHECKING:
-    from microid import Hold
-from fits.cli._common import Given, columns, in_sentences, json_output, quiet
-from fits.cli._files import fraction_or_files, keep_inputs, progress_to_stderr
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import answer, fraction_or_files, keep_inputs, progress_to_stderr, put_in
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
+
+if TYPE_CHECKING:
+    from microid import Hold
 
 _HOLDS: dict[str, Hold] = {"lines": "first", "steps": "zero", "curves": "smooth"}
 
 
 @click.command()
-@click.argument("runs", metavar="RUN.csv [MORE.csv ...]", nargs=-1, required=True)
+@options.runs
 @click.option("--out", required=True, metavar="MODEL.json", help="Model file to write.")
-@click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
+@options.plots("plots")
 @click.option(
     "--model",
     type=click.Choice(["loop", "stage"]),
@@ -32,19 +31,13 @@ _HOLDS: dict[str, Hold] = {"lines": "first", "steps": "zero", "curves": "smooth"
 )
 @click.option("--family", metavar="NAME", help="Density: grid, mixture or network (default grid).")
 @click.option("--levels", type=int, help="Number of switching voltages; found from the data by default.")
-@click.option(
-    "--holdout",
-    multiple=True,
-    metavar="FRACTION|FILE",
-    help="Fraction at the end of every run that is only predicted (default 0.2), or a CSV that is; give it again for "
-    "more files.",
+@options.holdout(
+    "Fraction at the end of every run that is only predicted (default 0.2), or a CSV that is; give it again for more "
+    "files."
 )
-@columns
-@click.option(
-    "--initial",
-    type=click.Choice(["unknown", "negative", "positive", "demagnetised"]),
-    multiple=True,
-    help="Memory before all runs (default unknown); for a stage, give it again for each further run.",
+@options.columns
+@options.initial(
+    "all runs (default unknown); for a stage, give it again for each further run", default=None, multiple=True
 )
 @click.option(
     "--loss",
@@ -60,9 +53,9 @@ _HOLDS: dict[str, Hold] = {"lines": "first", "steps": "zero", "curves": "smooth"
 @click.option(
     "--starts", type=click.IntRange(1, 100), help="Starts for families whose fit is not convex (default 8)."
 )
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the starts (default 0).")
-@json_output
-@quiet
+@click.option("--seed", type=options.SEEDS, help="Seed of the starts (default 0).")
+@options.json_output
+@options.quiet
 @in_sentences
 def fit(given: Given) -> None:
     """Fit Preisach weights to measured loops, or a whole stage to slow and fast runs.
@@ -70,7 +63,6 @@ def fit(given: Given) -> None:
     The files are runs of one rig, with the columns time_s, voltage_V and displacement_um. A stage needs a slow run
     over the whole range, and one with steps, a chirp or a multisine beyond the resonance.
     """
-    from fits.io._atomic import finite_json
     from fits.io._jax_setup import start_jax
     from fits.io._read_csv import read_csv, read_runs
     from fits.io._units import parse_columns
@@ -78,22 +70,18 @@ def fit(given: Given) -> None:
     from fits.loop._result import FitError
     from fits.plots._loop import plot_fit
     from fits.plots._stage import plot_stage
-    from fits.report._loop import describe, fit_report
-    from fits.report._stage import describe_stage, stage_report
+    from fits.report._fit import describe, fit_report
     from fits.stage._fit import fit_stage
     from fits.stage._model_file import model_text
 
     start_jax()
-    states: str | list[str]
-    options: dict[str, Any]
+    estimate: Any
+    draw: Any
     if given.model == "stage":
-        kind = _Kind(fit_stage, stage_report, describe_stage, plot_stage)
-        states, options = _stage_options(
-            given.family, given.starts, given.seed, given.loss, given.hold, given.initial, len(given.runs)
-        )
+        estimate, draw, asked = fit_stage, plot_stage, _for_stage(given)
     else:
-        kind = _Kind(fit, fit_report, describe, plot_fit)
-        states, options = _loop_options(given.family, given.starts, given.seed, given.loss, given.hold, given.initial)
+        estimate, draw, asked = fit, plot_fit, _for_loop(given)
+    initial = list(given.initial) if len(given.initial) > 1 else (given.initial or ("unknown",))[0]
     progress = progress_to_stderr(given.quiet)
     mapping = parse_columns(given.columns)
     fraction, files = fraction_or_files(given.holdout)
@@ -102,90 +90,53 @@ def fit(given: Given) -> None:
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         records = read_runs(given.runs, mapping)
-        aside = [read_csv(file, mapping) for file in files]
-        left_out = aside or fraction
+        same = {"holdout": [read_csv(file, mapping) for file in files] or fraction, "initial": initial}
+        asked |= {"levels": given.levels, "loss": given.loss or "squares", "progress": progress}
         try:
-            result = kind.fit(
-                records, levels=given.levels, holdout=left_out, initial=states, progress=progress, **options
-            )
+            result = estimate(records, **same, **asked)
         except FitError as error:
             raise DataError(f"{error}.") from error
-        report = kind.report(result)
-        drawn: Sequence[Path] = ()
+        report, drawn = fit_report(result), []
         if drawings is not None:
             progress("drawing")
-            drawn = kind.plot(result, records, drawings, holdout=left_out, initial=states)
+            drawn = draw(result, records, drawings, **same)
         unfinished.write_text(model_text(result.model, result.uncertainty, report), encoding="utf-8")
-    places = [str(Path(given.plots) / path.name) for path in drawn] if given.plots else []
-    if given.as_json:
-        click.echo(finite_json({"out": given.out, "plots": places, **report}))
-    else:
-        click.echo(
-            "\n".join([kind.describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)])
-        )
+    places = put_in(given.plots, drawn)
+    lines = [describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)]
+    answer(given, {"out": given.out, "plots": places, **report}, lines)
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """What can be fitted: how, and how to show it."""
-
-    fit: Callable[..., Any]
-    report: Callable[[Any], dict[str, Any]]
-    describe: Callable[[dict[str, Any]], str]
-    plot: Callable[..., Sequence[Path]]
-
-
-def _loop_options(
-    family: str | None,
-    starts: int | None,
-    seed: int | None,
-    loss: str | None,
-    hold: str | None,
-    initial: Sequence[str],
-) -> tuple[str, dict[str, Any]]:
-    """Memory before all runs, and the options of `fit`; what it cannot honour is refused."""
-    if hold is not None:
-        raise DataError(f"--hold {hold}: only the fit of a stage has a choice; leave it out, or use --model stage.")
-    if len(initial) > 1:
+def _for_loop(given: Given) -> dict[str, Any]:
+    """What `fit` is asked for, beside what `fit_stage` is too; what it cannot honour is refused."""
+    if given.hold is not None:
         raise DataError(
-            f"--initial: expected one state for all runs, found {len(initial)}; give one, or use --model stage."
+            f"--hold {given.hold}: only the fit of a stage has a choice; leave it out, or use --model stage."
         )
-    return (initial[0] if initial else "unknown"), {
-        "family": family or "grid",
-        "loss": loss or "squares",
-        "starts": starts or 8,
-        "seed": seed or 0,
-    }
+    if len(given.initial) > 1:
+        raise DataError(
+            f"--initial: expected one state for all runs, found {len(given.initial)}; give one, or use --model stage."
+        )
+    return {"family": given.family or "grid", "starts": given.starts or 8, "seed": given.seed or 0}
 
 
-def _stage_options(
-    family: str | None,
-    starts: int | None,
-    seed: int | None,
-    loss: str | None,
-    hold: str | None,
-    initial: Sequence[str],
-    count: int,
-) -> tuple[str | list[str], dict[str, Any]]:
-    """Memory before all runs or before each, and the options of `fit_stage`; what it cannot honour is refused."""
+def _for_stage(given: Given) -> dict[str, Any]:
+    """What `fit_stage` is asked for, beside what `fit` is too; what it cannot honour is refused."""
     from fits.stage._fit import default_stage
 
-    if family not in (None, "grid"):
+    if given.family not in (None, "grid"):
         raise DataError(
-            f"--family {family}: the hysteresis of a stage is fitted on a grid; leave out --family, or use "
+            f"--family {given.family}: the hysteresis of a stage is fitted on a grid; leave out --family, or use "
             "--model loop."
         )
-    for name, value in (("starts", starts), ("seed", seed)):
+    for name, value in (("starts", given.starts), ("seed", given.seed)):
         if value is not None:
             raise DataError(
                 f"--{name} {value}: a stage starts from what the runs show, not at random; leave out --{name}, or "
                 "use --model loop."
             )
-    if len(initial) not in (0, 1, count):
+    if len(given.initial) not in (0, 1, len(given.runs)):
         raise DataError(
-            f"--initial: {len(initial)} states were given for {count} runs; give one for all, or one for each in "
-            "their order."
+            f"--initial: {len(given.initial)} states were given for {len(given.runs)} runs; give one for all, or one "
+            "for each in their order."
         )
-    states = (initial[0] if initial else "unknown") if len(initial) < 2 else list(initial)
-    stage = default_stage(_HOLDS[hold or "lines"])
-    return states, {"loss": loss or "squares", "stage": stage}
+    return {"stage": default_stage(_HOLDS[given.hold or "lines"])}

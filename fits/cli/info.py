@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, in_sentences, json_output
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import answer
 from fits.io._errors import DataError
 
 if TYPE_CHECKING:
@@ -14,12 +16,11 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.json")
-@json_output
+@options.model
+@options.json_output
 @in_sentences
 def info(given: Given) -> None:
     """Say what a model file holds."""
-    from fits.io._atomic import finite_json
     from fits.io._jax_setup import start_jax
     from fits.stage._model_file import load_model
     from microid import Stage, parameter_table
@@ -32,26 +33,22 @@ def info(given: Given) -> None:
         for row in parameter_table(loaded.model)
     ]
     kind = type(loaded.model).__name__
-    if given.as_json:
-        content = {"written_by": loaded.written_by, "model": kind, "parameters": parameters, "fit": loaded.report}
-        click.echo(finite_json(content))
-        return
     lines = [f"{kind}, written by {loaded.written_by}"]
     for row in parameters:
         lines.append(f"  {row['path']:28} {'x'.join(map(str, row['shape'])) or '1':>8} {row['unit']}")
-    click.echo("\n".join([*lines, "", _known_of_fit(given.model, loaded)]))
+    if not given.as_json:
+        lines += ["", _known_of_fit(given.model, loaded)]
+    content = {"written_by": loaded.written_by, "model": kind, "parameters": parameters, "fit": loaded.report}
+    answer(given, content, lines)
 
 
 def _known_of_fit(path: str, loaded: ModelFile) -> str:
-    from fits.report._loop import describe
-    from fits.report._stage import describe_stage
-    from fits.stage._uncertainty import StageUncertainty
+    from fits.report._fit import describe
 
     if loaded.uncertainty is None:
         return "written by 'microid diagnose', whose report says how well it predicts"
-    words = describe_stage if isinstance(loaded.uncertainty, StageUncertainty) else describe
     try:
-        return words(loaded.report)
+        return describe(loaded.report)
     except (LookupError, TypeError, ValueError, AttributeError):
         # The format does not say what a report holds, and the words are made for that of a fit.
         raise DataError(f"{path}: its report is not that of a fit; fit again, or add --json to see it.") from None

@@ -1,25 +1,20 @@
 """The command `microid paper`: its options, and the work."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import click
 
-from fits.cli._common import Given, in_sentences, quiet
-from fits.cli._files import progress_to_stderr
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import progress_to_stderr, put_in
 from fits.io._file_set import file_set
 
 
 @click.command()
-@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+@options.out_folder
 @click.option(
     "--seeds", type=click.IntRange(1, 100), default=10, show_default=True, help="How many noises to go through."
 )
-@click.option(
-    "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Where all randomness starts."
-)
-@quiet
+@click.option("--seed", type=options.SEEDS, default=0, show_default=True, help="Where all randomness starts.")
+@options.quiet
 @in_sentences
 def paper(given: Given) -> None:
     """Repeat the paper's compensation on a virtual stage: its tables and figures beside ours.
@@ -34,6 +29,5 @@ def paper(given: Given) -> None:
     tell = progress_to_stderr(given.quiet)
     with file_set() as files:
         result = paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), tell)
-    click.echo(f"page   {Path(given.out) / 'paper.md'}\njson   {Path(given.out) / 'paper.json'}")
-    worse = result.worse()
-    click.echo("worse than the paper: " + ("; ".join(worse) if worse else "no row"))
+    page, figures = put_in(given.out, ("paper.md", "paper.json"))
+    click.echo(f"page   {page}\njson   {figures}\nworse than the paper: {'; '.join(result.worse()) or 'no row'}")

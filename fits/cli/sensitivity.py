@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-import re
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from fits.cli._common import Given, axis, in_sentences
-from fits.cli._files import keep_apart
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import keep_apart, length_mm, put_in, told_with_places
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
 if TYPE_CHECKING:
     from fits.machining._design import Design
 
-_TOLERANCE = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|um|µm|μm)\s*")
-
 
 @click.command()
 @click.argument("stage", metavar="[STAGE.toml]", required=False)
-@axis
+@options.axis
 @click.option(
     "--tolerance", metavar="LENGTH", help="Of all lengths instead of the stage's own, such as 0.02mm or 20um."
 )
@@ -31,8 +27,8 @@ _TOLERANCE = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|um|µm|μm)\s*")
     "--level", type=click.IntRange(0, 1), help="0: slender leaves and rigid blocks; 1: the stage's default."
 )
 @click.option("--voltage", is_flag=True, help="Also at a fixed voltage, where a stiffer stage compresses its piezo.")
-@click.option("--json", "json_file", metavar="FILE", help="JSON file to write; - prints it instead of the tables.")
-@click.option("--plots", metavar="DIR", help="Folder for plots; it is made if need be.")
+@options.json_file("tables")
+@options.plots("plots")
 @click.option("--write-stage", metavar="FILE", help="TOML file of the stage to write, to change and come back with.")
 @in_sentences
 def sensitivity(given: Given) -> None:
@@ -47,7 +43,7 @@ def sensitivity(given: Given) -> None:
     from fits.machining._claims import describe_claims, paper_claims
     from fits.machining._design_file import design_text
     from fits.machining._sensitivity import sensitivities
-    from fits.report._sensitivity import describe_sensitivity, sensitivity_json
+    from fits.report._machining import describe_sensitivity, sensitivity_json
 
     start_jax()
     printed = given.json_file == "-"
@@ -65,7 +61,7 @@ def sensitivity(given: Given) -> None:
         claims = (
             [] if given.stage or printed else [claim for claim in paper_claims(design) if {*claim.axes} & {*axes}]
         )
-        drawn: list[Path] = []
+        drawn = []
         if drawings is not None:
             from fits.plots._sensitivity import plot_sensitivity
 
@@ -77,16 +73,11 @@ def sensitivity(given: Given) -> None:
     if printed:
         click.echo(text)
         return
-    lines = [describe_sensitivity(report, given.voltage)]
+    words = describe_sensitivity(report, given.voltage)
     if claims:
-        lines += ["", describe_claims(claims)]
-    places = [
-        ("json", out),
-        ("stage", given.write_stage),
-        *(("plot", str(Path(given.plots or "") / path.name)) for path in drawn),
-    ]
-    written = [f"{what:5}  {place}" for what, place in places if place is not None]
-    click.echo("\n".join([*lines, *([""] if written else []), *written]))
+        words += f"\n\n{describe_claims(claims)}"
+    places = [("json", out), ("stage", given.write_stage), *(("plot", each) for each in put_in(given.plots, drawn))]
+    click.echo(told_with_places(words, places))
 
 
 def _design(stage: str | None, tolerance: str | None, level: int | None) -> Design:
@@ -96,23 +87,9 @@ def _design(stage: str | None, tolerance: str | None, level: int | None) -> Desi
 
     design = paper_design() if stage in (None, "paper") else read_design(stage)
     if tolerance is not None:
-        length_mm = _length_mm(tolerance)
+        size_mm = length_mm("--tolerance", tolerance, ("mm", "um", "µm", "μm"), "0.02mm or 20um")
         try:
-            design = design.with_tolerance(length_mm)
+            design = design.with_tolerance(size_mm)
         except DataError as error:
             raise DataError(f"--tolerance {tolerance}: {error}") from None
     return design if level is None else dataclasses.replace(design, level=level)
-
-
-def _length_mm(text: str) -> float:
-    """Read a tolerance such as 0.02mm or 20um."""
-    found = _TOLERANCE.fullmatch(text)
-    try:
-        number = float(found[1]) if found else math.nan
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and number > 0):
-        raise DataError(
-            f"--tolerance: expected a length above 0 with its unit, found '{text}'; write one such as 0.02mm or 20um."
-        )
-    return number if found and found[2] == "mm" else number / 1e3

@@ -1,13 +1,10 @@
 """The command `microid sweep`: its options, and the work."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import click
 
-from fits.cli._common import Given, in_sentences, json_output, quiet, stopped
-from fits.cli._files import progress_to_stderr
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences, stopped
+from fits.cli._files import answer, progress_to_stderr, put_in
 from fits.io._file_set import file_set
 from fits.sweeps import kinds
 
@@ -49,8 +46,8 @@ def sweep(context: click.Context, example: str | None) -> None:
 @click.option(
     "--cluster", metavar="ADDRESS|local:N", help="A Dask scheduler, or N processes of this machine, to compute on."
 )
-@json_output
-@quiet
+@options.json_output
+@options.quiet
 @in_sentences
 def run(given: Given) -> None:
     """Run SWEEP.toml.
@@ -58,7 +55,6 @@ def run(given: Given) -> None:
     DIR will hold results.zarr, which xarray opens, results.parquet, and what is needed to go on. A row that fails is
     kept with its reason and stops nothing else. Without --cluster all is computed in this process.
     """
-    from fits.io._atomic import finite_json
     from fits.io._jax_setup import start_jax
 
     start_jax()
@@ -72,45 +68,36 @@ def run(given: Given) -> None:
         outcome = run_all(sweep, given.out, resume=given.resume, cluster=given.cluster, progress=progress)
     except KeyboardInterrupt as stop:
         stopped(stop, "what was computed is kept; go on with --resume")
-    files = [str(Path(given.out) / name) for name in (RESULTS, TABLE)]
-    if given.as_json:
-        content = {
-            "out": given.out,
-            "rows": outcome.rows,
-            "failed": outcome.failed,
-            "computed": outcome.computed,
-            "chunks_computed_again": outcome.again,
-            "seconds": outcome.seconds,
-            "files": files,
-        }
-        click.echo(finite_json(content))
-        return
+    content = {
+        "out": given.out,
+        "rows": outcome.rows,
+        "failed": outcome.failed,
+        "computed": outcome.computed,
+        "chunks_computed_again": outcome.again,
+        "seconds": outcome.seconds,
+        "files": put_in(given.out, (RESULTS, TABLE)),
+    }
     failed = f", {outcome.failed:,} of them failed" if outcome.failed else ""
-    click.echo(f"{outcome.rows:,} rows{failed}; {outcome.computed:,} computed in {outcome.seconds:.1f} s")
-    click.echo("\n".join(f"results  {name}" for name in files))
+    line = f"{outcome.rows:,} rows{failed}; {outcome.computed:,} computed in {outcome.seconds:.1f} s"
+    answer(given, content, [line, *(f"results  {name}" for name in content["files"])])
 
 
 @sweep.command()
 @click.argument("folder", metavar="DIR")
 @click.option("--best", metavar="OUTPUT", help="Output by which rows are ranked; the first by default.")
 @click.option("--largest", is_flag=True, help="Large is good.")
-@click.option("--plots", metavar="DIR", help="Folder for heat maps and parallel coordinates; it is made if need be.")
-@json_output
+@options.plots("heat maps and parallel coordinates")
+@options.json_output
 @in_sentences
 def show(given: Given) -> None:
     """Say how far the sweep in DIR is, and what came out."""
-    from fits.io._atomic import finite_json
     from fits.sweeps._show import describe, summarise
 
-    summary = summarise(given.folder, given.best, given.largest)
-    drawn: list[Path] = []
+    summary, drawn = summarise(given.folder, given.best, given.largest), []
     with file_set() as files:
         drawings = files.folder(given.plots)
         if drawings is not None:
             from fits.plots._sweep import plot_sweep
 
             drawn = plot_sweep(given.folder, drawings, given.best)
-    if given.as_json:
-        click.echo(finite_json(summary))
-        return
-    click.echo("\n".join([describe(summary), *(f"plot  {Path(given.plots or '') / path.name}" for path in drawn)]))
+    answer(given, summary, [describe(summary), *(f"plot  {place}" for place in put_in(given.plots, drawn))])

@@ -1,13 +1,10 @@
 """The command `microid synth`: its options, and the work."""
 
-from __future__ import annotations
-
-import json
-from pathlib import Path
-
 import click
 
-from fits.cli._common import Given, in_sentences, json_output
+from fits.cli import _options as options
+from fits.cli._common import Given, in_sentences
+from fits.cli._files import answer, put_in
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -23,7 +20,7 @@ def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) ->
 
 @click.command()
 @click.argument("scenario")
-@click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+@options.out_folder
 @click.option("--seed", type=click.IntRange(0, 2**64 - 1), help="Seed; the scenario's own by default.")
 @click.option(
     "--list",
@@ -33,7 +30,7 @@ def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) ->
     callback=_list_scenarios,
     help="List the scenarios and exit.",
 )
-@json_output
+@options.json_output
 @in_sentences
 def synth(given: Given) -> None:
     """Write example CSVs from a virtual test bench.
@@ -52,8 +49,5 @@ def synth(given: Given) -> None:
         contents = data_synth.files(bench)
         for name, text in contents.items():
             (folder / name).write_bytes(text.encode())
-    files = [str(Path(given.out) / name) for name in contents]
-    if given.as_json:
-        click.echo(json.dumps({"seed": bench.seed, "files": files}, indent=1))
-    else:
-        click.echo("\n".join([f"seed {bench.seed}", *files]))
+    files = put_in(given.out, contents)
+    answer(given, {"seed": bench.seed, "files": files}, [f"seed {bench.seed}", *files])

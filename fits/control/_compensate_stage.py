@@ -134,7 +134,7 @@ def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.
     law = model if isinstance(model, Preisach) else hysteresis_of(model)
     lower, upper = float(law.density.lower_V), float(law.density.upper_V)
     if isinstance(model, Preisach):
-        return simulate_run(model, prepare_run(record, lower, upper, initial, 1.0))
+        return simulate_run(model, prepare_run(record, (lower, upper), initial, 1.0))
     n = len(record)
     step_s = record.duration_s / max(n - 1, 1) or 1.0
     # Even times are given as the one interval between them: that takes half as long to compile.

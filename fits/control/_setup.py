@@ -11,8 +11,7 @@ from fits.control._compensate import compensate
 from fits.io._errors import DataError
 from fits.io._record import Reference
 from fits.loop._run import initial_state
-from fits.stage._result import range_of
-from fits.stage._run import place_of_hysteresis
+from fits.stage._run import place_of_hysteresis, range_of
 from microid import Preisach, SampledStage, Stage, Start, two_degrees
 
 Feedforward = Literal["none", "static", "dynamic"]

@@ -9,17 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.diagnosis._evaluate import simulate
-from fits.io._columns import PATH
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.io.columns.path import PATH
 from fits.loop._choose_grid import choose_grid
 from fits.loop._design import columns_of
 from fits.loop._prior import roughness
 from fits.loop._result import FitError
-from fits.loop._run import prepare_run
+from fits.loop._run import Run, prepare_run
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._moments import Chain
-from fits.stage._run import StageRun, prepare_stage_run
 from fits.stage._solve import prior_precision
 from fits.stats._whiten import rough_noise_um
 from microid import Hold, Preisach, Stage
@@ -86,14 +85,14 @@ class Baseline:
     prior: np.ndarray
     stroke_um: float
     range_V: tuple[float, float]
-    runs: tuple[StageRun, ...]
-    aside: tuple[StageRun, ...]
-    coarse: tuple[StageRun, ...]
-    coarse_aside: tuple[StageRun, ...]
-    finest: tuple[StageRun, ...]
-    finest_aside: tuple[StageRun, ...]
-    fine: tuple[StageRun, ...]
-    fine_aside: tuple[StageRun, ...]
+    runs: tuple[Run, ...]
+    aside: tuple[Run, ...]
+    coarse: tuple[Run, ...]
+    coarse_aside: tuple[Run, ...]
+    finest: tuple[Run, ...]
+    finest_aside: tuple[Run, ...]
+    fine: tuple[Run, ...]
+    fine_aside: tuple[Run, ...]
     dynamic: bool
     remarks: tuple[str, ...]
     skewed: bool = False
@@ -132,14 +131,15 @@ def fit_baseline(
     remarks: tuple[str, ...] = ()
     try:
         stage = default_stage(hold) if hold != "first" else None
-        found = solve_stage(records, stage, None, holdout, initial, "squares", progress, _FINEST, anyway=True)
+        found = solve_stage(records, stage, None, holdout, initial, "squares", progress, _FINEST, accept_best=True)
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
         return _static(records, aside, range_V, holdout, initial, remarks, progress)
-    prior = prior_precision(found.chain, found.solved.hyper, found.stroke_um)
-    stride = found.solved.runs[0].samples.stride
+    solved, chain, stroke_um = found.solved, found.solved.problem.chain, found.solved.problem.stroke_um
+    prior = prior_precision(chain, solved.hyper, stroke_um)
+    stride = solved.runs[0].stride
 
-    def prepared(many: int) -> tuple[tuple[StageRun, ...], tuple[StageRun, ...]]:
+    def prepared(many: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
         return (
             _prepared(records, range_V, initial, holdout, many, hold),
             _prepared(aside, range_V, initial, 0.0, many, hold),
@@ -149,21 +149,21 @@ def fit_baseline(
     many = _FINE_STEPS if hold == "zero" else _FINE
     (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, many))
     return Baseline(
-        found.chain,
-        found.solved.z,
-        found.solved.columns_um,
+        chain,
+        solved.z,
+        solved.columns_um,
         prior,
-        found.stroke_um,
+        stroke_um,
         range_V,
         runs,
         held,
         *prepared(min(stride, _COARSE)),
         finest,
         finest_held,
-        tuple(map(partial(_finely, found.stage), runs, finest)),
-        tuple(map(partial(_finely, found.stage), held, finest_held)),
+        tuple(map(partial(_finely, solved.stage), runs, finest)),
+        tuple(map(partial(_finely, solved.stage), held, finest_held)),
         True,
-        found.remarks,
+        solved.problem.remarks,
     )
 
 
@@ -186,11 +186,11 @@ def _prepared(
     holdout: float,
     stride: int,
     hold: Hold = "first",
-) -> tuple[StageRun, ...]:
-    return tuple(prepare_stage_run(record, range_V, initial, holdout, stride, hold=hold) for record in records)
+) -> tuple[Run, ...]:
+    return tuple(prepare_run(record, range_V, initial, holdout, stride, hold=hold) for record in records)
 
 
-def _finely(stage: Stage, run: StageRun, finer: StageRun) -> StageRun:
+def _finely(stage: Stage, run: Run, finer: Run) -> Run:
     """Divide intervals into many steps where a simulation with those of the fit is off by more than chance."""
     if run.samples.stride >= finer.samples.stride:
         return run
@@ -209,7 +209,7 @@ def _static(
     remarks: tuple[str, ...],
     progress: Callable[[str], None],
 ) -> Baseline:
-    runs = [prepare_run(record, *range_V, initial, holdout) for record in records]
+    runs = [prepare_run(record, range_V, initial, holdout) for record in records]
     stroke, tried, _ = choose_grid(runs, None, progress, _FINEST)
     grid = tried.data.grid
     columns = np.asarray(tried.solution.columns) * stroke

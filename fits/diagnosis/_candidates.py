@@ -7,7 +7,7 @@ import numpy as np
 
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._evaluate import respond_again, with_effects
-from fits.io._columns import columns_beside
+from fits.io.columns import columns_beside
 from fits.stage._motion import Prepared, prepare, signals
 from microid import AbstractEffect, Mechanics, Scales, Signal, Stage, host
 
@@ -181,8 +181,8 @@ def _scaled(effect: AbstractEffect, share: float) -> AbstractEffect:
 
 def one_sided(form: type[AbstractEffect]) -> bool:
     """Whether the strength of an effect cannot be negative."""
-    from fits.stage._encode import _spec
+    from fits.stage._encode import spec_of
 
     fields = form.__dataclass_fields__
-    specs = [_spec(fields[name]) for name in form.strength]
+    specs = [spec_of(fields[name]) for name in form.strength]
     return not specs or all(spec is not None and spec.lower >= 0 for spec in specs)

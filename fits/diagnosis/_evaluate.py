@@ -3,31 +3,27 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.backend import get_backend
 
 from fits.io._record import Record
+from fits.loop._run import Run
 from fits.stage._motion import Prepared, pass_signal, prepare, programs, signals
-from fits.stage._run import StageRun
-from microid import AbstractEffect, Signal, Stage, extend, host, refined
+from microid import AbstractEffect, Signal, Stage, extend, host
 
 # Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
 _LONG, _MANY = 20_000, 500
 
 
-def simulate(stage: Stage, run: StageRun) -> np.ndarray:
+def simulate(stage: Stage, run: Run) -> np.ndarray:
     """Response of a stage to a run that is refined already, in um, shape `(n,)`."""
     values = signals(stage.with_substeps(1), prepare(stage, run))[-1].values
     return np.asarray(values)[:: run.samples.stride][: len(run.record)]
 
 
-def along_curves(run: StageRun) -> StageRun:
+def along_curves(run: Run) -> Run:
     """The same run, its command along curves between the samples."""
-    stride, voltage = run.samples.stride, run.samples.voltage_V
-    _, curves = refined(jnp.ones(()), voltage[::stride], stride, "smooth")
-    return replace(run, samples=eqx.tree_at(lambda s: s.voltage_V, run.samples, curves))
+    return replace(run, hold="smooth")
 
 
 def respond_again(stage: Stage, base: Stage, known: Sequence[Signal], prepared: Prepared) -> np.ndarray:

@@ -13,8 +13,9 @@ from fits.diagnosis._candidates import Bench
 from fits.diagnosis._evaluate import with_effects
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import Gain
+from fits.loop._run import Run
 from fits.stage._motion import Prepared, signals
-from fits.stage._run import StageRun, without
+from fits.stage._run import project_out
 from microid import AbstractEffect, Stage
 
 _BLOCKS = 24
@@ -52,21 +53,21 @@ def extended_stage(baseline: Baseline, effects: Sequence[AbstractEffect], subste
     return with_effects(baseline.stage, effects).with_substeps(substeps)
 
 
-def left_of(run: StageRun, own: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
+def left_of(run: Run, own: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
     """Measurement less response, the run's nuisance parameters fitted to some of the samples and taken off."""
     off = run.displacement_um - response_um
     weight = jnp.asarray(using.astype(float))
     return np.asarray(_without(jnp.asarray(own), weight, jnp.asarray(off)))
 
 
-_without = eqx.filter_jit(without)
+_without = eqx.filter_jit(project_out)
 
 
 @dataclass(frozen=True)
 class Compared:
     """Residuals of the plain and the extended stage in one run, shape `(n,)`, and which samples were held out."""
 
-    run: StageRun
+    run: Run
     before_um: np.ndarray
     after_um: np.ndarray
     held_out: np.ndarray

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import median_filter, rank_filter, uniform_filter1d
 
-from fits.stage._run import StageRun
+from fits.loop._run import Run
 from fits.stats._at_rest import idle_stretches
 from fits.stats._whiten import Noise, learn_noise, rough_noise_um
 
@@ -58,7 +58,7 @@ class Floor:
     idle: int
 
 
-def floor_of(run: StageRun, residual_um: np.ndarray, settling_s: float) -> Floor:
+def floor_of(run: Run, residual_um: np.ndarray, settling_s: float) -> Floor:
     """Read the noise of a run off its idle stretches, or off the fastest changes of the residual.
 
     A stretch is idle once the stage has settled, which takes it `settling_s`.
@@ -128,7 +128,7 @@ def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarr
     return found
 
 
-def spikes(run: StageRun, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarray:
+def spikes(run: Run, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarray:
     """Samples that stand alone, far off their neighbours, where the command gives no reason; shape `(n,)`."""
     off = residual_um - median_filter(residual_um, 7, mode="nearest")
     spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")

@@ -13,7 +13,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Kinds, Regression, regress
 from fits.diagnosis._tangent import passed
 from fits.io._record import Record
-from fits.stage._run import prepare_stage_run
+from fits.loop._run import prepare_run
 from fits.stats._whiten import Noise
 from microid import AbstractEffect
 
@@ -166,7 +166,7 @@ class Predictor:
         record = Record(time_s, voltage_V, np.zeros(n), extra, source="the next run")
         # With steps between the samples that are too long, a lag and a delay differ by what both are off.
         stride = baseline.finest[self._like].samples.stride
-        run = prepare_stage_run(record, baseline.range_V, "unknown", 0.0, stride, hold=baseline.stage.hold)
+        run = prepare_run(record, baseline.range_V, "unknown", 0.0, stride, hold=baseline.stage.hold)
         # What is known of the columns beforehand counts with the old runs.
         only, none = (run,), ()
         alone = replace(

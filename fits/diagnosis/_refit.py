@@ -12,7 +12,7 @@ from fits.diagnosis._candidates import Bench
 from fits.diagnosis._law import Law, law_of, remembering, strength_of
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Scored
-from fits.io._columns import columns_beside
+from fits.io.columns import columns_beside
 from microid import AbstractEffect
 
 _STEP = 1e-3

@@ -13,8 +13,8 @@ from fits.diagnosis._evaluate import simulate, with_effects
 from fits.diagnosis._tangent import answering, behind, dressed, passed
 from fits.loop._design import Grid
 from fits.loop._prior import interpolation
+from fits.loop._run import Run
 from fits.stage._moments import Chain, linearise, pieces
-from fits.stage._run import StageRun
 from microid import AbstractEffect
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
@@ -141,7 +141,7 @@ def _alive(own: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     return np.where(left, own, 0.0)
 
 
-def _slope(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: StageRun) -> np.ndarray:
+def _slope(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: Run) -> np.ndarray:
     """Derivatives along the coordinates of the stage with effects, shape `(n, p)`, by central differences.
 
     Their programs are at hand, those of exact ones would have to be compiled for every effect.
@@ -172,7 +172,7 @@ def _bases(baseline: Baseline) -> list[np.ndarray]:
 
 
 def _along(
-    finer: Chain, baseline: Baseline, run: StageRun, bases: list[np.ndarray], around_um: np.ndarray
+    finer: Chain, baseline: Baseline, run: Run, bases: list[np.ndarray], around_um: np.ndarray
 ) -> list[np.ndarray]:
     joined = np.concatenate(bases, axis=1)
     parts = [columns @ joined for _, columns in pieces(finer, jnp.asarray(baseline.z), run, True)]

@@ -8,8 +8,8 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._projector import Projector
-from fits.io._columns import columns_beside
-from fits.stage._run import StageRun
+from fits.io.columns import COLUMNS, columns_beside
+from fits.loop._run import Run
 
 _WAVES, _POWERS = 12, 4
 _CYCLES = 240
@@ -47,17 +47,17 @@ class Seen:
     p: float
 
 
-def views(runs: Sequence[StageRun], plain_um: Sequence[np.ndarray]) -> list[View]:
+def views(runs: Sequence[Run], plain_um: Sequence[np.ndarray]) -> list[View]:
     """The ways of looking in which structure counts as left over, each run by itself."""
     return _joined(runs, [_of_run(run, plain) for run, plain in zip(runs, plain_um, strict=True)])
 
 
-def further_views(runs: Sequence[StageRun]) -> list[View]:
+def further_views(runs: Sequence[Run]) -> list[View]:
     """Ways of looking that say more of the cause: along the command and along what was measured besides."""
     return _joined(runs, [_beside(run) for run in runs])
 
 
-def _joined(runs: Sequence[StageRun], found: Sequence[dict[str, list[np.ndarray]]]) -> list[View]:
+def _joined(runs: Sequence[Run], found: Sequence[dict[str, list[np.ndarray]]]) -> list[View]:
     kinds: dict[str, list[list[np.ndarray]]] = {}
     sizes = [len(run.record) for run in runs]
     for k, own in enumerate(found):
@@ -66,7 +66,11 @@ def _joined(runs: Sequence[StageRun], found: Sequence[dict[str, list[np.ndarray]
                 kinds.setdefault(name, []).append(
                     [column if i == k else np.zeros(size) for i, size in enumerate(sizes)]
                 )
-    return [View(name, tuple(tuple(c) for c in columns), _SENTENCES[name]) for name, columns in kinds.items()]
+    return [
+        # Further columns are called by their titles.
+        View(name, tuple(tuple(c) for c in columns), _SENTENCES.get(name, f"the residual goes with the {name}"))
+        for name, columns in kinds.items()
+    ]
 
 
 _SENTENCES = {
@@ -78,13 +82,11 @@ _SENTENCES = {
     "jumps": "the residual jumps",
     "voltage": "the residual depends on the command and its direction",
     "frequency": "the residual goes with the command, by another factor and phase at each frequency",
-    "temperature": "the residual goes with the temperature",
-    "other axis": "the residual goes with the second axis",
     "gain": "the residual is in proportion to the displacement, by a factor that changes along the run",
 }
 
 
-def _of_run(run: StageRun, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
+def _of_run(run: Run, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
     record = run.record
     n = len(record)
     time = (record.time_s - record.time_s[0]) / record.duration_s
@@ -121,7 +123,7 @@ def _of_run(run: StageRun, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
     return found
 
 
-def _beside(run: StageRun) -> dict[str, list[np.ndarray]]:
+def _beside(run: Run) -> dict[str, list[np.ndarray]]:
     voltage = run.record.voltage_V
     share = (voltage - voltage.min()) / (float(np.ptp(voltage)) or 1.0)
     up = np.gradient(voltage) >= 0
@@ -129,11 +131,10 @@ def _beside(run: StageRun) -> dict[str, list[np.ndarray]]:
         "voltage": [np.cos(np.pi * k * share) * side for side in (up.astype(float), 1.0 - up) for k in range(8)],
         "frequency": _bands(voltage),
     }
-    beside = columns_beside(run.record)
-    for name, column in (("temperature", "temperature_degC"), ("other axis", "other_um")):
-        if column in beside:
-            values = beside[column] - np.mean(beside[column])
-            found[name] = [values, np.gradient(values), np.cumsum(values)]
+    for name, values in columns_beside(run.record).items():
+        if COLUMNS[name].title:
+            values = values - np.mean(values)
+            found[COLUMNS[name].title] = [values, np.gradient(values), np.cumsum(values)]
     return found
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.diagnosis._evaluate import with_effects
+from fits.loop._run import Run
 from fits.stage._moments import Chain
-from fits.stage._run import StageRun, joined, place_of_hysteresis
+from fits.stage._run import joined, place_of_hysteresis
 from microid import PLACES, AbstractEffect, Coordinates, Signal, Stage
 
 # Directions that are passed on at a time.
@@ -57,7 +58,7 @@ def dressed(chain: Chain, z: np.ndarray, effects: tuple[AbstractEffect, ...]) ->
     return Chain(coordinates, place_of_hysteresis(coordinates(jnp.asarray(z))), chain.grid)  # type: ignore[arg-type]
 
 
-def behind(chain: Chain, z: np.ndarray, run: StageRun, around_um: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
+def behind(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
     """Pass changes of the hysteresis on through what follows it and is not linear.
 
     Parameters

@@ -22,18 +22,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary path does not exist yet, lies in the same folder and ends as `path` does, so that Matplotlib
     infers the format. A file that was at `path` before is replaced in one step or left as it was. What is written is
-    on the disk before it is at `path`. For several files that belong together, see `file_set`.
-
-    Parameters
-    ----------
-    path
-        File to write. A symbolic link is followed.
-
-    Raises
-    ------
-    DataError
-        The folder is missing or cannot be written to, `path` is write-protected or anything but a regular file, or
-        the disk is full.
+    on the disk before it is at `path`; a symbolic link is followed. For several files that belong together, and for
+    what is refused in a `DataError`, see `file_set`.
     """
     with file_set() as files:
         yield files.file(path)
@@ -74,23 +64,10 @@ def finite_json(content: Any) -> str:
 def write_csv(
     path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]], comments: Sequence[str] = ()
 ) -> None:
-    """Write columns as CSV, with as many digits as reading them back exactly takes.
+    """Write columns, each of shape `(n,)`, as CSV, with as many digits as reading them back exactly takes.
 
-    Parameters
-    ----------
-    path
-        File to write; a name that ends in ``.gz`` is compressed.
-    columns
-        Header to values, each of shape (n,).
-    comments
-        Lines before the header, each written behind ``#``, which the reader passes over.
-
-    Raises
-    ------
-    ValueError
-        The columns differ in length.
-    DataError
-        As `atomic_path`, or a value is not finite.
+    A name that ends in `.gz` is compressed. Comments come before the header, each behind `#`, which the reader passes
+    over. A `DataError` refuses values that are not finite, a ValueError columns that differ in length.
     """
     for name, values in columns.items():
         refuse_nonfinite(name, np.asarray(values))

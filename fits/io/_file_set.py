@@ -3,7 +3,7 @@
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -27,17 +27,30 @@ class _Move:
     target: Path
     shown: str
 
+    def refused(self, error: OSError) -> DataError:
+        """Say that the file cannot be written."""
+        return DataError(
+            f"{self.shown}: cannot be written ({reason_of(error)}); "
+            "free the disk, close the file in other programs or choose another place."
+        )
+
 
 @dataclass(frozen=True)
 class _Folder:
-    """A folder to be: `made` is the temporary one, and becomes `first`, the first that is missing on the way."""
+    """A folder to be: `staged` is the temporary one, and becomes `first`, the first that is missing on the way."""
 
-    made: Path
+    staged: Path
     first: Path
     files: Path
     target: Path
     shown: str
     option: str
+
+    def refused(self, error: OSError) -> DataError:
+        """Say that nothing can be put there."""
+        return DataError(
+            f"{self.shown}: files cannot be put there ({reason_of(error)}); choose another for {self.option}."
+        )
 
 
 class FileSet:
@@ -51,16 +64,13 @@ class FileSet:
     def file(self, path: str | os.PathLike[str]) -> Path:
         """Give a temporary name for a file to write; it does not exist yet, and ends as `path` does.
 
-        Raises
-        ------
-        DataError
-            `path` cannot be written to: its folder is missing or protected, or it is anything but a regular file.
+        A `DataError` says that `path` cannot be written to.
         """
         target = check_file(path)
         if any(is_temporary(part) for part in target.parts):
             # Of another set, which puts it in its place or deletes it.
             return target
-        self._refuse_twice(target, os.fspath(path))
+        _refuse_twice(target, os.fspath(path), self._all())
         remove_stale(target.parent)
         staged = target.with_name(temporary_name(target.suffix))
         self._files.append(_Move(staged, target, os.fspath(path)))
@@ -73,53 +83,35 @@ class FileSet:
     @overload
     def folder(self, path: str | os.PathLike[str], option: str = ...) -> Path: ...
     @overload
-    def folder(self, path: None, option: str = ...) -> None: ...
-    @overload
     def folder(self, path: str | os.PathLike[str] | None, option: str = ...) -> Path | None: ...
     def folder(self, path: str | os.PathLike[str] | None, option: str = "--plots") -> Path | None:
-        """Make a temporary folder, whose files go to the folder `path`, which is made if need be.
+        """Make a temporary folder, whose files go to the folder `path` that an option named; for None there is none.
 
-        Parameters
-        ----------
-        path
-            Of the folder; for None, None comes back.
-        option
-            That named it.
-
-        Raises
-        ------
-        DataError
-            `path` cannot be written to, or is no folder.
+        `path` is made if need be; a `DataError` says that it cannot be written to, or is no folder.
         """
         if path is None:
             return None
         target, anchor = usable_folder(path, option)
         missing = target.relative_to(anchor).parts
-        made = anchor / temporary_name()
-        files = made.joinpath(*missing[1:])
-        folder = _Folder(made, anchor.joinpath(*missing[:1]), files, target, os.fspath(path), option)
-        self._refuse_twice(target, folder.shown)
+        staged = anchor / temporary_name()
+        files = staged.joinpath(*missing[1:])
+        folder = _Folder(staged, anchor.joinpath(*missing[:1]), files, target, os.fspath(path), option)
+        _refuse_twice(target, folder.shown, self._all())
         # Known before it is there, so that an interruption at any moment finds it.
         self._folders.append(folder)
-        try:
+        with _told(folder):
             files.mkdir(parents=True)
-        except OSError as error:
-            raise _refused(folder, error) from error
         return files
 
-    def _refuse_twice(self, target: Path, shown: str) -> None:
-        if target in {*(move.target for move in self._files), *(folder.target for folder in self._folders)}:
-            raise DataError(f"{shown}: two results would go to this place; choose another for one of them.")
+    def _all(self) -> list[_Move | _Folder]:
+        return [*self._files, *self._folders]
 
     def commit(self) -> None:
         """Put all files in their places, or none."""
         files = [move for move in self._files if move.staged is not None or os.path.lexists(move.target)]
         moves = [*self._from_folders(), *files]
-        seen: dict[Path, str] = {}
-        for move in moves:
-            if move.target in seen:
-                raise DataError(f"{move.shown}: two results would go to this place; choose another for one of them.")
-            seen[move.target] = move.shown
+        for k, move in enumerate(moves):
+            _refuse_twice(move.target, move.shown, moves[:k])
             if move.staged is None or not move.staged.is_dir():
                 check_file(move.target, move.shown)
         for move in moves:
@@ -131,8 +123,11 @@ class FileSet:
                 # an interruption comes.
                 if len(moves) > 1:
                     undo.callback(self._undoing(move))
-                with _told(move.shown):
-                    _put(move)
+                with _told(move):
+                    if move.staged is None:
+                        move.target.unlink(missing_ok=True)
+                    else:
+                        os.replace(move.staged, move.target)
             undo.pop_all()
         for folder in {move.target.parent for move in moves}:
             _flush_folder(folder)
@@ -140,17 +135,15 @@ class FileSet:
     def _from_folders(self) -> list[_Move]:
         moves = []
         for folder in self._folders:
-            try:
+            with _told(folder):
+                files = sorted(folder.files.iterdir())
                 if not os.path.lexists(folder.first):
-                    for file in folder.files.iterdir():
+                    for file in files:
                         flush(file)
                     # All of it in one step.
-                    moves.append(_Move(folder.made, folder.first, folder.shown))
+                    moves.append(_Move(folder.staged, folder.first, folder.shown))
                     continue
                 folder.target.mkdir(parents=True, exist_ok=True)
-                files = sorted(folder.files.iterdir())
-            except OSError as error:
-                raise _refused(folder, error) from error
             for file in files:
                 real = Path(os.path.realpath(folder.target / file.name))
                 moves.append(_Move(file, real, str(Path(folder.shown) / file.name)))
@@ -162,7 +155,7 @@ class FileSet:
             return partial(_take_back, move.target, move.staged)
         kept = move.target.with_name(temporary_name())
         self._scraps.append(kept)
-        with _told(move.shown):
+        with _told(move):
             try:
                 # A second name: at no moment there is no file under the first.
                 os.link(move.target, kept)
@@ -176,20 +169,17 @@ class FileSet:
             with suppress(OSError):
                 path.unlink(missing_ok=True)
         for folder in self._folders:
-            shutil.rmtree(folder.made, ignore_errors=True)
+            shutil.rmtree(folder.staged, ignore_errors=True)
 
     def explain(self, error: OSError) -> DataError | None:
         """Put what the system says of these files into a sentence; errors of others are not ours to explain."""
         name = os.fspath(error.filename) if isinstance(error.filename, str | os.PathLike) else ""
-        for move in self._files:
-            if name == str(move.staged):
-                return _unwritable(move.shown, error)
-        for folder in self._folders:
-            if name == str(folder.made) or name.startswith(f"{folder.made}{os.sep}"):
-                return _refused(folder, error)
-        if error.errno in _DISK_TROUBLE:
-            shown = [move.shown for move in self._files] + [folder.shown for folder in self._folders]
-            return _unwritable(shown[0], error) if shown else None
+        for each in self._all():
+            if name == str(each.staged) or name.startswith(f"{each.staged}{os.sep}"):
+                return each.refused(error)
+        if error.errno in _DISK_TROUBLE and self._all():
+            first = self._all()[0]
+            return _Move(None, first.target, first.shown).refused(error)
         return None
 
 
@@ -203,12 +193,8 @@ def file_set() -> Iterator[FileSet]:
 
     All are written to the disk before the first is renamed. If a rename fails, those before it are undone. A process
     that is killed meanwhile leaves each file as it was or whole, and temporary ones that the next `file_set` in the
-    same folder removes; a folder that was not there appears in one step with all that is in it.
-
-    Raises
-    ------
-    DataError
-        A file cannot be written, or the disk is full.
+    same folder removes; a folder that was not there appears in one step with all that is in it. A `DataError` says
+    that a file cannot be written, or that the disk is full.
     """
     files = FileSet()
     _OPEN.append(files)
@@ -234,13 +220,9 @@ def discard_all() -> None:
         files.discard()
 
 
-def _put(move: _Move) -> None:
-    if move.staged is None:
-        move.target.unlink(missing_ok=True)
-    elif move.staged.is_dir():
-        os.rename(move.staged, move.target)
-    else:
-        os.replace(move.staged, move.target)
+def _refuse_twice(target: Path, shown: str, others: Iterable[_Move | _Folder]) -> None:
+    if any(target == each.target for each in others):
+        raise DataError(f"{shown}: two results would go to this place; choose another for one of them.")
 
 
 def _take_back(target: Path, staged: Path | None) -> None:
@@ -274,21 +256,8 @@ def _flush_folder(path: Path) -> None:
 
 
 @contextmanager
-def _told(shown: str) -> Iterator[None]:
+def _told(place: _Move | _Folder) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise _unwritable(shown, error) from error
-
-
-def _unwritable(shown: str, error: OSError) -> DataError:
-    return DataError(
-        f"{shown}: cannot be written ({reason_of(error)}); "
-        "free the disk, close the file in other programs or choose another place."
-    )
-
-
-def _refused(folder: _Folder, error: OSError) -> DataError:
-    return DataError(
-        f"{folder.shown}: files cannot be put there ({reason_of(error)}); choose another for {folder.option}."
-    )
+        raise place.refused(error) from error

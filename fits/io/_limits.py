@@ -3,9 +3,11 @@
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from fits.io._errors import DataError
@@ -13,6 +15,7 @@ from fits.io._record import Record
 
 # Range of each quantity, by name: lowest and highest value.
 Ranges = dict[str, tuple[float, float]]
+AnyRanges = Mapping[str, tuple[float, float]]
 
 UNITS = {
     "voltage": "V",
@@ -32,7 +35,7 @@ MARGIN = 0.02
 _COMMANDED = ("voltage", "slew")
 # These have a sign that means something; of the others the size is limited.
 _TWO_SIDED = ("voltage", "displacement")
-_PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "n": 1e-9}
+_PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "n": 1e-9}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _RANGE = re.compile(rf"(?:({_NUMBER}):)?({_NUMBER})\s*([^\d\s.:].*)?")
 # Part of a limit by which rounding may exceed it.
@@ -41,16 +44,9 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Extreme:
-    """What a command is predicted to reach of one quantity, beside its limits.
+    """What a command is predicted to reach of a quantity of `UNITS`, in its unit, beside its limits.
 
-    Attributes
-    ----------
-    name
-        One of `UNITS`.
-    low, high
-        Reached, in the unit of the quantity.
-    lowest, highest
-        Allowed; infinite where nothing is.
+    It goes from `low` to `high` where `lowest` to `highest` is allowed; these are infinite where nothing is limited.
     """
 
     name: str
@@ -67,10 +63,8 @@ class Extreme:
     @property
     def excess(self) -> float:
         """How far the worse side is beyond its limit; 0 or less where it is inside."""
-        slack = _ROUNDING * max(abs(self.low), abs(self.high), abs(self.lowest), abs(self.highest))
-        if math.isinf(slack):
-            slack = _ROUNDING * max(abs(self.low), abs(self.high))
-        return max(self.high - self.highest, self.lowest - self.low) - slack
+        sizes = [abs(value) for value in (self.low, self.high, self.lowest, self.highest) if math.isfinite(value)]
+        return max(self.high - self.highest, self.lowest - self.low) - _ROUNDING * max(sizes, default=0.0)
 
     def __str__(self) -> str:
         """As in `displacement 0.1 to 38.2 um (limits 0 to 40 um)`."""
@@ -81,17 +75,10 @@ class Extreme:
 
 
 def parse_limits(texts: Iterable[str]) -> Ranges:
-    """Read the texts of the option `--limit`, such as `displacement=0:40um` or `slew=2kV/s`.
+    """Read the texts of the option `--limit`, such as `displacement=0:40um` or, of a size, `slew=2kV/s`.
 
-    Parameters
-    ----------
-    texts
-        ``NAME=LOW:HIGH`` or, for what has a size only, ``NAME=HIGH``, each with or without a unit at its end.
-
-    Raises
-    ------
-    DataError
-        A name that is not in `UNITS`, a unit of another quantity, or no range of two rising numbers.
+    A `DataError` refuses a name that is not in `UNITS`, a unit of another quantity, and anything but a range of two
+    rising numbers.
     """
     found: Ranges = {}
     for text in texts:
@@ -122,15 +109,14 @@ def parse_limits(texts: Iterable[str]) -> Ranges:
 def _factor(name: str, unit: str) -> float:
     """What a stated unit is in that of the quantity."""
     expected = UNITS[name]
-    if unit in ("", expected):
-        return 1.0
     plain = unit.replace("µ", "u").replace("μ", "u").replace("²", "^2").replace("s2", "s^2")
-    head, slash, tail = plain.partition("/")
-    own, own_slash, own_tail = expected.partition("/")
-    base = "m" if own == "um" else own
-    prefix = head.removesuffix(base)
-    if head.endswith(base) and prefix in _PREFIXES and (slash, tail) == (own_slash, own_tail):
-        return _PREFIXES[prefix] * (1e6 if own == "um" else 1.0)
+    if plain in ("", expected):
+        return 1.0
+    # The unit without a prefix, such as m/s of um/s, and what it is.
+    base, own = (expected[1:], 1e6) if expected.startswith("um") else (expected, 1.0)
+    prefix = plain.removesuffix(base)
+    if plain.endswith(base) and prefix in _PREFIXES:
+        return _PREFIXES[prefix] * own
     raise DataError(f"--limit {name}: expected the unit {expected} or a multiple of it, found {unit!r}; convert it.")
 
 
@@ -143,18 +129,9 @@ def measured_ranges(record: Record, offset_um: float = 0.0) -> Ranges:
 
 
 def reached_in(report: Mapping[str, Any]) -> Ranges:
-    """What the runs reached that a model was fitted to.
+    """What the runs of a model reached, by what its file keeps under `fit`; empty where that says nothing.
 
-    Parameters
-    ----------
-    report
-        What a model file keeps under `fit`.
-
-    Returns
-    -------
-    dict
-        Empty where the file does not say. Displacements are as the sensor read them in the first run, whose offset is
-        the model's.
+    Displacements are as the sensor read them in the first run, whose offset is the model's.
     """
     runs = [run for run in report.get("runs", ()) if isinstance(run, Mapping) and run.get("reached")]
     found = []
@@ -168,7 +145,7 @@ def reached_in(report: Mapping[str, Any]) -> Ranges:
     return joined(found)
 
 
-def joined(ranges: Iterable[Mapping[str, tuple[float, float]]]) -> Ranges:
+def joined(ranges: Iterable[AnyRanges]) -> Ranges:
     """The smallest ranges that hold all of several."""
     found: Ranges = {}
     for one in ranges:
@@ -178,24 +155,11 @@ def joined(ranges: Iterable[Mapping[str, tuple[float, float]]]) -> Ranges:
     return found
 
 
-def allowed(
-    reached: Mapping[str, tuple[float, float]], stated: Mapping[str, tuple[float, float]], margin: float
-) -> Ranges:
-    """Limits: what was stated, or else what was reached.
+def allowed(reached: AnyRanges, stated: AnyRanges, margin: float) -> Ranges:
+    """Limits: what a user stated, or else what the records reached.
 
-    Parameters
-    ----------
-    reached
-        By the records. Of what has no sign that matters, the larger size counts both ways.
-    stated
-        By the user, as they are.
-    margin
-        By how much of its range a predicted quantity may go beyond what was reached; the command may not.
-
-    Raises
-    ------
-    DataError
-        If the margin is negative or not finite.
+    Of what has no sign that matters, the larger size counts both ways. A predicted quantity may go by `margin` of its
+    range beyond what was reached; the command may not. A `DataError` refuses a margin that is negative or not finite.
     """
     if not (math.isfinite(margin) and margin >= 0):
         raise DataError(f"--margin: expected a share of the ranges reached, 0 or more, found {margin:g}.")
@@ -213,13 +177,10 @@ def allowed(
     return found
 
 
-def compared(
-    predicted: Mapping[str, tuple[float, float]], limits: Mapping[str, tuple[float, float]]
-) -> tuple[Extreme, ...]:
+def compared(predicted: AnyRanges, limits: AnyRanges) -> tuple[Extreme, ...]:
     """What is predicted beside its limits, for all that is limited."""
-    return tuple(
-        Extreme(name, *predicted[name], *limits[name]) for name in UNITS if name in predicted and name in limits
-    )
+    both = [name for name in UNITS if name in predicted and name in limits]
+    return tuple(Extreme(name, *predicted[name], *limits[name]) for name in both)
 
 
 def beyond(extremes: Iterable[Extreme]) -> tuple[Extreme, ...]:
@@ -229,34 +190,16 @@ def beyond(extremes: Iterable[Extreme]) -> tuple[Extreme, ...]:
 
 def check_command(
     source: str,
-    predicted: Mapping[str, tuple[float, float]],
-    reached: Mapping[str, tuple[float, float]],
-    stated: Mapping[str, tuple[float, float]],
+    predicted: AnyRanges,
+    reached: AnyRanges,
+    stated: AnyRanges,
     margin: float,
     spared: Collection[str] = (),
 ) -> list[str]:
-    """Refuse a command that leaves what the rig has shown.
+    """Refuse, in a `DataError`, a command that leaves what the rig has shown; remarks come back.
 
-    Parameters
-    ----------
-    source
-        Of the reference that the command follows.
-    predicted
-        What the command is, and makes the rig do.
-    reached, stated, margin
-        See `allowed`.
-    spared
-        Quantities of which a remark is made instead, unless their limit is stated.
-
-    Returns
-    -------
-    list of str
-        Remarks.
-
-    Raises
-    ------
-    DataError
-        If something is beyond its limit.
+    It follows the reference `source`; `predicted` is what it is, and makes the rig do. For `reached`, `stated` and
+    `margin` see `allowed`. Of the quantities `spared` a remark is made instead, unless their limit is stated.
     """
     unknown = [name for name in stated if name not in predicted]
     if unknown:
@@ -304,7 +247,7 @@ def _below(value: float) -> str:
     return f"{-float(_above(-value)):.4g}"
 
 
-def ranges_json(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
+def ranges_json(ranges: AnyRanges) -> dict[str, list[float]]:
     """Ranges as a model file keeps them, each under its name with the unit, as in `velocity_um_per_s`."""
     return {_key(name): [float(low), float(high)] for name, (low, high) in ranges.items()}
 
@@ -315,9 +258,8 @@ def ranges_of_json(content: object) -> Ranges:
         return {}
     found: Ranges = {}
     for name in UNITS:
-        pair = content.get(_key(name))
-        if isinstance(pair, list) and len(pair) == 2 and all(isinstance(value, int | float) for value in pair):
-            found[name] = float(pair[0]), float(pair[1])
+        with suppress(msgspec.ValidationError):
+            found[name] = msgspec.convert(content.get(_key(name)), tuple[float, float])
     return found
 
 

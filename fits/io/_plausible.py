@@ -7,21 +7,9 @@ from fits.io._table import Table, data_error
 
 FloatArray = NDArray[np.float64]
 
-# Largest size of a value by its unit. Slips of a unit by 1e6 stay within, so that they are warned of in words.
-LARGEST = {
-    "s": 1e11,
-    "V": 1e9,
-    "um": 1e9,
-    "degC": 1e9,
-    "A": 1e9,
-    "Hz": 1e9,
-    "um/V": 1e9,
-    "um^2/V^2": 1e18,
-    "dB": 180.0,
-    "deg": 1e9,
-    "rad": 1e9,
-    "1": 1e9,
-}
+# Largest size of a value, and of those in other units. Slips of a unit by 1e6 stay within, so that they are warned
+# of in words.
+_LARGEST, _LARGEST_BY_UNIT = 1e9, {"s": 1e11, "um^2/V^2": 1e18, "dB": 180.0}
 # What changes by less than so much, in V or um, was not measured.
 LEAST_CHANGE = 1e-9
 SHORTEST_STEP_s = 1e-12
@@ -32,11 +20,11 @@ LARGEST_EXTRA = 1e30
 
 
 def check_size(table: Table, column: str, values: FloatArray, unit: str, given: str = "") -> None:
-    """Refuse, in a `DataError`, values too large to be measurements, shape `(n,)`, in a unit of `LARGEST`.
+    """Refuse, in a `DataError`, values too large to be measurements, shape `(n,)`, in some unit.
 
     Voltages and displacements that change must also change by enough. `given` is the unit in the file, if another.
     """
-    most = LARGEST[unit]
+    most = _LARGEST_BY_UNIT.get(unit, _LARGEST)
     wrong = ~(np.abs(values) <= most)
     remedy = f"correct the cell, or the unit {given or unit}"
     if wrong.any():

@@ -10,3 +10,8 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def plain(number: float, digits: int = 4, sign: str = "") -> str:
+    """Significant digits, or whole numbers where these are more, without an exponent for large ones."""
+    return f"{number:{sign}.{digits}g}" if abs(number) < 10**digits else f"{number:{sign}.0f}"

@@ -1,7 +1,8 @@
 """From a CSV file to a `Record`: what is read, what is refused and what is warned of."""
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from fits.io._errors import DataError
 from fits.io._plausible import LARGEST_EXTRA, check_size, check_steps
 from fits.io._record import Record, Reference
-from fits.io._table import Table, data_error, open_table
+from fits.io._table import Problem, Table, data_error, open_table
 from fits.io._units import Source, find_sources, known_quantity
 
 FloatArray = NDArray[np.float64]
@@ -62,26 +63,29 @@ def read_csv(
         One sentence with file, line and column, what was expected and what to do.
     """
     required = tuple(dict.fromkeys(("time_s", "voltage_V", *required)))
-    table = open_table(path)
-    place = f"{table.path}, line {table.header_line}"
-    sources = find_sources(table.names, columns or {}, required, place)
-    values, problems = table.read({source.column for source in sources.values()})
-
-    arrays = {column: _converted(table, column, source, values) for column, source in sources.items()}
+    read = KnownColumns.read(path, columns, required)
+    table, sources, arrays = read.table, read.sources, dict(read.arrays)
     time_s, voltage_V = arrays.pop("time_s"), arrays.pop("voltage_V")
     displacement_um = arrays.pop("displacement_um", None)
-    _check_time(table, sources["time_s"].column, time_s)
     if "displacement_um" in required:
-        _check_length(table, time_s)
-        _check_moves(table, sources["voltage_V"].column, values)
-        _check_moves(table, sources["displacement_um"].column, values)
+        if time_s.size < MIN_SAMPLES:
+            what = f"expected at least {MIN_SAMPLES} samples, found {time_s.size}; record longer or sample faster"
+            raise data_error(table.path, what, table.line(time_s.size - 1))
+        for name in ("voltage_V", "displacement_um"):
+            array = read.found[sources[name].column]
+            if array.min() == array.max():
+                what = (
+                    f"expected values that change, found {array[0]:.9g} in every line from here to line "
+                    f"{table.line(array.size - 1)}; choose another column with --columns, or check the wiring"
+                )
+                raise data_error(table.path, what, table.line(0), sources[name].column)
 
-    used = {source.column for source in sources.values()}
-    extra = {name: array for name, array in values.items() if name not in used and name not in sources} | arrays
+    used = {*sources, *(source.column for source in sources.values())}
+    extra = {name: array for name, array in read.found.items() if name not in used} | arrays
     warnings = [
-        f"{table.path}, line {problem.line}, column '{name}': dropped, because {problem.found} is not a number; "
-        "correct the cell if the column matters."
-        for name, problem in problems.items()
+        f"{table.path}, line {line}, column '{name}': dropped, because {found} is not a number; correct the cell if "
+        "the column matters."
+        for name, (line, found) in read.problems.items()
     ]
     for name in [name for name, array in extra.items() if np.abs(array).max() > LARGEST_EXTRA]:
         del extra[name]
@@ -90,11 +94,9 @@ def read_csv(
             "them if the column matters."
         )
     with np.errstate(all="ignore"):  # absurd magnitudes overflow here, and then warn of nothing
-        warnings += _odd_gaps(table, sources["time_s"].column, time_s)
-        warnings += _odd_voltage(table, sources, voltage_V, displacement_um)
+        warnings += [*read.odd_gaps(), *read.odd_voltage()]
         if displacement_um is not None:
-            warnings += _odd_stroke(table, sources, voltage_V, displacement_um)
-            warnings += _saturated(table, sources, voltage_V, displacement_um)
+            warnings += [*read.odd_stroke(), *read.saturated()]
     return Record(time_s, voltage_V, displacement_um, extra, os.path.basename(table.path), tuple(warnings))
 
 
@@ -113,24 +115,152 @@ def read_reference(path: str | os.PathLike[str], columns: Mapping[str, str] | No
 
     Arguments and errors are those of `read_csv`.
     """
-    table = open_table(path)
-    place = f"{table.path}, line {table.header_line}"
-    sources = find_sources(table.names, columns or {}, ("time_s", "displacement_um"), place)
-    wanted = {name: sources[name] for name in ("time_s", "displacement_um")}
-    values, _ = table.read({source.column for source in wanted.values()})
-    time_s, displacement_um = (_converted(table, name, source, values) for name, source in wanted.items())
-    _check_time(table, sources["time_s"].column, time_s)
+    read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), alone=True)
     with np.errstate(all="ignore"):
-        warnings = tuple(_odd_gaps(table, sources["time_s"].column, time_s))
-    return Reference(time_s, displacement_um, os.path.basename(table.path), warnings)
+        warnings = tuple(read.odd_gaps())
+    source = os.path.basename(read.table.path)
+    return Reference(read.arrays["time_s"], read.arrays["displacement_um"], source, warnings)
 
 
-def _converted(table: Table, column: str, source: Source, values: Mapping[str, FloatArray]) -> FloatArray:
-    quantity = known_quantity(column)
-    with np.errstate(over="ignore"):
-        array = quantity.convert(source.sign * values[source.column], source.unit)
-    check_size(table, source.column, array, quantity.unit, source.unit)
-    return array
+@dataclass(frozen=True)
+class KnownColumns:
+    """What a file holds: sources and arrays of shape (n,) by canonical column, and all that was found by header."""
+
+    table: Table
+    sources: Mapping[str, Source]
+    arrays: Mapping[str, FloatArray]
+    found: Mapping[str, FloatArray]
+    problems: Mapping[str, Problem]
+
+    @classmethod
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        columns: Mapping[str, str] | None,
+        required: Sequence[str],
+        more: Sequence[str] = (),
+        alone: bool = False,
+    ) -> "KnownColumns":
+        """Read the required columns; of all others, or of `more` alone, those that are there. See `read_csv`."""
+        table = open_table(path)
+        sources = find_sources(table.names, columns or {}, required, f"{table.path}, line {table.header_line}")
+        if alone:
+            sources = {name: sources[name] for name in (*required, *more) if name in sources}
+        found, problems = table.read({source.column for source in sources.values()})
+        arrays = {}
+        for name, source in sources.items():
+            quantity = known_quantity(name)
+            with np.errstate(over="ignore"):
+                arrays[name] = quantity.convert(source.sign * found[source.column], source.unit)
+            check_size(table, source.column, arrays[name], quantity.unit, source.unit)
+        _check_time(table, sources["time_s"].column, arrays["time_s"])
+        return cls(table, sources, arrays, found, problems)
+
+    def place(self, column: str, row: int | None = None) -> str:
+        """File, line and header of a canonical column, to begin a warning with."""
+        line = "" if row is None else f", line {self.table.line(row)}"
+        return f"{self.table.path}{line}, column '{self.sources[column].column}'"
+
+    def odd_gaps(self) -> Iterator[str]:
+        """Few long steps in an otherwise even time base; uneven sampling is legal."""
+        time_s = self.arrays["time_s"]
+        if time_s.size < MIN_SAMPLES:
+            return
+        steps_s = np.diff(time_s)
+        median_s = float(np.median(steps_s))
+        if np.quantile(steps_s, 0.95, method="lower") > 2.0 * median_s:
+            return
+        gaps = np.flatnonzero(steps_s > _GAP * median_s)
+        if gaps.size:
+            worst = int(np.argmax(steps_s))
+            count = "a gap" if gaps.size == 1 else f"{gaps.size} gaps, the longest"
+            yield (
+                f"{self.place('time_s', worst + 1)}: {count} of {steps_s[worst]:.4g} s after {time_s[worst]:.9g} s, "
+                f"where samples are otherwise {median_s:.4g} s apart; split the file there if the voltage moved "
+                "meanwhile."
+            )
+
+    def odd_voltage(self) -> Iterator[str]:
+        """A voltage that wiggles as a measured one does."""
+        voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays.get("displacement_um")
+        turns_V = _reversals(voltage_V)
+        share = turns_V.size / voltage_V.size
+        if voltage_V.size < MIN_SAMPLES or share <= _MAX_REVERSALS:
+            return
+        wiggle = float(np.median(np.abs(np.diff(turns_V)))) / float(np.ptp(voltage_V))
+        if not _WIGGLE_MIN < wiggle < _WIGGLE_MAX:
+            return
+        place = self.place("voltage_V")
+        if displacement_um is not None and _reversals(displacement_um).size < turns_V.size / 4:
+            yield (
+                f"{place}: it is noisy while the displacement is smooth, so the two are probably swapped; exchange "
+                f"them with {self.swap()}."
+            )
+        else:
+            yield (
+                f"{place}: it turns round at {share:.0%} of the samples, so it looks measured and each wiggle acts "
+                "as a small hysteresis loop; choose the commanded voltage with --columns voltage_V=NAME."
+            )
+
+    def odd_stroke(self) -> Iterator[str]:
+        """A stroke per volt that no piezo stage has, and one that falls as the voltage rises."""
+        voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays["displacement_um"]
+        source, place = self.sources["displacement_um"], self.place("displacement_um")
+        if np.ptp(voltage_V) == 0.0 or np.ptp(displacement_um) == 0.0:
+            return
+        ratio = float(np.ptp(displacement_um) / np.ptp(voltage_V))
+        if not _plausible(ratio):
+            likely = " or ".join(self.likely_slips(ratio))
+            remedy = f"perhaps {likely}" if likely else "check the units and the columns"
+            yield (
+                f"{place}: the stroke per volt is {ratio:.3g} um/V, expected {STROKE_PER_VOLT_MIN_um_per_V:g} to "
+                f"{STROKE_PER_VOLT_MAX_um_per_V:g} um/V; {remedy}."
+            )
+        if np.corrcoef(voltage_V, displacement_um)[0, 1] < -0.5:
+            yield (
+                f"{place}: the displacement falls as the voltage rises; flip its sign with "
+                f"--columns displacement_um={source.spec(flip=True)} if the sensor faces the other way."
+            )
+
+    def saturated(self) -> Iterator[str]:
+        """Readings that stand at one end while the voltage moves on: the longest such stretch."""
+        voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays["displacement_um"]
+        enough_V = _MOVES * float(np.ptp(voltage_V))
+        for end, words in ((displacement_um.max(), "largest"), (displacement_um.min(), "smallest")):
+            stands = np.concatenate([[False], displacement_um == end, [False]])
+            edges = np.flatnonzero(np.diff(stands.astype(int)))
+            for first, stop in zip(edges[::2], edges[1::2], strict=True):
+                moved = float(np.ptp(voltage_V[first:stop]))
+                if stop - first >= _STANDS and moved > enough_V:
+                    yield (
+                        f"{self.place('displacement_um', int(first))}: {stop - first} readings in a row are the "
+                        f"{words}, {end:.6g} um, while the voltage moves by {moved:.3g} V, so the sensor is at its "
+                        "end there; leave these lines out, or measure with more range."
+                    )
+                    break
+
+    def likely_slips(self, ratio_um_per_V: float) -> Iterator[str]:
+        """Slips of a unit and swapped columns that would bring the stroke per volt between its limits."""
+        for power in (-3, 3, -6, 6):
+            if not _plausible(ratio_um_per_V * 10.0**power):
+                continue
+            for column, shift in (("displacement_um", power), ("voltage_V", -power)):
+                quantity, source = known_quantity(column), self.sources[column]
+                unit = quantity.shifted(source.unit, shift)
+                if unit:
+                    changed = f"{column}={source.spec(unit=unit)}"
+                    yield f"the {quantity.stem} is in {unit} instead of {source.unit} (--columns {changed})"
+            break
+        if ratio_um_per_V and _plausible(1.0 / ratio_um_per_V):
+            yield f"voltage and displacement are swapped ({self.swap()})"
+
+    def swap(self) -> str:
+        """The option that exchanges voltage and displacement."""
+        voltage, displacement = self.sources["voltage_V"], self.sources["displacement_um"]
+        return (
+            f"--columns voltage_V={Source(displacement.column, 'V').spec()},"
+            f"displacement_um={Source(voltage.column, 'um').spec()}"
+        )
 
 
 def _check_time(table: Table, column: str, time_s: FloatArray) -> None:
@@ -149,42 +279,6 @@ def _check_time(table: Table, column: str, time_s: FloatArray) -> None:
     raise data_error(table.path, f"expected strictly increasing times, found {found}", table.line(row), column)
 
 
-def _check_length(table: Table, time_s: FloatArray) -> None:
-    n = time_s.size
-    if n < MIN_SAMPLES:
-        what = f"expected at least {MIN_SAMPLES} samples, found {n}; record longer or sample faster"
-        raise data_error(table.path, what, table.line(n - 1))
-
-
-def _check_moves(table: Table, column: str, values: Mapping[str, FloatArray]) -> None:
-    array = values[column]
-    if array.min() == array.max():
-        what = (
-            f"expected values that change, found {array[0]:.9g} in every line from here to line "
-            f"{table.line(array.size - 1)}; choose another column with --columns, or check the wiring"
-        )
-        raise data_error(table.path, what, table.line(0), column)
-
-
-def _odd_gaps(table: Table, column: str, time_s: FloatArray) -> Iterator[str]:
-    if time_s.size < MIN_SAMPLES:
-        return
-    steps_s = np.diff(time_s)
-    median_s = float(np.median(steps_s))
-    # Uneven sampling is legal: only the few long steps of an otherwise even time base are gaps.
-    if np.quantile(steps_s, 0.95, method="lower") > 2.0 * median_s:
-        return
-    gaps = np.flatnonzero(steps_s > _GAP * median_s)
-    if gaps.size:
-        worst = int(np.argmax(steps_s))
-        count = "a gap" if gaps.size == 1 else f"{gaps.size} gaps, the longest"
-        yield (
-            f"{table.path}, line {table.line(worst + 1)}, column '{column}': {count} of {steps_s[worst]:.4g} s after "
-            f"{time_s[worst]:.9g} s, where samples are otherwise {median_s:.4g} s apart; split the file there if the "
-            "voltage moved meanwhile."
-        )
-
-
 def _reversals(values: FloatArray) -> FloatArray:
     """Values at which a signal turns round, shape (number of reversals,)."""
     moves = np.flatnonzero(np.diff(values))
@@ -192,98 +286,5 @@ def _reversals(values: FloatArray) -> FloatArray:
     return values[moves[1:][rising[1:] != rising[:-1]]]
 
 
-def _odd_voltage(
-    table: Table, sources: Mapping[str, Source], voltage_V: FloatArray, displacement_um: FloatArray | None
-) -> Iterator[str]:
-    turns_V = _reversals(voltage_V)
-    share = turns_V.size / voltage_V.size
-    if voltage_V.size < MIN_SAMPLES or share <= _MAX_REVERSALS:
-        return
-    wiggle = float(np.median(np.abs(np.diff(turns_V)))) / float(np.ptp(voltage_V))
-    if not _WIGGLE_MIN < wiggle < _WIGGLE_MAX:
-        return
-    place = f"{table.path}, column '{sources['voltage_V'].column}'"
-    if displacement_um is not None and _reversals(displacement_um).size < turns_V.size / 4:
-        yield (
-            f"{place}: it is noisy while the displacement is smooth, so the two are probably swapped; exchange them "
-            f"with {_swap(sources)}."
-        )
-    else:
-        yield (
-            f"{place}: it turns round at {share:.0%} of the samples, so it looks measured and each wiggle acts as a "
-            "small hysteresis loop; choose the commanded voltage with --columns voltage_V=NAME."
-        )
-
-
-def _odd_stroke(
-    table: Table, sources: Mapping[str, Source], voltage_V: FloatArray, displacement_um: FloatArray
-) -> Iterator[str]:
-    source = sources["displacement_um"]
-    place = f"{table.path}, column '{source.column}'"
-    if np.ptp(voltage_V) == 0.0 or np.ptp(displacement_um) == 0.0:
-        return
-    ratio = float(np.ptp(displacement_um) / np.ptp(voltage_V))
-    if not _plausible(ratio):
-        likely = " or ".join(_likely_slips(sources, ratio))
-        remedy = f"perhaps {likely}" if likely else "check the units and the columns"
-        yield (
-            f"{place}: the stroke per volt is {ratio:.3g} um/V, expected {STROKE_PER_VOLT_MIN_um_per_V:g} to "
-            f"{STROKE_PER_VOLT_MAX_um_per_V:g} um/V; {remedy}."
-        )
-    if np.corrcoef(voltage_V, displacement_um)[0, 1] < -0.5:
-        yield (
-            f"{place}: the displacement falls as the voltage rises; flip its sign with "
-            f"--columns displacement_um={source.spec(flip=True)} if the sensor faces the other way."
-        )
-
-
-def _saturated(
-    table: Table, sources: Mapping[str, Source], voltage_V: FloatArray, displacement_um: FloatArray
-) -> Iterator[str]:
-    """Readings that stand at one end while the voltage moves on: the longest such stretch."""
-    for end, words in ((displacement_um.max(), "largest"), (displacement_um.min(), "smallest")):
-        stands = np.concatenate([[False], displacement_um == end, [False]])
-        edges = np.flatnonzero(np.diff(stands.astype(int)))
-        for first, stop in zip(edges[::2], edges[1::2], strict=True):
-            moved = float(np.ptp(voltage_V[first:stop]))
-            if stop - first >= _STANDS and moved > _MOVES * float(np.ptp(voltage_V)):
-                yield (
-                    f"{table.path}, line {table.line(int(first))}, column '{sources['displacement_um'].column}': "
-                    f"{stop - first} readings in a row are the {words}, {end:.6g} um, while the voltage moves by "
-                    f"{moved:.3g} V, so the sensor is at its end there; leave these lines out, or measure with more "
-                    "range."
-                )
-                break
-
-
-def _likely_slips(sources: Mapping[str, Source], ratio_um_per_V: float) -> Iterator[str]:
-    """Slips of a unit and swapped columns that would bring the stroke per volt between its limits."""
-    voltage, displacement = sources["voltage_V"], sources["displacement_um"]
-    for power in (-3, 3, -6, 6):
-        if not _plausible(ratio_um_per_V * 10.0**power):
-            continue
-        for column, source, shift in (
-            ("displacement_um", displacement, power),
-            ("voltage_V", voltage, -power),
-        ):
-            unit = known_quantity(column).shifted(source.unit, shift)
-            if unit:
-                stem = known_quantity(column).stem
-                yield (
-                    f"the {stem} is in {unit} instead of {source.unit} (--columns {column}={source.spec(unit=unit)})"
-                )
-        break
-    if ratio_um_per_V and _plausible(1.0 / ratio_um_per_V):
-        yield f"voltage and displacement are swapped ({_swap(sources)})"
-
-
 def _plausible(ratio_um_per_V: float) -> bool:
     return STROKE_PER_VOLT_MIN_um_per_V <= ratio_um_per_V <= STROKE_PER_VOLT_MAX_um_per_V
-
-
-def _swap(sources: Mapping[str, Source]) -> str:
-    voltage, displacement = sources["voltage_V"], sources["displacement_um"]
-    return (
-        f"--columns voltage_V={Source(displacement.column, 'V').spec()},"
-        f"displacement_um={Source(voltage.column, 'um').spec()}"
-    )

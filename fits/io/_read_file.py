@@ -23,21 +23,10 @@ _LARGEST_INTEGER = 2**63 - 1
 
 
 def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
-    """Read a file.
+    """Read `what` is expected at a path, such as `a CSV file`, of at most so many bytes.
 
-    Parameters
-    ----------
-    path
-        Its name as the user gave it.
-    what
-        What is expected there, such as `a CSV file`.
-    most
-        Bytes that it may have.
-
-    Raises
-    ------
-    DataError
-        If there is no such file, it is a folder, a device or a pipe, it has more bytes, or it cannot be read.
+    A `DataError` says that there is no such file, that it is a folder, a device or a pipe, has more bytes, or cannot
+    be read.
     """
     name = os.fspath(path)
     try:
@@ -81,22 +70,10 @@ def unpack(data: bytes, name: str, most: int) -> bytes:
 
 
 def parse_json(text: str, place: str, what: str) -> Any:
-    """Read JSON text.
+    """Read JSON text, which is to be such as `a model file`.
 
-    Parameters
-    ----------
-    text
-        The JSON.
-    place
-        Begins the sentence of an error.
-    what
-        What is expected, such as `a model file`.
-
-    Raises
-    ------
-    DataError
-        If it is not JSON, a key stands twice, it nests more than 32 deep, or it holds a number or a character that
-        cannot be kept.
+    A `DataError`, which begins with the place, says that it is not JSON, that a key stands twice, that it nests more
+    than 32 deep, or holds a number or a character that cannot be kept.
     """
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -119,19 +96,9 @@ def parse_json(text: str, place: str, what: str) -> Any:
 
 
 def parse_toml(text: str, place: str) -> dict[str, Any]:
-    """Read TOML text.
+    """Read TOML text; a `DataError` begins with the place.
 
-    Parameters
-    ----------
-    text
-        The TOML.
-    place
-        Begins the sentence of an error.
-
-    Raises
-    ------
-    DataError
-        If it is not TOML, nests more than 32 deep, or holds an integer beyond 64 bits.
+    It says that this is not TOML, nests more than 32 deep, or holds an integer beyond 64 bits.
     """
     try:
         found = tomllib.loads(text)
@@ -147,30 +114,26 @@ def _why(error: ValueError | RecursionError) -> str:
     if isinstance(error, json.JSONDecodeError):
         return f"{error.msg}, line {error.lineno}" if error.pos else error.msg
     # All else comes from Python's `int`, and is for programmers.
-    return (
-        str(error).rstrip(".") if isinstance(error, tomllib.TOMLDecodeError) else "an integer of thousands of digits"
-    )
+    toml = isinstance(error, tomllib.TOMLDecodeError)
+    return str(error).rstrip(".") if toml else "an integer of thousands of digits"
 
 
-def _check(found: Any, place: str, finite: bool) -> None:
+def _check(value: Any, place: str, finite: bool, path: str = "", depth: int = 0) -> None:
     """Refuse what later steps could not work with: deep nests, enormous numbers, halves of characters."""
-    left: list[tuple[Any, str, int]] = [(found, "", 0)]
-    while left:
-        value, path, depth = left.pop()
-        if depth > MOST_DEPTH:
-            raise DataError(f"{place}: expected up to {MOST_DEPTH} nested levels, found more; flatten it.")
-        items: Any = enumerate(value) if isinstance(value, list) else value.items() if isinstance(value, dict) else ()
-        for key, item in items:
-            wrong = _fault(item, finite) or (isinstance(key, str) and _fault(key, finite))
-            if wrong or isinstance(item, dict | list):
-                name = f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}".lstrip(".")
-                if wrong:
-                    raise DataError(f"{place}: {shown(name)[1:-1]}: expected {wrong}; correct it.")
-                left.append((item, name[:_LONGEST_PATH], depth + 1))
+    if depth > MOST_DEPTH:
+        raise DataError(f"{place}: expected up to {MOST_DEPTH} nested levels, found more; flatten it.")
+    listed = isinstance(value, list)
+    for key, item in enumerate(value) if listed else value.items() if isinstance(value, dict) else ():
+        wrong = _fault(item, finite) or _fault(key, finite)
+        if wrong or isinstance(item, dict | list):
+            name = f"{path}[{key}]" if listed else f"{path}.{key}".lstrip(".")
+            if wrong:
+                raise DataError(f"{place}: {shown(name)[1:-1]}: expected {wrong}; correct it.")
+            _check(item, place, finite, name[:_LONGEST_PATH], depth + 1)
 
 
 def _fault(item: Any, finite: bool) -> str:
-    """What is expected instead of a single value, nothing if it is fine."""
+    """What is expected instead of a single value or key, nothing if it is fine."""
     if isinstance(item, float):
         return "" if not finite or math.isfinite(item) else "a number that fits in 64 bits, found a larger one"
     if isinstance(item, int):

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,29 +38,16 @@ def data_error(path: str, what: str, line: int | None = None, column: str | None
     return DataError(f"{place}: {what}.")
 
 
-class Problem(NamedTuple):
-    """First cell of a column that is not a finite number: its physical line and what was found there."""
-
-    line: int
-    found: str
+# First cell of a column that is not a finite number: its physical line, and what was found there.
+Problem = tuple[int, str]
 
 
 @dataclass(frozen=True)
 class Table:
     r"""A CSV file of which the header is read and the body is still text.
 
-    Parameters
-    ----------
-    path
-        File name as the user gave it.
-    names
-        Headers, without quotes and spaces around them.
-    header_line
-        Physical line of the header, counted from 1.
-    separator
-        Comma, semicolon or tab.
-    body
-        All text after the header line, with ``\n`` at line ends.
+    `path` is as the user gave it, headers are without quotes and spaces around them, physical lines are counted from
+    1, and the separator is a comma, a semicolon or a tab. All lines of the body end in ``\n``.
     """
 
     path: str
@@ -70,27 +57,14 @@ class Table:
     body: str
 
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
-        """Parse all columns.
+        """Parse all columns: the numeric ones, each of shape (n,), and the first problem of each other.
 
-        Parameters
-        ----------
-        strict
-            Columns in which every cell must be a finite number.
-
-        Returns
-        -------
-        tuple
-            The numeric columns, each of shape (n,), and the first problem of each other column.
-
-        Raises
-        ------
-        DataError
-            A row with too many or too few cells, a strict cell that is not a finite number, or no rows.
+        A `DataError` refuses a row with too many or too few cells, a cell of a `strict` column that is not a finite
+        number, and a file without rows.
         """
         if next(self._lines(), None) is None:
-            raise data_error(
-                self.path, "expected rows of numbers below the header, found none; export again", self.header_line
-            )
+            what = "expected rows of numbers below the header, found none; export again"
+            raise data_error(self.path, what, self.header_line)
         columns = self._read_fast()
         if columns is None or not all(name in columns for name in strict):
             return self._read_slowly(strict)
@@ -190,7 +164,7 @@ class Table:
                 elif name in strict:
                     raise self._bad_cell(line, name, cell, number)
                 else:
-                    problems[name] = Problem(line, number)
+                    problems[name] = line, number
         columns = {
             name: np.array(column) for name, column in zip(self.names, values, strict=True) if name not in problems
         }
@@ -200,8 +174,8 @@ class Table:
         for line, cells in self._rows():
             number = self._number(cells[i])
             if isinstance(number, str):
-                return Problem(line, number)
-        return Problem(self.header_line + 1, "a number that pandas does not read")
+                return line, number
+        return self.header_line + 1, "a number that pandas does not read"
 
     def _number(self, cell: str) -> float | str:
         """Value of a cell, or what was found instead of a finite number."""
@@ -239,47 +213,34 @@ class Table:
 def open_table(path: str | os.PathLike[str]) -> Table:
     """Read a file and its header.
 
-    Raises
-    ------
-    DataError
-        The file is missing, a folder, unreadable, empty, binary or corrupted, or its header is missing or
-        has duplicates.
+    A `DataError` says that it is missing, a folder, unreadable, empty, binary or corrupted, or that the header is
+    missing or has duplicates.
     """
     shown = os.fspath(path)
-    text = _decode(shown, _load(shown))
+    data = read_bytes(shown, "a CSV file", MOST_CSV_BYTES)
+    if data.startswith(b"\x1f\x8b") or shown.lower().endswith(".gz"):
+        data = unpack(data, shown, MOST_CSV_BYTES)
+    text = _decode(shown, data)
     header_line, separator, header, end = _find_header(shown, text)
     names = [name.strip() for name in split_cells(header, separator)]
     while names and not names[-1]:  # trailing separators
         names.pop()
     if all(_looks_numeric(name) for name in names):
-        raise data_error(
-            shown,
-            "expected a header such as time_s,voltage_V,displacement_um, found numbers; insert the header above "
-            "this line, without # before it",
-            header_line,
-            names[0] if names else None,
+        what = (
+            "expected a header such as time_s,voltage_V,displacement_um, found numbers; insert the header above this "
+            "line, without # before it"
         )
+        raise data_error(shown, what, header_line, names[0] if names else None)
     if len(names) > MOST_COLUMNS:
         what = f"expected up to {MOST_COLUMNS:,} columns, found {len(names):,}; write a row per sample"
         raise data_error(shown, what, header_line)
     names = [name or f"column_{i}" for i, name in enumerate(names, 1)]
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise data_error(
-                shown,
-                f"expected each header once, found it in cells {names.index(name) + 1} and {i + 1}; "
-                "rename or remove one",
-                header_line,
-                name,
-            )
+            first = names.index(name) + 1
+            what = f"expected each header once, found it in cells {first} and {i + 1}; rename or remove one"
+            raise data_error(shown, what, header_line, name)
     return Table(shown, tuple(names), header_line, separator, text[end:])
-
-
-def _load(path: str) -> bytes:
-    data = read_bytes(path, "a CSV file", MOST_CSV_BYTES)
-    if data.startswith(b"\x1f\x8b") or path.lower().endswith(".gz"):
-        return unpack(data, path, MOST_CSV_BYTES)
-    return data
 
 
 def _decode(path: str, data: bytes) -> str:

@@ -1,69 +1,18 @@
 """Names and units of columns: what a header means, and which source column serves which quantity."""
 
-import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fits.io._errors import DataError
+from fits.io._quantity import BRACKETS, LENGTH, VOLTAGE, Quantity, split_unit
+from fits.io.columns import COLUMNS
 
-FloatArray = NDArray[np.float64]
-
-_PLAIN_SIGNS = {"µ": "u", "μ": "u", "°C": "degC"}  # both Unicode micro signs, and the degree sign
-_BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]")
-_KELVIN_AT_0_DEGC = 273.15
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A measured quantity: its canonical column and the units it may come in.
-
-    Parameters
-    ----------
-    stem
-        Name without unit, for example ``voltage``.
-    unit
-        Canonical unit, for example ``V``.
-    powers
-        Power of ten that takes each known unit to the canonical one.
-    """
-
-    stem: str
-    unit: str
-    powers: Mapping[str, int]
-
-    @property
-    def column(self) -> str:
-        """Canonical column name: stem and unit."""
-        return f"{self.stem}_{self.unit}"
-
-    def convert(self, values: FloatArray, unit: str) -> FloatArray:
-        """Values, shape (n,), of a known unit in the canonical unit."""
-        if unit == "K":
-            return values - _KELVIN_AT_0_DEGC
-        # Dividing by an exact power is rounded once; multiplying by 1e-3 would be rounded twice.
-        power = self.powers[unit]
-        return values * 10.0**power if power >= 0 else values / 10.0**-power
-
-    def shifted(self, unit: str, power: int) -> str | None:
-        """Name the unit 10**power times as large as `unit`, if there is one."""
-        wanted = self.powers[unit] + power
-        return next((name for name, value in self.powers.items() if value == wanted), None)
-
-
-_LENGTH = {"um": 0, "nm": -3, "mm": 3, "m": 6, "pm": -6}
-_VOLT = {"V": 0, "mV": -3, "uV": -6, "kV": 3}
 QUANTITIES = (
     Quantity("time", "s", {"s": 0, "ms": -3, "us": -6, "ns": -9}),
-    Quantity("voltage", "V", _VOLT),
-    Quantity("displacement", "um", _LENGTH),
-    Quantity("temperature", "degC", {"degC": 0, "C": 0, "K": 0}),
-    Quantity("y_displacement", "um", _LENGTH),
-    Quantity("drive_monitor", "V", _VOLT),
-    Quantity("current", "A", {"A": 0, "mA": -3, "uA": -6, "nA": -9}),
+    Quantity("voltage", "V", VOLTAGE),
+    Quantity("displacement", "um", LENGTH),
+    *(column.quantity for column in COLUMNS.values()),
 )
 
 
@@ -83,20 +32,6 @@ class Source:
         return f"{'-' if sign < 0 else ''}{self.column}{stated}"
 
 
-def split_unit(name: str) -> tuple[str, str | None]:
-    """Split ``height_nm``, ``height[nm]`` or ``height (nm)`` into stem and unit; None where there is no unit."""
-    match = _BRACKETS.fullmatch(name)
-    stem, unit = (match["stem"], match["unit"]) if match else _split_suffix(name)
-    for sign, plain in _PLAIN_SIGNS.items():
-        unit = unit.replace(sign, plain)
-    return stem, unit or None
-
-
-def _split_suffix(name: str) -> tuple[str, str]:
-    stem, _, unit = name.rpartition("_")
-    return (stem, unit) if stem else (name, "")
-
-
 def recognise(name: str) -> tuple[Quantity, str] | None:
     """Quantity and unit of a header such as ``voltage_mV``, or None where either is unknown."""
     stem, unit = split_unit(name)
@@ -108,22 +43,10 @@ def recognise(name: str) -> tuple[Quantity, str] | None:
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Read the text of the option ``--columns``.
+    """Read the option ``--columns``: pairs such as ``voltage_V=u1_V,displacement_um=-height[m]``.
 
-    Parameters
-    ----------
-    text
-        Pairs such as ``voltage_V=u1_V,displacement_um=-height[m]``.
-
-    Returns
-    -------
-    dict
-        Canonical column to source, as `read_csv` takes it.
-
-    Raises
-    ------
-    DataError
-        A pair without ``=``, an unknown or a repeated canonical column.
+    Canonical column to source comes back, as `read_csv` takes it. A `DataError` refuses a pair without ``=``, and an
+    unknown or a repeated column.
     """
     columns: dict[str, str] = {}
     for pair in filter(str.strip, text.split(",")):
@@ -151,23 +74,10 @@ def known_quantity(column: str) -> Quantity:
 def find_sources(
     names: Sequence[str], columns: Mapping[str, str], required: Collection[str], place: str
 ) -> dict[str, Source]:
-    """Choose the source column of every canonical column that the headers or the mapping give.
+    """Choose the source column of every canonical column that the headers, or the user's mapping, give.
 
-    Parameters
-    ----------
-    names
-        Headers of the file.
-    columns
-        Mapping that the user gave; it wins over the headers.
-    required
-        Canonical columns that must be found.
-    place
-        File and line of the header, to begin error messages with.
-
-    Raises
-    ------
-    DataError
-        Missing column, duplicate column, missing or unknown unit.
+    The mapping wins over the headers. `place`, file and line of the header, begins the sentence of a `DataError`: a
+    required column that is missing, a duplicate, a unit that is missing or unknown.
     """
     sources = {column: _mapped(column, text, names, place) for column, text in columns.items()}
     taken = {source.column for source in sources.values()}
@@ -198,7 +108,7 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
     if text not in names and text.startswith("-"):
         sign, text = -1, text[1:].strip()
     if text not in names:
-        match = _BRACKETS.fullmatch(text)
+        match = BRACKETS.fullmatch(text)
         if match:
             text, stated = match["stem"], split_unit(text)[1]
     if text not in names:

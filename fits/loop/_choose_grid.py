@@ -4,39 +4,34 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from optimistix import RESULTS
 from scipy import signal
 
 from fits.io._errors import DataError
-from fits.loop._design import Grid
 from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, solve_grid
-from fits.loop._moments import Data, gather
+from fits.loop._moments import Data, gather, grid_of
 from fits.loop._prior import Hyper
-from fits.loop._result import FitError, FitStatus, LevelTrial
+from fits.loop._result import FitError, LevelTrial
 from fits.loop._run import Run, simulate_run
 from fits.stats._at_rest import quantum_um
-from fits.stats._noise import correlation_samples, huber_weight
+from fits.stats._noise import WHITE, correlation_samples, huber_weight
 
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
 # Refining goes on while it takes this fraction off the error of predicted blocks.
 _WORTH = 0.005
 # From so many levels on more, by the square of their number.
-_DEAR = 32
+_COSTLY = 32
 # Errors up to so many times what a last digit rounds off are rounding.
 _ROUNDED = 1.2
 # Rounds after which the weights of outliers have settled.
 _REWEIGHED = 8
-# A residual less correlated than this counts as white.
-_WHITE = 1.2
 # Correlation of displacement with voltage below which there is no loop.
-_FOLLOWS = 0.3
+_CORRELATED = 0.3
 # Coherence from which on it follows all the same, and segments whose spectra are averaged.
 _COHERENT, _SEGMENTS = 0.3, 16
 # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
-_AHEAD = 0.5
+_LEADING = 0.5
 
 
 @dataclass(frozen=True)
@@ -55,28 +50,14 @@ def choose_grid(
 ) -> tuple[float, GridTrial, list[LevelTrial]]:
     """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
 
-    Returns
-    -------
-    stroke_um
-        Unit of the columns.
-    kept
-        The finest grid that predicts no worse than the others, as it is least felt.
-    trials
-        All that were tried.
-
-    Raises
-    ------
-    DataError
-        If there is no loop to fit.
-    FitError
-        If a solver fails.
+    Returns the stroke in um, which is the unit of the columns, the grid that is kept, and all that were tried. A
+    `DataError` where there is no loop to fit, a `FitError` where a solver fails.
     """
-    lower, upper = jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V)
     stroke = max(_stroke(run) for run in runs)
 
     def trial(n: int, hyper: Hyper) -> GridTrial:
         progress(f"{n} levels")
-        return try_grid(gather(Grid(lower, upper, n), runs), runs, stroke, hyper, levels is None)
+        return try_grid(gather(grid_of(runs, n), runs), runs, stroke, hyper, levels is None)
 
     digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
     tried, trials = _resolve(trial, levels, finest, _ROUNDED * digit / 12**0.5)
@@ -86,7 +67,7 @@ def choose_grid(
 def _resolve(
     trial: Callable[[int, Hyper], GridTrial], levels: int | None, finest: int, rounding_um: float
 ) -> tuple[GridTrial, list[LevelTrial]]:
-    """Refine until it no longer pays; the finest that predicts no worse is kept, as its grid is least felt.
+    """Refine until it no longer pays; of grids that predict alike the finest is kept.
 
     What a last digit rounds off repeats itself with every loop, and a fine grid follows it from digit to digit: an
     error that is no more than that is not worth refining.
@@ -103,7 +84,7 @@ def _resolve(
             break
         trials.append(LevelTrial(n, finer.error_um))
         # A fit takes eight times as long for twice the levels, and must be worth it.
-        pays = finer.error_um < (1 - _WORTH * max(1.0, n / _DEAR) ** 2) * best.error_um
+        pays = finer.error_um < (1 - _WORTH * max(1.0, n / _COSTLY) ** 2) * best.error_um
         best = finer if finer.error_um <= best.error_um else best
         if not pays:
             break
@@ -114,15 +95,13 @@ def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compa
     grid = data.grid
     correlation = 1.0
     solution = solve_grid(data, stroke, correlation, hyper)
-    _check(solution.result)
     model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
     left = [run.weighed(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
     found = correlation_samples(left)
-    if found > _WHITE:
+    if found > WHITE:
         correlation = found
         solution = solve_grid(data, stroke, correlation, hyper)
-        _check(solution.result)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
     return GridTrial(data, solution, correlation, error, discrepancy)
@@ -133,7 +112,7 @@ def _stroke(run: Run) -> float:
     if np.ptp(displacement) == 0 or np.ptp(voltage) == 0:
         raise DataError(f"{run.record.source}: nothing moves in the samples to be fitted; hold out less")
     together = float(np.corrcoef(voltage, displacement)[0, 1])
-    if abs(together) < _FOLLOWS:
+    if abs(together) < _CORRELATED:
         _refuse_ringing(run)
         raise DataError(
             f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so "
@@ -144,7 +123,7 @@ def _stroke(run: Run) -> float:
             f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
             "change the sign of one of the two columns"
         )
-    if _leads(voltage, displacement) > _AHEAD:
+    if _leads(voltage, displacement) > _LEADING:
         raise DataError(
             f"{run.record.source}: the displacement runs ahead of the voltage round its loops, where a piezo stays "
             "behind: the two columns are exchanged; correct the header, or name them the other way with --columns"
@@ -174,40 +153,20 @@ def _refuse_ringing(run: Run) -> None:
 
 
 def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:
-    """How the loops are run through: -1 where the displacement stays behind everywhere, 1 where it runs ahead.
-
-    That is the area of the loops about the smooth curve through them, over the same with all parts counted as
-    positive.
-    """
+    """Signed over absolute area of the loops: -1 where the displacement lags everywhere, 1 where it leads."""
     place = (voltage_V - voltage_V.mean()) / np.ptp(voltage_V)
     beside = displacement_um - np.polyval(np.polyfit(place, displacement_um, 3), place)
     parts = (beside[1:] + beside[:-1]) * np.diff(place)
     return float(parts.sum() / (np.abs(parts).sum() + 1e-300))
 
 
-def _check(result: RESULTS) -> None:
-    if result == RESULTS.successful:
-        return
-    if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
-        raise FitError(FitStatus.MAX_STEPS)
-    raise FitError(FitStatus.NONFINITE)
-
-
 def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list[Run]:
-    """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid.
-
-    Raises
-    ------
-    DataError, FitError
-        As `choose_grid`.
-    """
+    """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid."""
     progress("weighing outliers")
     stroke = max(_stroke(run) for run in runs)
-    grid = Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), LADDER[0])
-    hyper = Hyper.start()
+    grid, hyper = grid_of(runs, LADDER[0]), Hyper.start()
     for _ in range(_REWEIGHED):
         solution = solve_grid(gather(grid, runs), stroke, 1.0, hyper)
-        _check(solution.result)
         hyper = solution.hyper
         model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
         left = [run.displacement_um - simulate_run(model, run) for run in runs]

@@ -12,17 +12,10 @@ from microid import GridDensity, Preisach, Reversible, Staircase, everett, fores
 
 
 class Grid(eqx.Module):
-    """The columns of the regression, in units where the voltage range is 1.
+    """The columns of the regression on `N` levels, in units where the voltage range is 1.
 
     The first `N (N + 1) / 2` columns are densities of 1 at one node each, packed row by row; the last `N` are slopes
     of 1 at one level each. In these units the columns of all rigs look alike, so scales and priors need no unit.
-
-    Attributes
-    ----------
-    lower_V, upper_V
-        Range of the levels.
-    levels
-        Their number `N`.
     """
 
     lower_V: Float[Array, ""]
@@ -75,25 +68,9 @@ def columns_of(model: Preisach) -> Float[Array, " D"]:
 def design(
     grid: Grid, table: Float[Array, "4 k D"], voltage_V: Float[Array, " n"], start: Staircase
 ) -> tuple[Float[Array, "n D"], Staircase]:
-    """Respond with every column alone.
+    """Respond with every column alone, shape `(n, D)`, dimensionless; and the memory after the last sample.
 
-    Parameters
-    ----------
-    grid
-        The columns.
-    table
-        Their branch polynomials, from `branch_table`.
-    voltage_V
-        Shape `(n,)`.
-    start
-        Memory before the first sample.
-
-    Returns
-    -------
-    Array
-        Responses, shape `(n, D)`; dimensionless.
-    Staircase
-        Memory after the last sample.
+    `table` holds the columns' branch polynomials, from `branch_table`; `start` is the memory before the first sample.
     """
     n = grid.levels
     memory = remember(voltage_V, start)

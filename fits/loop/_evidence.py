@@ -18,14 +18,7 @@ _MIDDLE, _WIDTH = -4.6, 6.0
 class Posterior(eqx.Module):
     """Gaussian belief about the columns, in strokes, before non-negativity.
 
-    Attributes
-    ----------
-    mean
-        Shape `(D,)`.
-    precision
-        Inverse of the covariance, shape `(D, D)`.
-    root
-        Its lower Cholesky factor, shape `(D, D)`.
+    `precision` is the inverse of the covariance, `root` its lower Cholesky factor.
     """
 
     mean: Float[Array, " D"]
@@ -56,17 +49,7 @@ def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array,
 
 @eqx.filter_jit
 def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> Hyper:
-    """Find the smoothness and the noise under which the data are most probable.
-
-    Parameters
-    ----------
-    moments
-        Of the data, in strokes.
-    rough
-        Curvature of the same columns.
-    start
-        Where the search begins.
-    """
+    """Find the smoothness and the noise under which the data, in strokes, are most probable."""
     solver: Any = optx.BFGS(rtol=1e-3, atol=1e-2)
     solution: Any = optx.minimise(_negative_log, solver, start, args=(moments, rough), max_steps=256, throw=False)
     # Out of steps on a flat evidence, the best place so far is as good as any; the regression itself must converge.

@@ -7,7 +7,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from fits.io._record import Record
-from fits.stats._at_rest import quantum_um
+from fits.loop._run import Run
+from fits.stats._at_rest import quantum_um, stretches
 
 # A sensor sticks where so many readings in a row are the same to the last bit, while the stage, by its mean gain,
 # moves by such a part of its stroke, and by so many last digits.
@@ -25,26 +26,16 @@ _PULLED = 0.2
 _SPARSE_s = 1.0
 
 
-def remarks_on(
-    records: Sequence[Record], residuals: Sequence[np.ndarray], fitted: Sequence[np.ndarray], robust: bool
-) -> list[str]:
-    """Name what is wrong with records that were fitted.
+def remarks_on(runs: Sequence[Run], residuals: Sequence[np.ndarray], robust: bool) -> list[str]:
+    """Name what is wrong with runs that were fitted, by what the fit leaves of each in um, shape `(n,)`.
 
-    Parameters
-    ----------
-    records
-        The runs.
-    residuals
-        What the fit leaves of each, in um, shape `(n,)`.
-    fitted
-        Which samples were fitted, shape `(n,)`.
-    robust
-        Whether outliers count less in the fit already.
+    `robust` says whether outliers count less in the fit already.
     """
     out = []
-    for record, residual, used in zip(records, residuals, fitted, strict=True):
+    for run, residual in zip(runs, residuals, strict=True):
+        record = run.record
         out += stuck(record)
-        out += impulses(record, residual, used, robust)
+        out += impulses(run, residual, robust)
         interval = float(np.median(np.diff(record.time_s)))
         if interval > _SPARSE_s:
             out.append(
@@ -61,14 +52,13 @@ def stuck(record: Record) -> list[str]:
     stroke, span = float(np.ptp(reading)), float(np.ptp(voltage))
     # Readings that stand at an end of the sensor's range are told of when they are read.
     inside = (reading[1:] > reading.min()) & (reading[1:] < reading.max())
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (np.diff(reading) == 0) & inside, [0]])))
     digit = quantum_um(reading)
     found = []
-    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+    for first, stop in stretches((np.diff(reading) == 0) & inside):
         moved = float(np.ptp(voltage[first : stop + 1]))
         moved_um = moved * stroke / span
         if stop + 1 - first >= _STUCK and moved_um > max(_MOVES * stroke, _DIGITS * digit):
-            found.append((stop + 1 - first, int(first), moved))
+            found.append((stop + 1 - first, first, moved))
     if not found:
         return []
     count, first, moved = max(found)
@@ -82,15 +72,7 @@ def stuck(record: Record) -> list[str]:
 
 
 def outlying(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """Mark the readings that are far off their neighbours, where there are enough to matter to a fit, shape `(n,)`.
-
-    Parameters
-    ----------
-    residual_um
-        What the fit leaves, shape `(n,)`.
-    fitted
-        Which samples were fitted, shape `(n,)`.
-    """
+    """Mark readings far off their neighbours, where there are enough to matter to a fit, shape `(n,)`."""
     bad = impulsive(residual_um) & fitted
     height = _height(residual_um)
     if bad.any():
@@ -105,9 +87,9 @@ def _height(residual_um: np.ndarray) -> np.ndarray:
     return np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
 
 
-def impulses(record: Record, residual_um: np.ndarray, fitted: np.ndarray, robust: bool) -> list[str]:
+def impulses(run: Run, residual_um: np.ndarray, robust: bool) -> list[str]:
     """Find single readings that are far off their neighbours, and name their number and size."""
-    bad = outlying(residual_um, fitted)
+    bad = outlying(residual_um, run.fitted)
     if not bad.any():
         return []
     count, height = int(bad.sum()), _height(residual_um)[bad]
@@ -119,8 +101,8 @@ def impulses(record: Record, residual_um: np.ndarray, fitted: np.ndarray, robust
         else "they pull the fit: fit again with --loss huber, to which they count less, or leave them out"
     )
     return [
-        f"{record.source}: {count} readings ({100 * count / fitted.sum():.2g} %) jump out by {np.median(height):.3g} "
-        f"um in the median and back, samples {listed}{more}: these are outliers; {remedy}"
+        f"{run.record.source}: {count} readings ({100 * count / run.fitted.sum():.2g} %) jump out by "
+        f"{np.median(height):.3g} um in the median and back, samples {listed}{more}: these are outliers; {remedy}"
     ]
 
 
@@ -137,14 +119,13 @@ def without_impulses(record: Record) -> Record:
 
 def impulsive(residual_um: np.ndarray, digit_um: float = 0.0) -> np.ndarray:
     """Mark readings that are far off their neighbours, in last digits, too, shape `(n,)`."""
-    off = np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
+    off = _height(residual_um)
     spread = np.maximum(median_filter(off, 101, mode="nearest"), max(float(np.median(off)), digit_um))
     far = off > _IMPULSE * 1.4826 * spread + 1e-300
     # What rings, or turns back, goes on as fast as it came: its neighbours move about as far from sample to sample.
     steps = np.abs(np.diff(residual_um, append=residual_um[-1]))
     far &= off > _ALONE * median_filter(steps, 2 * _AROUND + 1, mode="nearest")
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
-    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+    for first, stop in stretches(far):
         if stop - first > _TOGETHER:
             far[first:stop] = False
     return far

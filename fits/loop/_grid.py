@@ -16,10 +16,11 @@ from scipy.optimize import nnls
 from fits.loop._evidence import Posterior, effective, maximise_evidence, posterior, renew_noise
 from fits.loop._moments import Data, Moments, blocks_of
 from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
-from fits.stats._estimate import Estimate
 from fits.stats._noise import shared_square
 from fits.stats._nonnegative import BlockPivoting
+from microid import Preisach
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
 EVIDENCE_LEVELS = 16
@@ -30,48 +31,44 @@ _SAME_NOISE = 0.02
 _ATOL = 1e-6
 _STEPS = 500
 # Steps per column where one column at a time is bounded or let go.
-_TURNS = 30
+_STEPS_PER_COLUMN = 30
 # More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
-_SLOWLY = 1100
+_MOST_COLUMNS = 1100
 # At least this many columns are bounded at first.
-_FEW = 64
+_FIRST_BOUNDED = 64
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What every family's solver hands over: a model in um, with no offset, how sure it is, and what it leaves.
+
+    `factor_um @ factor_um.T` is the covariance of the columns of a grid of `levels`, which may be coarser than the
+    model's. `noise_um` is the standard deviation of the residual, of which so many samples as `correlation` are worth
+    one independent one. `discrepancy_um` is that of the model's own error that the covariance does not own up to.
+    """
+
+    model: Preisach
+    levels: int
+    factor_um: Float[Array, "D k"]
+    noise_um: float
+    correlation: float
+    discrepancy_um: float
 
 
 @dataclass(frozen=True)
 class GridSolution:
-    """Weights and slopes of a grid, in strokes.
-
-    Attributes
-    ----------
-    columns
-        Non-negative solution, shape `(D,)`.
-    belief
-        Gaussian posterior it is the constrained mode of.
-    hyper
-        Smoothness and noise that the data chose.
-    result
-        Status of the regression.
-    """
+    """Non-negative weights and slopes of a grid, in strokes, and the Gaussian posterior they are the mode of."""
 
     columns: Float[Array, " D"]
     belief: Posterior
     hyper: Hyper
-    result: RESULTS
 
 
 def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -> GridSolution:
-    """Find the most probable non-negative columns, smoothness and noise.
+    """Find the most probable non-negative columns, smoothness and noise, all in strokes.
 
-    Parameters
-    ----------
-    data
-        Moments of the runs.
-    stroke_um
-        Unit of the columns and the noise.
-    correlation
-        Samples that are worth one independent one.
-    start
-        Smoothness and noise to start the search from.
+    So many samples as `correlation` are worth one independent one; the search begins at `start`. A `FitError` if the
+    regression does not converge.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
@@ -89,26 +86,32 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
         hyper = maximise_evidence(moments, rough, start)
         belief = posterior(moments, rough, hyper)
     if np.all(np.asarray(belief.mean) >= 0):
-        done: Any = RESULTS.successful
-        return GridSolution(belief.mean, belief, hyper, done)
+        return GridSolution(belief.mean, belief, hyper)
     columns, result = non_negative(belief)
-    return GridSolution(columns, belief, hyper, result)
+    if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
+        raise FitError(FitStatus.MAX_STEPS)
+    if result != RESULTS.successful:
+        raise FitError(FitStatus.NONFINITE)
+    return GridSolution(columns, belief, hyper)
 
 
 def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     """Find the mode of the belief among non-negative columns.
 
     Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
-    those ends up below zero, more are bounded. The answer is that of all bounds together.
+    those ends up below zero, more are bounded. The answer is that of all bounds together. Active-set solvers such as
+    `scipy.optimize.nnls` take one column at a time, and minutes for the thousands of a fine grid.
     """
     scale = np.sqrt(np.diagonal(belief.precision))
     lowest = np.asarray(belief.mean) * scale
     size = len(lowest)
-    bounded = _FEW
+    bounded = _FIRST_BOUNDED
     while True:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
-        columns, result = _bounded(belief, jnp.asarray(order))
+        spread, precision, mean, unit = _marginal(belief, jnp.asarray(order))
+        y, result = _pivot(precision, mean)
+        columns = _follow(belief, jnp.asarray(order), spread, precision, (y - mean, y), unit)
         left = np.asarray(columns) * scale
         if result != RESULTS.successful:
             return _one_by_one(belief)
@@ -122,23 +125,17 @@ def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
     precision = np.asarray(belief.precision)
     over: Any = RESULTS.nonlinear_max_steps_reached
-    if len(precision) > _SLOWLY:
+    if len(precision) > _MOST_COLUMNS:
         return jnp.maximum(belief.mean, 0), over
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
     done: Any = RESULTS.successful
     try:
-        columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_TURNS * len(scale))
+        columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_STEPS_PER_COLUMN * len(scale))
     except RuntimeError:
         return jnp.maximum(belief.mean, 0), over
     return jnp.asarray(columns / scale), done
-
-
-def _bounded(belief: Posterior, which: Int[Array, " k"]) -> tuple[Float[Array, " D"], RESULTS]:
-    spread, precision, mean, scale = _marginal(belief, which)
-    y, result = _pivot(precision, mean)
-    return _follow(belief, which, spread, precision, (y - mean, y), scale), result
 
 
 @eqx.filter_jit
@@ -216,24 +213,17 @@ def grid_estimate(
 def cross_validate(
     data: Data, runs: Sequence[Run], stroke_um: float, correlation: float, hyper: Hyper, levels: int
 ) -> tuple[float, float]:
-    """Predict each block of every run from the others, with the smoothness and noise given.
+    """Predict each block of every run from the others, with the smoothness and noise given, on few levels.
 
-    Done with at most `levels` levels: the grid's own to compare resolutions, fewer where only the discrepancy counts.
-
-    Returns
-    -------
-    error_um
-        Root mean square error, up to a constant in each block.
-    discrepancy_um
-        Standard deviation of what the posterior does not own up to: the part of the error that neighbouring samples
-        share, and that therefore is not noise, beyond the posterior's own. Zero where there is none.
+    Returns the root mean square error in um, up to a constant in each block, and the model discrepancy in um: the
+    part of the error that neighbouring samples share, which is no noise, beyond the posterior's own; zero if none.
     """
     rough, blocks, basis = roughness(data.grid.levels), data.blocks, None
     if levels < data.grid.levels:
         basis = interpolation(levels, data.grid.levels)
         rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
     whole = sum(blocks[1:], start=blocks[0])
-    pairs = [(run, blocks_of(run)) for run in runs]
+    labels = [blocks_of(run) for run in runs]
     squares = shared = expected = count = 0.0
     for number, block in enumerate(blocks):
         if not block.count > 0:
@@ -243,23 +233,16 @@ def cross_validate(
         columns = np.asarray(belief.mean if basis is None else basis @ belief.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
         # A short run may have no sample in a block.
-        off = [
-            _weighed_off(run, run.displacement_um - simulate_run(model, run), label == number)
-            for run, label in pairs
-            if np.any(label == number)
-        ]
+        off = []
+        for run, label in zip(runs, labels, strict=True):
+            if (inside := label == number).any():
+                left = run.displacement_um - simulate_run(model, run)
+                off.append(run.weighed(left - run.mean(left, inside))[inside])
         squares += sum(float(np.sum(o**2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)
         expected += float(_expected_square(belief, block)) * stroke_um**2
         count += float(block.count)
     return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
-
-
-def _weighed_off(run: Run, off_um: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Errors of some samples, without their mean, as large as they count."""
-    weight = None if run.weight is None else run.weight[samples]
-    centred = off_um - np.average(off_um[samples], weights=weight)
-    return np.asarray(run.weighed(centred)[samples])
 
 
 @eqx.filter_jit

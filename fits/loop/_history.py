@@ -48,39 +48,22 @@ def _solve(args: tuple[Preisach, Array, Array, Array]) -> Staircase:
     return _staircase(solution.value, args[0], args[1][0])
 
 
-def estimate_start(model: Preisach, run: Run, noise_um: float) -> Staircase | None:
-    """Fit the memory before the first sample to the samples that depend on it.
+def estimate_start(model: Preisach, run: Run, noise_um: float) -> Staircase:
+    """Fit the memory before the first sample to the samples that depend on it; the model has this run's offset.
 
     The output is differentiable in the remembered extremes as it is in any voltage, so the extremes themselves are
     the unknowns (Levenberg-Marquardt on `2 x 7` shares of the way from the ends of the range to the first sample).
-
-    Parameters
-    ----------
-    model
-        Fitted to the samples that do not depend on the past, with this run's offset.
-    run
-        The record.
-    noise_um
-        Standard deviation of the residuals.
-
-    Returns
-    -------
-    Staircase or None
-        None where no sample depends on the past.
     """
-    unknown = np.flatnonzero(~run.known)
-    if len(unknown) == 0:
-        return None
-    keep = np.arange(unknown[-1] + 1)
+    keep = np.arange(np.flatnonzero(~run.known)[-1] + 1)
     # Thinned out evenly; the extremes of the path must stay, as they make the memory.
     if len(keep) > _SAMPLES:
-        voltage = run.record.voltage_V[keep]
+        voltage = run.voltage_V[keep]
         turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(voltage))) != 0)
         even = np.linspace(0, len(keep) - 1, max(2, _SAMPLES - len(turns))).astype(np.int64)
         keep = np.unique(np.concatenate([even, turns]))[: 2 * _SAMPLES]
     size = 2 * _SAMPLES
     pad = (0, size - len(keep))
-    voltage = np.pad(run.record.voltage_V[keep], pad, mode="edge")
+    voltage = np.pad(run.voltage_V[keep], pad, mode="edge")
     displacement = np.pad(run.displacement_um[keep], pad)
     weight = np.pad(np.full(len(keep), 1 / noise_um), pad)
     return _solve((model, jnp.asarray(voltage), jnp.asarray(displacement), jnp.asarray(weight)))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fits.io._record import Record
+from fits.loop._run import Run
 from fits.stats._at_rest import idle_stretches, quantum_um
 from fits.stats._whiten import rough_noise_um
 
@@ -19,18 +20,8 @@ _FAR, _FAR_PCT = 2.0, 0.1
 class Misfit:
     """What a fit leaves of the run that it describes worst, against what the sensor's noise would leave.
 
-    Attributes
-    ----------
-    source
-        The run.
-    residual_um
-        Root mean square of its residual over the fitted samples.
-    share_pct
-        The same in % of the run's stroke.
-    noise_um
-        Standard deviation of the sensor's noise, its last digit included.
-    shown_by
-        What the noise was read off, in words.
+    `residual_um` is the root mean square over the fitted samples, `share_pct` the same in % of the run's stroke, and
+    `noise_um` the standard deviation of the sensor's noise, its last digit included, read off what `shown_by` says.
     """
 
     source: str
@@ -50,35 +41,37 @@ class Misfit:
         return self.times_noise > _FAR and self.share_pct > _FAR_PCT
 
 
-def misfits(records: Sequence[Record], residuals: Sequence[np.ndarray], fitted: Sequence[np.ndarray]) -> list[Misfit]:
-    """Compare the residual of each run with the noise of the sensor, which is that of its quietest run.
-
-    Parameters
-    ----------
-    records
-        The fitted runs.
-    residuals
-        What the fit leaves of each, in um, shape `(n,)`.
-    fitted
-        Which samples were fitted, shape `(n,)`.
-    """
+def misfits(runs: Sequence[Run], residuals: Sequence[np.ndarray]) -> list[Misfit]:
+    """Compare the residual of each run, in um, with the noise of the sensor, which is that of its quietest run."""
     noise, shown_by = min(
-        (sensor_noise_um(record, residual) for record, residual in zip(records, residuals, strict=True)),
+        (sensor_noise_um(run.record, residual) for run, residual in zip(runs, residuals, strict=True)),
         key=lambda one: one[0],
     )
     out = []
-    for record, residual, used in zip(records, residuals, fitted, strict=True):
-        assert record.displacement_um is not None
-        left = residual[used] - residual[used].mean()
+    for run, residual in zip(runs, residuals, strict=True):
+        left = residual[run.fitted] - residual[run.fitted].mean()
         rms = float(np.sqrt(np.mean(left**2)))
-        stroke = float(np.ptp(record.displacement_um[used]))
-        out.append(Misfit(record.source, rms, 100 * rms / max(stroke, 1e-300), noise, shown_by))
+        stroke = float(np.ptp(run.displacement_um[run.fitted]))
+        out.append(Misfit(run.record.source, rms, 100 * rms / max(stroke, 1e-300), noise, shown_by))
     return out
 
 
 def worst(found: Sequence[Misfit]) -> Misfit:
     """The run that is furthest from noise."""
     return max(found, key=lambda one: (one.far, one.times_noise))
+
+
+def compare_gains(moved_um: Sequence[np.ndarray], left_um: Sequence[np.ndarray]) -> tuple[int, int, float]:
+    """The runs that move furthest and least far for what a model says of them, and the ratio of the two.
+
+    Of each run the displacement that the model says, and what it leaves, in um.
+    """
+    gains = []
+    for moved, left in zip(moved_um, left_um, strict=True):
+        moved = moved - moved.mean()
+        gains.append(1 + float(moved @ left / max(moved @ moved, 1e-300)))
+    low, high = int(np.argmin(gains)), int(np.argmax(gains))
+    return high, low, gains[high] / gains[low] if gains[low] > 0 else np.inf
 
 
 def sensor_noise_um(record: Record, residual_um: np.ndarray) -> tuple[float, str]:

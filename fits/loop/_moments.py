@@ -27,18 +27,9 @@ def _zero_dimensional(value: Any) -> Any:
 
 
 class Moments(eqx.Module):
-    """Sums over samples of the products of responses and displacement, each run counted from its own mean.
+    """Sums over `count` samples of the products of responses, which have no dimension, and displacement.
 
-    Attributes
-    ----------
-    gram
-        Responses with responses, shape `(D, D)`; dimensionless.
-    cross_um
-        Responses with displacement, shape `(D,)`.
-    energy_um2
-        Displacement with itself.
-    count
-        Number of samples.
+    `gram` is of responses with responses, `cross_um` with displacement, `energy_um2` of displacement with itself.
     """
 
     gram: Float[Array | np.ndarray, "D D"]
@@ -79,18 +70,9 @@ class RunMean:
 
 @dataclass(frozen=True)
 class Data:
-    """Moments of all runs on one grid.
+    """Moments of all runs on one grid: over all fitted samples, and over consecutive fifths of every run's.
 
-    Attributes
-    ----------
-    grid
-        The columns.
-    total
-        Over all fitted samples, each run from its own mean.
-    blocks
-        Over consecutive fifths of every run's fitted samples, each from its own mean.
-    means
-        Of every run.
+    Each run, and each fifth, is counted from its own mean.
     """
 
     grid: Grid
@@ -105,30 +87,21 @@ def blocks_of(run: Run) -> np.ndarray:
     return np.where(run.fitted, order * BLOCKS // max(1, run.fitted.sum()), -1)
 
 
-def gather(grid: Grid, runs: Sequence[Run]) -> Data:
-    """Pass the runs through the regression once.
+def grid_of(runs: Sequence[Run], levels: int) -> Grid:
+    """A grid over the range of some runs, which is that of each."""
+    return Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), levels)
 
-    Parameters
-    ----------
-    grid
-        The columns.
-    runs
-        Prepared runs with displacement.
-    """
+
+def gather(grid: Grid, runs: Sequence[Run]) -> Data:
+    """Pass runs with displacement through the regression once."""
     totals, means = [], []
     blocks: list[list[Moments]] = [[] for _ in range(BLOCKS)]
     levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
     for run in runs:
-        squeezed = compress(
-            run.record.voltage_V,
-            run.displacement_um,
-            run.anchor_V,
-            run.rising,
-            blocks_of(run),
-            levels_V,
-            run.weight,
-        )
-        sums = _sums(grid, squeezed, run.starts[0])
+        path = run.path
+        branches = run.voltage_V, run.displacement_um, path.anchor_V, path.rising
+        squeezed = compress(*branches, blocks_of(run), levels_V, run.weight)
+        sums = _sums(grid, squeezed, path.starts[0])
         for block, part in enumerate(sums):
             blocks[block].append(_centre(part)[0])
         total, mean = _centre(sum(sums[1:], start=sums[0]))

@@ -3,21 +3,19 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._design import Grid
 from fits.loop._evidence import posterior
 from fits.loop._fit_checks import remarks_on
 from fits.loop._grid import non_negative, solve_grid
-from fits.loop._misfit import Misfit, misfits, worst
-from fits.loop._moments import gather
+from fits.loop._misfit import Misfit, compare_gains, misfits, worst
+from fits.loop._moments import gather, grid_of
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, simulate_run
-from fits.stats._noise import correlation_samples
+from fits.stats._noise import WHITE, correlation_samples
 from microid import Preisach
 
 # Levels on which parts are fitted alone: enough to see whether they agree.
@@ -34,7 +32,7 @@ _FARTHEST = 64
 # where more than so many times the noise stays.
 _WORTH, _MUCH, _NEAR = 30.0, 0.4, 2.0
 # What is so near the noise, and as white, holds no delay.
-_QUIET, _WHITE = 1.3, 1.2
+_QUIET = 1.3
 # A hysteresis takes part of a delay for width: it is known to half a sample at best.
 _ROUGHLY = 0.5
 
@@ -49,112 +47,68 @@ def check_loops(
 ) -> tuple[Misfit, list[str]]:
     """Say how far from noise a fitted hysteresis is, and what is wrong with the runs that it was fitted to.
 
-    Parameters
-    ----------
-    runs
-        What was fitted together.
-    prepare
-        Makes a record ready again.
-    model
-        The result.
-    stroke_um, hyper
-        Unit of the columns, and smoothness and noise to start from.
-    robust
-        Whether outliers counted less.
-
-    Raises
-    ------
-    DataError
-        As `disagreements`.
+    `prepare` makes a record ready again; `robust` says whether outliers counted less. A `DataError` as of
+    `disagreements`.
     """
-    records = [run.record for run in runs]
-    known = [left_of(model, run) for run in runs], [run.fitted for run in runs]
-    left = misfits(records, *known)
-    remarks = remarks_on(records, *known, robust)
-    alone = Alone(stroke_um, hyper)
+    residuals = [left_of(model, run) for run in runs]
+    left, remarks = misfits(runs, residuals), remarks_on(runs, residuals, robust)
+    separate = SeparateFits(stroke_um, hyper)
     try:
-        told = disagreements(runs, model, alone, left)
+        told = disagreements(runs, model, separate, left)
     except FitError:
         # Fits of parts are only asked for an opinion.
         told = []
     quiet = all(
-        one.times_noise < _QUIET and correlation_samples([residual[used]]) < _WHITE
-        for one, residual, used in zip(left, *known, strict=True)
+        one.times_noise < _QUIET and correlation_samples([residual[run.fitted]]) < WHITE
+        for one, residual, run in zip(left, residuals, runs, strict=True)
     )
     if not told and not quiet:
-        told = delays(runs, prepare, alone, left)
+        told = delays(runs, prepare, separate, left)
     return worst(left), [*told, *remarks]
 
 
-class Alone:
-    """Fits of single runs, or parts of them, on a coarse grid.
-
-    Parameters
-    ----------
-    stroke_um
-        Unit of the columns.
-    hyper
-        Smoothness and noise to start from.
-    """
+class SeparateFits:
+    """Fits of single runs, or parts of them, on a coarse grid, in strokes, with the smoothness and noise given."""
 
     def __init__(self, stroke_um: float, hyper: Hyper):
         self.stroke_um, self.hyper = stroke_um, hyper
 
     def fit(self, runs: Sequence[Run]) -> Preisach:
         """Fit a hysteresis to some runs; a `FitError` where that fails."""
-        grid = Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), _LEVELS)
-        solution = solve_grid(gather(grid, runs), self.stroke_um, 1.0, self.hyper)
-        return grid.model(np.asarray(solution.columns) * self.stroke_um, np.zeros(()))
+        data = gather(grid_of(runs, _LEVELS), runs)
+        solution = solve_grid(data, self.stroke_um, 1.0, self.hyper)
+        return data.grid.model(np.asarray(solution.columns) * self.stroke_um, np.zeros(()))
 
     def left(self, run: Run) -> np.ndarray:
         """What a run leaves that is fitted alone as smoothly as all are, at its fitted samples, in um."""
-        grid = Grid(jnp.asarray(run.lower_V), jnp.asarray(run.upper_V), _LEVELS)
-        moments = gather(grid, [run]).total.scaled(1.0, self.stroke_um)
+        data = gather(grid_of([run], _LEVELS), [run])
+        moments = data.total.scaled(1.0, self.stroke_um)
         columns, _ = non_negative(posterior(moments, roughness(_LEVELS), self.hyper))
-        return left_of(grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
+        return left_of(data.grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
 
 
 def left_of(model: Preisach, run: Run) -> np.ndarray:
     """Measurement less prediction, the offset taken off over the fitted samples, in um, shape `(n,)`."""
     left = run.displacement_um - simulate_run(model, run)
-    weight = None if run.weight is None else run.weight[run.fitted]
-    return np.asarray(left - np.average(left[run.fitted], weights=weight))
+    return np.asarray(left - run.mean(left, run.fitted))
 
 
-def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequence[Misfit]) -> list[str]:
+def disagreements(runs: Sequence[Run], model: Preisach, separate: SeparateFits, left: Sequence[Misfit]) -> list[str]:
     """Look for runs, and parts of runs, that a hysteresis explains one by one but not together.
 
-    Parameters
-    ----------
-    runs
-        What was fitted together.
-    model
-        The result.
-    alone
-        Fits them alone.
-    left
-        What the joint fit leaves of each run.
-
-    Returns
-    -------
-    list of str
-        A sentence for each disagreement.
-
-    Raises
-    ------
-    DataError
-        If the gains of two runs, or parts, differ by so much that they are not of one rig in one setting.
+    Returns a sentence for each. A `DataError` if the gains of two runs differ by so much that they are not of one rig
+    in one setting.
     """
     if not any(one.far for one in left):
         return []
     remarks = []
-    models = [alone.fit([run]) for run in runs]
+    models = [separate.fit([run]) for run in runs]
     own = [_rms(left_of(one, run)[run.fitted]) for one, run in zip(models, runs, strict=True)]
     together = [_rms(left_of(model, run)[run.fitted]) for run in runs]
     if len(runs) > 1 and _pooled(together, runs) > _TIMES * _pooled(own, runs):
-        gains = [_gain(left_of(model, run), run) for run in runs]
-        low, high = int(np.argmin(gains)), int(np.argmax(gains))
-        ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
+        left_um = [left_of(model, run) for run in runs]
+        said = [(run.displacement_um - one)[run.fitted] for run, one in zip(runs, left_um, strict=True)]
+        high, low, ratio = compare_gains(said, [one[run.fitted] for run, one in zip(runs, left_um, strict=True)])
         names = ", ".join(run.record.source for run in runs)
         strokes = [float(np.ptp(run.displacement_um[run.fitted])) for run in runs]
         apart = ", ".join(f"{100 * rms / stroke:.2g}" for rms, stroke in zip(own, strokes, strict=True))
@@ -169,11 +123,11 @@ def disagreements(runs: Sequence[Run], model: Preisach, alone: Alone, left: Sequ
             raise DataError(sentence)
         remarks.append(sentence)
     for run, rms in zip(runs, own, strict=True):
-        remarks += _changed(run, alone, rms)
+        remarks += _change_point(run, separate, rms)
     return remarks
 
 
-def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
+def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
     """Find the place from where on a run shows another hysteresis."""
     order = np.cumsum(run.fitted)
     total = int(order[-1])
@@ -191,7 +145,7 @@ def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
             first, second = parts(place)
             if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST:
                 break
-            models = alone.fit([first]), alone.fit([second])
+            models = separate.fit([first]), separate.fit([second])
             squares = [
                 np.where(run.fitted, left_of(m, p) ** 2, 0.0) for m, p in zip(models, parts(place), strict=True)
             ]
@@ -218,20 +172,10 @@ def _changed(run: Run, alone: Alone, rms_um: float) -> list[str]:
     return [sentence]
 
 
-def delays(runs: Sequence[Run], prepare: Callable[[Record], Run], alone: Alone, left: Sequence[Misfit]) -> list[str]:
-    """Look for readings that come late, or before their command, by fitting each run again with its voltage shifted.
-
-    Parameters
-    ----------
-    runs
-        What was fitted together.
-    prepare
-        Makes a record ready again.
-    alone
-        Fits them alone.
-    left
-        What the joint fit leaves of each run.
-    """
+def delays(
+    runs: Sequence[Run], prepare: Callable[[Record], Run], separate: SeparateFits, left: Sequence[Misfit]
+) -> list[str]:
+    """Look for readings that come late, or before their command, by fitting each run with its voltage shifted."""
     remarks = []
     for run, miss in zip(runs, left, strict=True):
         interval = float(np.median(np.diff(run.record.time_s)))
@@ -239,7 +183,7 @@ def delays(runs: Sequence[Run], prepare: Callable[[Record], Run], alone: Alone, 
         def residual(samples: float, run: Run = run, interval: float = interval) -> np.ndarray:
             record = run.record
             voltage = np.interp(record.time_s - samples * interval, record.time_s, record.voltage_V)
-            return alone.left(prepare(replace(record, voltage_V=voltage, extra=dict(record.extra))))
+            return separate.left(prepare(replace(record, voltage_V=voltage, extra=dict(record.extra))))
 
         try:
             found = _profile(residual)
@@ -290,13 +234,6 @@ def _profile(residual: Callable[[float], np.ndarray]) -> tuple[float, float, flo
     sd = float(np.sqrt(after / bend / count))
     before = cost(0.0)
     return at, sd, before**0.5, after**0.5, count * float(np.log(before / after)) if after > 0 else np.inf
-
-
-def _gain(left_um: np.ndarray, run: Run) -> float:
-    """How much further a run moves than the model says."""
-    left, said = left_um[run.fitted], (run.displacement_um - left_um)[run.fitted]
-    said = said - said.mean()
-    return 1 + float(said @ left / max(said @ said, 1e-300))
 
 
 def _rms(values: np.ndarray) -> float:

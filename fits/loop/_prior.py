@@ -18,16 +18,9 @@ _CLOSE, _FAR = 0.05, 0.35
 class Hyper(eqx.Module):
     """How smooth and how noisy, as natural logarithms; found from the data by the evidence.
 
-    Attributes
-    ----------
-    log_density
-        Of the weight on the integrated squared curvature of the density, in all directions.
-    log_along
-        Of the additional weight on its curvature along the diagonal: loops of one size are alike at all biases.
-    log_reversible
-        Of the weight on the integrated squared curvature of the reversible slope.
-    log_variance
-        Of the noise variance, in squared strokes.
+    `log_density` weighs the integrated squared curvature of the density in all directions, `log_along` in addition
+    that along the diagonal, as loops of one size are alike at all biases, and `log_reversible` that of the reversible
+    slope. `log_variance` is of the noise, in squared strokes.
     """
 
     log_density: Float[Array, ""]
@@ -43,18 +36,7 @@ class Hyper(eqx.Module):
 
 
 class Roughness(eqx.Module):
-    """Quadratic forms that measure curvature, in the columns of a `Grid`.
-
-    Attributes
-    ----------
-    density
-        Integral over the half-plane of the squared second derivatives of the density, less near the diagonal, shape
-        `(D, D)`.
-    along
-        The same of the second derivative along the diagonal alone, shape `(D, D)`.
-    reversible
-        Integral of the squared second derivative of the reversible slope, shape `(D, D)`.
-    """
+    """Quadratic forms that measure the squared curvature of what `Hyper` weighs, in the columns of a `Grid`."""
 
     density: Float[Array, "D D"]
     along: Float[Array, "D D"]

@@ -1,19 +1,21 @@
-"""What a fit gives back."""
+"""What a fit gives back, of a hysteresis alone or of a whole stage."""
 
 import enum
 from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.io._errors import DataError
-from fits.io._limits import Ranges
+from fits.io._limits import Ranges, measured_ranges
 from fits.io._record import Record
 from fits.loop._misfit import Misfit
-from fits.loop._run import prepare_run, simulate_run
-from fits.loop._uncertainty import Uncertainty, sd_run
-from fits.stats._metrics import Errors
-from microid import Everett, Preisach, Staircase
+from fits.loop._run import Run
+from fits.loop._uncertainty import AbstractUncertainty, Prediction
+from fits.stats._metrics import Errors, errors, loop_width_pct
+from microid import Everett, Preisach, Stage, Staircase, innermost
+
+_M = TypeVar("_M", Preisach, Stage)
 
 
 class FitStatus(enum.Enum):
@@ -59,6 +61,32 @@ class LevelTrial:
 
 
 @dataclass(frozen=True)
+class ParameterEstimate:
+    """One parameter of a stage.
+
+    Attributes
+    ----------
+    name
+        Part and field, such as `mechanics.natural_frequency_Hz`.
+    unit
+        Its unit.
+    value
+        The estimate.
+    sd
+        Its standard deviation, the noise as coloured as the residual is.
+    lower, upper
+        Ends of its 95 % interval, within its bounds.
+    """
+
+    name: str
+    unit: str
+    value: float
+    sd: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
 class RunReport:
     """How a model does on one run.
 
@@ -73,11 +101,18 @@ class RunReport:
     unknown
         Number of samples that depend on an unknown past; neither fitted nor counted in the errors.
     start
-        Memory before the first sample; estimated where it is unknown.
+        Memory before the first sample; a hysteresis alone estimates it where it is unknown.
     loop_measured_pct, loop_model_pct
         Width of the widest loop (Eq. 34); None where the record holds none.
     reached
         Ranges of voltage, slew and displacement in the record, see `fits.io._limits.measured_ranges`.
+    noise_um
+        Standard deviation of the residual, in the fit of a hysteresis that of all runs; None of a run that was only
+        predicted, as are the next two.
+    correlation_samples
+        Number of residual samples that are worth one independent one; 1 for white noise.
+    substeps
+        Steps into which each interval was divided.
     """
 
     source: str
@@ -89,77 +124,130 @@ class RunReport:
     loop_measured_pct: float | None
     loop_model_pct: float | None
     reached: Ranges = field(default_factory=dict)
+    noise_um: float | None = None
+    correlation_samples: float | None = None
+    substeps: int | None = None
+
+    @classmethod
+    def of(
+        cls, run: Run, predicted_um: np.ndarray, offset_um: float, start: Staircase, **figures: Any
+    ) -> "RunReport":
+        """Compare a prediction with a run; further figures are fields of the report."""
+        measured, voltage = run.displacement_um, run.record.voltage_V[run.known]
+        range_um = float(np.ptp(measured[run.known]))
+
+        def compare(samples: np.ndarray) -> Errors | None:
+            if not samples.any() or range_um == 0:
+                return None
+            return errors(measured[samples], predicted_um[samples], range_um)
+
+        return cls(
+            source=run.record.source,
+            offset_um=offset_um,
+            in_sample=compare(run.fitted),
+            held_out=compare(run.held_out),
+            unknown=int(np.sum(~run.known)),
+            start=start,
+            loop_measured_pct=loop_width_pct(voltage, measured[run.known]),
+            loop_model_pct=loop_width_pct(voltage, predicted_um[run.known]),
+            reached=measured_ranges(run.record),
+            **figures,
+        )
 
 
 @dataclass(frozen=True)
-class Prediction:
-    """Predicted displacement of a voltage program.
-
-    Attributes
-    ----------
-    displacement_um
-        Shape `(n,)`.
-    displacement_sd_um
-        Its standard deviation from noise and smoothing, sensor noise not included, shape `(n,)`.
-    """
-
-    displacement_um: np.ndarray
-    displacement_sd_um: np.ndarray
-
-
-@dataclass(frozen=True)
-class FitResult:
-    """A fitted model, and how far to trust it.
+class FitResult(Generic[_M]):
+    """A fitted hysteresis or stage, and how far to trust it.
 
     Attributes
     ----------
     model
-        The Preisach operator, with the offset of the first run.
+        The Preisach operator, or the stage, with the offset of the first run.
     uncertainty
         Of its predictions.
     status
         How the fit ended.
     remarks
         What the user should know, one sentence each.
-    noise_um
-        Standard deviation of the residual at the fitted samples.
-    correlation_samples
-        Number of residual samples that are worth one independent one; 1 for white noise.
-    smoothness
-        Weight on the squared curvature of the density that the data chose, in 1/strokes^2.
-    trials
-        The resolutions tried, in order.
     runs
         One report per fitted run, then one per held-out record.
     misfit
         How far the residual of the run that is described worst is from noise.
+    smoothness
+        Weight on the squared curvature of the density that the data chose, in 1/strokes^2; None where no grid of
+        weights was fitted.
+    trials
+        The resolutions that the fit of a hysteresis tried, in order.
+    parameters
+        Those of a stage outside of the hysteresis' grid, in the order of the solver's coordinates.
+    correlation
+        Between them, shape `(p, p)`.
+    unseen
+        Combinations of them that the data leave open, one sentence each.
     """
 
-    model: Preisach
-    uncertainty: Uncertainty
+    model: _M
+    uncertainty: AbstractUncertainty
     status: FitStatus
     remarks: tuple[str, ...]
-    noise_um: float
-    correlation_samples: float
-    smoothness: float
-    trials: tuple[LevelTrial, ...]
     runs: tuple[RunReport, ...]
     misfit: Misfit | None = None
+    smoothness: float | None = None
+    trials: tuple[LevelTrial, ...] = ()
+    parameters: tuple[ParameterEstimate, ...] = ()
+    correlation: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    unseen: tuple[str, ...] = ()
+
+    def __getitem__(self, name: str) -> ParameterEstimate:
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise KeyError(
+            f"no parameter {name!r} was fitted: choose one of {', '.join(p.name for p in self.parameters)}"
+        )
+
+    @property
+    def fitted_runs(self) -> tuple[RunReport, ...]:
+        """Reports of the runs that were fitted."""
+        return tuple(run for run in self.runs if run.noise_um is not None)
+
+    @property
+    def noise_um(self) -> float:
+        """Standard deviation of the residual at the fitted samples of all runs."""
+        return float(self._pooled([(run.noise_um or 0.0) ** 2 for run in self.fitted_runs])) ** 0.5
+
+    @property
+    def correlation_samples(self) -> float:
+        """Number of residual samples that are worth one independent one, in the mean over the fitted samples."""
+        return self._pooled([run.correlation_samples or 1.0 for run in self.fitted_runs])
+
+    def _pooled(self, values: list[float]) -> float:
+        counts = [run.in_sample.samples if run.in_sample else 0 for run in self.fitted_runs]
+        return float(np.average(values, weights=counts))
+
+    @property
+    def hysteresis(self) -> Preisach:
+        """The Preisach operator, be it the model or a part of it; a `ValueError` where there is none."""
+        parts = [self.model] if isinstance(self.model, Preisach) else map(innermost, self.model.parts)
+        for part in parts:
+            if isinstance(part, Preisach):
+                return part
+        raise ValueError("the stage holds no Preisach operator")
 
     @property
     def weights_um(self) -> Float[Array, "N N"]:
         """The weights of Eq. 9."""
-        return self.model.weights_um
+        return self.hysteresis.weights_um
 
     @property
     def everett(self) -> Everett:
         """The Everett surface, the paper's Preisach function (Eq. 10)."""
-        return self.model.everett
+        return self.hysteresis.everett
 
     @property
     def in_sample(self) -> Errors:
         """Errors on all fitted samples together."""
-        pooled = pool([run.in_sample for run in self.runs])
+        pooled = _pool([run.in_sample for run in self.runs])
         if pooled is None:
             raise ValueError("no run was fitted")
         return pooled
@@ -167,14 +255,14 @@ class FitResult:
     @property
     def held_out(self) -> Errors | None:
         """Errors on all held-out samples together; None where nothing was held out."""
-        return pool([run.held_out for run in self.runs])
+        return _pool([run.held_out for run in self.runs])
 
     def predict(self, record: Record, initial: str = "negative") -> Prediction:
-        """Predict the displacement of a voltage program; see `predict`."""
-        return predict(self.model, self.uncertainty, record, initial)
+        """Predict the displacement of a voltage program; see `fits.predict`."""
+        return self.uncertainty.predict(self.model, record, initial)
 
 
-def pool(parts: list[Errors | None]) -> Errors | None:
+def _pool(parts: list[Errors | None]) -> Errors | None:
     """Combine the errors of several runs; percentages refer to the largest range."""
     given = [part for part in parts if part is not None]
     if not given:
@@ -182,39 +270,3 @@ def pool(parts: list[Errors | None]) -> Errors | None:
     samples = sum(part.samples for part in given)
     rms = np.sqrt(sum(part.samples * part.rms_um**2 for part in given) / samples)
     return Errors(samples, float(rms), max(part.max_um for part in given), max(part.range_um for part in given))
-
-
-def predict(model: Preisach, uncertainty: Uncertainty, record: Record, initial: str = "negative") -> Prediction:
-    """Predict the displacement of a voltage program, with its uncertainty.
-
-    Parameters
-    ----------
-    model, uncertainty
-        From a fit or a model file.
-    record
-        The program; its displacement, if any, is not looked at.
-    initial
-        Memory before the first sample: `negative`, `positive` or `demagnetised`.
-
-    Raises
-    ------
-    DataError
-        If the voltage leaves the range that the model was fitted on.
-    """
-    lower, upper = float(model.density.lower_V), float(model.density.upper_V)
-    refuse_outside(record, lower, upper)
-    run = prepare_run(record, lower, upper, initial, holdout=1.0)
-    return Prediction(simulate_run(model, run), sd_run(uncertainty, run))
-
-
-def refuse_outside(record: Record, lower_V: float, upper_V: float) -> None:
-    """Refuse, in a `DataError`, a program that leaves the range that a model was fitted on."""
-    slack = 1e-9 * (upper_V - lower_V) if np.isfinite(upper_V - lower_V) else 0.0
-    outside = np.flatnonzero((record.voltage_V < lower_V - slack) | (record.voltage_V > upper_V + slack))
-    if len(outside):
-        first = int(outside[0])
-        raise DataError(
-            f"{record.source}: sample {first + 1} (time {record.time_s[first]:g} s) asks for "
-            f"{record.voltage_V[first]:g} V, but the model was fitted between {lower_V:g} and {upper_V:g} V: "
-            "clip the program or fit runs that cover it"
-        )

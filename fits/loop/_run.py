@@ -1,6 +1,8 @@
-"""A record made ready for fitting: its memory, which samples count, and where it is held out."""
+"""A record made ready for fitting: which samples count, what it began from, and what a model needs of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from microid import Preisach, Staircase, demagnetised, negative_saturation, positive_saturation, remember
+from fits.loop._samples import Samples, refine, resized
+from microid import Hold, Preisach, Staircase, demagnetised, negative_saturation, positive_saturation, remember
 
 # All records pass through the same compiled functions in pieces of this many samples.
 _PIECE = 8192
@@ -18,6 +21,8 @@ _STAIRCASES = (64, 512, 4096)
 # range: the first of these that does not cost most of the samples, as peaks of a smooth command miss an end by a
 # little.
 _NEAR = (1e-3, 3e-3, 1e-2)
+# Samples that a run must leave to fit.
+_FEWEST = 50
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 VIRGIN = "virgin"
@@ -25,90 +30,129 @@ VIRGIN = "virgin"
 
 
 @dataclass(frozen=True)
-class Run:
-    """One record and what its voltage alone says about it.
+class Path:
+    """A voltage followed by the memory of relays.
 
-    Attributes
-    ----------
-    record
-        The measured columns.
-    lower_V, upper_V
-        Range of the switching voltages.
-    starts
-        Memory at the beginning of every piece.
-    anchor_V, rising
-        Per sample, the remembered extreme its branch hangs from, and the branch's direction, shape `(n,)`.
-    known
-        Samples whose output does not depend on an unknown past, but for a constant, shape `(n,)`.
-    fitted
-        Samples that may be used for fitting: known and not held out, shape `(n,)`.
-    weight
-        Of each sample in the sum of squares, shape `(n,)`; None where all count alike.
+    `starts` are the memories at the beginning of every piece. Each sample lies on a branch that hangs from the
+    remembered extreme `anchor_V` and is `rising` or not, shape `(n,)`.
+    """
+
+    starts: tuple[Staircase, ...]
+    anchor_V: np.ndarray
+    rising: np.ndarray
+
+
+@dataclass(frozen=True)
+class Run:
+    """A record for the fit of a hysteresis or of a whole stage.
+
+    The switching voltages range from `lower_V` to `upper_V`; `gain` is the voltage at the hysteresis per command, at
+    rest, and `start` the memory before the first sample. Samples are `known` whose output does not depend on an
+    unknown past, but for a constant, and `fitted` those of them that are not held out, shape `(n,)`; `weight` is that
+    of each in the sum of squares, None where all count alike. For a stage the intervals are divided into `stride`
+    steps, between samples the command runs as `hold` says (see `Stage`), and the stage may have been `moving` when
+    the record began.
     """
 
     record: Record
     lower_V: float
     upper_V: float
-    starts: tuple[Staircase, ...]
-    anchor_V: np.ndarray
-    rising: np.ndarray
+    start: Staircase
     known: np.ndarray
     fitted: np.ndarray
     weight: np.ndarray | None = None
-
-    def weighed(self, residual_um: np.ndarray) -> np.ndarray:
-        """Make a residual as large as it counts, shape `(n,)`."""
-        return residual_um if self.weight is None else np.sqrt(self.weight) * residual_um
+    gain: float = 1.0
+    stride: int = 1
+    hold: Hold = "first"
+    moving: bool = False
 
     @property
     def displacement_um(self) -> np.ndarray:
-        """Measured displacement, shape `(n,)`."""
+        """Measured displacement, shape `(n,)`; a `DataError` where there is none."""
         if self.record.displacement_um is None:
             raise DataError(f"{self.record.source}: a displacement column is needed here")
         return self.record.displacement_um
+
+    @property
+    def voltage_V(self) -> np.ndarray:
+        """Voltage at the hysteresis if nothing ahead of it lagged, shape `(n,)`."""
+        return self.gain * self.record.voltage_V
 
     @property
     def held_out(self) -> np.ndarray:
         """Samples that are predicted, not fitted, shape `(n,)`."""
         return self.known & ~self.fitted
 
+    @property
+    def rate_Hz(self) -> float:
+        """Sampling rate, the median if it is uneven."""
+        return float(1 / np.median(np.diff(self.record.time_s)))
 
-def prepare_run(record: Record, lower_V: float, upper_V: float, initial: str, holdout: float) -> Run:
-    """Follow the memory along a record.
+    @property
+    def fit_weight(self) -> np.ndarray:
+        """What each sample counts in the sum of squares, 0 where it is not fitted, shape `(n,)`."""
+        return self.fitted.astype(float) if self.weight is None else self.weight * self.fitted
 
-    Parameters
-    ----------
-    record
-        Measured voltage and displacement.
-    lower_V, upper_V
-        Range of the switching voltages; covers the record.
-    initial
-        Memory before the first sample, one of `INITIAL_STATES`.
-    holdout
-        Fraction at the end that is kept out of the fit.
+    @cached_property
+    def path(self) -> Path:
+        """The voltage followed by the memory, as the fit of a hysteresis alone needs it."""
+        return _walk(self.voltage_V, self.start)
 
-    Raises
-    ------
-    DataError
-        If nothing of the record is left to fit.
+    @cached_property
+    def samples(self) -> Samples:
+        """The run padded and refined in time, as the fit of a stage needs it."""
+        return refine(self.record, self.fit_weight, self.start, self.stride, self.moving, self.hold)
+
+    def weighed(self, residual_um: np.ndarray) -> np.ndarray:
+        """Make a residual as large as it counts, shape `(n,)`."""
+        return residual_um if self.weight is None else np.sqrt(self.weight) * residual_um
+
+    def mean(self, values: np.ndarray, among: np.ndarray) -> float:
+        """Weighted mean of some of the samples."""
+        return float(np.average(values[among], weights=None if self.weight is None else self.weight[among]))
+
+
+def prepare_run(
+    record: Record,
+    range_V: tuple[float, float],
+    initial: str,
+    holdout: float,
+    stride: int = 1,
+    gain: float | None = 1.0,
+    hold: Hold = "first",
+    usable: np.ndarray | None = None,
+) -> Run:
+    """Make a record ready whose command stays in a range; a `DataError` if nothing of it is left to fit.
+
+    The memory before the first sample is `initial`, one of `INITIAL_STATES`, or `VIRGIN`; a fraction at the end is
+    held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Of the samples only those
+    that are `usable` may be fitted, shape `(n,)`. For the others see `Run`.
     """
-    voltage = record.voltage_V
-    starts, anchor_V, rising = _walk(voltage, initial_state(initial, lower_V, upper_V))
-    known = known_samples(voltage, lower_V, upper_V, initial)
-    fitted = known.copy()
+    n, (lower, upper) = len(record), range_V
+    known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
+    fitted = known.copy() if usable is None else known & usable
     if holdout > 0:
-        fitted[len(voltage) - round(holdout * len(voltage)) :] = False
-    if holdout < 1 and fitted.sum() < 50:
+        fitted[n - round(holdout * n) :] = False
+    if holdout < 1 and fitted.sum() < _FEWEST:
         raise DataError(
-            f"{record.source}: only {fitted.sum()} samples are left to fit, 50 are needed: the others come before "
-            "the voltage has been at an end of its range, where its unknown history still counts, or are held out; "
-            "state the initial state with --initial, hold out less, or record a full loop first"
+            f"{record.source}: only {fitted.sum()} samples are left to fit, {_FEWEST} are needed: the others come "
+            "before the voltage has been at an end of its range, where its unknown history still counts, or are held "
+            "out; state the initial state with --initial, hold out less, or start each run with a full loop"
         )
-    return Run(record, lower_V, upper_V, starts, anchor_V, rising, known, fitted)
+    ahead = 1.0 if gain is None else gain
+    lower, upper = ahead * lower, ahead * upper
+    start, unknown = initial_state(initial, lower, upper), initial in ("unknown", VIRGIN)
+    return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown)
+
+
+def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
+    """Range of the commands of all records."""
+    voltages = [record.voltage_V for record in records]
+    return min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
 
 
 def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
-    """Make the memory before a record from its name, one of `INITIAL_STATES`.
+    """Make the memory before a record from its name, one of `INITIAL_STATES`; a `DataError` for another name.
 
     An unknown state is stood in for by negative saturation; the samples that would show the difference are not
     known ones.
@@ -143,28 +187,21 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
     return next(known for known in found if 2 * known.sum() >= found[-1].sum())
 
 
-def _walk(voltage: np.ndarray, start: Staircase) -> tuple[tuple[Staircase, ...], np.ndarray, np.ndarray]:
+def _walk(voltage: np.ndarray, start: Staircase) -> Path:
     for size in _STAIRCASES:
-        walked = _pieces(voltage, _resized(start, size))
-        if walked is not None:
-            return walked
+        path = _followed(voltage, resized(start, size))
+        if path is not None:
+            return path
     raise DataError(
         f"the voltage nests more than {_STAIRCASES[-1]} loops into each other: that is noise, not a drive; "
         "use the commanded voltage"
     )
 
 
-def _resized(start: Staircase, size: int) -> Staircase:
-    old = start.extremes_V.shape[0]
-    if old >= size:
-        return start
-    pad = jnp.full(size - old, start.extremes_V[0])
-    return Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
-
-
-def _pieces(voltage: np.ndarray, start: Staircase) -> tuple[tuple[Staircase, ...], np.ndarray, np.ndarray] | None:
+def _followed(voltage: np.ndarray, start: Staircase) -> Path | None:
+    """Follow a voltage; None where the memory has no room for its extremes."""
     starts, anchors, risings = [], [], []
-    for piece in split(voltage):
+    for piece in _split(voltage):
         starts.append(start)
         anchor, rising, start = _remember(jnp.asarray(piece), start)
         anchors.append(anchor)
@@ -172,16 +209,18 @@ def _pieces(voltage: np.ndarray, start: Staircase) -> tuple[tuple[Staircase, ...
         if np.isnan(start.extremes_V[0]):
             return None
     n = len(voltage)
-    return tuple(starts), np.concatenate(anchors)[:n], np.concatenate(risings)[:n]
+    return Path(tuple(starts), np.concatenate(anchors)[:n], np.concatenate(risings)[:n])
 
 
-def split(values: np.ndarray) -> list[np.ndarray]:
+def _split(values: np.ndarray) -> list[np.ndarray]:
     """Cut values into pieces of one length; the last is filled up with its final value, which changes no memory."""
-    pieces = []
-    for first in range(0, len(values), _PIECE):
-        piece = values[first : first + _PIECE]
-        pieces.append(np.pad(piece, (0, _PIECE - len(piece)), mode="edge"))
-    return pieces
+    padded = np.pad(values, (0, -len(values) % _PIECE), mode="edge")
+    return list(padded.reshape(-1, _PIECE))
+
+
+def voltage_pieces(run: Run) -> list[tuple[Float[Array, " n"], Staircase]]:
+    """The voltage of a run in pieces of one length, each with the memory that it begins with."""
+    return [(jnp.asarray(v), start) for v, start in zip(_split(run.voltage_V), run.path.starts, strict=True)]
 
 
 @eqx.filter_jit
@@ -199,7 +238,6 @@ def _respond(model: Preisach, voltage_V: Float[Array, " n"], start: Staircase) -
 
 
 def simulate_run(model: Preisach, run: Run) -> np.ndarray:
-    """Predict the displacement of a run, in um, shape `(n,)`."""
-    pieces = split(run.record.voltage_V)
-    out = [_respond(model, jnp.asarray(v), start) for v, start in zip(pieces, run.starts, strict=True)]
+    """Predict the displacement of a run by a hysteresis alone, in um, shape `(n,)`."""
+    out = [_respond(model, voltage, start) for voltage, start in voltage_pieces(run)]
     return np.concatenate(out)[: len(run.record)]

@@ -11,11 +11,11 @@ import optimistix as optx
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from fits.loop._design import columns_of
+from fits.loop._grid import Estimate
 from fits.loop._moments import Data, Moments
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
-from fits.stats._estimate import Estimate
 from fits.stats._noise import correlation_samples, shared_square
 from microid import FAMILIES, Coordinates, Preisach, Reversible
 
@@ -33,7 +33,7 @@ _AGREE = 2.0
 # A fit ends where the optimum is closer than this, in standard deviations per parameter that the data determine.
 _STATIONARY = 0.2
 # Directions of the data that hold less than this fraction of its largest are rounding.
-_DUST = 1e-13
+_NEGLIGIBLE = 1e-13
 
 
 class _Problem(eqx.Module):
@@ -99,42 +99,14 @@ def solve_shape(
     key: PRNGKeyArray,
     progress: Callable[[str], None],
 ) -> tuple[Estimate, bool]:
-    """Fit a family that is not linear in its parameters.
+    """Fit a family of `microid.FAMILIES` that is not linear in its parameters.
 
     The record enters through its moments only, so that a start costs milliseconds whatever the record's length.
     The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise
-    is what this family leaves, which may be more than the grid's.
+    is what this family leaves, which may be more than the grid's, in `hyper`.
 
-    Parameters
-    ----------
-    family
-        Name in `microid.FAMILIES`.
-    data
-        Moments of the runs.
-    runs
-        The runs themselves.
-    stroke_um
-        Displacement that the relays account for, roughly.
-    hyper
-        Noise, and smoothness of the reversible part, as the grid found them.
-    starts
-        Number of starts.
-    key
-        Draws the starts.
-    progress
-        Told what is being done.
-
-    Returns
-    -------
-    Estimate
-        The best of all starts.
-    agree
-        Whether the two best starts ended at the same cost.
-
-    Raises
-    ------
-    FitError
-        If no start gives a finite cost, or the best one does not become stationary.
+    Returns the best of all starts, and whether the two best ended at the same cost. A `FitError` if no start gives a
+    finite cost, or the best one does not become stationary.
     """
     grid = data.grid
     moments = data.total.scaled(1.0, stroke_um)
@@ -209,7 +181,7 @@ def solve_shape(
 def _square_root(moments: Moments) -> tuple[Float[Array, "D D"], Float[Array, " D"]]:
     """Factor the moments: `root' root` is the Gram matrix, `root' target` the cross products."""
     value, vector = jnp.linalg.eigh(moments.gram)
-    kept = value > _DUST * value[-1]
+    kept = value > _NEGLIGIBLE * value[-1]
     scale = jnp.sqrt(jnp.where(kept, value, 0))
     seen = vector.T @ moments.cross_um
     return scale[:, None] * vector.T, jnp.where(kept, seen / jnp.where(kept, scale, 1), 0)

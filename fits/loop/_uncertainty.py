@@ -1,20 +1,62 @@
 """How sure a prediction is."""
 
+from abc import abstractmethod
+from dataclasses import dataclass
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from fits.io._errors import DataError
+from fits.io._record import Record
 from fits.loop._design import Grid
-from fits.loop._run import Run, split
-from microid import Staircase, everett, remember
+from fits.loop._run import Run, prepare_run, simulate_run, voltage_pieces
+from microid import Preisach, Stage, Staircase, everett, remember
 
 _BATCH = 32
 
 
-class Uncertainty(eqx.Module):
-    """Independent perturbations of a model, each one standard deviation long.
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted displacement of a voltage program.
+
+    Attributes
+    ----------
+    displacement_um
+        Shape `(n,)`.
+    displacement_sd_um
+        Its standard deviation from noise and smoothing, sensor noise not included, shape `(n,)`; NaN where it is not
+        known.
+    """
+
+    displacement_um: np.ndarray
+    displacement_sd_um: np.ndarray
+
+
+class AbstractUncertainty(eqx.Module):
+    """How sure the predictions of a fitted model are.
+
+    Attributes
+    ----------
+    discrepancy_um
+        Standard deviation of the model's own error, as predicting parts of the record from others shows it.
+    """
+
+    discrepancy_um: eqx.AbstractVar[Float[Array, ""]]
+
+    @abstractmethod
+    def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
+        """Standard deviation of the predicted displacement of a run, shape `(n,)`."""
+
+    @abstractmethod
+    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
+        """Predict the displacement of a voltage program; see `fits.predict`."""
+
+
+class Uncertainty(AbstractUncertainty):
+    """Independent perturbations of a hysteresis, each one standard deviation long.
 
     The variance of a prediction is the sum of the squared responses to all of them: the covariance of the weights,
     carried through the linear operator. To that comes what the model is seen to leave out. It is the uncertainty of
@@ -27,7 +69,7 @@ class Uncertainty(eqx.Module):
     offset_um
         And of the sensor offset, shape `(k,)`.
     discrepancy_um
-        Standard deviation of the model's own error, as predicting parts of the record from others shows it.
+        See `AbstractUncertainty`.
     grid
         The columns.
     """
@@ -37,24 +79,35 @@ class Uncertainty(eqx.Module):
     discrepancy_um: Float[Array, ""]
     grid: Grid
 
-    def sd_um(self, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
-        """Standard deviation of the predicted displacement, shape `(n,)`."""
-        memory = remember(voltage_V, start)
-        n = self.grid.weights
+    def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
+        """Standard deviation of the predicted displacement of a run, shape `(n,)`; it is that of any such model."""
+        del model
+        out = [_sd(self, voltage, start) for voltage, start in voltage_pieces(run)]
+        return np.concatenate(out)[: len(run.record)]
 
-        def variance(perturbation: tuple[Float[Array, " D"], Float[Array, ""]]) -> Float[Array, " n"]:
-            columns, offset = perturbation
-            surface = everett(
-                self.grid.nodes(columns[:n]) / self.grid.range_V**2,
-                columns[n:] / self.grid.range_V,
-                self.grid.lower_V,
-                self.grid.upper_V,
-            )
-            return (surface.respond(memory) + offset) ** 2
+    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
+        """Predict the displacement of a voltage program; see `fits.predict`."""
+        if not isinstance(model, Preisach):
+            raise DataError("the uncertainty is that of a hysteresis, and the model is a stage: fit it again")
+        range_V = float(model.density.lower_V), float(model.density.upper_V)
+        refuse_outside(record, *range_V)
+        run = prepare_run(record, range_V, initial, holdout=1.0)
+        return Prediction(simulate_run(model, run), self.sd_um(model, run))
 
-        # In batches: all at once would take k times the memory of a simulation.
-        each = lax.map(variance, (self.columns_um, self.offset_um), batch_size=_BATCH)
-        return jnp.sqrt(jnp.sum(each, axis=0) + self.discrepancy_um**2)
+
+@eqx.filter_jit
+def _sd(uncertainty: Uncertainty, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
+    memory, grid = remember(voltage_V, start), uncertainty.grid
+    n = grid.weights
+
+    def variance(perturbation: tuple[Float[Array, " D"], Float[Array, ""]]) -> Float[Array, " n"]:
+        columns, offset = perturbation
+        nodes, slopes = grid.nodes(columns[:n]) / grid.range_V**2, columns[n:] / grid.range_V
+        return (everett(nodes, slopes, grid.lower_V, grid.upper_V).respond(memory) + offset) ** 2
+
+    # In batches: all at once would take k times the memory of a simulation.
+    each = lax.map(variance, (uncertainty.columns_um, uncertainty.offset_um), batch_size=_BATCH)
+    return jnp.sqrt(jnp.sum(each, axis=0) + uncertainty.discrepancy_um**2)
 
 
 @eqx.filter_jit
@@ -65,34 +118,24 @@ def perturbations(
     offset_sd_um: Float[Array, ""],
     discrepancy_um: Float[Array, ""],
 ) -> Uncertainty:
-    """Turn a factor of the covariance into perturbations of a model.
+    """Turn a factor of the covariance of the columns, `factor @ factor.T`, into perturbations of a model.
 
-    Parameters
-    ----------
-    grid
-        The columns.
-    factor_um
-        `factor @ factor.T` is the covariance of the columns in um^2.
-    mean_response
-        Mean response of the run whose mean displacement fixes the offset.
-    offset_sd_um
-        Standard deviation of that mean.
-    discrepancy_um
-        See `Uncertainty`.
+    The offset is fixed by the mean displacement of a run: it makes up for what a perturbation does to the run's mean
+    response, and has the standard deviation of that mean.
     """
-    # The offset makes up for what a perturbation does to the mean of the record.
     columns = jnp.concatenate([factor_um.T, jnp.zeros((1, grid.columns))])
     offsets = jnp.append(-(mean_response @ factor_um), offset_sd_um)
     return Uncertainty(columns, offsets, discrepancy_um, grid)
 
 
-@eqx.filter_jit
-def _sd(uncertainty: Uncertainty, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
-    return uncertainty.sd_um(voltage_V, start)
-
-
-def sd_run(uncertainty: Uncertainty, run: Run) -> np.ndarray:
-    """Standard deviation of the predicted displacement of a run, in um, shape `(n,)`."""
-    pieces = split(run.record.voltage_V)
-    out = [_sd(uncertainty, jnp.asarray(v), start) for v, start in zip(pieces, run.starts, strict=True)]
-    return np.concatenate(out)[: len(run.record)]
+def refuse_outside(record: Record, lower_V: float, upper_V: float) -> None:
+    """Refuse, in a `DataError`, a program that leaves the range that a model was fitted on."""
+    slack = 1e-9 * (upper_V - lower_V) if np.isfinite(upper_V - lower_V) else 0.0
+    outside = np.flatnonzero((record.voltage_V < lower_V - slack) | (record.voltage_V > upper_V + slack))
+    if len(outside):
+        first = int(outside[0])
+        raise DataError(
+            f"{record.source}: sample {first + 1} (time {record.time_s[first]:g} s) asks for "
+            f"{record.voltage_V[first]:g} V, but the model was fitted between {lower_V:g} and {upper_V:g} V: "
+            "clip the program or fit runs that cover it"
+        )

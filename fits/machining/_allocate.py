@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from scipy.optimize import NonlinearConstraint, minimize, nnls
 
 from fits.io._errors import DataError
-from fits.machining._design import Design
-from fits.machining._second_order import check, first_order, inputs_of, nominal, second_order, setting, twin
+from fits.machining._design import Design, lever_mm
+from fits.machining._gains import gain_model, gradient, inputs_of, twin
+from fits.machining._second_order import second_order
+from fits.machining._tolerances import check, check_independent, tolerances
 from microid import DIMENSIONS, Axis
 
 Limit = Literal["three_sigma", "worst_case"]
@@ -106,13 +108,13 @@ def allocate(
     _check(design, budget_pct, cost or {}, limit, bounds_mm)
     axes = _tightest(budget_pct)
     names = tuple(dict.fromkeys(name for axis in axes for name in inputs_of(axis, voltage)))
-    tolerance = np.array([design.tolerance[name] for name in names])
+    tolerance = tolerances(design, names)
     if not np.all(tolerance > 0):
         name = names[int(np.argmin(tolerance))]
         raise DataError(f"the cost of {name} at its present tolerance of zero is infinite: give it a positive one")
     price = np.array([(cost or {}).get(name, 1.0) for name in names])
-    leg = np.array([float(design.geometry[DIMENSIONS[n].leg or ""]) if DIMENSIONS[n].leg else 1.0 for n in names])
-    lower, upper = (np.log(bound / leg / tolerance) for bound in bounds_mm)
+    lever = np.array([lever_mm(design.geometry, name) for name in names])
+    lower, upper = (np.log(bound / lever / tolerance) for bound in bounds_mm)
     for axis in axes:
         straight = np.log(_straight(design, axis, names, voltage, curvature_share * budget_pct[axis]) / tolerance)
         upper = np.maximum(lower, np.minimum(upper, straight))
@@ -202,17 +204,15 @@ class _Problem:
 
 def _effect_pct(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool) -> _Vector:
     """Relative derivatives of a gain with respect to all names, in percent per mm or rad."""
-    own = inputs_of(axis, voltage)
-    value, slopes = first_order(nominal(design, own), twin(axis), own, *setting(design, voltage))
-    by_name = dict(zip(own, np.asarray(slopes).tolist(), strict=True))
-    return np.array([100 * by_name.get(name, 0.0) / float(value) for name in names])
+    value, slopes = gradient(gain_model(design, voltage), twin(axis), names)
+    return np.asarray(100 * slopes / value)
 
 
 def _straight(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool, share_pct: float) -> _Vector:
     """Tolerances at which the second order of each dimension alone comes to so much."""
     if not np.isfinite(share_pct):
         return np.full(len(names), np.inf)
-    expanded = second_order(design, twin(axis), voltage=voltage)
+    expanded = second_order(design, axis, voltage=voltage)
     bend = np.abs(np.diagonal(expanded.hessian)) / abs(expanded.gain) / 2
     allowed = dict(zip(expanded.names, np.sqrt(share_pct / 100 / np.maximum(bend, 1e-300)), strict=True))
     return np.array([allowed.get(name, np.inf) for name in names])
@@ -237,12 +237,9 @@ def _check(
     check(design, tuple(budget_pct), "normal")
     if limit not in _POWERS:
         raise DataError(f"there is no limit {limit!r}: choose one of {', '.join(_POWERS)}")
-    if limit == "three_sigma" and design.together:
-        names = ", ".join(design.together[0].dimensions)
-        raise DataError(
-            f"{names} go together, and three standard deviations are allocated to independent dimensions only: "
-            "choose the worst_case, or a design without `together`"
-        )
+    if limit == "three_sigma":
+        why = "three standard deviations are allocated to independent dimensions only: choose the worst_case"
+        check_independent(design, why)
     for what, given in (("budget", budget_pct), ("cost", cost)):
         for name, value in given.items():
             if not (np.isfinite(value) and value > 0):

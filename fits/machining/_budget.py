@@ -6,18 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import NDArray
 
 import microid as m
 from fits.control._compensate_stage import static_equivalent
 from fits.io._errors import DataError
 from fits.machining._design import Design
+from fits.machining._gains import once_per_function, quick_jit, require_float64
 from fits.machining._idle import IdleNoise
-from fits.machining._sensitivity import _ALIKE, _derive, quick_jit
+from fits.machining._sensitivity import derivatives_of, output_scale, refuse_infinite
 
 Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
 MEASURES: tuple[Measures, ...] = ("pzt", *m.AXES)
@@ -66,13 +65,9 @@ class AxisBudget:
         Output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
     driving_highest, driving_lowest
         Largest driving errors to either side, with their signs.
-    machining_signed
-        Sum over all dimensions, each at plus one tolerance, the elongation being imposed (Eq. 4).
-    machining_worst_case
-        Sum of the sizes.
-    machining_root_sum_square
-        For errors that are independent, or correlated as the design says; for normal ones of three standard
-        deviations.
+    machining_signed, machining_worst_case, machining_root_sum_square
+        Of all dimensions, each at plus one tolerance, the elongation being imposed (Eq. 4): the sum, the sum of the
+        sizes, and the root of the sum of squares with the design's correlations.
     machining_voltage_worst_case, machining_voltage_root_sum_square
         The same with the voltage being imposed, which the paper leaves out: the input stiffness then acts too.
     measuring
@@ -116,13 +111,10 @@ class AxisBudget:
     @property
     def shares(self) -> dict[str, float]:
         """What part of the squares in `root_sum_square` is from driving, machining and measuring."""
-        parts = {
-            "driving": self.driving,
-            "machining": self.machining_root_sum_square,
-            "measuring": self.measuring or 0.0,
-        }
-        total = sum(part**2 for part in parts.values())
-        return {name: part**2 / total if total > 0 else 0.0 for name, part in parts.items()}
+        parts = self.driving, self.machining_root_sum_square, self.measuring or 0.0
+        total = sum(part**2 for part in parts)
+        shares = (part**2 / total if total > 0 else 0.0 for part in parts)
+        return dict(zip(("driving", "machining", "measuring"), shares, strict=True))
 
 
 @dataclass(frozen=True)
@@ -137,14 +129,10 @@ class Budget:
         Of the piezo.
     measures
         What the displacement of the model was: the piezo's elongation (`pzt`), or the output of an axis.
-    noise_um
-        Measuring error of the sensor.
-    zeroed
-        Whether its offset is left out of that.
-    arm_mm
-        Distance from the axis of rotation at which the sensor reads, or None.
-    level
-        Of the motion functions.
+    noise_um, zeroed
+        Measuring error of the sensor, and whether its offset is left out of that.
+    arm_mm, level
+        Distance from the axis of rotation at which the sensor reads, or None; and level of the motion functions.
     remarks
         What a reader must know, one sentence each.
     """
@@ -201,24 +189,14 @@ def budget(
     RuntimeError
         If JAX is not in double precision.
     """
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError('budgets need float64: jax.config.update("jax_enable_x64", True)')
+    require_float64("budgets")
     if arm_mm is not None and not (math.isfinite(arm_mm) and arm_mm > 0):
         raise DataError(f"expected an arm above 0 mm, found {arm_mm:g}; give the distance from the axis of rotation.")
     driving = _driving(design, model, measures, arm_mm)
     noise_um = idle.error_um(zeroed)
-    found: dict[m.Axis, AxisBudget] = {}
-    for axis in axes:
-        known = next((each for name, each in found.items() if _alike(name) == _alike(axis)), None)
-        measuring = _reading(axis, noise_um, arm_mm)
-        found[axis] = dataclasses.replace(known or _of_axis(design, _alike(axis), driving, measuring), axis=axis)
+    found = once_per_function(axes, lambda axis: _of_axis(design, axis, driving, _reading(axis, noise_um, arm_mm)))
     remarks = (*_remarks(design, found, driving, arm_mm), *(f"Idle record: {remark}" for remark in idle.remarks))
     return Budget(found, driving, measures, noise_um, zeroed, arm_mm, design.level, remarks)
-
-
-def _alike(axis: m.Axis) -> m.Axis:
-    """The axis itself, or the one with the same motion function."""
-    return _ALIKE.get(axis, axis)
 
 
 def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, arm_mm: float | None) -> Driving:
@@ -230,28 +208,23 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
     # What the model calls a um is this many of the piezo.
     scale = 1.0
     if measures != "pzt":
-        # A rotation in um at its arm.
-        per_rad = 1.0
+        # The model's um per unit of the output, which is a rotation at an arm where it is in rad.
+        per_unit = 1.0
         if m.MOTIONS[measures].unit == "rad":
             if arm_mm is None:
                 raise DataError(
                     f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
                 )
-            per_rad = 1e3 * arm_mm
-        found = _derive(_alike(measures), design.geometry, design.constants, design.actuation)
-        scale = 1 / (per_rad * float(found.gain))
+            per_unit = 1e3 * arm_mm
+        scale = 1 / (per_unit * float(derivatives_of(design, measures).gain))
     stroke_um = scale * float(highest_um)
     if not stroke_um > 0:
         raise DataError(
             f"expected a model that moves between {lower_V:g} and {upper_V:g} V, found one that does not; fit it "
             "again."
         )
-    return Driving(
-        stroke_um,
-        scale * float(error.slope_um_per_V),
-        scale * float(error.signed_um.max()),
-        scale * float(error.signed_um.min()),
-    )
+    figures = error.slope_um_per_V, error.signed_um.max(), error.signed_um.min()
+    return Driving(stroke_um, *(scale * float(figure) for figure in figures))
 
 
 @quick_jit
@@ -263,21 +236,17 @@ def _loop(law: m.Preisach, voltage_V: Float[Array, " n"]) -> tuple[m.DrivingErro
 
 
 def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | None) -> AxisBudget:
-    scale, unit = (1e6, "urad") if m.MOTIONS[axis].unit == "rad" else (1.0, "um")
+    scale, unit = output_scale(axis)
     # The load takes a fixed part of any free elongation.
-    usual = _derive(axis, design.geometry, design.constants, design.actuation)
-    free_um = driving.stroke_um * float(design.actuation.free_stroke_um / usual.loaded_stroke_um)
+    loaded_um = derivatives_of(design, axis).loaded_stroke_um
+    free_um = driving.stroke_um * float(design.actuation.free_stroke_um / loaded_um)
     actuation = dataclasses.replace(design.actuation, free_stroke_um=jnp.asarray(free_um))
-    derived = _derive(axis, design.geometry, design.constants, actuation)
+    derived = derivatives_of(design, axis, actuation)
     stroke = scale * float(derived.stroke)
     slope = scale * float(derived.by_voltage.piezo) * free_um / driving.stroke_um
     signed, worst, squares = _sums(design, derived.slopes_at_full_stroke, scale)
     _, voltage_worst, voltage_squares = _sums(design, derived.by_voltage.dimensions, scale)
-    if not np.all(np.isfinite([stroke, slope, worst, voltage_worst])):
-        raise DataError(
-            f"{axis}: expected dimensions of a stage that moves, found some that are so small or so large that no "
-            "finite number comes out; correct them."
-        )
+    refuse_infinite(axis, (stroke, slope, worst, voltage_worst))
     return AxisBudget(
         axis=axis,
         output_unit=unit,
@@ -296,7 +265,7 @@ def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | 
 
 def _sums(design: Design, slopes: Mapping[str, Array], scale: float) -> tuple[float, float, float]:
     """Sum of the errors at plus one tolerance, of their sizes, and the root of their squares with correlations."""
-    changes: NDArray[np.float64] = scale * np.array([float(slopes[name]) * design.tolerance[name] for name in slopes])
+    changes = scale * np.array([float(slopes[name]) * design.tolerance[name] for name in slopes])
     variance = float(changes @ design.correlation([*slopes]) @ changes)
     return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
 
@@ -316,10 +285,7 @@ def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, a
             f"The measuring error of {', '.join(turning)} is left out: a displacement sensor reads a rotation at an "
             "arm; give it."
         )
-    loaded_um = max(
-        float(_derive(_alike(axis), design.geometry, design.constants, design.actuation).loaded_stroke_um)
-        for axis in axes
-    )
+    loaded_um = max(float(derivatives_of(design, axis).loaded_stroke_um) for axis in axes)
     if driving.stroke_um > 1.05 * loaded_um:
         remarks.append(
             f"The model elongates its piezo by {driving.stroke_um:.4g} um, but against the stage the piezos of this "

@@ -12,16 +12,12 @@ from jaxtyping import Array, Float
 
 import microid as m
 from fits.machining._design import TOLERANCE_MM, Design
-from fits.machining._sensitivity import (
-    AxisSensitivity,
-    DimensionEffect,
-    SensitivityReport,
-    gains_at,
-    quick_jit,
-    sensitivities,
-)
+from fits.machining._gains import quick_jit
+from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, gains_at, sensitivities
 
 Verdict = Literal["agree", "partly", "disagree"]
+# Verdict, number, unit and reason of a claim.
+_Judgement = tuple[Verdict, float, str, str]
 _AXES: tuple[m.Axis, ...] = ("x", "z", "alpha", "gamma")
 # Below this part of the largest effect of an axis, one can be neglected.
 _NEGLIGIBLE = 0.05
@@ -73,17 +69,24 @@ def paper_claims(design: Design) -> tuple[Claim, ...]:
         See `sensitivities`.
     """
     report = sensitivities(design, _AXES)
+    x, z, alpha, gamma = (report[axis] for axis in _AXES)
+    xy: tuple[m.Axis, ...] = ("x", "y")
+    tilts: tuple[m.Axis, ...] = ("alpha", "beta")
     return (
-        _leaders_of_x(report["x"]),
-        _t1(design, report["x"]),
-        _t4_of_z(report["z"]),
-        _gradual(design, report["z"]),
-        _rise_and_fall(design, report["z"]),
-        _l(report["alpha"]),
-        _negligible(report["alpha"], "l5"),
-        _negligible(report["alpha"], "t4"),
-        _same_amplifiers(report),
-        _leaders_of_gamma(report["gamma"]),
+        Claim(xy, "t1, t2, l1 and la1 have a great influence", *_leaders_of_x(x)),
+        Claim(xy, "t1 has a great influence", *_t1(design, x)),
+        Claim(("z",), "t4 affects the error most", *_t4_of_z(z)),
+        Claim(("z",), "the effect of t4 grows gradually with the machining error", *_gradual(design, z)),
+        Claim(("z",), "the effect of la2 rises sharply, then falls and flattens", *_rise_and_fall(design, z)),
+        Claim(tilts, "l is among the most severe", *_l(alpha)),
+        Claim(tilts, "l5 can be neglected", *_negligible(alpha, "l5")),
+        Claim(tilts, "t4 can be neglected", *_negligible(alpha, "t4")),
+        Claim(
+            ("z", *tilts),
+            "t4 affects z most, and can be neglected in the rotations about x and y",
+            *_same_amplifiers(z, alpha),
+        ),
+        Claim(("gamma",), "t6, t7 and l6 are the most severe", *_leaders_of_gamma(gamma)),
     )
 
 
@@ -130,147 +133,100 @@ def _sign_change(geometry: m.Geometry, constants: m.Constants) -> Float[Array, "
     return (across * back_slope / across_slope - back) / one_leg
 
 
-def _leaders_of_x(x: AxisSensitivity) -> Claim:
-    said = ("t1", "t2", "l1", "la1")
-    lengths = _lengths(x)
-    leaders = [effect.name for effect in lengths[: len(said)]]
-    common = len(set(leaders) & set(said))
-    verdict: Verdict = "agree" if common == len(said) else "partly" if lengths[0].name in said else "disagree"
-    share = 100 * sum(x[name].share_of_variance for name in said)
-    angle = [effect.name for effect in x.dimensions].index("alpha1") + 1
-    return Claim(
-        ("x", "y"),
-        "t1, t2, l1 and la1 have a great influence",
-        verdict,
-        share,
-        "%",
-        f"The largest among the lengths are {_changes(lengths[: len(said)])}; the four named make up {share:.1f} % "
-        f"of the variance. alpha1, for which the paper gives no tolerance, has place {angle} of {len(x.dimensions)}.",
+def _verdict(agree: bool, partly: bool = False) -> Verdict:
+    return "agree" if agree else "partly" if partly else "disagree"
+
+
+def _leaders(axis: AxisSensitivity, said: Sequence[str]) -> tuple[Verdict, float]:
+    """Verdict on the lengths said to have the largest effects, and their share of the variance in percent."""
+    lengths = [effect.name for effect in _lengths(axis)]
+    verdict = _verdict(set(lengths[: len(said)]) == set(said), lengths[0] in said)
+    return verdict, 100 * sum(axis[name].share_of_variance for name in said)
+
+
+def _leaders_of_x(x: AxisSensitivity) -> _Judgement:
+    verdict, share = _leaders(x, ("t1", "t2", "l1", "la1"))
+    reason = (
+        f"The largest among the lengths are {_changes(_lengths(x)[:4])}; the four named make up {share:.1f} % of the "
+        f"variance. alpha1, for which the paper gives no tolerance, has place {_place(x, 'alpha1')}."
     )
+    return verdict, share, "%", reason
 
 
-def _t1(design: Design, x: AxisSensitivity) -> Claim:
+def _t1(design: Design, x: AxisSensitivity) -> _Judgement:
     guides, change = sign_change_guides(design), x["t1"].relative_change_pct
-    severe = abs(change) >= _NEGLIGIBLE * abs(x.dimensions[0].relative_change_pct)
+    severe = _part(x, "t1") >= _NEGLIGIBLE
     if guides is None:
-        return Claim(
-            ("x", "y"),
-            "t1 has a great influence",
-            "agree" if severe else "disagree",
-            change,
-            "%",
-            f"{change:+.3f} % at plus one tolerance, and no number of guiding legs makes it vanish.",
-        )
-    return Claim(
-        ("x", "y"),
-        "t1 has a great influence",
-        "agree" if severe else "partly",
-        guides,
-        "guiding legs",
+        reason = f"{change:+.3f} % at plus one tolerance, and no number of guiding legs makes it vanish."
+        return _verdict(severe), change, "%", reason
+    reason = (
         f"{change:+.3f} % with {design.guides:g} guiding legs, but it changes its sign at {guides:.2f}, as a thicker "
-        "hinge lowers the ratio and stiffens the output; near there terms of second order decide.",
+        "hinge lowers the ratio and stiffens the output; near there terms of second order decide."
     )
+    return _verdict(severe, partly=True), guides, "guiding legs", reason
 
 
-def _t4_of_z(z: AxisSensitivity) -> Claim:
+def _t4_of_z(z: AxisSensitivity) -> _Judgement:
     first, second = z.dimensions[:2]
     ratio = _ratio(z["t4"].relative_change_pct, (second if first.name == "t4" else first).relative_change_pct)
-    return Claim(
-        ("z",),
-        "t4 affects the error most",
-        "agree" if first.name == "t4" else "partly" if ratio >= _SEVERE else "disagree",
-        ratio,
-        "",
-        f"{_changes(z.dimensions)}: t4 has {ratio:.3g} times the effect of the largest other dimension.",
-    )
+    reason = f"{_changes(z.dimensions)}: t4 has {ratio:.3g} times the effect of the largest other dimension."
+    return _verdict(first.name == "t4", ratio >= _SEVERE), ratio, "", reason
 
 
-def _gradual(design: Design, z: AxisSensitivity) -> Claim:
-    bend, one_way = _curve(design, "t4")
-    return Claim(
-        ("z",),
-        "the effect of t4 grows gradually with the machining error",
-        "agree" if one_way else "disagree",
-        z["t4"].relative_change_exact_pct,
-        "%",
-        f"{z['t4'].relative_change_exact_pct:+.3f} % at plus one tolerance; over all of it the curve "
-        f"{'goes one way' if one_way else 'turns'} and is off a straight line by {bend:.2g} % of the output.",
-    )
+def _gradual(design: Design, z: AxisSensitivity) -> _Judgement:
+    _, one_way, reason = _curve(design, z["t4"])
+    return _verdict(one_way), z["t4"].relative_change_exact_pct, "%", reason
 
 
-def _rise_and_fall(design: Design, z: AxisSensitivity) -> Claim:
-    bend, one_way = _curve(design, "la2")
-    return Claim(
-        ("z",),
-        "the effect of la2 rises sharply, then falls and flattens",
-        "disagree" if one_way else "agree",
-        bend,
-        "%",
-        f"{z['la2'].relative_change_exact_pct:+.3f} % at plus one tolerance; over all of it the curve "
-        f"{'goes one way' if one_way else 'turns'} and is off a straight line by {bend:.2g} % of the output. The "
-        "first-order differential that the paper draws is straight and can do neither.",
-    )
+def _rise_and_fall(design: Design, z: AxisSensitivity) -> _Judgement:
+    bend, one_way, reason = _curve(design, z["la2"])
+    reason += " The first-order differential that the paper draws is straight and can do neither."
+    return _verdict(not one_way), bend, "%", reason
 
 
-def _l(alpha: AxisSensitivity) -> Claim:
+def _l(alpha: AxisSensitivity) -> _Judgement:
     first = alpha.dimensions[0]
     ratio = _ratio(first.relative_change_pct, alpha["l"].relative_change_pct)
     # By Eq. 14 of the tilt's lever, the relative change per mm of l is below 2 / (2 l + l5).
     slope_per_mm = abs(first.relative_change_pct) / 100 / alpha["l"].tolerance if alpha["l"].tolerance else 0.0
     below = f"; to have as much, 2 l + l5 would have to be below {2 / slope_per_mm:.2g} mm" if slope_per_mm else ""
-    return Claim(
-        ("alpha", "beta"),
-        "l is among the most severe",
-        "agree" if first.name == "l" else "partly" if ratio * _SEVERE <= 1 else "disagree",
-        ratio,
-        "",
-        f"{first.name} has {ratio:.3g} times the effect of l{below if first.name != 'l' else ''}.",
+    reason = f"{first.name} has {ratio:.3g} times the effect of l{below if first.name != 'l' else ''}."
+    return _verdict(first.name == "l", ratio * _SEVERE <= 1), ratio, "", reason
+
+
+def _negligible(alpha: AxisSensitivity, name: str) -> _Judgement:
+    part = _part(alpha, name)
+    reason = (
+        f"{name} has place {_place(alpha, name)}, with {alpha[name].relative_change_pct:+.3f} % or {100 * part:.3g} "
+        "% of the largest effect."
     )
+    return _verdict(part < _NEGLIGIBLE, part < _SEVERE), 100 * part, "%", reason
 
 
-def _negligible(alpha: AxisSensitivity, name: str) -> Claim:
-    place = [effect.name for effect in alpha.dimensions].index(name) + 1
-    part = _ratio(alpha[name].relative_change_pct, alpha.dimensions[0].relative_change_pct)
-    return Claim(
-        ("alpha", "beta"),
-        f"{name} can be neglected",
-        "agree" if part < _NEGLIGIBLE else "partly" if part < _SEVERE else "disagree",
-        100 * part,
-        "%",
-        f"{name} has place {place} of {len(alpha.dimensions)}, with {alpha[name].relative_change_pct:+.3f} % or "
-        f"{100 * part:.3g} % of the largest effect.",
+def _same_amplifiers(z: AxisSensitivity, alpha: AxisSensitivity) -> _Judgement:
+    of_z, of_alpha = (axis["t4"].derivative / axis.gain for axis in (z, alpha))
+    reason = (
+        f"d ln z / d t4 = {of_z:+.6g} per mm and d ln alpha / d t4 = {of_alpha:+.6g} per mm: the same amplifiers "
+        "drive both, so that the paper contradicts itself."
     )
+    agree = z.dimensions[0].name == "t4" and _part(alpha, "t4") < _NEGLIGIBLE
+    return _verdict(agree), _ratio(of_alpha, of_z), "", reason
 
 
-def _same_amplifiers(report: SensitivityReport) -> Claim:
-    z, alpha = (report[axis]["t4"].derivative / report[axis].gain for axis in ("z", "alpha"))
-    part = _ratio(report["alpha"]["t4"].relative_change_pct, report["alpha"].dimensions[0].relative_change_pct)
-    both = report["z"].dimensions[0].name == "t4" and part < _NEGLIGIBLE
-    return Claim(
-        ("z", "alpha", "beta"),
-        "t4 affects z most, and can be neglected in the rotations about x and y",
-        "agree" if both else "disagree",
-        _ratio(alpha, z),
-        "",
-        f"d ln z / d t4 = {z:+.6g} per mm and d ln alpha / d t4 = {alpha:+.6g} per mm: the same amplifiers drive "
-        "both, so that the paper contradicts itself.",
-    )
+def _leaders_of_gamma(gamma: AxisSensitivity) -> _Judgement:
+    verdict, share = _leaders(gamma, ("t6", "t7", "l6"))
+    changes = _changes(_lengths(gamma))
+    return verdict, share, "%", f"Among the lengths {changes}; the three named make up {share:.1f} % of the variance."
 
 
-def _leaders_of_gamma(gamma: AxisSensitivity) -> Claim:
-    said = ("t6", "t7", "l6")
-    lengths = _lengths(gamma)
-    leaders = {effect.name for effect in lengths[: len(said)]}
-    verdict: Verdict = "agree" if leaders == set(said) else "partly" if lengths[0].name in said else "disagree"
-    share = 100 * sum(gamma[name].share_of_variance for name in said)
-    return Claim(
-        ("gamma",),
-        "t6, t7 and l6 are the most severe",
-        verdict,
-        share,
-        "%",
-        f"Among the lengths {_changes(lengths)}; the three named make up {share:.1f} % of the variance.",
-    )
+def _place(axis: AxisSensitivity, name: str) -> str:
+    """Rank of a dimension by its effect, such as `2 of 5`."""
+    return f"{[effect.name for effect in axis.dimensions].index(name) + 1} of {len(axis.dimensions)}"
+
+
+def _part(axis: AxisSensitivity, name: str) -> float:
+    """Effect of a dimension over the largest."""
+    return _ratio(axis[name].relative_change_pct, axis.dimensions[0].relative_change_pct)
 
 
 def _lengths(axis: AxisSensitivity) -> list[DimensionEffect]:
@@ -286,14 +242,19 @@ def _ratio(one: float, other: float) -> float:
     return abs(one / other) if other else float("inf")
 
 
-def _curve(design: Design, name: str) -> tuple[float, bool]:
-    """How far the output in z over errors of a dimension is off a line, in %, and whether it goes one way."""
+def _curve(design: Design, effect: DimensionEffect) -> tuple[float, bool, str]:
+    """How far the output in z over errors of a dimension is off a line, in %; whether it goes one way; in words."""
     names = m.MOTIONS["z"].dimensions
-    width = design.tolerance[name] or TOLERANCE_MM
+    width = effect.tolerance or TOLERANCE_MM
     errors = np.zeros((_STEPS, len(names)))
-    errors[:, names.index(name)] = np.linspace(-width, width, _STEPS)
+    errors[:, names.index(effect.name)] = np.linspace(-width, width, _STEPS)
     gains = gains_at(design, "z", errors)
     steps = np.diff(gains)
-    straight = np.linspace(gains[0], gains[-1], _STEPS)
-    bend = 100 * float(np.max(np.abs(gains - straight)) / gains[_STEPS // 2])
-    return bend, bool(np.all(steps > 0) or np.all(steps < 0))
+    bend = 100 * float(np.max(np.abs(gains - np.linspace(gains[0], gains[-1], _STEPS))) / gains[_STEPS // 2])
+    one_way = bool(np.all(steps > 0) or np.all(steps < 0))
+    return (
+        bend,
+        one_way,
+        f"{effect.relative_change_exact_pct:+.3f} % at plus one tolerance; over all of it the curve "
+        f"{'goes one way' if one_way else 'turns'} and is off a straight line by {bend:.2g} % of the output.",
+    )

@@ -3,15 +3,15 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import NDArray
 
 import microid as m
 from fits.io._errors import DataError
+from fits.io._typed import nearest
 
 TOLERANCE_MM = 0.02
 LARGEST_ANGLE_RAD = 1.5
@@ -26,14 +26,9 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Together:
-    """Dimensions whose errors go together, as one offset of a wire cut shifts several thicknesses.
+    """Dimensions, named as in `microid.DIMENSIONS`, whose errors go together with a correlation of any two, -1 to 1.
 
-    Attributes
-    ----------
-    dimensions
-        Names in `microid.DIMENSIONS`.
-    correlation
-        Of the errors of any two of them, -1 to 1.
+    One offset of a wire cut, for example, shifts several thicknesses.
     """
 
     dimensions: tuple[str, ...]
@@ -102,34 +97,22 @@ class Design:
 def paper_design(tolerance_mm: float = TOLERANCE_MM) -> Design:
     """Return the paper's stage (Table 1).
 
-    The paper gives no tolerance for angles (erratum 9), here that of a length over its leg, and no value for `l`
-    (erratum 7), here 40 mm.
-
-    Parameters
-    ----------
-    tolerance_mm
-        Of every length.
+    All lengths have one tolerance. The paper gives none for angles (erratum 9), here that of a length over its leg,
+    and no value for `l` (erratum 7), here 40 mm.
     """
     geometry = m.Geometry()
     return Design(geometry, uniform_tolerance(geometry, tolerance_mm))
 
 
 def uniform_tolerance(geometry: m.Geometry, length_mm: float) -> dict[str, float]:
-    """Tolerance of every dimension in its unit, the same for all lengths; angles as `default_tolerance`."""
-    sizes = {name: float(geometry[name]) for name in m.DIMENSIONS}
-    return {name: default_tolerance(name, sizes, length_mm) for name in m.DIMENSIONS}
+    """Tolerance of every dimension in its unit that goes with one of all lengths."""
+    return {name: length_mm / lever_mm(geometry, name) for name in m.DIMENSIONS}
 
 
-def default_tolerance(name: str, sizes: Mapping[str, float], length_mm: float = TOLERANCE_MM) -> float:
-    """Tolerance of a dimension that goes with one of lengths: for an angle, over the leg it is measured along."""
+def lever_mm(geometry: m.Geometry, name: str) -> float:
+    """Length of the leg at whose end an error of an angle is counted as a length; 1 for a length."""
     leg = m.DIMENSIONS[name].leg
-    return length_mm if leg is None else length_mm / sizes[leg]
-
-
-def nearest(name: str, known: Sequence[str]) -> str:
-    """Say what a name may have been meant for."""
-    close = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean {close[0]}?" if close else f"use one of {', '.join(known)}."
+    return 1.0 if leg is None else float(geometry[leg])
 
 
 def _faults(design: Design) -> Iterator[str]:

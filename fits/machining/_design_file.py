@@ -3,16 +3,18 @@
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import msgspec
 
 import microid as m
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_TOML_BYTES, parse_toml, read_text
-from fits.machining._design import TOLERANCE_MM, Design, Together, default_tolerance, nearest
+from fits.io._typed import typed
+from fits.machining._design import TOLERANCE_MM, Design, Together, lever_mm
 
 SCHEMA = "microid.stage/1"
 _DEGREE = math.pi / 180
@@ -23,7 +25,7 @@ _ANGLE = {"rad": (1.0, 1.0), "mrad": (1.0, 1e3), "deg": (_DEGREE, 1.0)}
 _INERTIA = {"kg mm^2": (1.0, 1.0), "kg m^2": (1e6, 1.0)}
 _MASS = {"kg": (1.0, 1.0), "g": (1.0, 1e3)}
 _MODULUS = {"GPa": (1.0, 1.0), "MPa": (1.0, 1e3)}
-_NUMBER: dict[str, tuple[float, float]] = {}
+_NO_UNIT: dict[str, tuple[float, float]] = {}
 _Units = Mapping[str, tuple[float, float]]
 
 # Key, units (the first is the one written), field of `microid.Actuation`, and meaning.
@@ -35,24 +37,52 @@ _ACTUATION: tuple[tuple[str, _Units, str, str], ...] = (
     ("mass_z", _MASS, "mass_z_kg", "moved along z"),
     ("inertia_tilt", _INERTIA, "inertia_tilt_kg_mm2", "turned about x or y"),
     ("inertia_rotor", _INERTIA, "inertia_rotor_kg_mm2", "turned about z"),
-    ("damping_ratio", _NUMBER, "damping_ratio", "of all axes"),
+    ("damping_ratio", _NO_UNIT, "damping_ratio", "of all axes"),
 )
-_TABLES = ("schema", "level", "geometry", "material", "actuation", "together")
+
+
+class _Quantity(msgspec.Struct):
+    value: float
+    unit: str
+
+
+class _Dimension(msgspec.Struct):
+    value: float
+    unit: str
+    tolerance: float | None = None
+
+
+class _Material(msgspec.Struct):
+    youngs_modulus: _Quantity
+    guides: float
+
+
+class _Group(msgspec.Struct):
+    dimensions: list[str]
+    correlation: float
+
+
+_Geometry = msgspec.defstruct("_Geometry", [(name, _Dimension) for name in m.DIMENSIONS])
+_Actuation = msgspec.defstruct("_Actuation", [(key, _Quantity if units else float) for key, units, *_ in _ACTUATION])
+
+
+class _Stage(msgspec.Struct):
+    schema: str
+    level: int
+    geometry: _Geometry  # type: ignore[valid-type]
+    material: _Material
+    actuation: _Actuation  # type: ignore[valid-type]
+    together: list[_Group] = []
 
 
 def read_design(path: str | os.PathLike[str]) -> Design:
-    """Read the design of a stage.
+    """Read the design of a stage, in mm and rad.
 
     Parameters
     ----------
     path
         TOML as `write_design` writes it. Lengths may be in mm, um or m and angles in rad, mrad or deg; a tolerance is
         in the unit of its dimension, and 0.02 mm, for an angle over its leg, where none is given.
-
-    Returns
-    -------
-    Design
-        In mm and rad.
 
     Raises
     ------
@@ -121,108 +151,43 @@ def _design(table: Mapping[str, Any]) -> Design:
     if table.get("schema") != SCHEMA:
         found = shown(table["schema"]) if "schema" in table else "none"
         raise DataError(f"schema: expected {_quoted(SCHEMA)}, found {found}; give that, or another file.")
-    _keys(table, _TABLES, "", optional=("together",))
-    level = table["level"]
-    if isinstance(level, bool) or not isinstance(level, int) or level not in (0, 1):
-        raise DataError(f"level: expected 0 or 1, found {shown(level)}; give one of them.")
-    geometry = _table(table["geometry"], "geometry")
-    _keys(geometry, [*m.DIMENSIONS], "geometry.")
+    stage = typed(table, _Stage)
     sizes, tolerance = {}, {}
     for name, dimension in m.DIMENSIONS.items():
-        scale = _ANGLE if dimension.unit == "rad" else _LENGTH
-        sizes[name], given = _quantity(geometry[name], f"geometry.{name}", scale, tolerated=True)
-        if given is not None:
-            tolerance[name] = given
+        written = getattr(stage.geometry, name)
+        units = _ANGLE if dimension.unit == "rad" else _LENGTH
+        sizes[name] = _converted(written.value, written.unit, units, f"geometry.{name}")
+        if written.tolerance is not None:
+            tolerance[name] = _converted(written.tolerance, written.unit, units, f"geometry.{name}")
+    geometry = m.Geometry(**{m.DIMENSIONS[name].field: jnp.asarray(size) for name, size in sizes.items()})
     for name in m.DIMENSIONS:
-        leg = m.DIMENSIONS[name].leg
-        if name not in tolerance and (leg is None or sizes[leg] > 0):
-            tolerance[name] = default_tolerance(name, sizes, TOLERANCE_MM)
-    material = _table(table["material"], "material")
-    _keys(material, ("youngs_modulus", "guides"), "material.")
-    actuation = _table(table["actuation"], "actuation")
-    _keys(actuation, [key for key, *_ in _ACTUATION], "actuation.")
+        # A leg of no length is refused below.
+        tolerance.setdefault(name, TOLERANCE_MM / (lever_mm(geometry, name) or 1.0))
     moved = {}
-    for key, units, field, _ in _ACTUATION:
-        place = f"actuation.{key}"
-        moved[field], _ = _quantity(actuation[key], place, units) if units else (_number(actuation[key], place), None)
+    for key, scale, field, _ in _ACTUATION:
+        number, place = getattr(stage.actuation, key), f"actuation.{key}"
+        moved[field] = _converted(number.value, number.unit, scale, place) if scale else number
         if not moved[field] > 0:
             raise DataError(f"{place}: expected a number above 0, found {moved[field]:g}; correct it.")
+    modulus = stage.material.youngs_modulus
     return Design(
-        geometry=m.Geometry(**{m.DIMENSIONS[name].field: jnp.asarray(size) for name, size in sizes.items()}),
-        tolerance=tolerance,
-        level=level,
-        guides=_number(material["guides"], "material.guides"),
-        youngs_modulus_GPa=_quantity(material["youngs_modulus"], "material.youngs_modulus", _MODULUS)[0],
+        geometry=geometry,
+        tolerance={name: tolerance[name] for name in m.DIMENSIONS},
+        level=stage.level,
+        guides=stage.material.guides,
+        youngs_modulus_GPa=_converted(modulus.value, modulus.unit, _MODULUS, "material.youngs_modulus"),
         actuation=m.Actuation(**{field: jnp.asarray(value) for field, value in moved.items()}),
-        together=_groups(table.get("together", [])),
+        together=tuple(Together(tuple(group.dimensions), group.correlation) for group in stage.together),
     )
 
 
-def _groups(found: Any) -> tuple[Together, ...]:
-    if not isinstance(found, list):
-        raise DataError(f"together: expected tables [[together]], found {shown(found)}; double the brackets.")
-    groups = []
-    for k, item in enumerate(found):
-        place = f"together[{k}]"
-        group = _table(item, place)
-        _keys(group, ("dimensions", "correlation"), f"{place}.")
-        names = group["dimensions"]
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise DataError(
-                f'{place}.dimensions: expected a list of names, found {shown(names)}; write ["t1", "t2"].'
-            )
-        groups.append(Together(tuple(names), _number(group["correlation"], f"{place}.correlation")))
-    return tuple(groups)
-
-
-def _keys(table: Mapping[str, Any], known: Sequence[str], above: str, optional: Sequence[str] = ()) -> None:
-    """Refuse unknown and missing keys; of both, a misspelt one explains the missing one."""
-    for key in table:
-        if key not in known:
-            raise DataError(f"{above}{_plain(key)}: expected a known key, found {shown(key)}; {nearest(key, known)}")
-    for key in known:
-        if key not in table and key not in optional:
-            raise DataError(f"{above}{key}: expected this key, found none; add it.")
-
-
-def _table(found: Any, place: str) -> Mapping[str, Any]:
-    if not isinstance(found, dict):
-        raise DataError(f"{place}: expected a table, found {shown(found)}; write [{place}] and its keys below.")
-    return found
-
-
-def _quantity(found: Any, place: str, units: _Units, tolerated: bool = False) -> tuple[float, float | None]:
-    """Value and tolerance in the first of some units."""
-    first = next(iter(units))
-    if not isinstance(found, dict):
-        raise DataError(
-            f"{place}: expected a value with its unit, found {shown(found)}; write {{ value = 1.0, unit = "
-            f"{_quoted(first)} }}."
-        )
-    optional = ("tolerance",)
-    _keys(found, ("value", "unit", *(optional if tolerated else ())), f"{place}.", optional)
-    unit = found["unit"]
-    if not isinstance(unit, str) or unit.replace("µ", "u").replace("μ", "u") not in units:
+def _converted(value: float, unit: str, units: _Units, place: str) -> float:
+    """A value in the first of some units."""
+    plain = unit.replace("µ", "u").replace("μ", "u")
+    if plain not in units:
         raise DataError(f"{place}.unit: expected one of {', '.join(units)}, found {shown(unit)}; convert the value.")
-    times, over = units[unit.replace("µ", "u").replace("μ", "u")]
-    value = _number(found["value"], f"{place}.value") * times / over
-    if "tolerance" not in found:
-        return value, None
-    return value, _number(found["tolerance"], f"{place}.tolerance") * times / over
-
-
-def _number(found: Any, place: str) -> float:
-    try:
-        number = math.nan if isinstance(found, bool) or not isinstance(found, int | float) else float(found)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise DataError(f"{place}: expected a finite number, found {shown(found)}; give one without quotes.")
-    return number
-
-
-def _plain(key: str) -> str:
-    return shown(key)[1:-1]
+    times, over = units[plain]
+    return value * times / over
 
 
 def _line_of(text: str, place: str) -> int | None:

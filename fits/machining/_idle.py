@@ -1,7 +1,7 @@
 """The measuring error (Eq. 6): what a sensor reads while the stage is at rest."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from fits.io._errors import DataError
-from fits.io._read_csv import _check_time, _converted
+from fits.io._read_csv import KnownColumns
 from fits.io._record import Reference
-from fits.io._table import data_error, open_table
-from fits.io._units import find_sources
+from fits.io._table import data_error
 from fits.stats._noise import correlation_samples
 from fits.stats._noise_spectrum import NoiseBand, NoiseLine, allan_deviation, find_lines, noise_bands
 
@@ -43,8 +42,7 @@ class IdleNoise:
     samples, rate_Hz, duration_s
         Length of the record; `samples` times the interval between them.
     mean_um, mean_sd_um
-        The offset, and its standard error with the noise's own correlation: neighbouring samples are no independent
-        evidence.
+        The offset, and its standard error with the noise's own correlation.
     sd_um, sd_detrended_um
         Standard deviation about the mean, and about a straight line in time.
     drift_um_per_s, drift_sd_um_per_s
@@ -57,16 +55,13 @@ class IdleNoise:
         Time after which a sample counts as a new one; the sampling interval for white noise.
     frequency_Hz, asd_um_per_rtHz
         Amplitude spectral density, one-sided, shape `(f,)`, by Welch's method without the drift.
-    bands
-        The noise by decades of frequency; the squares add up to the variance about the line.
-    lines
-        Sines above the floor, such as mains hum.
+    bands, lines
+        The noise by decades of frequency, whose squares add up to the variance about the line; and sines above the
+        floor, such as mains hum.
     averaging_s, adev_um, adev_sd_um
         Overlapping Allan deviation of the readings, shape `(a,)`, and its approximate standard error.
     bias_instability_um, bias_instability_s
         Its minimum, and the averaging time at which it is reached: averaging any longer does not help.
-    remarks
-        What a reader must know, one sentence each.
     source
         Name of the file.
     """
@@ -92,8 +87,12 @@ class IdleNoise:
     adev_sd_um: FloatArray
     bias_instability_um: float
     bias_instability_s: float
-    remarks: tuple[str, ...] = ()
     source: str = ""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader must know, one sentence each."""
+        return tuple(_remarks(self))
 
     def error_um(self, zeroed: bool = True, coverage: float = 2.0) -> float:
         """Measuring error that enters Eq. 1, of a single reading within a time as long as the record.
@@ -132,12 +131,8 @@ def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = 
         One sentence with file, line and column: a voltage that changes, fewer than 100 samples, uneven time steps, a
         reading that never changes, or what `read_csv` refuses.
     """
-    table = open_table(path)
-    place = f"{table.path}, line {table.header_line}"
-    sources = find_sources(table.names, columns or {}, ("time_s", "displacement_um"), place)
-    wanted = [name for name in ("time_s", "displacement_um", "voltage_V") if name in sources]
-    values, _ = table.read({sources[name].column for name in wanted})
-    arrays = {name: _converted(table, name, sources[name], values) for name in wanted}
+    read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), ("voltage_V",), alone=True)
+    table, sources, arrays = read.table, read.sources, read.arrays
     if "voltage_V" in arrays:
         voltage_V = arrays["voltage_V"]
         changes = np.flatnonzero(voltage_V != voltage_V[0])
@@ -147,7 +142,6 @@ def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = 
                 "out the part at rest, or drop the column if it is a noisy monitor of a constant voltage"
             )
             raise data_error(table.path, what, table.line(int(changes[0])), sources["voltage_V"].column)
-    _check_time(table, sources["time_s"].column, arrays["time_s"])
     fault = _find_fault(arrays["time_s"], arrays["displacement_um"])
     if fault:
         what, row, name = fault
@@ -181,54 +175,48 @@ def idle_noise(reference: Reference) -> IdleNoise:
     fault = _find_fault(reference.time_s, reference.displacement_um)
     if fault:
         raise DataError(f"{reference.source or 'idle record'}, row {fault[1]}, column '{fault[2]}': {fault[0]}.")
-    readings = reference.displacement_um
-    n = len(readings)
+    readings, n = reference.displacement_um, len(reference.time_s)
     interval_s = float(reference.time_s[-1] - reference.time_s[0]) / (n - 1)
-    rate_Hz, duration_s = 1 / interval_s, n * interval_s
-
+    rate_Hz = 1 / interval_s
     mean = float(readings.mean())
-    centred = readings - mean
     time_s = interval_s * (np.arange(n) - (n - 1) / 2)
     moment = float(time_s @ time_s)
-    drift = float(time_s @ centred) / moment
-    residual = centred - drift * time_s
+    drift = float(time_s @ (readings - mean)) / moment
+    residual = readings - mean - drift * time_s
     # A record without noise but for a straight line has a residual of rounding alone.
     residual = residual if np.ptp(residual) > 1e-9 * np.ptp(readings) else np.zeros(n)
     sd_detrended = float(np.sqrt(residual @ residual / (n - 2)))
     correlation = _correlation_samples(residual)
     error = sd_detrended * np.sqrt(correlation)
-
     segment = min(n, max(_MIN_SEGMENT, n // _SEGMENTS))
     # The drift is gone already; taking more out of each segment would take slow noise with it.
     frequency_Hz, density = signal.welch(residual, rate_Hz, nperseg=segment, detrend=False)
     averaging_s, adev, adev_sd = allan_deviation(readings, interval_s)
     lowest = int(np.argmin(adev))
-
-    figures = {
-        "samples": n,
-        "rate_Hz": rate_Hz,
-        "duration_s": duration_s,
-        "mean_um": mean,
-        "mean_sd_um": float(error / np.sqrt(n)),
-        "sd_um": float(readings.std(ddof=1)),
-        "sd_detrended_um": sd_detrended,
-        "drift_um_per_s": drift,
-        "drift_sd_um_per_s": float(error / np.sqrt(moment)),
-        "peak_to_peak_um": float(np.ptp(readings)),
-        "resolution_um": _quantum(readings),
-        "correlation_s": correlation * interval_s,
-        "frequency_Hz": frequency_Hz[1:],
-        "asd_um_per_rtHz": np.sqrt(density[1:]),
-        "bands": noise_bands(residual, rate_Hz),
-        "lines": find_lines(residual, rate_Hz),
-        "averaging_s": averaging_s,
-        "adev_um": adev,
-        "adev_sd_um": adev_sd,
-        "bias_instability_um": float(adev[lowest]),
-        "bias_instability_s": float(averaging_s[lowest]),
-        "source": reference.source,
-    }
-    return IdleNoise(**figures, remarks=_remarks(IdleNoise(**figures)))
+    return IdleNoise(
+        samples=n,
+        rate_Hz=rate_Hz,
+        duration_s=n * interval_s,
+        mean_um=mean,
+        mean_sd_um=float(error / np.sqrt(n)),
+        sd_um=float(readings.std(ddof=1)),
+        sd_detrended_um=sd_detrended,
+        drift_um_per_s=drift,
+        drift_sd_um_per_s=float(error / np.sqrt(moment)),
+        peak_to_peak_um=float(np.ptp(readings)),
+        resolution_um=_quantum(readings),
+        correlation_s=correlation * interval_s,
+        frequency_Hz=frequency_Hz[1:],
+        asd_um_per_rtHz=np.sqrt(density[1:]),
+        bands=noise_bands(residual, rate_Hz),
+        lines=find_lines(residual, rate_Hz),
+        averaging_s=averaging_s,
+        adev_um=adev,
+        adev_sd_um=adev_sd,
+        bias_instability_um=float(adev[lowest]),
+        bias_instability_s=float(averaging_s[lowest]),
+        source=reference.source,
+    )
 
 
 def _find_fault(time_s: FloatArray, displacement_um: FloatArray) -> tuple[str, int, str] | None:
@@ -285,42 +273,43 @@ def _quantum(readings_um: FloatArray) -> float | None:
     return quantum if np.all(np.abs(steps / quantum - multiples) < 0.1) else None
 
 
-def _remarks(noise: IdleNoise) -> tuple[str, ...]:
-    remarks = [
+def _remarks(noise: IdleNoise) -> Iterator[str]:
+    yield (
         f"The mean of {noise.mean_um:.4g} um is an offset that zeroing the sensor removes; what enters Eq. 1 as the "
         f"measuring error is {noise.error_um():.3g} um, twice the random part. The paper takes the average, "
-        "0.103 um, instead.",
+        "0.103 um, instead."
+    )
+    yield (
         f"The standard deviation is {noise.sd_um:.3g} um and no percentage: the paper's 3.18 % has no reference, and "
-        "0.0318 um would fit its band of 0.05 to 0.15 um.",
-    ]
+        "0.0318 um would fit its band of 0.05 to 0.15 um."
+    )
     if abs(noise.drift_um_per_s) > 3 * noise.drift_sd_um_per_s:
-        remarks.append(
+        yield (
             f"The readings drift by {noise.drift_um_per_s:.3g} um/s, {noise.drift_um_per_s * noise.duration_s:.3g} "
-            "um over the record, so the standard deviation depends on how long one waits; "
-            "zero again from time to time."
+            "um over the record, so the standard deviation depends on how long one waits; zero again from time to "
+            "time."
         )
     if noise.duration_s < _MIN_STRETCHES * noise.correlation_s:
-        remarks.append(
+        yield (
             f"The noise is correlated over {noise.correlation_s:.3g} s, which is long for a record of "
             f"{noise.duration_s:.3g} s: the errors of mean and drift are rough; record for longer."
         )
     if noise.resolution_um is not None and noise.sd_um < noise.resolution_um / 2:
-        remarks.append(
+        yield (
             f"The readings scatter by less than half their quantum of {noise.resolution_um:.3g} um, so their "
             "standard deviation is not that of the noise; no less is counted than an even spread over the quantum."
         )
     if noise.bias_instability_s == noise.averaging_s[-1]:
-        remarks.append(
+        yield (
             "The Allan deviation still falls at the longest averaging time, so the bias instability is an upper "
             "bound; record for longer."
         )
     elif noise.adev_um[-1] - noise.adev_sd_um[-1] > noise.bias_instability_um:
-        remarks.append(
+        yield (
             f"The Allan deviation rises beyond {noise.bias_instability_s:.3g} s: the readings wander, averaging for "
             "longer does not help, and the mean of another record may differ by more than its error says."
         )
     if noise.lines:
         named = ", ".join(f"{line.amplitude_um:.2g} um at {line.frequency_Hz:.4g} Hz" for line in noise.lines[:3])
         more = f" and {len(noise.lines) - 3} more" if len(noise.lines) > 3 else ""
-        remarks.append(f"Narrow lines stand above the floor: {named}{more}; they do not average out as noise does.")
-    return tuple(remarks)
+        yield f"Narrow lines stand above the floor: {named}{more}; they do not average out as noise does."

@@ -3,31 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from scipy.optimize import brentq
-from scipy.special import ndtr
+from jaxtyping import Array
 
 from fits.io._errors import DataError
 from fits.machining._design import Design
-from fits.machining._second_order import (
-    Distribution,
-    SecondOrder,
-    check,
-    covariance,
-    first_order,
-    gain_at,
-    inputs_of,
-    nominal,
-    second_order,
-    setting,
-    tolerances,
-    twin,
-)
-from microid import AXES, MOTIONS, Axis, Constants, Geometry
+from fits.machining._gains import gain_model, gains_of_many, gradient, inputs_of, once_per_function, twin
+from fits.machining._second_order import SecondOrder, second_order
+from fits.machining._tolerances import Distribution, check, copula_root, covariance, from_normal, tolerances
+from microid import AXES, MOTIONS, Axis
 
 # One compiled function serves all calls; the last piece is filled up.
 _CHUNK = 65536
@@ -35,7 +19,6 @@ _QUANTILES_PCT = (0.135, 2.5, 50.0, 97.5, 99.865)
 _FEWEST, _MOST = 1000, 30_000_000
 # First order counts as right within this, and this many standard errors.
 _AGREE, _STANDARD_ERRORS = 0.02, 3.0
-_NODES = 80
 
 
 @dataclass(frozen=True)
@@ -46,18 +29,14 @@ class AxisSpread:
     ----------
     axis, unit
         Which, and the unit of its gain: `um/um` or `rad/um`; per um of free elongation with an imposed voltage.
-    nominal
-        Gain at the nominal dimensions.
-    mean, sd, skewness
-        Of the draws.
+    nominal, mean, sd, skewness
+        Gain at the nominal dimensions, and statistics of the draws.
     sd_error
         Standard error of `sd`, from the fourth moment.
     quantiles
         By percentage: 0.135, 2.5, 50, 97.5 and 99.865.
-    first_order_sd
-        Standard deviation from the gradient.
-    second
-        The expansion to second order where `flagged`, else `None`.
+    first_order_sd, second
+        Standard deviation from the gradient, and the expansion to second order where `flagged`, else `None`.
     """
 
     axis: Axis
@@ -142,28 +121,21 @@ def monte_carlo(
     check(design, axes, distribution)
     if not _FEWEST <= samples <= _MOST:
         raise DataError(f"between {_FEWEST:,} and {_MOST:,} samples are needed, got {samples:,}")
-    # x and y are one function of the same dimensions, and so are alpha and beta.
     different = tuple(dict.fromkeys(twin(axis) for axis in axes))
-    names = tuple(dict.fromkeys(name for axis in different for name in inputs_of(axis, voltage)))
-    gains = _drawn(design, different, names, samples, distribution, seed, voltage, progress)
+    gains = _gains_of_draws(design, different, samples, distribution, seed, voltage, progress)
     progress("summing up")
-    spreads = {
-        axis: _spread(values, design, axis, distribution, voltage)
-        for axis, values in zip(different, gains, strict=True)
-    }
-    return MonteCarlo(
-        {axis: _named(spreads[twin(axis)], axis) for axis in axes},
-        samples,
-        distribution,
-        seed,
-        voltage,
+    spreads = once_per_function(
+        axes, lambda axis: _spread(gains[different.index(twin(axis))], design, axis, distribution, voltage)
     )
+    for axis, spread in spreads.items():
+        if spread.flagged:
+            spreads[axis] = replace(spread, second=second_order(design, axis, distribution, voltage=voltage))
+    return MonteCarlo(spreads, samples, distribution, seed, voltage)
 
 
-def _drawn(
+def _gains_of_draws(
     design: Design,
     axes: tuple[Axis, ...],
-    names: tuple[str, ...],
     samples: int,
     distribution: Distribution,
     seed: int,
@@ -171,167 +143,53 @@ def _drawn(
     progress: Callable[[str], None],
 ) -> np.ndarray:
     """Gains of the axes, shape `(axes, samples)`."""
+    names = tuple(dict.fromkeys(name for axis in axes for name in inputs_of(axis, voltage)))
+    model, scale = gain_model(design, voltage), tolerances(design, names)[:, None]
+    root = copula_root(design, names, distribution)
     rng = np.random.Generator(np.random.SFC64(seed))
-    together = mixing(design, names, distribution)
-    scale = tolerances(design, names)
-    start, step = {"normal": (0.0, 1 / 3), "uniform": (-1.0, 2.0), "triangular": (-1.0, 1.0)}[distribution]
-    offset, slope = nominal(design, names) + start * scale, jnp.asarray(step * scale)
-    fixed = setting(design, voltage)
     gains = np.empty((len(axes), samples))
-    pending: tuple[int, Array] | None = None
+
+    def keep(begin: int, found: Array) -> None:
+        part = gains[:, begin : begin + _CHUNK]
+        part[:] = np.asarray(found)[:, : part.shape[1]]
+
+    before: tuple[int, Array] | None = None
     for begin in range(0, samples, _CHUNK):
-        draws = draw(rng, distribution, together, len(names), _CHUNK)
+        standard = rng.standard_normal((len(names), _CHUNK))
+        errors = scale * from_normal(root @ standard if design.together else standard, distribution)
         # Computed while the next are drawn.
-        coming = (begin, gains_of(jnp.asarray(draws), offset, slope, axes, names, *fixed))
-        if pending is not None:
-            _store(gains, *pending)
+        coming = begin, gains_of_many(model, errors, axes, names)
+        if before is not None:
+            keep(*before)
+        before = coming
         if begin * 10 // samples != (begin + _CHUNK) * 10 // samples:
             progress(f"{min(samples, begin + _CHUNK):,} of {samples:,} samples")
-        pending = coming
-    if pending is not None:
-        _store(gains, *pending)
+    assert before is not None
+    keep(*before)
     if not np.isfinite(gains).all():
         raise DataError("some of the stages drawn cannot be built: lower the tolerances")
     return gains
 
 
-def _store(gains: np.ndarray, begin: int, found: Array) -> None:
-    part = gains[:, begin : begin + _CHUNK]
-    part[:] = np.asarray(found)[:, : part.shape[1]]
-
-
-@eqx.filter_jit
-def gains_of(
-    draws: Float[Array, "k n"],
-    offset: Float[Array, " k"],
-    slope: Float[Array, " k"],
-    axes: tuple[Axis, ...],
-    names: tuple[str, ...],
-    geometry: Geometry,
-    constants: Constants,
-    piezo_N_per_um: Float[Array, ""] | None,
-) -> Float[Array, "axes n"]:
-    """Gains of some axes for many stages, whose dimensions are `offset + slope * draws`."""
-
-    def one(draw: Array) -> Array:
-        values = offset + slope * draw
-        return jnp.stack([gain_at(values, axis, names, geometry, constants, piezo_N_per_um) for axis in axes])
-
-    return jax.vmap(one, in_axes=1, out_axes=1)(draws)
-
-
-def draw(
-    rng: np.random.Generator,
-    distribution: Distribution,
-    together: tuple[list[int], np.ndarray],
-    count: int,
-    samples: int,
-) -> np.ndarray:
-    """Draws of standard normal numbers, uniform ones in [0, 1], or triangular ones in [0, 2].
-
-    Parameters
-    ----------
-    rng
-        Where they come from.
-    distribution
-        Which.
-    together
-        See `mixing`.
-    count, samples
-        Numbers of dimensions and of stages.
-
-    Returns
-    -------
-    ndarray
-        Shape `(count, samples)`.
-    """
-    if distribution == "normal":
-        draws = rng.standard_normal((count, samples))
-    else:
-        draws = rng.random((count, samples))
-        if distribution == "triangular":
-            draws += rng.random((count, samples))
-    rows, mix = together
-    if rows:
-        draws[rows] = _quantile(mix @ rng.standard_normal((len(rows), samples)), distribution)
-    return draws
-
-
-def _quantile(standard: np.ndarray, distribution: Distribution) -> np.ndarray:
-    """Turn standard normal numbers into those of `draw`."""
-    if distribution == "normal":
-        return standard
-    chance = ndtr(standard)
-    if distribution == "uniform":
-        return np.asarray(chance)
-    # The tail on the upper side from its own probability, which does not lose digits.
-    half = np.sqrt(2 * np.minimum(chance, ndtr(-standard)))
-    return np.where(standard < 0, half, 2 - half)
-
-
-def mixing(design: Design, names: tuple[str, ...], distribution: Distribution) -> tuple[list[int], np.ndarray]:
-    """Rows that do not stand alone, and the matrix that makes independent normal numbers into correlated ones."""
-    wanted = design.correlation(names)
-    rows = np.flatnonzero((wanted != np.eye(len(names))).any(axis=1))
-    block = wanted[np.ix_(rows, rows)]
-    copula = np.vectorize(lambda value: _copula(value, distribution), otypes=[float])(block)
-    # A matrix of normal numbers' correlations may miss being one by little where those wanted are near the limit.
-    values, vectors = np.linalg.eigh(copula)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return rows.tolist(), root / np.linalg.norm(root, axis=1, keepdims=True)
-
-
-def _copula(correlation: float, distribution: Distribution) -> float:
-    """Correlation of normal numbers whose transforms have the one given."""
-    if distribution == "normal" or abs(correlation) in (0.0, 1.0):
-        return correlation
-    node, weight = np.polynomial.hermite_e.hermegauss(_NODES)
-    weight = weight / weight.sum()
-    first = _quantile(node, distribution)
-    first = first - weight @ first
-    variance = weight @ first**2
-
-    def excess(copula: float) -> float:
-        second = _quantile(copula * node[:, None] + np.sqrt(1 - copula**2) * node, distribution)
-        return float((weight * first) @ second @ weight / variance - correlation)
-
-    return float(brentq(excess, -1.0, 1.0, xtol=1e-12))
-
-
 def _spread(values: np.ndarray, design: Design, axis: Axis, distribution: Distribution, voltage: bool) -> AxisSpread:
-    """Statistics of the values, which are used up."""
+    """Statistics of the gains of one axis, shape `(samples,)`."""
     names = inputs_of(axis, voltage)
-    value, slopes = first_order(nominal(design, names), axis, names, *setting(design, voltage))
-    gradient = np.asarray(slopes)
-    first = float(np.sqrt(gradient @ covariance(design, names, distribution) @ gradient))
+    value, slopes = (np.asarray(found) for found in gradient(gain_model(design, voltage), twin(axis), names))
     # Sorting takes less time than finding five of the samples by partition does.
-    values.sort()
-    place = np.array(_QUANTILES_PCT) / 100 * (len(values) - 1)
-    quantiles = np.interp(place, np.arange(len(values)), values)
-    mean = float(np.mean(values))
-    values -= mean
-    squares = values * values
-    variance = float(np.mean(squares))
-    kurtosis = float(squares @ squares) / len(values) / variance**2
-    sd = float(np.sqrt(variance * len(values) / (len(values) - 1)))
-    spread = AxisSpread(
-        axis,
-        f"{MOTIONS[axis].unit}/um",
-        float(value),
-        mean,
-        sd,
-        float(squares @ values) / len(values) / variance**1.5,
-        sd * float(np.sqrt((kurtosis - 1) / (4 * len(values)))),
-        dict(zip(_QUANTILES_PCT, quantiles.tolist(), strict=True)),
-        first,
-        None,
+    quantiles = np.quantile(np.sort(values), np.array(_QUANTILES_PCT) / 100)
+    mean, sd = float(values.mean()), float(values.std(ddof=1))
+    off = (values - mean) / sd
+    squares = off * off
+    kurtosis = float(squares @ squares) / len(off)
+    return AxisSpread(
+        axis=axis,
+        unit=f"{MOTIONS[axis].unit}/um",
+        nominal=float(value),
+        mean=mean,
+        sd=sd,
+        skewness=float(squares @ off) / len(off),
+        sd_error=sd * float(np.sqrt((kurtosis - 1) / (4 * len(values)))),
+        quantiles=dict(zip(_QUANTILES_PCT, quantiles.tolist(), strict=True)),
+        first_order_sd=float(np.sqrt(slopes @ covariance(design, names, distribution) @ slopes)),
+        second=None,
     )
-    if not spread.flagged:
-        return spread
-    return replace(spread, second=second_order(design, axis, distribution, voltage=voltage))
-
-
-def _named(spread: AxisSpread, axis: Axis) -> AxisSpread:
-    """The same spread under the name of the axis, which may be the twin of the one computed."""
-    second = None if spread.second is None else replace(spread.second, axis=axis)
-    return replace(spread, axis=axis, second=second)

@@ -1,10 +1,8 @@
 """What machining errors do to each axis: derivatives, ranking, and shares of the variance (Eq. 4 and 5)."""
 
-import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -15,21 +13,21 @@ from numpy.typing import NDArray
 
 import microid as m
 from fits.io._errors import DataError
-from fits.machining._design import Design
+from fits.machining._design import Design, uniform_tolerance
+from fits.machining._gains import (
+    check_axes,
+    gain_model,
+    gains_of_few,
+    once_per_function,
+    quick_jit,
+    require_float64,
+    twin,
+)
+from fits.machining._tolerances import tolerances
 
-# By symmetry: the motion functions of the second are those of the first (Eq. 2).
-_ALIKE: dict[m.Axis, m.Axis] = {"y": "x", "beta": "alpha"}
 _TEN_UM_MM = 0.01
 # So short a stroke that all motions are in proportion to it, to the last digit.
 _SHORT_UM = 1e-6
-_Result = TypeVar("_Result")
-
-
-def quick_jit(function: Callable[..., _Result]) -> Callable[..., _Result]:
-    """Compile fast: a call takes microseconds however it is compiled, and compiling with optimisation seconds."""
-    quick = {"xla_backend_optimization_level": 0, "xla_disable_hlo_passes": "fusion"}
-    compiled: Callable[..., _Result] = eqx.filter_jit(function, compiler_options=quick)  # type: ignore[call-overload]
-    return compiled
 
 
 @dataclass(frozen=True)
@@ -42,10 +40,8 @@ class DimensionEffect:
         The dimension, in mm or rad.
     derivative
         Of the gain, in its unit per mm or rad.
-    relative_change_pct
-        Of the output at an error of plus one tolerance, to first order.
-    relative_change_exact_pct
-        The same without linearising.
+    relative_change_pct, relative_change_exact_pct
+        Of the output at an error of plus one tolerance, to first order and without linearising.
     share_of_variance
         Of the output, to first order; with correlated dimensions it can be negative. Zero where no tolerance has any
         effect, otherwise the shares of an axis add up to 1.
@@ -71,22 +67,16 @@ class AxisSensitivity:
 
     Attributes
     ----------
-    axis
-        Its name.
-    output_unit
-        `um` or `urad`.
+    axis, output_unit
+        Its name, and `um` or `urad`.
     gain
         Output per elongation of the piezo for small strokes, in `output_unit` per um.
-    loaded_stroke_um
-        Elongation of the loaded piezo at the highest voltage (Eq. 14).
-    stroke
-        Output there, in `output_unit`.
+    loaded_stroke_um, stroke
+        Elongation of the loaded piezo at the highest voltage (Eq. 14), and the output there, in `output_unit`.
     dimensions
         The arguments of Eq. 5, largest relative change first.
-    rss_pct
-        Root sum of squares of the relative changes, with their correlations.
-    worst_case_pct
-        Sum of their sizes.
+    rss_pct, worst_case_pct
+        Root sum of squares of the relative changes, with their correlations, and sum of their sizes.
     voltage_change_pct
         Relative change of the output at plus one tolerance, to first order, the voltage being imposed instead of the
         elongation: for every dimension that has an effect, also by the input stiffness, largest first.
@@ -129,6 +119,13 @@ class SensitivityReport:
         """Sensitivities of an axis by its name."""
         return self.axes[axis]
 
+    def alike(self) -> list[list[AxisSensitivity]]:
+        """Group axes that are the same function of the same dimensions."""
+        groups: dict[m.Axis, list[AxisSensitivity]] = {}
+        for name, axis in self.axes.items():
+            groups.setdefault(twin(name), []).append(axis)
+        return list(groups.values())
+
 
 def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> SensitivityReport:
     """Differentiate the motion of a stage with respect to its dimensions.
@@ -150,19 +147,13 @@ def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> Sensitivit
     RuntimeError
         If JAX is not in double precision.
     """
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError('sensitivities need float64: jax.config.update("jax_enable_x64", True)')
-    found: dict[m.Axis, AxisSensitivity] = {}
-    for axis in (axes,) if isinstance(axes, str) else axes:
-        if axis not in m.AXES:
-            raise DataError(f"there is no axis {axis!r}: choose some of {', '.join(m.AXES)}.")
-        alike = _ALIKE.get(axis, axis)
-        known = next((each for name, each in found.items() if _ALIKE.get(name, name) == alike), None)
-        found[axis] = _of_axis(design, alike, axis) if known is None else dataclasses.replace(known, axis=axis)
-    return SensitivityReport(design.level, found)
+    require_float64("sensitivities")
+    chosen: Sequence[m.Axis] = (axes,) if isinstance(axes, str) else axes  # type: ignore[assignment]
+    check_axes(chosen)
+    return SensitivityReport(design.level, once_per_function(chosen, lambda axis: _of_axis(design, axis)))
 
 
-class _Derived(eqx.Module):
+class AxisDerivatives(eqx.Module):
     """Numbers of one axis in um, mm and rad, dimensions in the order of Eq. 5."""
 
     gain: Float[Array, ""]
@@ -173,13 +164,20 @@ class _Derived(eqx.Module):
     by_voltage: m.Sensitivity
 
 
+def derivatives_of(design: Design, axis: m.Axis, actuation: m.Actuation | None = None) -> AxisDerivatives:
+    """Differentiate the motion of an axis, with the design's piezos or others."""
+    return _differentiate(twin(axis), design.geometry, design.constants, actuation or design.actuation)
+
+
 @quick_jit
-def _derive(axis: m.Axis, geometry: m.Geometry, constants: m.Constants, actuation: m.Actuation) -> _Derived:
+def _differentiate(
+    axis: m.Axis, geometry: m.Geometry, constants: m.Constants, actuation: m.Actuation
+) -> AxisDerivatives:
     piezo = (actuation.free_stroke_um, constants, actuation.piezo_N_per_um)
     full_um = m.loaded_um(axis, geometry, *piezo)
     strokes_um = jnp.stack([jnp.full_like(full_um, _SHORT_UM), full_um])
     found = jax.vmap(lambda stroke_um: m.sensitivity(axis, geometry, stroke_um, constants))(strokes_um)
-    return _Derived(
+    return AxisDerivatives(
         gain=found.piezo[0],
         slopes={name: slope[0] / _SHORT_UM for name, slope in found.dimensions.items()},
         loaded_stroke_um=full_um,
@@ -190,51 +188,39 @@ def _derive(axis: m.Axis, geometry: m.Geometry, constants: m.Constants, actuatio
 
 
 def gains_at(design: Design, axis: m.Axis, errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gain of an axis with errors of its dimensions, in um/um or rad/um, shape `(n,)`.
-
-    Parameters
-    ----------
-    design, axis
-        See `sensitivities`.
-    errors
-        In mm and rad, shape `(n, k)`; the columns are the arguments of Eq. 5 as in `microid.MOTIONS`.
-    """
-    return np.asarray(_gains(_ALIKE.get(axis, axis), design.geometry, design.constants, jnp.asarray(errors)))
+    """Gain of an axis in um/um or rad/um, shape `(n,)`, with errors of the arguments of Eq. 5, shape `(n, k)`."""
+    return np.asarray(gains_of_few(gain_model(design), errors.T, (twin(axis),), m.MOTIONS[axis].dimensions)[0])
 
 
-@quick_jit
-def _gains(
-    axis: m.Axis, geometry: m.Geometry, constants: m.Constants, errors: Float[Array, "n k"]
-) -> Float[Array, " n"]:
-    names = m.MOTIONS[axis].dimensions
-
-    def gain(error: Float[Array, " k"]) -> Float[Array, ""]:
-        sizes = [geometry[name] + error[i] for i, name in enumerate(names)]
-        fields = [m.DIMENSIONS[name].field for name in names]
-        changed = eqx.tree_at(lambda g: [getattr(g, field) for field in fields], geometry, sizes)
-        return m.gain(axis, changed, constants)
-
-    return jax.vmap(gain)(errors)
+def output_scale(axis: m.Axis) -> tuple[float, str]:
+    """Unit in which the output of an axis is shown, and what to multiply an output in um or rad by."""
+    return (1e6, "urad") if m.MOTIONS[axis].unit == "rad" else (1.0, "um")
 
 
-def _of_axis(design: Design, alike: m.Axis, axis: m.Axis) -> AxisSensitivity:
-    """Sensitivities of an axis, computed as those of one alike."""
-    names = m.MOTIONS[axis].dimensions
-    derived = _derive(alike, design.geometry, design.constants, design.actuation)
-    tolerance = np.array([design.tolerance[name] for name in names])
-    slopes = np.array([float(derived.slopes[name]) for name in names])
-    changes = slopes * tolerance / float(derived.gain)
-    exact = gains_at(design, axis, np.diag(tolerance)) / float(derived.gain) - 1
-    by_voltage = _by_voltage(design, derived.by_voltage)
-    numbers = [*changes, *exact, *slopes, *by_voltage.values(), float(derived.stroke)]
-    if not np.all(np.isfinite(numbers)) or not derived.gain > 0:
+def refuse_infinite(axis: m.Axis, numbers: Iterable[float]) -> None:
+    """Raise a `DataError` if a design leads to numbers that are not finite."""
+    if not np.all(np.isfinite([*numbers])):
         raise DataError(
             f"{axis}: expected dimensions of a stage that moves, found some that are so small or so large that no "
             "finite number comes out; correct them."
         )
-    scale, unit = (1e6, "urad") if m.MOTIONS[axis].unit == "rad" else (1.0, "um")
+
+
+def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
+    names = m.MOTIONS[axis].dimensions
+    derived = derivatives_of(design, axis)
+    gain, tolerance = float(derived.gain), tolerances(design, names)
+    slopes = np.array([float(derived.slopes[name]) for name in names])
+    changes = slopes * tolerance / gain
+    exact = gains_at(design, axis, np.diag(tolerance)) / gain - 1
+    by_voltage = _by_voltage(design, derived.by_voltage)
+    refuse_infinite(
+        axis, [*changes, *exact, *slopes, *by_voltage.values(), float(derived.stroke), gain if gain > 0 else math.nan]
+    )
+    scale, unit = output_scale(axis)
     parts = changes * (design.correlation(names) @ changes)
     variance = float(parts.sum())
+    ten_um = uniform_tolerance(design.geometry, _TEN_UM_MM)
     effects = [
         DimensionEffect(
             name=name,
@@ -245,14 +231,14 @@ def _of_axis(design: Design, alike: m.Axis, axis: m.Axis) -> AxisSensitivity:
             relative_change_pct=100 * float(changes[i]),
             relative_change_exact_pct=100 * float(exact[i]),
             share_of_variance=float(parts[i]) / variance if variance > 0 else 0.0,
-            output_change_per_10um=scale * float(derived.slopes_at_full_stroke[name]) * _ten_um(design, name),
+            output_change_per_10um=scale * float(derived.slopes_at_full_stroke[name]) * ten_um[name],
         )
         for i, name in enumerate(names)
     ]
     return AxisSensitivity(
         axis=axis,
         output_unit=unit,
-        gain=scale * float(derived.gain),
+        gain=scale * gain,
         loaded_stroke_um=float(derived.loaded_stroke_um),
         stroke=scale * float(derived.stroke),
         dimensions=tuple(sorted(effects, key=lambda effect: -abs(effect.relative_change_pct))),
@@ -260,12 +246,6 @@ def _of_axis(design: Design, alike: m.Axis, axis: m.Axis) -> AxisSensitivity:
         worst_case_pct=100 * float(np.abs(changes).sum()),
         voltage_change_pct=by_voltage,
     )
-
-
-def _ten_um(design: Design, name: str) -> float:
-    """Ten um in the unit of a dimension."""
-    leg = m.DIMENSIONS[name].leg
-    return _TEN_UM_MM if leg is None else _TEN_UM_MM / float(design.geometry[leg])
 
 
 def _by_voltage(design: Design, found: m.Sensitivity) -> dict[str, float]:

@@ -1,16 +1,16 @@
 """Shares of the variance of a gain, globally: Sobol indices, which hold where first order fails."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
+from scipy.special import ndtri
 
 from fits.io._errors import DataError
 from fits.machining._design import Design
-from fits.machining._monte_carlo import gains_of
-from fits.machining._second_order import Distribution, check, inputs_of, setting, twin
+from fits.machining._gains import gain_model, gains_of_many, inputs_of, once_per_function, twin
+from fits.machining._tolerances import Distribution, check, check_independent, from_normal, tolerances
 from microid import AXES, Axis
 
 _FEWEST, _MOST = 256, 2**20
@@ -26,10 +26,9 @@ class SobolIndices:
         Which.
     names
         Dimensions that the gain depends on, `k` of them.
-    first
-        Part that a dimension explains by itself, shape `(k,)`.
-    total
-        Part that would not be there without it: with all its interactions, shape `(k,)`.
+    first, total
+        Part that a dimension explains by itself, and part that would not be there without it: with all its
+        interactions, shape `(k,)`.
     first_interval, total_interval
         Lower and upper end of confidence intervals by bootstrap, shape `(k, 2)`. Points that fill the space evenly
         err less than independent ones, so these are on the safe side.
@@ -82,87 +81,42 @@ def sobol(
         distribution, a tolerance is as large as its dimension, or the number of samples is not a power of two.
     """
     check(design, axes, distribution)
-    if design.together:
-        names = ", ".join(design.together[0].dimensions)
-        raise DataError(
-            f"{names} go together, and the variance has no unique parts for correlated dimensions: use monte_carlo, "
-            "or a design without `together`"
-        )
+    check_independent(design, "the variance has no unique parts for correlated dimensions: use monte_carlo")
     if samples.bit_count() != 1 or not _FEWEST <= samples <= _MOST:
         raise DataError(f"the number of samples is a power of two from {_FEWEST} to {_MOST}, got {samples}")
     if not 0 < confidence < 1 or resamples < 100:
         raise DataError("intervals need a confidence between 0 and 1 and at least 100 resamples")
-    # x and y are one function of the same dimensions, and so are alpha and beta.
-    different = dict.fromkeys(twin(axis) for axis in axes)
-    found = {axis: _of_axis(design, axis, samples, distribution, seed, voltage) for axis in different}
-    made = {
-        axis: SobolIndices(
-            axis,
-            inputs_of(axis, voltage),
-            *indices(*outputs),
-            *intervals(*outputs, confidence, resamples, seed),
-            confidence,
-            samples * (2 + len(outputs[2])),
-        )
-        for axis, outputs in found.items()
-    }
-    return {axis: replace(made[twin(axis)], axis=axis) for axis in axes}
 
+    def of_axis(axis: Axis) -> SobolIndices:
+        names = inputs_of(axis, voltage)
+        model, scale = gain_model(design, voltage), tolerances(design, names)[:, None]
 
-Outputs = tuple[np.ndarray, np.ndarray, np.ndarray]
+        def gain(points: np.ndarray) -> np.ndarray:
+            errors = scale * from_normal(ndtri(points.T), distribution)
+            return np.asarray(gains_of_many(model, errors, (twin(axis),), names)[0])
 
+        outputs = outputs_of(gain, len(names), samples, seed)
+        found = *indices(*outputs), *intervals(*outputs, confidence, resamples, seed)
+        return SobolIndices(axis, names, *found, confidence, samples * (2 + len(names)))
 
-def _of_axis(
-    design: Design, axis: Axis, samples: int, distribution: Distribution, seed: int, voltage: bool
-) -> Outputs:
-    names = inputs_of(axis, voltage)
-    values = jnp.array([float(design.geometry[name]) for name in names])
-    scale = jnp.array([design.tolerance[name] for name in names])
-    fixed = setting(design, voltage)
-
-    def function(draws: np.ndarray) -> np.ndarray:
-        return np.asarray(gains_of(jnp.asarray(draws), values, scale, (axis,), names, *fixed)[0])
-
-    standard = {
-        "normal": stats.norm(0, 1 / 3),
-        "uniform": stats.uniform(-1, 2),
-        "triangular": stats.triang(0.5, -1, 2),
-    }[distribution]
-    return outputs_of(function, standard.ppf, len(names), samples, seed)
+    return once_per_function(axes, of_axis)
 
 
 def outputs_of(
-    function: Callable[[np.ndarray], np.ndarray],
-    quantile: Callable[[np.ndarray], np.ndarray],
-    count: int,
-    samples: int,
-    seed: int,
-) -> Outputs:
-    """Evaluate a function of `count` alike, independent inputs where the indices need it.
-
-    Parameters
-    ----------
-    function
-        Of inputs of shape `(count, samples)`, with outputs of shape `(samples,)`.
-    quantile
-        Inverse of the inputs' cumulative distribution.
-    count, samples, seed
-        Numbers of inputs and samples, and the seed of the scrambled Sobol sequence.
+    function: Callable[[np.ndarray], np.ndarray], count: int, samples: int, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Evaluate a function of points in the unit cube, shape `(samples, count)`, where the indices need it.
 
     Returns
     -------
     tuple
-        Outputs at two independent sets of inputs, each of shape `(samples,)`, and at the first with one input after
-        the other taken from the second, shape `(count, samples)`. The mean is taken out.
+        Outputs at two independent sets of points of a scrambled Sobol sequence, each of shape `(samples,)`, and at
+        the first with one coordinate after the other taken from the second, shape `(count, samples)`. The mean is
+        taken out.
     """
-    points = quantile(stats.qmc.Sobol(2 * count, seed=seed, bits=64).random(samples)).T
-    first, second = points[:count], points[count:]
-    both = [function(np.ascontiguousarray(half)) for half in (first, second)]
-    swapped = np.empty((count, samples))
-    for i in range(count):
-        mixed = first.copy()
-        mixed[i] = second[i]
-        swapped[i] = function(mixed)
+    first, second = np.hsplit(stats.qmc.Sobol(2 * count, seed=seed, bits=64).random(samples), 2)
+    both = [function(first), function(second)]
+    swapped = np.stack([function(np.where(np.arange(count) == i, second, first)) for i in range(count)])
     mean = np.mean(both)
     return both[0] - mean, both[1] - mean, swapped - mean
 

@@ -30,13 +30,7 @@ _TRACK_RATE, _STEP_RATE = 0.005, 3e-4
 
 @dataclass(frozen=True)
 class PaperMode:
-    """What the feedback is designed on: the slow mode, as its response was fitted.
-
-    Attributes
-    ----------
-    natural_rad_per_s, damping_ratio, gain_um_per_V
-        Of the mode about where the axis works.
-    """
+    """What the feedback is designed on: the slow mode about where the axis works, as its response was fitted."""
 
     natural_rad_per_s: float
     damping_ratio: float
@@ -46,21 +40,13 @@ class PaperMode:
 def placed_pid(mode: PaperMode, pair_rad_per_s: float, single_rad_per_s: float, filter_s: float, step: bool) -> PID:
     """A PID controller that puts the poles of the loop on the real axis.
 
-    The loop's polynomial `s³ + (2 zeta w + g w² Kd) s² + w² (1 + g Kp) s + g w² Ki` becomes `(s + p)² (s + q)`, but
-    for the filter, the driver and the sampling.
+    The loop's polynomial `s³ + (2 zeta w + g w² Kd) s² + w² (1 + g Kp) s + g w² Ki` becomes `(s + p)² (s + q)`, with
+    p and q the places of the pair and of the single pole, but for the driver, the sampling and the filter of the
+    derivative, whose time constant is `filter_s`.
 
-    Parameters
-    ----------
-    mode
-        The stage, as far as the design knows it.
-    pair_rad_per_s, single_rad_per_s
-        `p` and `q`.
-    filter_s
-        Time constant of the filter of the derivative.
-    step
-        Whether the reference is a step, of which the feedforward already makes one: then the weights of the reference
-        are such that the answer is that of `p² / (s + p)²`, which does not overshoot. Otherwise they are 1, and what
-        moves slowly is followed without lag.
+    For a step, of which the feedforward already makes one, the weights of the reference are such that the answer is
+    that of `p² / (s + p)²`, which does not overshoot. Otherwise they are 1, and what moves slowly is followed without
+    lag.
     """
     w, zeta, g = mode.natural_rad_per_s, mode.damping_ratio, mode.gain_um_per_V
     p, q = pair_rad_per_s, single_rad_per_s
@@ -80,20 +66,9 @@ def placed_pid(mode: PaperMode, pair_rad_per_s: float, single_rad_per_s: float, 
 
 
 def paper_controller(scheme: str, mode: PaperMode, seed: int, largest_um: float, step: bool) -> AbstractController:
-    """The controller of a scheme of the tables.
+    """The controller of `HC+PID`, `HC+BP-PID` or `HC+CMAC-PID`, for references from 0 to `largest_um` or a step.
 
-    Parameters
-    ----------
-    scheme
-        `HC+PID`, `HC+BP-PID` or `HC+CMAC-PID`.
-    mode
-        What it is designed on.
-    seed
-        Of the network's first weights.
-    largest_um
-        Largest reference, from zero on.
-    step
-        Whether the reference is a step.
+    The seed is that of the network's first weights.
     """
     pid = placed_pid(mode, *(_STEP if step else _TRACK[scheme]), step)
     if scheme == "HC+PID":

@@ -3,42 +3,22 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from data_synth import PaperBench
 from microid.control import AbstractController
-
-
-class SteppedBench(Protocol):
-    """What is under control: `benches` stages side by side."""
-
-    def reset(self) -> tuple[np.ndarray, np.ndarray]:
-        """Displacements and readings at rest, in um, shape `(benches,)`."""
-        ...
-
-    def step(self, command_V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Displacements and readings one interval later."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
 class PaperRun:
     """What happened on the benches, each of shape `(benches, n)` but for the reference, `(n,)`.
 
-    Attributes
-    ----------
-    reference_um
-        Wanted.
-    displacement_um
-        True displacement at the sample.
-    reading_um
-        What the sensor said of it.
-    command_V
-        From this sample to the next.
+    The displacement is the true one at the sample, and the command is held from there to the next.
     """
 
     reference_um: np.ndarray
@@ -78,21 +58,15 @@ def stacked(make: Callable[[int], AbstractController], count: int) -> AbstractCo
 
 def run_feedback(
     controllers: AbstractController,
-    bench: SteppedBench,
+    bench: PaperBench,
     reference_um: np.ndarray,
     feedforward_V: np.ndarray,
     shown_um: np.ndarray | None = None,
 ) -> PaperRun:
     """Run closed loops on benches side by side; the controllers come from `stacked`.
 
-    Parameters
-    ----------
-    reference_um
-        Wanted, shape `(n,)`.
-    feedforward_V
-        Shape `(benches, n)`.
-    shown_um
-        The reference as the controllers are shown it, shape `(benches, n)`; as it is by default.
+    The reference has shape `(n,)`; feedforward, and the reference as the controllers are shown it if that differs,
+    have shape `(benches, n)`.
     """
     shown = np.broadcast_to(reference_um, feedforward_V.shape) if shown_um is None else shown_um
     states, form = jax.tree.flatten(eqx.filter_jit(eqx.filter_vmap(lambda one: one.init()))(controllers))

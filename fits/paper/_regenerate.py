@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from fits.paper._runs import (
     identify,
     identify_modes,
 )
-from fits.paper._tables import AXIS_TITLES, PAPER, Measured, PaperResult, paper_json, paper_page
+from fits.paper._tables import AXIS_TITLES, PAPER, Measured, PaperResult, paper_json, paper_page, render
 from fits.plots._idle import plot_idle
 from fits.plots._paper import plot_inverse, plot_loop, plot_steps, plot_tracking
 from fits.plots._sensitivity import plot_sensitivity
@@ -99,59 +100,59 @@ _tracking_errors = eqx.filter_jit(tracking_errors)
 def _steps(run: PaperRun, noisy: PaperRun, said: dict[str, float]) -> dict[str, Measured]:
     time_s = jnp.asarray(np.arange(len(run.reference_um)) * INTERVAL_s)
     target_um = jnp.asarray(run.reference_um[-1])
-    found = [
+    ours, beside = (
         [_step_metrics(time_s, jnp.asarray(one), target_um) for one in each.displacement_um] for each in (run, noisy)
-    ]
-    ours, beside = ({name: np.array([float(getattr(m, name)) for m in each]) for name in said} for each in found)
+    )
     way_um = float(target_um)
-    distances_um = {
-        "overshoot_pct": way_um / 100 * ours["overshoot_pct"],
-        "settling_value_um": np.abs(way_um - ours["settling_value_um"]),
-        "positioning_error_pct": way_um / 100 * ours["positioning_error_pct"],
-    }
-    return {
-        name: Measured(paper, ours[name], beside[name], _hidden(distances_um.get(name)))
-        for name, paper in said.items()
-    }
 
+    def distance_um(name: str, values: np.ndarray) -> np.ndarray | None:
+        if name == "settling_time_s":
+            return None
+        return np.abs(way_um - values) if name == "settling_value_um" else way_um / 100 * values
 
-def _hidden(distances_um: np.ndarray | None) -> bool:
-    """Whether a distance is less than what the paper's sensor shows in single readings; of a time, it is none."""
-    sensor = data_synth.PaperSensor()
-    return distances_um is not None and bool(np.median(distances_um) < max(sensor.noise_um, sensor.resolution_um))
+    return _measured(said, ours, beside, distance_um)
 
 
 def _tracking(run: PaperRun, said: dict[str, float]) -> dict[str, Measured]:
     reference_um = jnp.asarray(run.reference_um)
-    found = [
+    ours, beside = (
         [_tracking_errors(reference_um, jnp.asarray(one)) for one in each]
         for each in (run.displacement_um, run.reading_um)
-    ]
-    ours, beside = ({name: np.array([float(getattr(m, name)) for m in each]) for name in said} for each in found)
+    )
     share_um = np.ptp(run.reference_um) / 100
-    return {
-        name: Measured(paper, ours[name], beside[name], _hidden(share_um * ours[name]))
-        for name, paper in said.items()
-    }
+    return _measured(said, ours, beside, lambda _, values: share_um * values)
+
+
+def _measured(
+    said: dict[str, float], ours: list[Any], beside: list[Any], distance_um: Callable[..., np.ndarray | None]
+) -> dict[str, Measured]:
+    """Figures by seed, and whether the distance that each stands for is less than single readings show."""
+    sensor = data_synth.PaperSensor()
+    smallest_um = max(sensor.noise_um, sensor.resolution_um)
+    found = {}
+    for name, paper in said.items():
+        values, others = (np.array([float(getattr(one, name)) for one in each]) for each in (ours, beside))
+        distances_um = distance_um(name, values)
+        hidden = distances_um is not None and bool(np.median(distances_um) < smallest_um)
+        found[name] = Measured(paper, values, others, hidden)
+    return found
 
 
 def _loop_figures(identified: list[Identified]) -> dict[str, Measured]:
-    said, found = PAPER["figures"]["fig6"], [one.fit.runs[0] for one in identified]
-    inside = [run.in_sample for run in found if run.in_sample is not None]
-    widths = np.array([run.loop_measured_pct or np.nan for run in found])
-    ours = widths, np.array([e.e_max_pct for e in inside]), np.array([e.e_rms_pct for e in inside])
-    return {name: Measured(paper, values) for (name, paper), values in zip(said.items(), ours, strict=True)}
+    runs = [one.fit.runs[0] for one in identified]
+    return _of_loops("fig6", [(run.loop_measured_pct, run.in_sample) for run in runs])
 
 
 def _inverse_figures(identified: list[Identified], piezo: data_synth.PaperPiezo) -> dict[str, Measured]:
-    said, rows = PAPER["figures"]["fig9"], []
-    for one in identified:
-        wanted_um, _, reached_um = compensated(one, piezo)
-        off = errors(wanted_um, reached_um)
-        rows.append((loop_width_pct(wanted_um, reached_um) or np.nan, off.e_max_pct, off.e_rms_pct))
-    return {
-        name: Measured(paper, values) for (name, paper), values in zip(said.items(), np.array(rows).T, strict=True)
-    }
+    loops = [compensated(one, piezo) for one in identified]
+    return _of_loops("fig9", [(loop_width_pct(um, reached), errors(um, reached)) for um, _, reached in loops])
+
+
+def _of_loops(figure: str, found: list[tuple[float | None, Any]]) -> dict[str, Measured]:
+    """Widths and errors of loops by seed, beside those of a figure of the paper."""
+    rows = [(width or np.nan, off.e_max_pct, off.e_rms_pct) for width, off in found if off is not None]
+    said = PAPER["figures"][figure].items()
+    return {name: Measured(paper, values) for (name, paper), values in zip(said, np.array(rows).T, strict=True)}
 
 
 def _draw_loop(one: Identified, folder: Path) -> Path:
@@ -191,45 +192,16 @@ def _draw_steps(steps: dict[str, PaperRun], folder: Path) -> Path:
 
 
 def _draw_tracks(tracks: dict[str, dict[str, PaperRun]], path: Path) -> Path:
-    rows = []
-    for title, runs in tracks.items():
-        reference_um = next(iter(runs.values())).reference_um
-        rows.append((title, reference_um, {scheme: run.displacement_um[0] for scheme, run in runs.items()}))
+    rows = [
+        (title, next(iter(runs.values())).reference_um, {name: run.displacement_um[0] for name, run in runs.items()})
+        for title, runs in tracks.items()
+    ]
     return plot_tracking(INTERVAL_s, rows, path)
 
 
 def _assumed() -> list[str]:
-    sensor, axes = data_synth.PaperSensor(), data_synth.PAPER_AXES
-    rotation = list(axes.values())[-1]
-    gains = ", ".join(f"{name} {100 * axis.gain_error:+.2f} %" for name, axis in axes.items())
-    rests = ", ".join(f"{name} {axis.rest_s:g} s" for name, axis in axes.items())
-    return [
-        "The stage is the virtual bench of `data_synth`: a driver of 1 ms, a piezo of 40.7 um with a loop of 12.83 % "
-        "of it as a sum of plays, an amplifier whose gain is off, and a slow mode of 34.7 rad/s with a damping ratio "
-        "of 0.1305 (erratum 46), the same for all axes. It shares no code with the models that are fitted to it.",
-        f"Calibrated are the damping ratio, the frequency and the gain of x to Table 2's HC, the piezo's curve to "
-        f"Table 3's OPEN, and the other gains ({gains}) to Table 4's OPEN: whatever one piezo's hysteresis does not "
-        "explain of an open loop is an error of the gain. For the rotations that is far beyond what tolerances of "
-        "0.02 mm do (3 %), and HC, which knows nothing of it, is left with it.",
-        f"Tracking runs hold rests before and after two periods ({rests}): the paper's e_max of the open loops is "
-        "1.9 to 2.7 times its e_rms, which no steady tracking of a sine gives. Errors are counted over the whole "
-        "record.",
-        f"A reading of the sensor has a white noise of {1e3 * sensor.noise_um:g} nm rms and a last digit of "
-        f"{1e3 * sensor.resolution_um:g} nm; there are {sensor.rate_Hz:g} readings in a second, and a controller at "
-        "1 kHz is given the mean of those since its last sample. The paper gives no rate: averaging is why true "
-        "errors can be smaller than a reading's.",
-        "The piezo's sensor is the same; each of the 100 samples a second of its CSV is the mean of the readings "
-        "while the voltage is held.",
-        f"The hysteresis is `fits.fit` with {LEVELS} levels, the mode `fits.fit_response`; both from CSVs alone. HC "
-        "is the static inverse of the hysteresis with the nominal amplification: the piezo is measured, not the "
-        "stage.",
-        f"Axes rest and work at {data_synth.PAPER_BIAS_V:g} V, reached from above. Rotations are read as the "
-        "displacement of a point 40 mm from the axis; the swing of 2 um is the paper's for X, Y and assumed for the "
-        f"others: {data_synth.PAPER_SWING_um * rotation.per_um:g} {rotation.unit} of a rotation.",
-        "Gains follow from the identified mode by placing the loop's poles, for all axes alike: for tracking at "
-        "30 rad/s (25 rad/s beside the CMAC), for steps at 86, 86 and 27 rad/s. BP-PID starts from the gains of PID, "
-        "and its network keeps them within a factor of 1.5. For steps the reference has weights in the controller. "
-        "These poles, the filters and the learning rates were chosen on the bench that judges them.",
-        f"Loops are closed {LEAD_s:g} s before a run. For tracking, the CMAC's table has learnt from {TRAINING_RUNS} "
-        "shorter runs of the same kind right before, which do not count; for steps it begins empty.",
-    ]
+    axes = data_synth.PAPER_AXES
+    values = {"levels": LEVELS, "lead_s": LEAD_s, "training_runs": TRAINING_RUNS}
+    bench = {"sensor": data_synth.PaperSensor(), "axes": axes, "rotation": list(axes.values())[-1]}
+    work = {"bias_V": data_synth.PAPER_BIAS_V, "swing_um": data_synth.PAPER_SWING_um}
+    return render("assumed.txt.j2", **values, **bench, **work).splitlines()

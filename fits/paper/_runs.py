@@ -33,21 +33,13 @@ _STEP_s = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """What one noisy set of CSVs taught.
+    """What one noisy CSV taught: the piezo's hysteresis, fitted to the record."""
 
-    Attributes
-    ----------
-    fit, record
-        The piezo's hysteresis, and what it was fitted to.
-    rest_um
-        What the piezo's sensor would read at the bias, by the fit.
-    slope_um_per_V
-        The straight line of the open loop: stroke over range.
-    """
-
-    fit: FitResult
+    fit: FitResult[Preisach]
     record: Record
+    # What the piezo's sensor would read at the bias, by the fit.
     rest_um: float
+    # The straight line of the open loop: stroke over range.
     slope_um_per_V: float
 
     def model_um(self) -> np.ndarray:
@@ -102,15 +94,7 @@ def identify_modes(
 
 @dataclass(frozen=True, eq=False)
 class PaperStand:
-    """One axis with everything that was identified for it.
-
-    Attributes
-    ----------
-    axis, piezo
-        What is on the bench.
-    identified, modes
-        By seed.
-    """
+    """One axis on the bench, with everything that was identified for it by seed."""
 
     axis: data_synth.PaperAxis
     piezo: data_synth.PaperPiezo
@@ -123,17 +107,19 @@ class PaperStand:
             self.axis, self.piezo, rng=rng, benches=len(self.identified), interval_s=INTERVAL_s
         )
 
+    def feedforward_V(self, reference_um: np.ndarray) -> np.ndarray:
+        """Voltages of the inverse hysteresis, shape `(seeds, n)`."""
+        return np.stack([one.feedforward_V(self.axis, reference_um) for one in self.identified])
+
     def track(self, scheme: str, rng: np.random.Generator) -> PaperRun:
         """The tracking run of Tables 3 and 4."""
         reference_um = data_synth.paper_reference_um(self.axis, INTERVAL_s)
         bench = self.bench(rng)
         if scheme == "OPEN":
-            lines = [
-                data_synth.PAPER_BIAS_V + reference_um / self.axis.amplification / one.slope_um_per_V
-                for one in self.identified
-            ]
-            return PaperRun(reference_um, *bench.run(np.stack(lines)), np.stack(lines))
-        lead_V = np.stack([one.feedforward_V(self.axis, reference_um) for one in self.identified])
+            slopes_um_per_V = np.array([[one.slope_um_per_V] for one in self.identified])
+            command_V = data_synth.PAPER_BIAS_V + reference_um / self.axis.amplification / slopes_um_per_V
+            return PaperRun(reference_um, *bench.run(command_V), command_V)
+        lead_V = self.feedforward_V(reference_um)
         if scheme == "HC":
             return PaperRun(reference_um, *bench.run(lead_V), lead_V)
         # At the bias loops close where they begin, so that every period asks for the same voltages.
@@ -153,8 +139,7 @@ class PaperStand:
         target_um = data_synth.PAPER_STEP_um
         samples, rest = round(_STEP_s / INTERVAL_s), round(LEAD_s / INTERVAL_s)
         reference_um = np.concatenate([np.zeros(rest), np.full(samples, target_um)])
-        lead_V = np.stack([one.feedforward_V(self.axis, reference_um) for one in self.identified])
-        bench = self.bench(rng)
+        bench, lead_V = self.bench(rng), self.feedforward_V(reference_um)
         if scheme == "HC":
             return PaperRun(reference_um, *bench.run(lead_V), lead_V).last(samples)
         controllers = stacked(lambda k: paper_controller(scheme, self.modes[k], k, target_um, True), len(self.modes))

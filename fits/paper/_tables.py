@@ -1,9 +1,11 @@
 """The paper's tables of compensation, and ours beside them: figures, JSON values and a page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import jinja2
 import numpy as np
 
 SCHEMA = "microid.paper/1"
@@ -14,44 +16,42 @@ STEP_UNITS = {
     "positioning_error_pct": "positioning error (%)",
 }
 TRACK_UNITS = {"e_max_pct": "e_max (%)", "e_rms_pct": "e_rms (%)"}
-Figures = Mapping[str, Mapping[str, float]]
+
+
+def _rows(names: Iterable[str], rows: Mapping[str, Sequence[float]]) -> dict[str, dict[str, float]]:
+    """Figures by scheme and name."""
+    return {scheme: dict(zip(names, row, strict=True)) for scheme, row in rows.items()}
+
 
 # Erratum 35: Z's open loop has an e_rms of 5.50 %, printed as 50.
 PAPER: dict[str, Any] = {
-    "table2": {
-        "HC": dict(zip(STEP_UNITS, (0.84, 66.12, 6.429, 2.78), strict=True)),
-        "HC+PID": dict(zip(STEP_UNITS, (0.68, 0.0, 6.488, 1.89), strict=True)),
-        "HC+BP-PID": dict(zip(STEP_UNITS, (0.46, 0.0, 6.542, 1.07), strict=True)),
-        "HC+CMAC-PID": dict(zip(STEP_UNITS, (0.11, 1.39, 6.601, 0.18), strict=True)),
-    },
-    "table3": {
-        "OPEN": dict(zip(TRACK_UNITS, (18.22, 6.70), strict=True)),
-        "HC": dict(zip(TRACK_UNITS, (5.46, 2.61), strict=True)),
-        "HC+PID": dict(zip(TRACK_UNITS, (2.91, 1.38), strict=True)),
-        "HC+BP-PID": dict(zip(TRACK_UNITS, (1.07, 0.62), strict=True)),
-        "HC+CMAC-PID": dict(zip(TRACK_UNITS, (0.63, 0.23), strict=True)),
-    },
+    "table2": _rows(
+        STEP_UNITS,
+        {
+            "HC": (0.84, 66.12, 6.429, 2.78),
+            "HC+PID": (0.68, 0.0, 6.488, 1.89),
+            "HC+BP-PID": (0.46, 0.0, 6.542, 1.07),
+            "HC+CMAC-PID": (0.11, 1.39, 6.601, 0.18),
+        },
+    ),
+    "table3": _rows(
+        TRACK_UNITS,
+        {
+            "OPEN": (18.22, 6.70),
+            "HC": (5.46, 2.61),
+            "HC+PID": (2.91, 1.38),
+            "HC+BP-PID": (1.07, 0.62),
+            "HC+CMAC-PID": (0.63, 0.23),
+        },
+    ),
     "table4": {
-        "z": {
-            "OPEN": dict(zip(TRACK_UNITS, (11.62, 5.50), strict=True)),
-            "HC": dict(zip(TRACK_UNITS, (6.79, 3.30), strict=True)),
-            "HC+CMAC-PID": dict(zip(TRACK_UNITS, (1.77, 0.95), strict=True)),
-        },
-        "alpha": {
-            "OPEN": dict(zip(TRACK_UNITS, (30.77, 16.10), strict=True)),
-            "HC": dict(zip(TRACK_UNITS, (22.16, 10.33), strict=True)),
-            "HC+CMAC-PID": dict(zip(TRACK_UNITS, (6.97, 3.06), strict=True)),
-        },
-        "gamma": {
-            "OPEN": dict(zip(TRACK_UNITS, (54.17, 25.34), strict=True)),
-            "HC": dict(zip(TRACK_UNITS, (31.53, 16.82), strict=True)),
-            "HC+CMAC-PID": dict(zip(TRACK_UNITS, (19.02, 7.32), strict=True)),
-        },
+        "z": _rows(TRACK_UNITS, {"OPEN": (11.62, 5.50), "HC": (6.79, 3.30), "HC+CMAC-PID": (1.77, 0.95)}),
+        "alpha": _rows(TRACK_UNITS, {"OPEN": (30.77, 16.10), "HC": (22.16, 10.33), "HC+CMAC-PID": (6.97, 3.06)}),
+        "gamma": _rows(TRACK_UNITS, {"OPEN": (54.17, 25.34), "HC": (31.53, 16.82), "HC+CMAC-PID": (19.02, 7.32)}),
     },
-    "figures": {
-        "fig6": {"loop_width_pct": 12.83, "e_max_pct": 1.43, "e_rms_pct": 0.28},
-        "fig9": {"loop_width_pct": 3.02, "e_max_pct": 1.84, "e_rms_pct": 0.65},
-    },
+    "figures": _rows(
+        ("loop_width_pct", "e_max_pct", "e_rms_pct"), {"fig6": (12.83, 1.43, 0.28), "fig9": (3.02, 1.84, 0.65)}
+    ),
 }
 # What the bench was calibrated to: no result, and the rest is.
 CALIBRATED = {("table2", "HC"), ("table3", "OPEN"), ("z", "OPEN"), ("alpha", "OPEN"), ("gamma", "OPEN")}
@@ -60,29 +60,25 @@ AXIS_TITLES = {"z": "Z", "alpha": "rotation about X, Y", "gamma": "rotation abou
 
 @dataclass(eq=False)
 class Measured:
-    """One figure by seed, of the true displacement and of the sensor's readings.
+    """One figure of the true displacement by seed, shape `(seeds,)`; not finite where a run did not settle."""
 
-    Attributes
-    ----------
-    paper
-        What the paper prints.
-    ours
-        By seed, shape `(seeds,)`; not finite where a run did not settle.
-    beside
-        The same of the readings; for steps, of the true displacement where the sensor is noisy.
-    below_sensor
-        Whether the median stands for a distance that no single reading of the sensor shows (erratum 40).
-    """
-
+    # What the paper prints.
     paper: float
     ours: np.ndarray
+    # The same of the readings; for steps, of the true displacement where the sensor is noisy.
     beside: np.ndarray | None = None
+    # Whether the median stands for a distance that no single reading of the sensor shows (erratum 40).
     below_sensor: bool = False
 
     @property
     def median(self) -> float | None:
         """Median over the seeds; None where it is not finite."""
         return _finite(np.median(self.ours))
+
+    @property
+    def median_beside(self) -> float | None:
+        """The same of `beside`."""
+        return None if self.beside is None else _finite(np.median(self.beside))
 
     @property
     def spread(self) -> float | None:
@@ -102,12 +98,8 @@ class Measured:
 
     def json(self) -> dict[str, float | bool | None]:
         """The figure in JSON values."""
-        return {
-            "paper": self.paper,
-            "ours": self.median,
-            "spread": self.spread,
-            "below_sensor": self.below_sensor,
-        }
+        figures = {"paper": self.paper, "ours": self.median, "spread": self.spread}
+        return figures | {"below_sensor": self.below_sensor}
 
 
 def _finite(value: Any) -> float | None:
@@ -167,7 +159,7 @@ def paper_json(result: PaperResult) -> dict[str, Any]:
             for place, figures in result.figures.items()
         },
         "beside": [
-            {"where": _PLACES[place], "scheme": scheme, "figure": name, "ours": _finite(np.median(f.beside))}
+            {"where": _PLACES[place], "scheme": scheme, "figure": name, "ours": f.median_beside}
             for place, scheme, name, f in result.rows()
             if f.beside is not None
         ],
@@ -176,102 +168,28 @@ def paper_json(result: PaperResult) -> dict[str, Any]:
     }
 
 
-_SENSOR = (
-    "*Below the sensor* are figures whose median is less than 100 nm, the sensor's last digit; a reading has a",
-    "noise of 31.8 nm besides. In Tables 3 and 4 these are 5 % and 1.59 % of 2 um, in Table 2 1.51 % and 0.48 % of",
-    "6.613 um; settling values are counted from the target. Such a sensor cannot show these errors: they are known",
-    "because the bench knows the truth. Nor could the paper's show its own (erratum 40): the 0.63 % and 0.23 % of",
-    "Table 3 are 12.6 and 4.6 nm.",
-)
-_DESIGN = (
-    "Poles, filters and learning rates of the controllers were chosen on this very bench, which then judges them:",
-    "ours is what the schemes do where they were set, not what they would do on a stage that was never tried.",
-    "In tracking, the CMAC has learnt in six runs of the same kind before the one that counts; the other schemes",
-    "have no such runs.",
-)
-
-
 def paper_page(result: PaperResult, pictures: Sequence[tuple[str, str]]) -> str:
-    """Put a result into a Markdown page.
-
-    Parameters
-    ----------
-    pictures
-        Caption and name of each.
-    """
-    lines = [
-        "# The paper's tables and figures, and ours",
-        "",
-        f"Ours is the median over {result.seeds} seeds, and the spread is the largest less the smallest; a seed is "
-        "new noise in all that is measured: the CSV the hysteresis is identified from, the CSV of the response, and "
-        "every reading of the runs. Errors are of the true displacement, which a bench knows and an experiment does "
-        "not; beside them stand those of the sensor's readings. Rows marked *calibrated* are what the bench was made "
-        "to show; all others are results.",
-        "",
-        *_SENSOR,
-        "",
-        *_DESIGN,
-        "",
-        "## Table 2: a step of 6.613 um along X, Y",
-        "",
-        "The paper's is a simulation, and so is ours: a sensor without noise. Beside it, with the noisy sensor.",
-        "",
-        *_table(result.table2, "table2", STEP_UNITS, "with the noisy sensor"),
-        "",
-        "## Table 3: tracking 0.5 Hz, 2 um peak to peak, along X, Y",
-        "",
-        *_table(result.table3, "table3", TRACK_UNITS, "of the readings"),
-        "",
-        "## Table 4: the other axes",
-        "",
-    ]
-    for axis, schemes in result.table4.items():
-        lines += [f"### {AXIS_TITLES[axis]}", "", *_table(schemes, axis, TRACK_UNITS, "of the readings"), ""]
-    lines += ["## What was identified: Fig. 6 and 9", "", *_figures(result.figures), ""]
-    worse = result.worse()
-    lines += ["## Worse than the paper", ""]
-    lines += [f"- {row}" for row in worse] if worse else ["No row."]
-    lines += ["", "## What was assumed", "", *(f"- {sentence}" for sentence in result.assumed), ""]
-    lines += ["## Pictures", ""]
-    for caption, name in pictures:
-        lines += [f"### {caption}", "", f"![{caption}]({name})", ""]
-    return "\n".join(lines)
+    """Put a result, and pictures by caption and file name, into a Markdown page."""
+    names = STEP_UNITS | TRACK_UNITS | {"loop_width_pct": "width of the loop (%)"}
+    return render("page.md.j2", result=result, pictures=pictures, names=names, axis_titles=AXIS_TITLES)
 
 
-def _table(
-    schemes: Mapping[str, Mapping[str, Measured]], place: str, units: Mapping[str, str], beside: str
-) -> list[str]:
-    lines = [
-        f"| scheme | figure | paper | ours | spread | ratio | {beside} | | below the sensor |",
-        "|---|---|--:|--:|--:|--:|--:|---|---|",
-    ]
-    for scheme, figures in schemes.items():
-        for name, figure in figures.items():
-            cells = [_number(x) for x in (figure.paper, figure.median, figure.spread, figure.ratio)]
-            cells.append("" if figure.beside is None else _number(_finite(np.median(figure.beside))))
-            cells += [_verdict(place, scheme, name, figure), "yes" if figure.below_sensor else ""]
-            lines.append(f"| {scheme} | {units[name]} | {' | '.join(cells)} |")
-    return lines
+def render(template: str, **values: Any) -> str:
+    """Fill a template of this folder."""
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(
+        loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True
+    )
+    environment.filters |= {"number": _number, "verdict": _verdict}
+    return environment.get_template(template).render(values)
 
 
-def _verdict(place: str, scheme: str, name: str, figure: Measured) -> str:
+def _verdict(figure: Measured, place: str, scheme: str, name: str) -> str:
     if (place, scheme) in CALIBRATED:
         return "calibrated"
     if name == "settling_value_um":
         return ""
     return "worse" if figure.worse else "no worse"
-
-
-def _figures(figures: Mapping[str, Mapping[str, Measured]]) -> list[str]:
-    lines = ["| figure | what | paper | ours | spread |", "|---|---|--:|--:|--:|"]
-    for place, rows in figures.items():
-        for name, figure in rows.items():
-            cells = " | ".join(_number(x) for x in (figure.paper, figure.median, figure.spread))
-            lines.append(f"| Fig. {place[3:]} | {_NAMES[name]} | {cells} |")
-    return lines
-
-
-_NAMES = TRACK_UNITS | {"loop_width_pct": "width of the loop (%)"}
 
 
 def _number(value: float | None) -> str:

@@ -4,15 +4,16 @@ import os
 from pathlib import Path
 from typing import Any
 
+from fits.io._printable import plain
 from fits.machining._budget import Budget
-from fits.plots._sensitivity import AXIS_SIGNS, UNIT_SIGNS, plain
+from fits.plots._sensitivity import AXIS_SIGNS, UNIT_SIGNS
 from fits.plots._style import DARK, WIDE_in, figure, label, legend, save
 
 _PARTS = {"driving": "0.3", "machining": "0.65", "measuring": "0.95"}
 
 
 def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw the parts of the worst case of each axis in percent of its stroke, and the root sum of squares.
+    """Draw the parts of the worst case of each axis in percent of its stroke, and the root sum of squares, in a file.
 
     Parameters
     ----------
@@ -20,11 +21,6 @@ def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
         From `budget`.
     folder
         Existing folder for `budget.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The file written.
 
     Raises
     ------
@@ -36,12 +32,8 @@ def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
     picture = figure(WIDE_in, 0.9 + 0.34 * len(axes))
     bars = picture.subplots()
     ends = [0.0] * len(axes)
-    for part, color in _PARTS.items():
-        sizes = {
-            "driving": [abs(axis.driving) for axis in axes],
-            "machining": [axis.machining_worst_case for axis in axes],
-            "measuring": [axis.measuring or 0.0 for axis in axes],
-        }[part]
+    parts = [(abs(axis.driving), axis.machining_worst_case, axis.measuring or 0.0) for axis in axes]
+    for (part, color), sizes in zip(_PARTS.items(), zip(*parts, strict=True), strict=True):
         widths = [100 * size / axis.stroke for size, axis in zip(sizes, axes, strict=True)]
         bars.barh(places, widths, 0.62, ends, color=color, edgecolor=DARK, linewidth=0.4, label=f"{part}, largest")
         ends = [end + width for end, width in zip(ends, widths, strict=True)]

@@ -4,16 +4,12 @@ import os
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from fits.control._compensate import Compensation
 from fits.control._compensate_stage import simulate_model
 from fits.io._record import Record, Reference
-from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, TWO_SIDED_95, WIDE_in, curve, figure, label, legend, save
 from microid import Preisach, Stage
-
-# Half-width of a 95 % interval in standard deviations.
-_TWO_SIDED_95 = 1.959964
 
 
 def plot_compensation(
@@ -39,12 +35,7 @@ def plot_compensation(
     displacement_sd_um
         Standard deviation of the model's displacement, shape `(n,)`, from `predict`; no band is drawn if None.
     folder
-        Existing folder for `compensation.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The file written.
+        Existing folder for `compensation.png`; 200 dots per inch. The paths come back.
 
     Raises
     ------
@@ -57,27 +48,21 @@ def plot_compensation(
 
     picture = figure(WIDE_in, 4.8, gap=0.08)
     (loop, inverse), (output, error) = picture.subplots(2, 2)
-    _line(loop, straight_V, plain, MEASURED, "without compensation")
-    label(loop, "voltage (V)", "displacement (µm)")
-    _line(inverse, wanted, voltage, MODEL, "with compensation")
-    label(inverse, "reference (µm)", "voltage (V)")
-    _line(output, wanted, plain, MEASURED)
-    _line(output, wanted, reached, MODEL)
-    label(output, "reference (µm)", "displacement (µm)")
+    curve(loop, straight_V, plain, "without compensation", **MEASURED)
+    label(loop, "voltage (V)", "displacement (µm)", "loop")
+    curve(inverse, wanted, voltage, "with compensation", **MODEL)
+    label(inverse, "reference (µm)", "voltage (V)", "inverse loop")
+    curve(output, wanted, plain, **MEASURED)
+    curve(output, wanted, reached, **MODEL)
+    label(output, "reference (µm)", "displacement (µm)", "output")
     off = reached - wanted
     error.axhline(0.0, color=LIGHT, linewidth=0.6)
-    _line(error, reference.time_s, off, MODEL)
+    curve(error, reference.time_s, off, **MODEL)
     if displacement_sd_um is not None:
-        half = _TWO_SIDED_95 * displacement_sd_um
-        keep = thinned(half)
-        for side in (-half, half):
-            name = "95 % band of the model" if side is half else ""
-            error.plot(
-                reference.time_s[keep], (off + side)[keep], color=DARK, linestyle=":", linewidth=0.7, label=name
-            )
-    label(error, "time (s)", "error (µm)")
-    for axes, title in zip((loop, inverse, output, error), ("loop", "inverse loop", "output", "error"), strict=True):
-        axes.set_title(title, loc="left", fontsize=7)
+        half = TWO_SIDED_95 * displacement_sd_um
+        for side, name in ((-half, ""), (half, "95 % band of the model")):
+            curve(error, reference.time_s, off + side, name, color=DARK, linestyle=":", linewidth=0.7)
+    label(error, "time (s)", "error (µm)", "error")
     legend(picture, (loop, inverse, error))
     return [save(picture, Path(folder) / "compensation.png")]
 
@@ -88,8 +73,3 @@ def _straight(wanted_um: np.ndarray, voltage_V: np.ndarray) -> np.ndarray:
     power = float(centred @ centred)
     gain = float(centred @ voltage_V) / power if power > 0 else 0.0
     return np.clip(voltage_V.mean() + gain * centred, voltage_V.min(), voltage_V.max())
-
-
-def _line(axes: Axes, x: np.ndarray, y: np.ndarray, style: dict, name: str = "") -> None:
-    keep = thinned(y)
-    axes.plot(x[keep], y[keep], label=name, **style)

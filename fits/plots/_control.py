@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.control._tune_start import slope_array
-from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save
 from microid import AbstractController, ControlledRun, Stage, loop_gain
 
 _FREQUENCIES = 600
@@ -34,35 +34,22 @@ def plot_control(
     plants
         Stages that the controller is to work with, the one that was run first.
     folder
-        Existing folder for `run.png` and `margins.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+        Existing folder for `run.png` and `margins.png`; 200 dots per inch. The paths come back.
 
     Raises
     ------
     DataError
         If a file cannot be written.
     """
-    columns = {
-        name: np.asarray(getattr(run, name))
-        for name in ("time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um")
-    }
+    time_s = np.asarray(run.time_s)
     picture = figure(WIDE_in, 5.2)
     above, error, below = picture.subplots(3, 1, sharex=True, height_ratios=(1.6, 1, 1))
-    for name, words, style in (
-        ("measured_um", "measured", MEASURED),
-        ("reference_um", "reference", {"color": DARK, "linewidth": 0.9, "linestyle": "--"}),
-        ("displacement_um", "displacement", MODEL),
-    ):
-        keep = thinned(columns[name])
-        above.plot(columns["time_s"][keep], columns[name][keep], label=words, **style)
+    curve(above, time_s, np.asarray(run.measured_um), "measured", **MEASURED)
+    curve(above, time_s, np.asarray(run.reference_um), "reference", color=DARK, linewidth=0.9, linestyle="--")
+    curve(above, time_s, np.asarray(run.displacement_um), "displacement", **MODEL)
     error.axhline(0.0, color=LIGHT, linewidth=0.6)
-    for axes, name in ((error, "error_um"), (below, "command_V")):
-        keep = thinned(columns[name])
-        axes.plot(columns["time_s"][keep], columns[name][keep], **MODEL)
+    curve(error, time_s, np.asarray(run.error_um), **MODEL)
+    curve(below, time_s, np.asarray(run.command_V), **MODEL)
     label(above, "", "displacement (µm)")
     label(error, "", "error (µm)")
     label(below, "time (s)", "command (V)")

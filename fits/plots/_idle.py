@@ -8,13 +8,13 @@ from matplotlib.axes import Axes
 
 from fits.io._record import Reference
 from fits.machining._idle import IdleNoise
-from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned, verbatim
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save, verbatim
 
 _MOST_LINES = 5
 
 
 def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
+    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation, in a file.
 
     Parameters
     ----------
@@ -24,11 +24,6 @@ def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[
         From `idle_noise`.
     folder
         Existing folder for `idle.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The file written.
 
     Raises
     ------
@@ -43,24 +38,17 @@ def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[
     _draw_readings(readings, histogram, reference, noise)
     _draw_spectrum(spectrum, noise)
     _draw_allan(allan, noise)
-    titles = {readings: verbatim(reference.source) or "readings", spectrum: "spectrum", allan: "Allan deviation"}
-    for axes, title in titles.items():
-        axes.set_title(title, loc="left", fontsize=7)
     legend(picture, (readings,))
     return [save(picture, Path(folder) / "idle.png")]
 
 
 def _draw_readings(axes: Axes, margin: Axes, reference: Reference, noise: IdleNoise) -> None:
-    values = reference.displacement_um
-    keep = thinned(values)
-    axes.plot(reference.time_s[keep], values[keep], label="readings", **MEASURED | {"linewidth": 0.4})
-    half = noise.error_um()
-    for level in (noise.mean_um - half, noise.mean_um, noise.mean_um + half):
-        style = "-" if level == noise.mean_um else ":"
-        name = {noise.mean_um: "offset", noise.mean_um + half: "offset ± measuring error"}.get(level, "")
+    values, half = reference.displacement_um, noise.error_um()
+    curve(axes, reference.time_s, values, "readings", **MEASURED | {"linewidth": 0.4})
+    for more, style, name in ((-half, ":", ""), (0.0, "-", "offset"), (half, ":", "offset ± measuring error")):
         for each in (axes, margin):
-            each.axhline(level, color=DARK, linestyle=style, linewidth=0.8, label=name)
-    label(axes, "time (s)", "displacement (µm)")
+            each.axhline(noise.mean_um + more, color=DARK, linestyle=style, linewidth=0.8, label=name)
+    label(axes, "time (s)", "displacement (µm)", verbatim(reference.source) or "readings")
     margin.hist(values, _edges(noise, values), orientation="horizontal", color=LIGHT)
     margin.tick_params(labelleft=False)
     margin.set_xticks([])
@@ -79,15 +67,15 @@ def _edges(noise: IdleNoise, values: np.ndarray) -> list[float]:
 
 def _draw_spectrum(axes: Axes, noise: IdleNoise) -> None:
     density = noise.asd_um_per_rtHz
-    keep = thinned(density)
-    axes.loglog(noise.frequency_Hz[keep], density[keep], **MODEL)
+    curve(axes, noise.frequency_Hz, density, **MODEL)
+    axes.set(xscale="log", yscale="log")
     at_Hz = [line.frequency_Hz for line in noise.lines[:_MOST_LINES]]
     if at_Hz:
         tops = [float(density[np.argmin(np.abs(noise.frequency_Hz - each))]) for each in at_Hz]
         axes.plot(at_Hz, tops, "v", color=DARK, markersize=3.5)
         for x, y in zip(at_Hz, tops, strict=True):
             axes.annotate(f"{x:.4g} Hz", (x, y), (3, 1), textcoords="offset points", fontsize=6)
-    label(axes, "frequency (Hz)", "amplitude density (µm/√Hz)")
+    label(axes, "frequency (Hz)", "amplitude density (µm/√Hz)", "spectrum")
 
 
 def _draw_allan(axes: Axes, noise: IdleNoise) -> None:
@@ -99,4 +87,4 @@ def _draw_allan(axes: Axes, noise: IdleNoise) -> None:
     axes.plot(time_s, deviation[0] * np.sqrt(time_s[0] / time_s), ":", color=DARK, linewidth=0.8, label="white noise")
     axes.plot(noise.bias_instability_s, noise.bias_instability_um, "o", color=DARK, markersize=3, label="minimum")
     axes.legend(frameon=False)
-    label(axes, "averaging time (s)", "Allan deviation (µm)")
+    label(axes, "averaging time (s)", "Allan deviation (µm)", "Allan deviation")

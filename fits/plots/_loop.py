@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -14,44 +14,17 @@ from matplotlib.figure import Figure
 
 from fits.io._record import Record
 from fits.loop._result import FitResult, RunReport
-from fits.loop._run import Run, prepare_run, simulate_run, split
-from fits.loop._uncertainty import sd_run
-from fits.plots._style import (
-    DARK,
-    LIGHT,
-    MEASURED,
-    MODEL,
-    NARROW_in,
-    WIDE_in,
-    figure,
-    label,
-    legend,
-    save,
-    thinned,
-    verbatim,
-)
-from fits.stats._metrics import Errors
-from microid import Preisach, Reversible, Staircase, remember
+from fits.loop._run import Run, prepare_run, simulate_run
+from fits.plots._runs import Drawn, held_out, loops, over_time
+from fits.plots._style import DARK, NARROW_in, WIDE_in, figure, label, save
+from microid import Preisach, Reversible
 
-# Half-width of a 95 % interval in standard deviations.
-_TWO_SIDED_95 = 1.959964
-# Runs side by side in one picture.
-_MOST_RUNS = 3
 _MESH = 361
 _ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """A run with its prediction, as the report compares them."""
-
-    run: Run
-    report: RunReport
-    predicted_um: np.ndarray
-
-
 def plot_fit(
-    result: FitResult,
+    result: FitResult[Preisach],
     records: Sequence[Record],
     folder: str | os.PathLike[str],
     *,
@@ -67,12 +40,8 @@ def plot_fit(
     records, holdout, initial
         What `fit` was given.
     folder
-        Existing folder for `loops.png`, `density.png`, `everett.png` and `heldout.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+        Existing folder for `loops.png`, `density.png`, `everett.png` and `heldout.png`; 200 dots per inch. The paths
+        come back.
 
     Raises
     ------
@@ -81,111 +50,31 @@ def plot_fit(
     ValueError
         If the records are not those of the result.
     """
-    fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
-    aside: Sequence[Record] = () if isinstance(holdout, int | float) else holdout
-    if len(records) + len(aside) != len(result.runs):
-        raise ValueError(
-            f"the result has {len(result.runs)} runs, and {len(records) + len(aside)} records were given"
-        )
-    lower, upper = float(result.model.density.lower_V), float(result.model.density.upper_V)
-    runs = [prepare_run(record, lower, upper, initial, fraction) for record in records]
-    for record in aside:
-        run = prepare_run(record, lower, upper, initial, holdout=1.0)
-        runs.append(replace(run, fitted=np.zeros_like(run.known)))
+    fraction, aside = held_out(holdout, len(records), len(result.runs))
+    range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
+    runs = [prepare_run(record, range_V, initial, fraction) for record in records]
+    runs += [prepare_run(record, range_V, initial, holdout=1.0) for record in aside]
     drawn = [_simulated(result, run, report) for run, report in zip(runs, result.runs, strict=True)]
 
     voltage, (density, everett) = _over_half_plane(result.model)
     pictures = {
-        "loops": _loops(drawn[: len(records)]),
+        "loops": loops(drawn[: len(records)]),
         "density": _density(voltage, density, result.model.reversible),
         "everett": _everett(voltage, everett),
     }
-    held_out = [each for each in drawn if each.run.held_out.any()]
-    if held_out:
-        pictures["heldout"] = _heldout(result, held_out)
+    if predicted := [each for each in drawn if each.run.held_out.any()]:
+        pictures["heldout"] = over_time(predicted, held_out_alone=True)
     return [save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
 
 
-def _simulated(result: FitResult, run: Run, report: RunReport) -> _Drawn:
+def _simulated(result: FitResult[Preisach], run: Run, report: RunReport) -> Drawn:
     model = eqx.tree_at(lambda m: m.offset_um, result.model, jnp.asarray(report.offset_um))
     predicted = simulate_run(model, run)
     if not run.known.all():
         # The reported errors are those of the known samples; the start was estimated from the others.
-        predicted = np.where(run.known, predicted, simulate_run(model, _started(run, report.start)))
-    return _Drawn(run, report, predicted)
-
-
-def _started(run: Run, start: Staircase) -> Run:
-    """Let a run begin with another memory."""
-    size = run.starts[0].extremes_V.shape[0]
-    starts = [Staircase(jnp.pad(start.extremes_V, (0, size - start.extremes_V.shape[0]), mode="edge"), start.count)]
-    for piece in split(run.record.voltage_V)[:-1]:
-        starts.append(_end(jnp.asarray(piece), starts[-1]))
-    return replace(run, starts=tuple(starts))
-
-
-@eqx.filter_jit
-def _end(voltage_V: Float[Array, " n"], start: Staircase) -> Staircase:
-    return remember(voltage_V, start).end()
-
-
-def _columns(runs: Sequence[_Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
-    """Two rows of axes, values above errors, with a column for each of the first runs."""
-    shown = min(len(runs), _MOST_RUNS)
-    picture = figure(width_in if shown == 1 else WIDE_in, 3.6)
-    axes = picture.subplots(2, shown, squeeze=False, sharex="col", height_ratios=(2.2, 1))
-    label(axes[0, 0], "", "displacement (µm)")
-    label(axes[1, 0], "", "error (µm)")
-    return picture, axes
-
-
-def _caption(axes: Axes, report: RunReport, errors: Errors | None) -> None:
-    figures = "" if errors is None else f"\ne_rms {errors.e_rms_pct:.3g} %, e_max {errors.e_max_pct:.3g} %"
-    axes.set_title(verbatim(report.source) + figures, loc="left", fontsize=7)
-
-
-def _loops(runs: Sequence[_Drawn]) -> Figure:
-    picture, axes = _columns(runs, NARROW_in)
-    for each, (loop, error) in zip(runs, axes.T, strict=False):
-        voltage, measured = each.run.record.voltage_V, each.run.displacement_um
-        keep = thinned(measured)
-        # Nested loops lie close together, so the lines are thinner than elsewhere.
-        loop.plot(voltage[keep], measured[keep], label="measured", **MEASURED | {"linewidth": 1.1})
-        loop.plot(voltage[keep], each.predicted_um[keep], label="fitted", **MODEL | {"linewidth": 0.3})
-        off = (measured - each.predicted_um)[each.run.known]
-        keep = thinned(off)
-        error.axhline(0.0, color=LIGHT, linewidth=0.6)
-        error.plot(voltage[each.run.known][keep], off[keep], color=DARK, linewidth=0.25)
-        label(error, "voltage (V)")
-        label(loop)
-        _caption(error, each.report, each.report.in_sample)
-    legend(picture, axes[:1, 0])
-    return picture
-
-
-def _heldout(result: FitResult, runs: Sequence[_Drawn]) -> Figure:
-    picture, axes = _columns(runs, WIDE_in)
-    for each, (above, below) in zip(runs, axes.T, strict=False):
-        samples = each.run.held_out
-        time_s, measured = each.run.record.time_s[samples], each.run.displacement_um[samples]
-        predicted = each.predicted_um[samples]
-        half = _TWO_SIDED_95 * sd_run(result.uncertainty, each.run)[samples]
-        noisy = np.hypot(half, _TWO_SIDED_95 * result.noise_um)
-        keep = thinned(measured)
-        above.plot(time_s[keep], measured[keep], label="measured", **MEASURED)
-        above.plot(time_s[keep], predicted[keep], label="predicted", **MODEL)
-        low, high = (predicted - half)[keep], (predicted + half)[keep]
-        above.fill_between(time_s[keep], low, high, color="0.3", linewidth=0, zorder=1)
-        keep = thinned(measured - predicted)
-        below.plot(time_s[keep], (measured - predicted)[keep], color="0.6", linewidth=0.35, label="error")
-        for curve, style, name in ((half, "-", "95 % band"), (noisy, ":", "95 % band with noise")):
-            below.plot(time_s[keep], curve[keep], color=DARK, linestyle=style, linewidth=0.9, label=name)
-            below.plot(time_s[keep], -curve[keep], color=DARK, linestyle=style, linewidth=0.9)
-        label(below, "time (s)")
-        label(above)
-        _caption(below, each.report, each.report.held_out)
-    legend(picture, axes[:, 0])
-    return picture
+        predicted = np.where(run.known, predicted, simulate_run(model, replace(run, start=report.start)))
+    sd_um = result.uncertainty.sd_um(result.model, run) if run.held_out.any() else np.zeros(len(predicted))
+    return Drawn(run, report, predicted, sd_um, result.noise_um)
 
 
 @eqx.filter_jit

@@ -5,10 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fits.plots._style import LIGHT, MEASURED, MODEL, WIDE_in, figure, label, legend, save, thinned
+from fits.plots._style import LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save
 
 _STYLES: dict[str, dict[str, Any]] = {
     "reference": {"color": "0.75", "linewidth": 2.5},
@@ -52,8 +51,7 @@ def plot_inverse(
     ]
     for letter, (axes, x, y, below, beside) in zip("abcd", curves, strict=True):
         axes.plot(x, y, **MODEL)
-        label(axes, below, beside)
-        axes.set_title(f"({letter})", loc="left")
+        label(axes, below, beside, f"({letter})", size_pt=8)
     return save(picture, path)
 
 
@@ -73,33 +71,18 @@ def plot_steps(time_s: np.ndarray, target_um: float, steps: Mapping[str, np.ndar
 def plot_tracking(
     interval_s: float, runs: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]], path: Path
 ) -> Path:
-    """Draw Fig. 11 and 12: rows of a run and its errors.
-
-    Parameters
-    ----------
-    interval_s
-        Between two samples.
-    runs
-        A title per row, the reference, and displacements by scheme, each of shape `(n,)`.
-    """
+    """Draw Fig. 11 and 12: rows of a title, a reference and displacements by scheme, each of shape `(n,)`."""
     picture: Figure = figure(WIDE_in, 2.1 * len(runs) + 0.4, gap=0.08)
     rows = np.atleast_2d(picture.subplots(len(runs), 2))
     for (shown, error), (title, reference_um, schemes) in zip(rows, runs, strict=True):
         time_s = interval_s * np.arange(len(reference_um))
-        _line(shown, time_s, reference_um, "reference")
+        curve(shown, time_s, reference_um, "reference", **_STYLES["reference"])
         error.axhline(0, color=LIGHT, linewidth=0.6)
         for scheme, displacement_um in schemes.items():
-            _line(shown, time_s, displacement_um, scheme)
-            _line(error, time_s, 100 * (reference_um - displacement_um) / np.ptp(reference_um), scheme)
-        shown.set_title(title, loc="left")
-        label(shown, "time (s)", "displacement (µm)")
+            off_pct = 100 * (reference_um - displacement_um) / np.ptp(reference_um)
+            curve(shown, time_s, displacement_um, scheme, **_STYLES[scheme])
+            curve(error, time_s, off_pct, **_STYLES[scheme])
+        label(shown, "time (s)", "displacement (µm)", title, size_pt=8)
         label(error, "time (s)", "error (%)")
-    pairs = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in rows[:, 0]]
-    handles = {name: handle for row in pairs for handle, name in row}
-    picture.legend(handles.values(), handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    legend(picture, rows[:, 0])
     return save(picture, path)
-
-
-def _line(axes: Axes, time_s: np.ndarray, values_um: np.ndarray, name: str) -> None:
-    keep = thinned(values_um)
-    axes.plot(time_s[keep], values_um[keep], label=name, **_STYLES[name])

@@ -1,6 +1,5 @@
 """Pictures of what machining errors do: tornado plots, and the curves of the paper's Fig. 7."""
 
-import dataclasses
 import os
 import re
 import textwrap
@@ -16,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 import microid as m
+from fits.io._printable import plain
 from fits.machining._claims import Claim, paper_claims
-from fits.machining._design import Design, paper_design
+from fits.machining._design import Design, lever_mm, paper_design
 from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at
 from fits.plots._style import DARK, LIGHT, WIDE_in, figure, label, legend, save
 
@@ -34,30 +34,16 @@ _CHARACTERS = 64
 _DIMENSION = re.compile(rf"\b(?:{'|'.join({name for motion in m.MOTIONS.values() for name in motion.dimensions})})\b")
 
 
-_LEADER: dict[str, Any] = {
-    "arrowstyle": "-",
-    "color": "0.5",
-    "linewidth": 0.4,
-    "shrinkA": 1.5,
-    "shrinkB": 0,
-    "relpos": (0, 0.5),
-    "patchA": None,
-}
+# A thin line from a label to its curve; without `patchA` it would end at the frame of the label.
+_LEADER: dict[str, Any] = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.4, "patchA": None}
+_LEADER |= {"shrinkA": 1.5, "shrinkB": 0, "relpos": (0, 0.5)}
 
 
 @dataclass(frozen=True)
 class _Panel:
-    """One motion, or two that are alike.
+    """One motion, or two that are alike: sensitivities of the first, the names of all, and curves by dimension.
 
-    Attributes
-    ----------
-    axis
-        Sensitivities of the first.
-    title
-        Names of all.
-    curves
-        Relative change of the output by dimension over the steps of its error, from minus to plus one tolerance,
-        each of shape `(s,)`.
+    A curve is the relative change of the output over errors from minus to plus one tolerance, shape `(s,)`.
     """
 
     axis: AxisSensitivity
@@ -77,11 +63,6 @@ def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os
     folder
         Existing folder for `tornado.png` and `machining_error.png`; 200 dots per inch.
 
-    Returns
-    -------
-    list of Path
-        The files written.
-
     Raises
     ------
     DataError
@@ -96,14 +77,10 @@ def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os
 
 
 def _panels(design: Design, report: SensitivityReport) -> list[_Panel]:
-    panels: list[_Panel] = []
-    left = list(report.axes.values())
-    while left:
-        first = left[0]
-        names = [each.axis for each in left if dataclasses.replace(each, axis=first.axis) == first]
-        left = [each for each in left if each.axis not in names]
-        title = ", ".join(AXIS_SIGNS.get(name, name) for name in names)
-        panels.append(_Panel(first, title, _curves(design, first.axis)))
+    panels = []
+    for axes in report.alike():
+        title = ", ".join(AXIS_SIGNS.get(each.axis, each.axis) for each in axes)
+        panels.append(_Panel(axes[0], title, _curves(design, axes[0].axis)))
     return panels
 
 
@@ -141,51 +118,50 @@ def _draw_bars(axes: Axes, panel: _Panel) -> None:
     places = range(len(effects))
     changes = np.array([effect.relative_change_pct for effect in effects])
     exact = 100 * np.array([panel.curves[effect.name][[0, -1]] for effect in effects])
-    plain: dict[str, Any] = {"height": 0.72, "linewidth": 0.4, "edgecolor": DARK}
-    axes.barh(places, changes, color="0.45", label="plus one tolerance, first order", **plain)
-    axes.barh(places, -changes, color="0.9", label="minus one tolerance, first order", **plain)
-    marks: dict[str, Any] = {"linestyle": "none", "markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
-    axes.plot(exact[:, 1], places, marker="D", label="plus, exact", markerfacecolor="0.0", **marks)
-    axes.plot(exact[:, 0], places, marker="D", label="minus, exact", markerfacecolor="1.0", **marks)
+    bars: dict[str, Any] = {"height": 0.72, "linewidth": 0.4, "edgecolor": DARK}
+    marks: dict[str, Any] = {"markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
+    for name, values, color in (("plus", changes, "0.45"), ("minus", -changes, "0.9")):
+        axes.barh(places, values, color=color, label=f"{name} one tolerance, first order", **bars)
+    for name, values, color in (("plus", exact[:, 1], "0.0"), ("minus", exact[:, 0], "1.0")):
+        axes.plot(values, places, "D", label=f"{name}, exact", markerfacecolor=color, **marks)
     axes.axvline(0, color=DARK, linewidth=0.6)
     axes.set_ylim(len(effects) - 0.4, -0.6)
     axes.set_yticks(places, [f"{symbol(effect.name)} ± {_tolerance(effect)}" for effect in effects])
+    beside: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "ha": "right", "va": "center", "fontsize": 7}
     for place, effect in zip(places, effects, strict=True):
-        words = _signed(f"{effect.relative_change_pct:+.3f} %")
-        axes.text(1.10, place, words, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
-        share = _signed(f"{100 * effect.share_of_variance:.1f} %")
-        axes.text(1.20, place, share, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=7)
+        axes.text(1.10, place, _signed(f"{effect.relative_change_pct:+.3f} %"), **beside)
+        axes.text(1.20, place, _signed(f"{100 * effect.share_of_variance:.1f} %"), **beside)
     for x, words in ((1.10, "change"), (1.20, "share of\nvariance")):
         axes.text(x, 1.0, words, transform=axes.transAxes, ha="right", va="bottom", fontsize=_SMALL_pt)
     axis = panel.axis
     title = f"{panel.title}: root sum of squares {axis.rss_pct:.2f} %, worst case {axis.worst_case_pct:.2f} %"
-    axes.set_title(title, loc="left", fontsize=8)
-    label(axes)
+    label(axes, title=title, size_pt=8)
     axes.tick_params(axis="y", length=0)
 
 
 def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[Claim]) -> Figure:
     """Fig. 7: panels in two columns, each with its claims below."""
     columns = min(_COLUMNS, len(panels))
-    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
-    words = {panel.title: _claim_lines(panel, claims) for panel in panels}
-    heights = [
-        height
-        for row in rows
-        for height in (_PANEL_in, _LINE_in * max(1, *(len(words[panel.title]) for panel in row)))
-    ]
-    picture = figure(WIDE_in * (1 if columns > 1 else 0.55), sum(heights) + 0.55 * len(rows) + 0.25, gap=0.06)
-    grid = picture.add_gridspec(2 * len(rows), columns, height_ratios=heights)
+    lines = [_claim_lines(panel, claims) for panel in panels]
+    heights = []
+    for k in range(0, len(panels), columns):
+        heights += [_PANEL_in, _LINE_in * max(1, *map(len, lines[k : k + columns]))]
+    width_in = WIDE_in * (1 if columns > 1 else 0.55)
+    picture = figure(width_in, sum(heights) + 0.55 * len(heights) / 2 + 0.25, gap=0.06)
+    grid = picture.add_gridspec(len(heights), columns, height_ratios=heights)
     for k, panel in enumerate(panels):
         row, column = divmod(k, columns)
         axes = picture.add_subplot(grid[2 * row, column])
         _draw_curves(axes, design, panel)
-        unit = UNIT_SIGNS[panel.axis.output_unit]
-        axes.set_title(f"({'abcdef'[k]}) {panel.title}: full stroke {plain(panel.axis.stroke)} {unit}", loc="left")
-        axes.title.set_fontsize(8)
+        stroke = f"{plain(panel.axis.stroke)} {UNIT_SIGNS[panel.axis.output_unit]}"
+        label(axes, title=f"({'abcdef'[k]}) {panel.title}: full stroke {stroke}", size_pt=8)
         below = picture.add_subplot(grid[2 * row + 1, column])
         below.set_axis_off()
-        _write(below, words[panel.title])
+        for number, (words, color) in enumerate(lines[k]):
+            place: dict[str, Any] = {"xytext": (0, -72 * _LINE_in * number), "textcoords": "offset points"}
+            below.annotate(
+                words, (0, 1), **place, xycoords="axes fraction", va="top", fontsize=_SMALL_pt, color=color
+            )
     kinds = [picture.axes[0].plot([], [], style, color="0.0", linewidth=0.8)[0] for style in ("-", "--")]
     names = ["length", "angle, by the error across its leg"]
     picture.legend(kinds, names, loc="outside upper center", ncols=2, frameon=False)
@@ -196,7 +172,7 @@ def _draw_curves(axes: Axes, design: Design, panel: _Panel) -> None:
     unit = UNIT_SIGNS[panel.axis.output_unit]
     effects = sorted(panel.axis.dimensions, key=lambda effect: panel.curves[effect.name][-1])
     curves = {effect.name: panel.axis.stroke * panel.curves[effect.name] for effect in effects}
-    ends_mm = {effect.name: _length_mm(design, effect) for effect in effects}
+    ends_mm = {effect.name: effect.tolerance * lever_mm(design.geometry, effect.name) for effect in effects}
     widest_mm = max(ends_mm.values()) or 1.0
     reach = 1.08 * max(float(np.abs(curve).max()) for curve in curves.values()) or 1.0
     axes.set_xlim(-widest_mm, widest_mm)
@@ -228,37 +204,19 @@ def _apart(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
     return np.asarray(isotonic_regression(wanted - steps).x) + steps
 
 
-@dataclass(frozen=True)
-class _Line:
-    """A line of words in a colour, with a verdict in bold before them where there is one."""
-
-    words: str
-    color: str = DARK
-    verdict: str = ""
-
-
-def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[_Line]:
-    """What the paper says of a motion, each with our verdict and the figures for it."""
-    lines: list[_Line] = []
+def _claim_lines(panel: _Panel, claims: Sequence[Claim]) -> list[tuple[str, str]]:
+    """What the paper says of a motion with our verdict in bold and the figures for it: lines and their colours."""
+    lines: list[tuple[str, str]] = []
     for claim in claims:
         # One on several motions stands below the last of them.
         if panel.axis.axis in claim.axes and (panel.axis.axis == claim.axes[0]) == (len(claim.axes) < 3):
             reason = claim.reason.partition(". ")[0].rstrip(".")
             room = " " * len(f"{claim.verdict}: ")
             first, *more = textwrap.wrap(claim.statement, _CHARACTERS, initial_indent=room, subsequent_indent="   ")
-            lines.append(_Line(first[len(room) :], verdict=claim.verdict))
-            lines += [_Line(line) for line in more]
-            lines += [_Line(f"   {line}", "0.4") for line in textwrap.wrap(reason, _CHARACTERS - 3)]
-    return [_Line("The paper's reading of its Fig. 7, and this stage:"), *lines] if lines else []
-
-
-def _write(axes: Axes, lines: Sequence[_Line]) -> None:
-    for k, line in enumerate(lines):
-        words = _with_symbols(line.words)
-        if line.verdict:
-            words = rf"$\bf{{{line.verdict}}}$: {words}"
-        place: dict[str, Any] = {"xy": (0, 1), "xytext": (0, -72 * _LINE_in * k), "textcoords": "offset points"}
-        axes.annotate(words, **place, xycoords="axes fraction", va="top", fontsize=_SMALL_pt, color=line.color)
+            lines.append((rf"$\bf{{{claim.verdict}}}$: {_with_symbols(first[len(room) :])}", DARK))
+            lines += [(_with_symbols(line), DARK) for line in more]
+            lines += [(_with_symbols(f"   {line}"), "0.4") for line in textwrap.wrap(reason, _CHARACTERS - 3)]
+    return [("The paper's reading of its Fig. 7, and this stage:", DARK), *lines] if lines else []
 
 
 def _with_symbols(words: str) -> str:
@@ -281,17 +239,5 @@ def symbol(name: str) -> str:
     return f"${stem}_{{{index}}}$" if index else f"${stem}$"
 
 
-def plain(number: float, digits: int = 4) -> str:
-    """Significant digits, or whole numbers where these are more, without an exponent for large ones."""
-    return f"{number:.{digits}g}" if abs(number) < 10**digits else f"{number:.0f}"
-
-
 def _tolerance(effect: DimensionEffect) -> str:
-    unit, scale = ("mrad", 1e3) if effect.unit == "rad" else ("µm", 1e3)
-    return f"{scale * effect.tolerance:.3g} {unit}"
-
-
-def _length_mm(design: Design, effect: DimensionEffect) -> float:
-    """Tolerance as a length: of an angle, that of the end of its leg."""
-    leg = m.DIMENSIONS[effect.name].leg
-    return effect.tolerance * (1.0 if leg is None else float(design.geometry[leg]))
+    return f"{1e3 * effect.tolerance:.3g} {'mrad' if effect.unit == 'rad' else 'µm'}"

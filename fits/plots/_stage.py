@@ -2,37 +2,22 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from fits.control._compensate_stage import static_equivalent
 from fits.io._record import Record
-from fits.loop._result import RunReport
-from fits.loop._run import prepare_run, simulate_run
-from fits.plots._loop import _MOST_RUNS, _TWO_SIDED_95, _caption
-from fits.plots._style import (
-    DARK,
-    LIGHT,
-    MEASURED,
-    MODEL,
-    NARROW_in,
-    WIDE_in,
-    figure,
-    label,
-    legend,
-    save,
-    thinned,
-    verbatim,
-)
-from fits.stage._result import StageFit
-from fits.stage._run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run, residual_of
+from fits.loop._result import FitResult
+from fits.loop._run import Run, prepare_run, simulate_run
+from fits.plots._runs import Drawn, held_out, loops, over_time
+from fits.plots._style import WIDE_in, figure, label, legend, save, verbatim
+from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of
 from fits.stage._start import MeasuredResponse, measure_response
 from microid import AbstractLinear, Preisach, Stage
 
@@ -42,23 +27,8 @@ _FREQUENCIES, _BEYOND = 600, 1.3
 _SURE, _FAINTEST = 0.8, 0.85
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """A run with its prediction, as the report compares them."""
-
-    run: StageRun
-    report: RunReport
-    predicted_um: np.ndarray
-    sd_um: np.ndarray
-    noise_um: float
-
-    @property
-    def off_um(self) -> np.ndarray:
-        return self.run.displacement_um - self.predicted_um
-
-
 def plot_stage(
-    result: StageFit,
+    result: FitResult[Stage],
     records: Sequence[Record],
     folder: str | os.PathLike[str],
     *,
@@ -75,12 +45,7 @@ def plot_stage(
         What `fit_stage` was given.
     folder
         Existing folder for `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
-        out) and `loop.png`; 200 dots per inch.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+        out) and `loop.png`; 200 dots per inch. The paths come back.
 
     Raises
     ------
@@ -89,47 +54,39 @@ def plot_stage(
     ValueError
         If the records are not those of the result.
     """
-    fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
-    aside: Sequence[Record] = () if isinstance(holdout, int | float) else holdout
+    fraction, aside = held_out(holdout, len(records), len(result.runs))
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
-    if len(records) != len(result.substeps) or len(records) + len(aside) != len(result.runs):
-        raise ValueError(
-            f"the result has {len(result.runs)} runs, and {len(records) + len(aside)} records were given"
-        )
+    known = result.fitted_runs
+    if len(records) != len(known):
+        raise ValueError(f"the result is of {len(known)} fitted runs, and {len(records)} were given")
     # The runs are refined already.
-    stage = result.model.with_substeps(1)
-    range_V = _range_V([*records, *aside])
-    gain = gain_ahead(stage)
-    before_aside = initial if isinstance(initial, str) else "unknown"
+    stage, gain = result.model.with_substeps(1), gain_ahead(result.model)
+    voltages = np.concatenate([record.voltage_V for record in (*records, *aside)])
+    range_V = float(voltages.min()), float(voltages.max())
     runs = [
-        prepare_stage_run(record, range_V, state, fraction, stride, gain, stage.hold)
-        for record, state, stride in zip(records, states, result.substeps, strict=True)
+        prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold)
+        for record, state, report in zip(records, states, known, strict=True)
     ]
+    before_aside = initial if isinstance(initial, str) else "unknown"
     for record in aside:
-        run = prepare_stage_run(record, range_V, before_aside, 1.0, result.substeps[-1], gain, stage.hold)
-        runs.append(replace(run, fitted=run.known).weighted(run.known))
-    noises = [*result.noise_um, *([max(result.noise_um)] * len(aside))]
+        run = prepare_run(record, range_V, before_aside, 1.0, known[-1].substeps or 1, gain, stage.hold)
+        runs.append(replace(run, fitted=run.known))
+    noises = [report.noise_um or 0.0 for report in known]
+    noises += [max(noises)] * len(aside)
     drawn = [
-        _simulated(result, stage, run, report, noise)
+        Drawn(run, report, run.displacement_um - residual_of(stage, run), result.uncertainty.sd_um(stage, run), noise)
         for run, report, noise in zip(runs, result.runs, noises, strict=True)
     ]
     fitted, predicted = drawn[: len(records)], drawn[len(records) :]
     pictures: dict[str, Figure] = {}
-    response = _measured(stage, [each.run for each in fitted], states, fraction)
+    response = _measured(stage, runs[: len(records)], states, fraction)
     if response is not None:
         pictures["response"] = _response(stage, *response)
-    pictures["runs"] = _runs(fitted)
+    pictures["runs"] = over_time(fitted)
     if predicted:
-        pictures["heldout"] = _runs(predicted)
-    pictures["loop"] = _loop(min(fitted, key=lambda each: _speed_per_s(each.run.record)))
+        pictures["heldout"] = over_time(predicted)
+    pictures["loop"] = loops([min(fitted, key=lambda each: _speed_per_s(each.run.record))])
     return [save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
-
-
-def _range_V(records: Sequence[Record]) -> tuple[float, float]:
-    return (
-        min(float(record.voltage_V.min()) for record in records),
-        max(float(record.voltage_V.max()) for record in records),
-    )
 
 
 def _speed_per_s(record: Record) -> float:
@@ -138,13 +95,8 @@ def _speed_per_s(record: Record) -> float:
     return float(np.sqrt(np.mean(rate**2)) / np.ptp(record.voltage_V))
 
 
-def _simulated(result: StageFit, stage: Stage, run: StageRun, report: RunReport, noise_um: float) -> _Drawn:
-    predicted = run.displacement_um - residual_of(stage, run)
-    return _Drawn(run, report, predicted, result.uncertainty.sd_um(stage, run), noise_um)
-
-
 def _measured(
-    stage: Stage, runs: Sequence[StageRun], states: Sequence[str], fraction: float
+    stage: Stage, runs: Sequence[Run], states: Sequence[str], fraction: float
 ) -> tuple[str, MeasuredResponse] | None:
     """Frequency response behind the hysteresis, from the run that shows the highest frequencies."""
     found = []
@@ -167,8 +119,8 @@ def _static_um(stage: Stage, record: Record, state: str, fraction: float) -> np.
     law: Any = None if place is None else stage.parts[place]
     if isinstance(law, Preisach):
         static = static_equivalent(stage)
-        lower, upper = float(static.density.lower_V), float(static.density.upper_V)
-        return simulate_run(static, prepare_run(record, lower, upper, state, fraction))
+        range_V = float(static.density.lower_V), float(static.density.upper_V)
+        return simulate_run(static, prepare_run(record, range_V, state, fraction))
     if law is None:
         return float(stage.static_gain) * record.voltage_V
     return float(stage.static_gain) * np.asarray(law(jnp.asarray(record.voltage_V)))
@@ -214,72 +166,8 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
     turn.semilogx(frequency, np.degrees(phase), color="0.5", linewidth=1.2)
     turn.xaxis.set_major_formatter(LogFormatter())
     turn.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
-    label(size, "", "magnitude")
+    title = f"{verbatim(source)}\nover the displacement that the hysteresis alone would give"
+    label(size, "", "magnitude", title)
     label(turn, "frequency (Hz)", "phase (°)")
-    size.set_title(
-        f"{verbatim(source)}\nover the displacement that the hysteresis alone would give", loc="left", fontsize=7
-    )
     legend(picture, (size,))
-    return picture
-
-
-def _runs(runs: Sequence[_Drawn]) -> Figure:
-    """Displacement and residual against time, with a column for each of the first runs."""
-    shown = runs[:_MOST_RUNS]
-    picture = figure(WIDE_in, 3.9, gap=0.04)
-    axes = picture.subplots(2, len(shown), squeeze=False, sharex="col", height_ratios=(1.6, 1))
-    for each, (above, below) in zip(shown, axes.T, strict=True):
-        time_s, measured = each.run.record.time_s, each.run.displacement_um
-        keep = thinned(measured)
-        above.plot(time_s[keep], measured[keep], label="measured", **MEASURED)
-        above.plot(time_s[keep], each.predicted_um[keep], label="model", **MODEL)
-        _residual(below, each)
-        _mark_held_out(above, each)
-        _mark_held_out(below, each)
-        label(below, "time (s)")
-        label(above)
-        _caption(above, each.report, each.report.in_sample or each.report.held_out)
-    label(axes[0, 0], "", "displacement (µm)")
-    label(axes[1, 0], "", "error (µm)")
-    legend(picture, axes[:, 0])
-    return picture
-
-
-def _residual(axes: Axes, each: _Drawn) -> None:
-    time_s = each.run.record.time_s
-    off = np.where(each.run.known, each.off_um, np.nan)
-    keep = thinned(np.where(each.run.known, off, 0.0))
-    axes.plot(time_s[keep], off[keep], color="0.6", linewidth=0.35, label="error")
-    half = _TWO_SIDED_95 * each.sd_um
-    noisy = np.hypot(half, _TWO_SIDED_95 * each.noise_um)
-    for curve, style, name in ((half, "-", "95 % band"), (noisy, ":", "95 % band with noise")):
-        keep = thinned(curve)
-        axes.plot(time_s[keep], curve[keep], color=DARK, linestyle=style, linewidth=0.8, label=name)
-        axes.plot(time_s[keep], -curve[keep], color=DARK, linestyle=style, linewidth=0.8)
-
-
-def _mark_held_out(axes: Axes, each: _Drawn) -> None:
-    """Shade what the fit did not see, where it saw the rest."""
-    held_out = np.flatnonzero(each.run.held_out)
-    if len(held_out) and each.run.fitted.any():
-        time_s = each.run.record.time_s
-        axes.axvspan(time_s[held_out[0]], time_s[held_out[-1]], color="0.93", linewidth=0, zorder=0)
-
-
-def _loop(each: _Drawn) -> Figure:
-    picture = figure(NARROW_in, 3.6)
-    loop, error = picture.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
-    voltage, measured = each.run.record.voltage_V, each.run.displacement_um
-    keep = thinned(measured)
-    # Nested loops lie close together, so the lines are thinner than elsewhere.
-    loop.plot(voltage[keep], measured[keep], label="measured", **MEASURED | {"linewidth": 1.1})
-    loop.plot(voltage[keep], each.predicted_um[keep], label="model", **MODEL | {"linewidth": 0.3})
-    off, voltage = each.off_um[each.run.known], voltage[each.run.known]
-    keep = thinned(off)
-    error.axhline(0.0, color=LIGHT, linewidth=0.6)
-    error.plot(voltage[keep], off[keep], color=DARK, linewidth=0.25)
-    label(loop, "", "displacement (µm)")
-    label(error, "voltage (V)", "error (µm)")
-    _caption(loop, each.report, each.report.in_sample)
-    legend(picture, (loop,))
     return picture

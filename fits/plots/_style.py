@@ -19,6 +19,8 @@ NARROW_in, WIDE_in = 3.54, 7.09
 DARK, LIGHT = "0.1", "0.75"
 MEASURED: dict[str, Any] = {"color": "0.65", "linewidth": 1.5}
 MODEL: dict[str, Any] = {"color": "0.0", "linewidth": 0.5}
+# Half-width of a 95 % interval in standard deviations.
+TWO_SIDED_95 = 1.959964
 _FONT_pt = 8
 _DPI = 200
 # More points than this do not show at this size.
@@ -32,10 +34,12 @@ def figure(width_in: float, height_in: float, gap: float = 0.02) -> Figure:
     return made
 
 
-def label(axes: Axes, x: str = "", y: str = "") -> None:
-    """Name the axes, where there is a name; the frame is open at the top and right."""
+def label(axes: Axes, x: str = "", y: str = "", title: str = "", size_pt: float = 7) -> None:
+    """Name the axes, and the panel at its left, where there is a name; the frame is open at the top and right."""
     axes.set_xlabel(x or axes.get_xlabel())
     axes.set_ylabel(y or axes.get_ylabel())
+    if title:
+        axes.set_title(title, loc="left", fontsize=size_pt)
     axes.spines[["top", "right"]].set_visible(False)
 
 
@@ -46,27 +50,17 @@ def verbatim(text: str, most: int = 60) -> str:
 
 
 def legend(picture: Figure, axes: Iterable[Axes]) -> None:
-    """Explain the curves of some axes in one line above the picture."""
-    curves, names = [], []
-    for each in axes:
-        found = each.get_legend_handles_labels()
-        curves += found[0]
-        names += found[1]
-    picture.legend(curves, names, loc="outside upper center", ncols=len(names), frameon=False, handlelength=1.8)
+    """Explain the curves of some axes in one line above the picture, each name once."""
+    found = [zip(*each.get_legend_handles_labels(), strict=True) for each in axes]
+    curves = {name: handle for each in found for handle, name in each}
+    place: dict[str, Any] = {"loc": "outside upper center", "ncols": len(curves)}
+    picture.legend(curves.values(), curves.keys(), frameon=False, handlelength=1.8, **place)
 
 
 def thinned(values: np.ndarray) -> np.ndarray:
-    """Choose samples that look like all of them: the extremes of even stretches, and the ends.
+    """Choose samples that look like all, shape `(n,)`: the extremes of even stretches, and the ends.
 
-    Parameters
-    ----------
-    values
-        Shape `(n,)`.
-
-    Returns
-    -------
-    ndarray
-        Increasing indices, at most some thousands.
+    Increasing indices come back, at most some thousands.
     """
     n = len(values)
     if n <= _POINTS:
@@ -74,6 +68,12 @@ def thinned(values: np.ndarray) -> np.ndarray:
     stretches = np.array_split(np.arange(n), _POINTS // 2)
     extremes = [(s[np.argmin(values[s])], s[np.argmax(values[s])]) for s in stretches]
     return np.unique(np.concatenate([np.ravel(extremes), [0, n - 1]]))
+
+
+def curve(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "", **style: Any) -> None:
+    """Draw what a curve of many samples, shape `(n,)`, looks like; values that are not known are NaN."""
+    keep = thinned(np.nan_to_num(y))
+    axes.plot(x[keep], y[keep], label=name, **style)
 
 
 def save(picture: Figure, path: Path) -> Path:

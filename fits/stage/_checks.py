@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._misfit import Misfit
-from fits.stage._run import StageRun, residual_of, simulate_stage
+from fits.loop._misfit import Misfit, compare_gains
+from fits.loop._run import Run
+from fits.stage._run import residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
 from fits.stats._noise import correlation_samples
-from microid import Coordinates, Driver, Mechanics, Stage
+from microid import Driver, Mechanics, Stage
 
 # Gains that differ by more than this are not those of one rig, and by more than that are worth a remark.
 _REFUSED, _REMARKED = 0.1, 0.05
@@ -38,13 +37,7 @@ _POLES = ("time_constant_s", "natural_frequency_Hz")
 
 
 def refuse_slopes(records: Sequence[Record]) -> None:
-    """Refuse slow runs over one range of voltage that move differently far.
-
-    Raises
-    ------
-    DataError
-        If they cannot be of one rig.
-    """
+    """Refuse, in a `DataError`, slow runs over one range of voltage that move differently far."""
     spans = [
         (float(np.ptp(record.voltage_V)), float(np.ptp(record.displacement_um)), speed_Hz(record), record.source)
         for record in records
@@ -76,50 +69,29 @@ def _not_one_rig(one: str, other: str, ratio: float) -> str:
     )
 
 
-def refuse_unseen(
-    stage: Stage,
-    coordinates: Coordinates[Stage],
-    solved: Solved,
-    drives: Sequence[np.ndarray],
-    fast: bool,
-    spare: bool = False,
+def refuse_unidentifiable(
+    solved: Solved, drives: Sequence[np.ndarray], fast: bool, may_drop: bool = False
 ) -> str | None:
-    """Refuse runs that do not show the dynamics they are fitted with.
+    """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with.
 
-    Parameters
-    ----------
-    stage
-        With the poles that explain the runs best.
-    coordinates, solved
-        Of these poles, the hysteresis being given.
-    drives
-        What the hysteresis alone would give, for each run, shape `(n,)`.
-    fast
-        Whether a run is faster than the others.
-    spare
-        Whether a mechanics may be left out where a driver alone may do.
-
-    Returns
-    -------
-    str or None
-        Name of a mechanics that the runs do not show, though they are sampled finely enough: leave it out.
-
-    Raises
-    ------
-    DataError
-        If no run moves fast enough, or none is sampled fast enough.
+    The solution is that of the poles that explain the runs best, the hysteresis being given; `drives` are what it
+    alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the others. Where a
+    mechanics may be left out (`may_drop`) that the runs do not show, though they are sampled finely enough, its name
+    is returned instead.
     """
+    stage = solved.stage
     information = marginal_information(
         solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
     )
-    slope = np.abs(_relative(coordinates, solved.z))
-    names = _names(stage, coordinates)
+    named, value, derivative = solved.parameters()
+    slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
+    names = [name for name, _ in named]
     poles = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _POLES]
     if not poles:
         return None
     spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     # At a bound the slope vanishes, however far the coordinate may run.
-    blurred = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > _LOST]
+    unidentified = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > _LOST]
     sources = ", ".join(run.record.source for run in solved.runs)
     fastest = max(solved.runs, key=lambda run: run.rate_Hz)
     mechanics = [
@@ -128,21 +100,21 @@ def refuse_unseen(
         if isinstance(part, Mechanics)
     ]
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST * fastest.rate_Hz]
-    seen = gained(solved, drives) >= WORTH
-    some = bool(blurred) and (len(blurred) == len(poles) or not fast)
+    seen = likelihood_ratio(solved, drives) >= WORTH
+    some = bool(unidentified) and (len(unidentified) == len(poles) or not fast)
     driven = any(isinstance(part, Driver) for part in stage.parts)
-    if spare and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
+    if may_drop and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
         return (beyond or mechanics)[0][0]
-    if blurred and not fast and len(blurred) < len(poles):
+    if unidentified and not fast and len(unidentified) < len(poles):
         raise DataError(
-            f"{sources}: these runs are all about as slow, and do not show {', '.join(blurred)}; add a run with "
+            f"{sources}: these runs are all about as slow, and do not show {', '.join(unidentified)}; add a run with "
             "steps, a chirp or a multisine that goes beyond the resonance"
         )
-    if len(blurred) == len(poles) or not seen:
+    if len(unidentified) == len(poles) or not seen:
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
         if noise[loudest] > _LOUD * min(noise):
-            compare_gains(stage, solved.runs, refuse=True)
+            check_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
             what = (
                 f"{noise[loudest]:.3g} um of it stay unexplained, {noise[loudest] / min(noise):.3g} times as much as "
@@ -173,14 +145,8 @@ def refuse_unseen(
     return None
 
 
-def refuse_coarse(stage: Stage, runs: Sequence[StageRun], left: Sequence[Misfit]) -> None:
-    """Refuse a fitted resonance that the runs cannot show: they are sampled too slowly for it, and leave much.
-
-    Raises
-    ------
-    DataError
-        If they are.
-    """
+def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
+    """Refuse, in a `DataError`, a resonance that runs cannot show: sampled too slowly for it, they leave much."""
     finest = max(run.rate_Hz for run in runs)
     for part in stage.parts:
         if not isinstance(part, Mechanics):
@@ -198,7 +164,7 @@ def refuse_coarse(stage: Stage, runs: Sequence[StageRun], left: Sequence[Misfit]
                 )
 
 
-def _resolved(run: StageRun) -> bool:
+def _resolved(run: Run) -> bool:
     """Whether the command is sampled so finely that little of it lies in the upper half of the band."""
     voltage = run.record.voltage_V
     # By differences, so that a slow motion of large amplitude does not hide what is fast.
@@ -210,17 +176,7 @@ def _resolved(run: StageRun) -> bool:
 def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> tuple[str, float] | None:
     """Find poles that no piezo stage has: the time is probably in another unit than its column says.
 
-    Parameters
-    ----------
-    names, values
-        Parameters of the fitted stage, in their units.
-    sources
-        The runs.
-
-    Returns
-    -------
-    tuple or None
-        A sentence, and what a time in the unit it suspects has to be multiplied by to be in s.
+    Returns a sentence, and what a time in the unit it suspects has to be multiplied by to be in s; None without such.
     """
     for name, value in zip(names, values, strict=True):
         field = name.rpartition(".")[2]
@@ -239,72 +195,27 @@ def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence
     return None
 
 
-def gained(solved: Solved, drives: Sequence[np.ndarray]) -> float:
+def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
     """Twice the logarithm of how much likelier poles make the run that shows them best.
 
     Slow runs may become less likely: the hysteresis read off them has taken in the driver's lag, which now counts
     twice.
     """
-    gained = []
+    ratios = []
     for run, drive, noise in zip(solved.runs, drives, solved.weighing.noise_um, strict=True):
         x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
         left = y - y.mean() - x * (x @ y / (x @ x))
-        gained.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
-    return max(gained)
+        ratios.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
+    return max(ratios)
 
 
-def _names(stage: Stage, coordinates: Coordinates[Stage]) -> list[str]:
-    return [stage.named(info.path) for info in coordinates.table for _ in range(int(np.prod(info.shape)))]
+def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
+    """Find runs that move further, or less far, than the others under the same voltage: a remark, if any.
 
-
-def _relative(coordinates: Coordinates[Stage], z: np.ndarray) -> np.ndarray:
-    """Change of each parameter's logarithm per coordinate, shape `(p,)`."""
-    value, slope = coordinates_slope(coordinates, z)
-    return slope / np.maximum(np.abs(value), 1e-300)
-
-
-def coordinates_slope(coordinates: Coordinates[Stage], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and their derivatives, each by its own coordinate, shapes `(p,)`."""
-    point = jnp.asarray(z)
-    value, slope = jax.jvp(coordinates.values, (point,), (jnp.ones_like(point),))
-    return np.asarray(value), np.asarray(slope)
-
-
-def _gains(stage: Stage, runs: Sequence[StageRun]) -> np.ndarray:
-    """How much each run moves for what the stage says it moves."""
-    gains = []
-    for run in runs:
-        predicted, left = simulate_stage(stage, run)[run.fitted], residual_of(stage, run)[run.fitted]
-        predicted = predicted - predicted.mean()
-        gains.append(1 + float(predicted @ left / (predicted @ predicted)))
-    return np.asarray(gains)
-
-
-def compare_gains(stage: Stage, runs: Sequence[StageRun], refuse: bool = False) -> list[str]:
-    """Find runs that move further, or less far, than the others under the same voltage.
-
-    Parameters
-    ----------
-    stage
-        Fitted to all of them.
-    runs
-        The runs.
-    refuse
-        Whether too large a difference is an error.
-
-    Returns
-    -------
-    list of str
-        A remark, if there is anything to say.
-
-    Raises
-    ------
-    DataError
-        If they cannot be of one rig.
+    With `refuse`, too large a difference is a `DataError`, as such runs cannot be of one rig.
     """
-    gains = _gains(stage, runs)
-    low, high = int(np.argmin(gains)), int(np.argmax(gains))
-    ratio = gains[high] / gains[low] if gains[low] > 0 else np.inf
+    predicted = [simulate_stage(stage, run)[run.fitted] for run in runs]
+    high, low, ratio = compare_gains(predicted, [residual_of(stage, run)[run.fitted] for run in runs])
     one, other = runs[high].record.source, runs[low].record.source
     if refuse and ratio > 1 + _REFUSED:
         raise DataError(_not_one_rig(one, other, ratio))

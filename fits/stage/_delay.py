@@ -7,17 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
-from fits.io._record import Record
 from fits.loop._design import columns_of
 from fits.loop._misfit import Misfit, misfits
-from fits.loop._result import FitError
-from fits.stage._moments import Chain, along, linearise, pieces
-from fits.stage._reach import Reach
-from fits.stage._result import StageFit
-from fits.stage._run import StageRun, lead_ins, simulate_stage, without
-from fits.stage._solve import Solved, solve_chain
+from fits.loop._result import FitError, FitResult
+from fits.loop._run import Run
+from fits.stage._alternative import Alternative
+from fits.stage._moments import along, linearise, pieces
+from fits.stage._run import nuisance_columns, project_out, simulate_stage
+from fits.stage._solve import Problem, Solved, solve_chain
 from fits.stage._start import best_shifts, measure_response, start_stages
-from fits.stage._steps import Plan, Problem, hysteresis_alone
+from fits.stage._steps import Plan, hysteresis_alone
 from fits.stage._uncertainty import Precision, sandwich
 from microid import Preisach, Stage
 
@@ -37,7 +36,7 @@ _BETTER = 0.7
 # Where more than so many times the noise is left, a delay counts if it takes all but this part away.
 _NEAR, _MUCH = 2.0, 0.4
 # Precision, in scaled coordinates, that stands in for none.
-_FAINT = 1e-8
+_WEAK = 1e-8
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
 _REMEDY = (
@@ -49,7 +48,7 @@ _REMEDY = (
 class Delay:
     """A run's delay: how much later than the stage the readings come, and its standard deviation, in s."""
 
-    run: StageRun
+    run: Run
     delay_s: float
     sd_s: float
 
@@ -74,73 +73,50 @@ class Delay:
 
 
 @dataclass(frozen=True)
-class Undelayed:
-    """A fit of the same runs with their delays taken out.
-
-    Attributes
-    ----------
-    delays
-        Of the runs that have one.
-    solved, precision
-        The fit without them.
-    """
+class WithoutDelays:
+    """A fit of the same runs without their delays, and the delays of those that have one."""
 
     delays: tuple[Delay, ...]
     solved: Solved
     precision: Precision
 
-    def left(self, records: Sequence[Record]) -> list[Misfit]:
+    def left(self) -> list[Misfit]:
         """What stays of each run without its delay."""
-        known = [one.residual_um for one in self.solved.sums], [run.fitted for run in self.solved.runs]
-        return misfits(records, *known)
+        return misfits(self.solved.runs, self.solved.residuals_um)
 
     def words(self) -> str:
         """Say what the columns of the runs look like."""
         return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
 
 
-def take_out_delays(
-    plan: Plan, problem: Problem, solved: Solved, precision: Precision | None, left: Sequence[Misfit]
-) -> Undelayed | None:
-    """Look for delays in what a fit leaves, and fit again without them.
+def fit_without_delays(
+    plan: Plan, solved: Solved, precision: Precision | None, left: Sequence[Misfit]
+) -> WithoutDelays | None:
+    """Look for delays in what a fit leaves of each run, and fit again without them; None where that does not help.
 
     A small one shows as the derivative of the residual with respect to a delay, whatever the parameters may do
     beside it (the score test of Rao 1948). In runs that are far from noise the measured frequency response is
-    searched for larger ones.
-
-    Parameters
-    ----------
-    plan, problem
-        What was asked for.
-    solved, precision
-        The fit; without a precision, only large delays are looked for.
-    left
-        What it leaves of each run.
-
-    Returns
-    -------
-    Undelayed or None
-        None where no run has a delay, or taking it out does not help.
+    searched for larger ones; without a precision, only these are looked for.
     """
     # Between two samples a command in steps has no place where it could be shifted to, and without a resonance to
     # measure it by a delay is part of the lag.
     if plan.hold == "zero":
         return None
-    if problem.even:
+    start = solved.onward
+    if start.least_noise_share:
         # Unless much is left, which may hide the resonance that was not found.
-        gross = problem.full is not None and max(one.share_pct for one in left) > GROSS_PCT
-        return take_out_delays(plan, *problem.full, None, left) if gross and problem.full is not None else None
+        gross = max(one.share_pct for one in left) > GROSS_PCT
+        return fit_without_delays(plan, start.full, None, left) if gross and start.full is not None else None
     shifts = np.zeros(len(plan.records))
-    start = problem.z, solved.columns_um
     far = [k for k, one in enumerate(left) if one.times_noise > _LOUD]
-    searched = _search(plan, problem, solved, far)
+    searched = _search(plan, solved, far)
     if searched is not None:
         shifts, start = searched
     elif precision is None or not any(one.seen for one in _scores(plan, solved, precision, shifts)):
         return None
     found, sure = solved, precision
     if np.any(shifts):
-        again = _solved_with(plan, problem, solved, start, shifts)
+        again = _solved_with(plan, start, solved.runs[0].stride, shifts)
         if again is None:
             return None
         found, sure = again
@@ -159,7 +135,8 @@ def take_out_delays(
         # Where a parameter is at its bound, a line goes too far.
         for _ in range(_HALVED):
             plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts + step)} ms")
-            again = _solved_with(plan, problem, solved, (found.z, found.columns_um), shifts + step)
+            start = replace(start, z=found.z, columns_um=found.columns_um)
+            again = _solved_with(plan, start, solved.runs[0].stride, shifts + step)
             if again is not None and again[0].weighing.noise_um[first] <= _NO_WORSE * found.weighing.noise_um[first]:
                 break
             step /= 2
@@ -177,65 +154,52 @@ def take_out_delays(
     )
     if not seen:
         return None
-    if searched is None and precision is not None:
-        moved = np.abs(found.z - solved.z) / np.sqrt(np.diagonal(precision.covariance(precision.influence())))
-        if np.max(moved) < _MOVED:
-            return None
-    return Undelayed(seen, found, sure)
+    if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd()) < _MOVED:
+        return None
+    return WithoutDelays(seen, found, sure)
 
 
-def _solved_with(
-    plan: Plan, problem: Problem, solved: Solved, start: tuple[np.ndarray, np.ndarray], shifts_s: np.ndarray
-) -> tuple[Solved, Precision] | None:
+def _solved_with(plan: Plan, start: Problem, stride: int, shifts_s: np.ndarray) -> tuple[Solved, Precision] | None:
     """Fit again with the command of each run that much later, as well as can be; None where that fails."""
-    runs = plan.shifted(shifts_s).runs(solved.runs[0].samples.stride)
-    given = problem.chain, *start, runs, problem.hyper, problem.stroke_um, plan.loss, plan.progress
     try:
-        found = solve_chain(*given, anyway=True, even=problem.even)
+        found = solve_chain(start, plan.shifted(shifts_s).runs(stride), plan.loss, plan.progress, accept_best=True)
     except (FitError, np.linalg.LinAlgError):
         return None
-    return found, Precision(problem.chain, found, problem.stroke_um)
+    return found, Precision(found)
 
 
-def refuse_delays(undelayed: Undelayed | None) -> None:
+def refuse_delays(undelayed: WithoutDelays | None) -> None:
     """Refuse runs whose delays kept a fit from an answer, in a `DataError`; nothing where there are none."""
     if undelayed is not None:
         raise DataError(f"{undelayed.words()}, and no fit was found with that: {_REMEDY}")
 
 
-def own_up(fit: StageFit, chain: Chain, undelayed: Undelayed) -> StageFit:
+def widen_for_delays(fit: FitResult[Stage], undelayed: WithoutDelays) -> FitResult[Stage]:
     """Name the delays of a fit, and widen the intervals by what they did to its parameters.
 
-    Raises
-    ------
-    DataError
-        If a parameter moves so much that the fit says nothing.
+    A `DataError` if a parameter moves so much that the fit says nothing.
     """
-    reach, said = Reach.of(chain, undelayed.solved, undelayed.precision), undelayed.words()
-    if ruined := reach.ruined(fit):
-        raise DataError(f"{said}, and {ruined[0]}: {_REMEDY}")
-    return reach.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
+    other, said = Alternative.of(undelayed.precision), undelayed.words()
+    if moved := other.contradicted(fit):
+        raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")
+    return other.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
 
 
 def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray) -> list[Delay]:
     """Delays to first order beside all parameters, each run's alone; of the noise, that of the run itself counts."""
     chain, size = precision.chain, precision.chain.size
-    here = jnp.asarray(solved.z), jnp.asarray(solved.columns_um)
-    stage = chain.stage(*here)
+    here, stage = (jnp.asarray(solved.z), jnp.asarray(solved.columns_um)), solved.stage
     whole = precision.gram + precision.prior
     # What nothing is known of must not spoil the rest.
-    whole = whole + _FAINT * np.eye(len(whole))
+    whole = whole + _WEAK * np.eye(len(whole))
     out = []
     for k, (run, one) in enumerate(zip(solved.runs, solved.sums, strict=True)):
-        n, step = len(run.record), _STEP / run.rate_Hz
-        late, early = (
-            simulate_stage(stage, plan.run(k, run.samples.stride, shifts[k] + sign * step)) for sign in (1, -1)
-        )
+        n, step, weight = len(run.record), _STEP / run.rate_Hz, run.fit_weight
+        late, early = (simulate_stage(stage, plan.run(k, run.stride, shifts[k] + sign * step)) for sign in (1, -1))
         full = np.zeros(run.samples.weight.shape[0])
         full[:n] = (late - early) / (2 * step)
-        weight = np.asarray(run.samples.weight)[:n]
-        own = jnp.asarray(lead_ins(stage, run.samples))
-        late_um_per_s = np.asarray(without(own, run.samples.weight, jnp.asarray(full)))[:n]
+        own = jnp.asarray(nuisance_columns(stage, run.samples))
+        late_um_per_s = np.asarray(project_out(own, run.samples.weight, jnp.asarray(full)))[:n]
         worth = solved.weighing.shares[k] / precision.variance
         weighed = worth * weight * late_um_per_s
         _, slope, _ = linearise(chain, *here, run)
@@ -255,12 +219,13 @@ def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray
     return out
 
 
-def _search(plan: Plan, problem: Problem, solved: Solved, far: Sequence[int]) -> tuple | None:
+def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray, Problem] | None:
     """Large delays of the runs that are far from noise: shifts, and what to go on from; None where none helps."""
     # As it began: a delay bends the hysteresis of a joint fit, and the slow runs hardly feel it.
-    stage = problem.stage
-    columns_um = _columns(problem, stage)
-    drives = hysteresis_alone(stage, plan)
+    problem, stage = solved.onward, solved.problem.stage
+    law = None if problem.chain.place is None else stage.parts[problem.chain.place]
+    columns_um = np.asarray(columns_of(law)) if isinstance(law, Preisach) else np.zeros(0)
+    drives = hysteresis_alone(stage, solved.runs)
     shifts, best = np.zeros(len(plan.records)), solved
     for k in far:
         run = solved.runs[k]
@@ -274,21 +239,14 @@ def _search(plan: Plan, problem: Problem, solved: Solved, far: Sequence[int]) ->
             there[k] = shift
             plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
             moved = replace(response, response=response.response * np.exp(2j * np.pi * response.frequency_Hz * shift))
-            runs = plan.shifted(there).runs(run.samples.stride)
+            runs = plan.shifted(there).runs(run.stride)
             for candidate in start_stages(stage, [moved])[:1]:
                 z = np.asarray(problem.chain.coordinates.of(candidate))
-                given = problem.chain, z, columns_um, runs, None, problem.stroke_um, plan.loss, plan.progress
+                start = replace(problem, z=z, columns_um=columns_um, hyper=None)
                 try:
-                    found = solve_chain(*given, rough=True)
+                    found = solve_chain(start, runs, plan.loss, plan.progress, rough=True)
                 except (FitError, np.linalg.LinAlgError):
                     continue
                 if found.cost < best.cost + float(run.fitted.sum()) * np.log(_BETTER):
                     best, shifts = found, there
-    return (shifts, (best.z, columns_um)) if np.any(shifts) else None
-
-
-def _columns(problem: Problem, stage: Stage) -> np.ndarray:
-    """Columns of a stage's grid, in um, shape `(D,)`; none where none is fitted."""
-    place = problem.chain.place
-    law = None if place is None else stage.parts[place]
-    return np.asarray(columns_of(law)) if isinstance(law, Preisach) else np.zeros(0)
+    return (shifts, replace(problem, z=best.z, columns_um=columns_um)) if np.any(shifts) else None

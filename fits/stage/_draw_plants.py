@@ -7,17 +7,14 @@ from fits.io._errors import DataError
 from fits.loop._design import Grid, columns_of
 from fits.loop._prior import interpolation
 from fits.loop._uncertainty import Uncertainty
+from fits.stage._moments import offsets_out
 from fits.stage._run import place_of_hysteresis
-from fits.stage._uncertainty import StageUncertainty, offsets_out
+from fits.stage._uncertainty import StageUncertainty
 from microid import Preisach, Stage
 
 
 def draw_plants(
-    model: Preisach | Stage,
-    uncertainty: Uncertainty | StageUncertainty | None,
-    count: int,
-    *,
-    seed: int = 0,
+    model: Preisach | Stage, uncertainty: Uncertainty | StageUncertainty | None, count: int, *, seed: int = 0
 ) -> tuple[Stage, ...]:
     """Draw stages from the covariance of a fit.
 

@@ -29,21 +29,9 @@ _DTYPES = ("float32", "float64", "int32", "int64", "bool")
 
 
 def encode(value: Any, unit: str = "1", packed: Collection[str] = ()) -> Any:
-    """Turn a module, or what one of its fields may hold, into JSON values.
+    """Turn a module, or what one of its fields may hold, into JSON values; arrays in `packed` fields into base64.
 
-    Parameters
-    ----------
-    value
-        Module, array, tuple, string, number or None.
-    unit
-        Unit of the arrays in it.
-    packed
-        Names of array fields that are written in base64.
-
-    Raises
-    ------
-    DataError
-        If something in it cannot be written; the message says only what.
+    A `DataError` says what in it cannot be written.
     """
     if isinstance(value, eqx.nn.MLP):
         return _encode_network(value, unit)
@@ -61,22 +49,7 @@ def encode(value: Any, unit: str = "1", packed: Collection[str] = ()) -> Any:
 
 
 def decode(item: Any, where: str, spec: ParameterSpec | None = None) -> Any:
-    """Invert `encode`.
-
-    Parameters
-    ----------
-    item
-        From JSON.
-    where
-        Begins the error messages.
-    spec
-        What is known of the arrays in it.
-
-    Raises
-    ------
-    DataError
-        If anything is not as `encode` writes it.
-    """
+    """Invert `encode`; a `DataError` that begins with `where` if anything is not as `encode` writes it."""
     if isinstance(item, list):
         return tuple(decode(entry, f"{where}[{index}]", spec) for index, entry in enumerate(item))
     if isinstance(item, int | float) and abs(item) > _LARGEST_PLAIN:
@@ -99,11 +72,7 @@ def _classes() -> dict[str, type[eqx.Module]]:
     return (
         {name: cls for name, cls in modules.items() if not inspect.isabstract(cls)}
         | {plugin.__name__: plugin for plugin in plugins}
-        | {
-            "Grid": Grid,
-            "StageUncertainty": StageUncertainty,
-            "Uncertainty": Uncertainty,
-        }
+        | {"Grid": Grid, "StageUncertainty": StageUncertainty, "Uncertainty": Uncertainty}
     )
 
 
@@ -111,13 +80,13 @@ def _fields(cls: type[eqx.Module]) -> dict[str, dataclasses.Field[Any]]:
     return {field.name: field for field in dataclasses.fields(cls) if field.init}
 
 
-def _spec(field: dataclasses.Field[Any]) -> ParameterSpec | None:
+def spec_of(field: dataclasses.Field[Any]) -> ParameterSpec | None:
     return next((entry for entry in field.metadata.values() if isinstance(entry, ParameterSpec)), None)
 
 
 def _unit(field: dataclasses.Field[Any]) -> str:
     """Take the unit from the specification, or else from the end of the name, such as `um/V^2` from `x_um_per_V2`."""
-    spec = _spec(field)
+    spec = spec_of(field)
     if spec is not None:
         return spec.unit
     name = field.name.split("_")
@@ -133,7 +102,7 @@ def _encode_module(module: eqx.Module, packed: Collection[str]) -> dict[str, Any
     for key, field in _fields(type(module)).items():
         value, unit = getattr(module, key), _unit(field)
         if key in packed and isinstance(value, jax.Array) and value.dtype == np.float64:
-            out[key] = _encode_packed(np.asarray(value), unit)
+            out[key] = _encode_array(np.asarray(value), unit, packed=True)
         else:
             out[key] = encode(value, unit, packed)
     return out
@@ -146,7 +115,7 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
     fields = _fields(cls)
     if set(item) - {"type"} != set(fields):
         raise DataError(f"{where}: a {item['type']} has the fields {', '.join(fields)}, and no others")
-    values = {key: decode(item[key], f"{where}.{key}", _spec(field)) for key, field in fields.items()}
+    values = {key: decode(item[key], f"{where}.{key}", spec_of(field)) for key, field in fields.items()}
     # One context, so that an `N` means the same in all fields.
     with jaxtyping.jaxtyped("context"):
         for key, field in fields.items():
@@ -167,20 +136,16 @@ def _words(kind: Any) -> str:
     return f"an array of {len(axes)} axes ({', '.join(axes)})" if axes else "a single number with its unit"
 
 
-def _encode_array(array: np.ndarray, unit: str) -> dict[str, Any]:
+def _encode_array(array: np.ndarray, unit: str, packed: bool = False) -> dict[str, Any]:
     if not np.all(np.isfinite(array)):
         raise DataError("it holds a number that is not finite")
+    if packed:
+        data = base64.b64encode(array.astype("<f8").tobytes()).decode("ascii")
+        return {"unit": unit, "shape": list(array.shape), "float64_base64": data}
     out = {"unit": unit, "value": array.tolist()}
     if array.dtype.name not in _DTYPES:
         raise DataError(f"it holds an array of {array.dtype.name}, for which the format has no form")
     return out if array.dtype == np.float64 else out | {"dtype": array.dtype.name}
-
-
-def _encode_packed(array: np.ndarray, unit: str) -> dict[str, Any]:
-    if not np.all(np.isfinite(array)):
-        raise DataError("it holds a number that is not finite")
-    data = base64.b64encode(array.astype("<f8").tobytes()).decode("ascii")
-    return {"unit": unit, "shape": list(array.shape), "float64_base64": data}
 
 
 def _decode_array(item: dict[str, Any], where: str, spec: ParameterSpec | None) -> jax.Array:

@@ -3,26 +3,25 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import jax.numpy as jnp
 
 from fits.io._errors import DataError
-from fits.io._record import Record, refuse_repeats
+from fits.io._record import Record
 from fits.loop._choose_grid import LADDER
+from fits.loop._fit import check_fit
 from fits.loop._fit_checks import remarks_on
 from fits.loop._misfit import misfits, worst
-from fits.loop._result import FitError
-from fits.stage._checks import implausible, refuse_coarse
-from fits.stage._delay import GROSS_PCT, own_up, refuse_delays, take_out_delays
-from fits.stage._moments import Chain
-from fits.stage._reach import Reach, leave_outliers
-from fits.stage._result import StageFit
-from fits.stage._run import gain_ahead, place_of_hysteresis, prepare_stage_run
+from fits.loop._result import FitError, FitResult
+from fits.loop._run import prepare_run
+from fits.loop._samples import refuse_many_steps
+from fits.stage._alternative import Alternative, fit_without_outliers
+from fits.stage._checks import implausible, refuse_undersampled
+from fits.stage._delay import GROSS_PCT, fit_without_delays, refuse_delays, widen_for_delays
+from fits.stage._run import gain_ahead, place_of_hysteresis
 from fits.stage._solve import Solved
-from fits.stage._steps import Plan, Problem, refine_problem, start_problem
+from fits.stage._steps import Plan, refine_problem, start_problem
 from fits.stage._summary import summarise
 from fits.stage._uncertainty import Precision
-from fits.stats._noise import LOSSES
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
 
 
@@ -60,7 +59,7 @@ def fit_stage(
     initial: str | Sequence[str] = "unknown",
     loss: str = "squares",
     progress: Callable[[str], None] = lambda _: None,
-) -> StageFit:
+) -> FitResult[Stage]:
     """Fit driver, hysteresis and mechanics jointly to slow and fast runs of one rig.
 
     The slow runs give a first hysteresis, what the fast ones make of it a frequency response, and that the poles to
@@ -89,7 +88,7 @@ def fit_stage(
 
     Returns
     -------
-    StageFit
+    FitResult
         Never the start: a fit that fails raises.
 
     Raises
@@ -101,22 +100,20 @@ def fit_stage(
     RuntimeError
         If JAX computes in single precision.
     """
-    asked = stage, levels, holdout, initial, loss, progress
-    found = solve_stage(records, *asked)
-    runs, sources = found.solved.runs, [record.source for record in records]
-    known = [one.residual_um for one in found.solved.sums], [run.fitted for run in runs]
-    left = misfits(records, *known)
+    found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
+    solved, runs = found.solved, found.solved.runs
+    left, simplified = misfits(runs, solved.residuals_um), solved.problem.least_noise_share > 0
     progress("looking for delays")
-    undelayed = take_out_delays(found.plan, found.problem, found.solved, found.precision, left)
+    undelayed = fit_without_delays(found.plan, solved, found.precision, left)
     # What is sampled too slowly may look late; a delay is believed that leaves little else.
-    if undelayed is None or any(one.far for one in undelayed.left(records)):
-        refuse_coarse(found.stage, runs, left)
-    if found.failure is not None or found.problem.even:
+    if undelayed is None or any(one.far for one in undelayed.left()):
+        refuse_undersampled(solved.stage, runs, left)
+    if found.failure is not None or simplified:
         refuse_delays(undelayed)
     if found.failure is not None:
         raise found.failure
     gross = worst(left)
-    if found.problem.even and gross.share_pct > GROSS_PCT:
+    if simplified and gross.share_pct > GROSS_PCT:
         raise DataError(
             f"{gross.source}: neither a lag nor a resonance explains what moves in it: {gross.share_pct:.3g} % of "
             f"its stroke stay unexplained, {gross.times_noise:.3g} times the sensor's noise; check columns, time "
@@ -124,63 +121,38 @@ def fit_stage(
         )
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
-    before = initial if isinstance(initial, str) else "unknown"
-    chain = found.chain
-    settings = before, 1.0, found.solved.runs[-1].samples.stride, gain_ahead(found.stage), found.stage.hold
-    held = [prepare_stage_run(record, found.range_V, *settings) for record in aside]
-    summary = summarise(found.stage, chain.coordinates, found.solved, found.precision, held)
+    before, stage = initial if isinstance(initial, str) else "unknown", solved.stage
+    settings = before, 1.0, runs[-1].stride, gain_ahead(stage), stage.hold
+    held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
+    summary = summarise(found.precision, held)
     if undelayed is not None:
-        summary = own_up(summary, chain, undelayed)
-    outliers = leave_outliers(found.plan, found.problem, found.solved)
+        summary = widen_for_delays(summary, undelayed)
+    outliers = fit_without_outliers(found.plan, solved)
     if outliers is not None:
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
-    odd = remarks_on(records, *known, robust=loss == "huber")
+    odd = remarks_on(runs, solved.residuals_um, robust=loss == "huber")
+    sources = [record.source for record in records]
     unit = implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
     if unit is not None:
-        summary = Reach.in_unit(summary, unit[1]).widen(
+        summary = Alternative.in_unit(summary, unit[1]).widen(
             summary, unit[0], "name the right one as in --columns time_s=time_ms"
         )
     notes = [warning for record in (*records, *aside) for warning in record.warnings]
-    told = tuple(dict.fromkeys((*odd, *notes, *found.remarks, *summary.remarks)))
+    told = tuple(dict.fromkeys((*odd, *notes, *solved.problem.remarks, *summary.remarks)))
     return replace(summary, misfit=worst(left), remarks=told)
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What the fit of a stage found, before it is compared with anything.
+    """What the fit of a stage found before it is compared with anything, and what was asked for.
 
-    Attributes
-    ----------
-    stage
-        The fitted stage, without an offset.
-    chain
-        The same in the coordinates of its fit.
-    solved
-        Where the fit ended.
-    precision
-        How sure it is.
-    stroke_um
-        Unit of the columns of the grid.
-    range_V
-        Range of the commands.
-    remarks
-        What the user should know, one sentence each.
-    plan, problem
-        What was asked for, and where the fit began.
-    failure
-        Why this is only the best place that was found; None where the fit converged.
+    `failure` says why this is only the best place that was found; None where the fit converged.
     """
 
-    stage: Stage
-    chain: Chain
     solved: Solved
     precision: Precision
-    stroke_um: float
-    range_V: tuple[float, float]
-    remarks: tuple[str, ...]
     plan: Plan
-    problem: Problem
-    failure: FitError | None
+    failure: FitError | None = None
 
 
 def solve_stage(
@@ -192,28 +164,18 @@ def solve_stage(
     loss: str,
     progress: Callable[[str], None],
     finest: int = LADDER[-1],
-    anyway: bool = False,
+    accept_best: bool = False,
 ) -> Solution:
     """Fit a stage, on a grid of at most the finest levels; other arguments and errors are those of `fit_stage`.
 
-    `anyway` takes the best place for an answer where the fit does not become stationary.
+    `accept_best` takes the best place for an answer where the fit does not become stationary.
     """
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
-    if loss not in LOSSES:
-        raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
-    if not records:
-        raise DataError("there is no record to fit")
-    aside = () if isinstance(holdout, int | float) else tuple(holdout)
-    refuse_repeats([*records, *aside])
+    fraction, _, range_V = check_fit(records, holdout, loss)
+    for record in records:
+        refuse_many_steps(record, 1)
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
     if len(states) != len(records):
         raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
-    fraction = float(holdout) if isinstance(holdout, int | float) else 0.0
-    if not 0 <= fraction <= 0.9:
-        raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
-    voltages = [record.voltage_V for record in (*records, *aside)]
-    range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     stage = default_stage() if stage is None else stage
     ahead = stage.parts[: place_of_hysteresis(stage)]
     if stage.hold == "zero" and not any(isinstance(part, Driver) for part in ahead):
@@ -222,17 +184,13 @@ def solve_stage(
             "insert one, or use hold='first'"
         )
     plan = Plan(
-        tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, anyway
+        tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, accept_best
     )
     problem = start_problem(plan, stage, levels, finest)
-    failure = None
     try:
-        problem, solved, precision = refine_problem(plan, problem)
-    except FitError as error:
-        if anyway:
+        return Solution(*refine_problem(plan, problem), plan)
+    except FitError as failure:
+        if accept_best:
             raise
         # What the best place leaves may show why.
-        failure = error
-        problem, solved, precision = refine_problem(replace(plan, anyway=True), problem)
-    place = problem.at(solved), problem.chain, solved, precision, problem.stroke_um, range_V
-    return Solution(*place, problem.remarks, plan, problem, failure)
+        return Solution(*refine_problem(replace(plan, accept_best=True), problem), plan, failure)

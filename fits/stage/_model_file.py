@@ -54,7 +54,8 @@ from fits.io._version import written_by
 from fits.loop._design import Grid
 from fits.loop._uncertainty import Uncertainty
 from fits.stage._encode import decode, encode
-from fits.stage._uncertainty import StageUncertainty, offsets_out
+from fits.stage._moments import offsets_out
+from fits.stage._uncertainty import StageUncertainty
 from microid import Preisach, Stage
 
 _FAMILY = "microid.model/"
@@ -75,7 +76,7 @@ class ModelFile:
     uncertainty
         Of its predictions.
     report
-        What is known of the fit, as `fit_report` or `stage_report` makes it.
+        What is known of the fit, as `fit_report` makes it.
     written_by
         Program and version.
     """
@@ -103,7 +104,7 @@ def save_model(
     uncertainty
         Of its predictions.
     report
-        JSON values under string keys, such as `fit_report` or `stage_report` makes.
+        JSON values under string keys, such as `fit_report` makes.
 
     Raises
     ------
@@ -176,9 +177,8 @@ def load_model(path: str | os.PathLike[str]) -> ModelFile:
         raise DataError(f"{name}: expected a model and its uncertainty; write the file again with 'microid fit'.")
     if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
         raise DataError(f"{name}: the uncertainty does not fit the stage; write the file again with 'microid fit'.")
-    if uncertainty is not None and uncertainty.columns_um.shape[1] != (
-        0 if uncertainty.grid is None else uncertainty.grid.columns
-    ):
+    columns = 0 if uncertainty is None or uncertainty.grid is None else uncertainty.grid.columns
+    if uncertainty is not None and uncertainty.columns_um.shape[1] != columns:
         raise DataError(f"{name}: the uncertainty does not fit its grid; write the file again with 'microid fit'.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
 

@@ -12,30 +12,45 @@ from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
-from fits.stage._run import Samples, StageRun, ahead, joined, lead_ins, respond, without
-from microid import Coordinates, LinearSystem, Stage, Staircase
+from fits.loop._run import Run
+from fits.loop._samples import Samples
+from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
+from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
 
 # Samples that go through the compiled regression at a time.
 _PIECE = 2048
 
 
-@dataclass(frozen=True)
-class Chain:
-    """A stage in the coordinates of its fit.
+def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
+    """Coordinates of what a fit of a stage moves: all that is free, but for offsets and the grid's own parameters.
 
-    Attributes
-    ----------
-    coordinates
-        Of all parameters but those of the grid and the offsets.
-    place
-        Where the hysteresis stands in the chain; None where no grid is fitted.
-    grid
-        Its columns; None where no grid is fitted.
+    A `ValueError` where nothing is left to move.
+    """
+    place = place_of_hysteresis(stage)
+    name = None if place is None or not grid else stage.names[place]
+
+    def moves(info: ParameterInfo) -> bool:
+        path = stage.named(info.path)
+        return stage.free(info) and not path.endswith("offset_um") and path.partition(".")[0] != name
+
+    return Coordinates(stage, moves)
+
+
+class Chain(eqx.Module):
+    """A stage in the coordinates of its fit: of all parameters but those of the grid and the offsets.
+
+    The grid stands at a place in the chain; both are None where no grid is fitted.
     """
 
     coordinates: Coordinates[Stage]
-    place: int | None
+    place: int | None = eqx.field(static=True)
     grid: Grid | None
+
+    @classmethod
+    def of(cls, stage: Stage, grid: Grid | None) -> "Chain":
+        """Coordinates of a stage whose hysteresis is fitted on a grid, if there is one."""
+        place = None if grid is None else place_of_hysteresis(stage)
+        return cls(offsets_out(stage, grid is not None), place, grid)
 
     @property
     def size(self) -> int:
@@ -47,41 +62,24 @@ class Chain:
         """Levels of the grid."""
         return 0 if self.grid is None else self.grid.levels
 
-    def stage(self, z: Float[Array, " p"], columns_um: Float[Array, " D"]) -> Stage:
-        """The stage with these coordinates and columns, and no offset."""
-        return _stage(self.coordinates, self.place, self.grid, z, columns_um)
-
-
-def _stage(
-    coordinates: Coordinates[Stage],
-    place: int | None,
-    grid: Grid | None,
-    z: Float[Array, " p"],
-    columns_um: Float[Array, " D"] | None,
-) -> Stage:
-    stage = coordinates(z)
-    if grid is None or place is None or columns_um is None:
-        return stage
-    return stage.swap(stage.names[place], grid.model(columns_um, jnp.zeros(())))
+    def stage(self, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None) -> Stage:
+        """The stage with these coordinates and columns, and no offset; without columns, with those that it has."""
+        stage = self.coordinates(z)
+        if self.grid is None or self.place is None or columns_um is None:
+            return stage
+        return stage.swap(stage.names[self.place], self.grid.model(columns_um, jnp.zeros(())))
 
 
 @eqx.filter_jit
 def _linearised(
-    coordinates: Coordinates[Stage],
-    place: int | None,
-    grid: Grid | None,
-    z: Float[Array, " p"],
-    columns_um: Float[Array, " D"] | None,
-    samples: Samples,
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, samples: Samples
 ) -> tuple[Float[Array, " n"], Float[Array, "n p"], Float[Array, "n k"]]:
-    """Response of a run, its derivatives along the coordinates, and the run's nuisance parameters."""
-
     def response(z: Float[Array, " p"]) -> tuple[Array, Array]:
-        out = respond(_stage(coordinates, place, grid, z, columns_um), samples)
+        out = respond(chain.stage(z, columns_um), samples)
         return out, out
 
     slope, out = jax.jacfwd(response, has_aux=True)(z)
-    return out, slope, lead_ins(_stage(coordinates, place, grid, z, columns_um), samples)
+    return out, slope, nuisance_columns(chain.stage(z, columns_um), samples)
 
 
 @eqx.filter_jit
@@ -123,21 +121,15 @@ def _rows(
     return system.gain * response + more, memory, (state, response[-1])
 
 
-_without = eqx.filter_jit(without)
+_project_out = eqx.filter_jit(project_out)
 
 
 @dataclass(frozen=True)
 class RunSums:
-    """What one run adds to the regression.
+    """What one run adds to the regression on columns and coordinates, its nuisance parameters eliminated.
 
-    Attributes
-    ----------
-    moments
-        Of columns and coordinates, the run's nuisance parameters eliminated.
-    mean
-        Mean of the rows over the fitted samples, shape `(D + p,)`.
-    residual_um
-        Measurement less prediction at all samples, the run's nuisance parameters taken off, shape `(n,)`.
+    `mean` is that of the rows over the fitted samples, shape `(D + p,)`; `residual_um` is measurement less prediction
+    at all samples, the nuisance parameters taken off, shape `(n,)`.
     """
 
     moments: Moments
@@ -146,20 +138,11 @@ class RunSums:
 
 
 def run_sums(
-    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"], run: StageRun, free: bool = True
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"], run: Run, free: bool = True
 ) -> RunSums:
-    """Pass one run through the regression.
+    """Pass one run through the regression, linearised at some coordinates and columns.
 
-    Parameters
-    ----------
-    chain
-        The stage.
-    z, columns_um
-        Where it is linearised.
-    run
-        Prepared, with its samples weighed.
-    free
-        Whether the columns are part of the regression, or left as they are.
+    The columns are part of it only if they are `free`.
     """
     samples, size = run.samples, chain.size if free else 0
     out, slope, own = linearise(chain, z, columns_um, run)
@@ -179,16 +162,15 @@ def run_sums(
             used.T @ used, used.T @ target, np.asarray(target @ target), np.asarray(weight[piece].sum())
         )
     reduced, _, _ = split_moments(sums, known, 0.0)
-    off = np.asarray(_without(jnp.asarray(own), samples.weight, jnp.asarray(residual)))
+    off = np.asarray(_project_out(jnp.asarray(own), samples.weight, jnp.asarray(residual)))
     return RunSums(reduced, np.asarray(sums.gram)[:known, known] / weight.sum(), off[: len(run.record)])
 
 
 def linearise(
-    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, run: StageRun
+    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, run: Run
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Response of a padded run, its slopes along the coordinates, and its own unknowns; see `_linearised`."""
-    here = chain.coordinates, chain.place, chain.grid
-    out, slope, own = _linearised(*here, z, columns_um, run.samples)
+    """Response of a padded run, its slopes along the coordinates, and its nuisance columns."""
+    out, slope, own = _linearised(chain, z, columns_um, run.samples)
     return np.asarray(out), np.asarray(slope), np.asarray(own)
 
 
@@ -196,26 +178,15 @@ def along(
     chain: Chain,
     z: Float[Array, " p"],
     columns_um: Float[Array, " D"] | None,
-    run: StageRun,
+    run: Run,
     directions: tuple[np.ndarray, np.ndarray],
     reduce: Callable[[np.ndarray], np.ndarray] = lambda moved: moved,
 ) -> np.ndarray:
-    """Move coordinates and columns along directions, to first order.
+    """Move coordinates and columns along `k` directions, to first order: changes of the displacement, shape `(n, k)`.
 
-    Parameters
-    ----------
-    chain, z, columns_um, run
-        The run, and where it is linearised: without columns, at those that the stage has, whose grid may then differ
-        from the chain's.
-    directions
-        Of the columns, shape `(D, k)`, and of the coordinates, shape `(p, k)`.
-    reduce
-        What is kept of the changes of each piece, shape `(samples, k)`.
-
-    Returns
-    -------
-    Array
-        Changes of the displacement, or what is kept of them, for all samples, shape `(n, ...)`.
+    The directions are those of the columns, shape `(D, k)`, and of the coordinates, shape `(p, k)`. Without columns
+    the run is linearised at those that the stage has, whose grid may then differ from the chain's. Of the changes of
+    each piece, shape `(samples, k)`, only what `reduce` makes of them is kept.
     """
     _, slope, _ = linearise(chain, z, columns_um, run)
     moved = [
@@ -225,11 +196,10 @@ def along(
     return np.concatenate(moved)
 
 
-def pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> Iterator[tuple[int, np.ndarray]]:
+def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the rows of the columns, piece by piece, with the sample that each piece begins at.
 
-    They are not refined: as directions to move in they are good enough, and only the residual decides where the fit
-    ends.
+    They are not refined: good enough as directions to move in, while only the residual decides where the fit ends.
     """
     samples, grid, n = run.samples, chain.grid, len(run.record)
     if grid is None or chain.place is None or not free:
@@ -256,25 +226,11 @@ def pieces(chain: Chain, z: Float[Array, " p"], run: StageRun, free: bool) -> It
 
 
 def split_moments(total: Moments, size: int, damping: float) -> tuple[Moments, np.ndarray, np.ndarray]:
-    """Eliminate the last unknowns of a regression.
+    """Eliminate the last unknowns of a regression, all but the first `size`.
 
-    Parameters
-    ----------
-    total
-        Of all unknowns.
-    size
-        Number of those that stay, `D`.
-    damping
-        Share of the diagonal that is added to the eliminated ones' own block (Marquardt).
-
-    Returns
-    -------
-    reduced
-        Moments of those that stay, with the best of the others for each.
-    answer
-        Best of the others without those that stay, shape `(p,)`.
-    follow
-        What it loses for each of those, shape `(p, D)`.
+    Returns the moments of those that stay, with the best of the others for each; the best of the others without them,
+    shape `(p,)`; and what that loses for each of them, shape `(p, D)`. Marquardt's damping is the share of the
+    diagonal that is added to the eliminated ones' own block.
     """
     gram, cross = np.asarray(total.gram), np.asarray(total.cross_um)
     own = gram[size:, size:]

@@ -10,7 +10,8 @@ import numpy as np
 
 from fits.io._limits import Ranges, joined, measured_ranges
 from fits.io._record import Record
-from fits.stage._run import StageRun, gain_ahead, place_of_hysteresis, prepare_stage_run
+from fits.loop._run import Run, prepare_run
+from fits.stage._run import gain_ahead, place_of_hysteresis
 from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
 
 # Steps in a period of the resonance: a sampled sine misses less than 2 % of its peak.
@@ -23,12 +24,12 @@ _MOST = 1 << 18
 class Prepared:
     """A run, and what a stage makes of it."""
 
-    run: StageRun
+    run: Run
     time_s: Any
     scene: Scene
 
 
-def prepare(stage: Stage, run: StageRun) -> Prepared:
+def prepare(stage: Stage, run: Run) -> Prepared:
     """Build the scene of a run."""
     samples = run.samples
     command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
@@ -83,16 +84,7 @@ def motion(
 ) -> tuple[Ranges, np.ndarray]:
     """Extremes of what a command makes a stage do, between its samples as well.
 
-    Parameters
-    ----------
-    stage
-        With or without effects.
-    record
-        The command, and further columns that effects need; the displacement is not looked at.
-    range_V
-        Range of the switching voltages of the hysteresis, as commands.
-    initial
-        Memory before the first sample, one of `INITIAL_STATES`.
+    The displacement of the record is not looked at. `range_V` is that of the switching voltages, as commands.
 
     Returns
     -------
@@ -102,9 +94,8 @@ def motion(
     """
     n = len(record)
     stride = fine_steps(stage, float(np.median(np.diff(record.time_s))), n)
-    blank = replace(record, displacement_um=np.zeros(n))
     # Held out as a whole, so that short commands are no error: nothing is fitted.
-    run = prepare_stage_run(blank, range_V, initial, 1.0, stride, hold=stage.hold)
+    run = prepare_run(record, range_V, initial, 1.0, stride, hold=stage.hold)
     found = signals(stage.with_substeps(1), prepare(stage, run))
     last = (n - 1) * stride + 1
     time_s = np.asarray(run.samples.time_s)
@@ -129,18 +120,8 @@ def predicted_ranges(
 ) -> Ranges:
     """What a command is, and makes a model do, between its samples too where the model rings.
 
-    Parameters
-    ----------
-    model
-        From a fit or a model file.
-    program
-        The command.
-    displacement_um
-        What the model does at the samples, shape `(n,)`.
-    initial
-        Memory before the first sample.
-    every
-        Whether velocity, acceleration and current are asked for as well.
+    The displacement is what the model does at the samples, shape `(n,)`. Velocity, acceleration and current are given
+    if `every` range is asked for.
     """
     ranges = measured_ranges(replace(program, displacement_um=displacement_um))
     stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
@@ -178,18 +159,8 @@ def reached_by(
 ) -> tuple[Ranges, list[float]]:
     """What records have shown of a rig: the displacement as measured, its derivatives as a fitted stage has them.
 
-    Noise would make derivatives of the measurement larger than anything the rig did.
-
-    Parameters
-    ----------
-    stage
-        Fitted to the records.
-    records
-        With displacements.
-    range_V, states
-        See `motion`; a state for each record.
-    known
-        Samples whose response does not depend on an unknown past, one array of shape `(n,)` for each record.
+    Noise would make derivatives of the measurement larger than anything the rig did. Each record has a state before
+    it and samples that do not depend on an unknown past, shape `(n,)`; see `motion`.
 
     Returns
     -------

@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.stage._result import StageFit, prepare_again
-from fits.stage._run import Samples, lead_ins, residual_of, respond, without
+from fits.loop._result import FitResult
+from fits.loop._samples import Samples
+from fits.stage._moments import offsets_out
+from fits.stage._run import nuisance_columns, prepare_again, project_out, residual_of, respond
 from fits.stage._solve import Weighing
-from fits.stage._uncertainty import offsets_out
 from microid import Coordinates, Stage
 
 
@@ -38,17 +39,21 @@ class Draws:
 
 
 def _potential(
-    z: Float[Array, " p"], coordinates: Coordinates[Stage], runs: list[Samples], precision: list[Float[Array, ""]]
+    data: tuple[Coordinates[Stage], list[Samples], list[Float[Array, ""]]], z: Float[Array, " p"]
 ) -> Float[Array, ""]:
+    """Minus the logarithm of the likelihood."""
+    coordinates, runs, precision = data
     stage, total = coordinates(z), jnp.zeros(())
     for samples, share in zip(runs, precision, strict=True):
-        off = without(lead_ins(stage, samples), samples.weight, samples.displacement_um - respond(stage, samples))
+        off = project_out(
+            nuisance_columns(stage, samples), samples.weight, samples.displacement_um - respond(stage, samples)
+        )
         total = total + share * jnp.sum(samples.weight * off**2) / 2
     return total
 
 
 def sample_posterior(
-    result: StageFit,
+    result: FitResult[Stage],
     records: Sequence[Record],
     *,
     draws: int = 1000,
@@ -91,7 +96,7 @@ def sample_posterior(
     coordinates = offsets_out(stage, True)
     data = coordinates, [run.samples for run in runs], precision
     sampler = MCMC(
-        NUTS(potential_fn=eqx.Partial(_swapped, data), dense_mass=True),
+        NUTS(potential_fn=eqx.Partial(_potential, data), dense_mass=True),
         num_warmup=warmup,
         num_samples=draws,
         progress_bar=False,
@@ -103,9 +108,3 @@ def sample_posterior(
         lost = int(np.sum(np.asarray(sampler.get_extra_fields()["diverging"])))
     values = np.asarray(jax.vmap(coordinates.values)(z))
     return Draws(tuple(parameter.name for parameter in result.parameters), values, lost)
-
-
-def _swapped(
-    data: tuple[Coordinates[Stage], list[Samples], list[Float[Array, ""]]], z: Float[Array, " p"]
-) -> Float[Array, ""]:
-    return _potential(z, *data)

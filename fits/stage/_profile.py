@@ -12,11 +12,10 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._prior import Hyper
-from fits.stage._moments import Chain
-from fits.stage._result import StageFit, prepare_again
-from fits.stage._run import StageRun, place_of_hysteresis, residual_of
-from fits.stage._solve import Solved, prior_precision, solve_chain
-from fits.stage._uncertainty import offsets_out
+from fits.loop._result import FitResult
+from fits.loop._run import Run
+from fits.stage._run import place_of_hysteresis, prepare_again, residual_of
+from fits.stage._solve import Problem, Solved, prior_precision, solve_chain
 from microid import GridDensity, Preisach, Stage, parameter_table
 
 # Half of the width that is looked at, in standard deviations of the quadratic approximation.
@@ -48,7 +47,7 @@ class Profile:
 
 
 def profile_stage(
-    result: StageFit,
+    result: FitResult[Stage],
     records: Sequence[Record],
     name: str,
     *,
@@ -92,13 +91,14 @@ def profile_stage(
         high = spec.upper - 0.01 * (spec.upper - at.value)
     values = np.linspace(low, high, points)
     runs = prepare_again(result.model, records, initial, holdout)
-    problem = _Held.of(result.model.with_substeps(1), runs, initial_hyper=Hyper.start())
+    fitted = result.model.with_substeps(1)
+    stroke_um = max(float(np.ptp(run.displacement_um)) for run in runs)
+    best = _solved(fitted, runs, Hyper.start(), stroke_um)
 
     def deviance(value: float) -> float:
         progress(f"{name} = {value:.6g} {at.unit}")
-        stage = problem.stage
-        held = stage.swap(part, eqx.tree_at(lambda p: getattr(p, field), stage[part], jnp.asarray(value)))
-        return problem.deviance(held.freeze(name))
+        held = fitted.swap(part, eqx.tree_at(lambda p: getattr(p, field), fitted[part], jnp.asarray(value)))
+        return _deviance(best, held.freeze(name))
 
     found = np.array([deviance(float(value)) for value in values])
     # Its square root is nearly straight.
@@ -108,58 +108,32 @@ def profile_stage(
     return Profile(name, at.unit, values, found, lower, upper)
 
 
-@dataclass(frozen=True)
-class _Held:
-    """A fit that others are compared with."""
-
-    stage: Stage
-    runs: Sequence[StageRun]
-    solved: Solved
-    stroke_um: float
-
-    @classmethod
-    def of(cls, stage: Stage, runs: Sequence[StageRun], initial_hyper: Hyper) -> "_Held":
-        stroke = max(float(np.ptp(run.displacement_um)) for run in runs)
-        chain, columns = _chain(stage)
-        hyper = initial_hyper if chain.grid is not None else None
-        z = np.asarray(chain.coordinates.of(stage))
-        return cls(stage, runs, solve_chain(chain, z, columns, runs, hyper, stroke, "squares", _quiet), stroke)
-
-    def deviance(self, stage: Stage) -> float:
-        """Twice the loss of log posterior with the rest fitted again, the noise and the prior as they are here."""
-        best = self.solved
-        try:
-            chain, columns = _chain(stage)
-        except ValueError:
-            # Nothing else may move.
-            left, columns, size = [residual_of(stage, run) for run in self.runs], np.zeros(0), 0
-            prior = np.zeros((0, 0))
-        else:
-            start = np.asarray(chain.coordinates.of(stage)), columns, self.runs, best.hyper, self.stroke_um
-            solved = solve_chain(chain, *start, "squares", _quiet)
-            left, columns, size = [one.residual_um for one in solved.sums], solved.columns_um, chain.size
-            prior = prior_precision(chain, best.hyper, self.stroke_um)
-        variance = best.weighing.least_um**2
-        misfit = best.weighing.cost_um2(self.runs, left)
-        misfit -= best.weighing.cost_um2(self.runs, [one.residual_um for one in best.sums])
-        if size == 0:
-            return misfit / variance
-        return misfit / variance + float(columns @ prior @ columns - best.columns_um @ prior @ best.columns_um)
-
-
-def _quiet(_: str) -> None:
-    pass
-
-
-def _chain(stage: Stage) -> tuple[Chain, np.ndarray]:
+def _solved(stage: Stage, runs: Sequence[Run], hyper: Hyper | None, stroke_um: float) -> Solved:
+    """Fit what is free of a stage; a `ValueError` where nothing is."""
     place = place_of_hysteresis(stage)
     law = None if place is None else stage.parts[place]
-    if (
-        isinstance(law, Preisach)
-        and isinstance(law.density, GridDensity)
-        and stage.names[place or 0] not in stage.frozen
-    ):
-        density = law.density
-        grid = Grid(density.lower_V, density.upper_V, density.levels)
-        return Chain(offsets_out(stage, True), place, grid), np.asarray(columns_of(law))
-    return Chain(offsets_out(stage, False), None, None), np.zeros(0)
+    frozen = stage.names[place or 0] in stage.frozen
+    if isinstance(law, Preisach) and isinstance(law.density, GridDensity) and not frozen:
+        grid = Grid(law.density.lower_V, law.density.upper_V, law.density.levels)
+        problem = Problem.of(stage, grid, np.asarray(columns_of(law)), hyper, stroke_um)
+    else:
+        problem = Problem.of(stage, None, np.zeros(0), None, stroke_um)
+    return solve_chain(problem, runs, "squares", lambda _: None)
+
+
+def _deviance(best: Solved, stage: Stage) -> float:
+    """Twice the loss of log posterior with the rest of a stage fitted again, noise and prior as they are at best."""
+    runs, stroke_um = best.runs, best.problem.stroke_um
+    try:
+        solved = _solved(stage, runs, best.hyper, stroke_um)
+    except ValueError:
+        # Nothing else may move.
+        left, columns = [residual_of(stage, run) for run in runs], np.zeros(0)
+    else:
+        left, columns = solved.residuals_um, solved.columns_um
+    misfit = best.weighing.cost_um2(runs, left) - best.weighing.cost_um2(runs, best.residuals_um)
+    deviance = misfit / best.weighing.least_um**2
+    if not len(columns):
+        return deviance
+    prior = prior_precision(best.problem.chain, best.hyper, stroke_um)
+    return deviance + float(columns @ prior @ columns - best.columns_um @ prior @ best.columns_um)

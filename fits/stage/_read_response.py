@@ -73,9 +73,7 @@ def read_response(path: str | os.PathLike[str]) -> ResponseData:
         size = 10 ** (first / 20) if magnitude == _DECIBEL else first
         response = size * np.exp(1j * (np.deg2rad(second) if phase == _DEGREES else second))
     return ResponseData(
-        values["frequency_Hz"],
-        response[:, None, None],
-        values[_VARIANCE][:, None, None] if known else None,
+        values["frequency_Hz"], response[:, None, None], values[_VARIANCE][:, None, None] if known else None
     )
 
 

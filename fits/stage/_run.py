@@ -1,8 +1,8 @@
-"""A record made ready for fitting a whole stage: padded, refined in time, and weighed."""
+"""What a stage makes of a run: its response, what is left of the run, and where its hysteresis stands."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -11,217 +11,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.io._columns import columns_beside
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._run import VIRGIN, initial_state, known_samples
+from fits.io.columns import COLUMNS, columns_beside
+from fits.loop._run import Run, command_range_V, prepare_run
+from fits.loop._samples import Samples
+from fits.loop._uncertainty import refuse_outside
 from microid import (
+    AbstractEffect,
     AbstractHysteresis,
     AbstractLinear,
-    Hold,
     LinearSystem,
     Preisach,
     Signal,
     Stage,
-    Staircase,
     Start,
     innermost,
-    refined,
 )
 
-# Records are filled up to a power of two, so that those of like length share what was compiled.
-_SHORTEST = 1024
-# Intervals that differ by less than this from their mean, as a fraction of it, count as even.
-_EVEN = 1e-6
-# Extremes that a memory may hold: filtered multisines nest deeply.
-_EXTREMES = 512
-# A hundred arrays of so many values are 8 GB.
-_MOST_STEPS = 10_000_000
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
-
-
-class Samples(eqx.Module):
-    """The arrays of a run, as compiled functions take them.
-
-    Attributes
-    ----------
-    time_s
-        Refined times, shape `(m,)`, or the one interval between them, shape `()`.
-    voltage_V
-        Command at the refined times, shape `(m,)`.
-    displacement_um
-        Measurement, shape `(n,)`, with `m = (n - 1) stride + 1`.
-    weight
-        Of each measured sample in the sum of squares, 0 where it is not fitted, shape `(n,)`.
-    start
-        Memory and rest before the first sample.
-    stride
-        Refined steps per sample.
-    moving
-        Whether the stage may have been moving when the record began.
-    beside
-        Further columns at the refined times under the names of `columns_beside`, shape `(m,)`.
-    """
-
-    time_s: Float[Array, " m"] | Float[Array, ""]
-    voltage_V: Float[Array, " m"]
-    displacement_um: Float[Array, " n"]
-    weight: Float[Array, " n"]
-    start: Start
-    stride: int = eqx.field(static=True)
-    moving: bool = eqx.field(static=True)
-    beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class StageRun:
-    """One record for a whole stage.
-
-    Attributes
-    ----------
-    record
-        The measured columns.
-    samples
-        The same, padded.
-    known
-        Samples whose output does not depend on an unknown past, but for a constant, shape `(n,)`.
-    fitted
-        Samples that may be used for fitting, shape `(n,)`.
-    """
-
-    record: Record
-    samples: Samples
-    known: np.ndarray
-    fitted: np.ndarray
-
-    @property
-    def displacement_um(self) -> np.ndarray:
-        """Measured displacement, shape `(n,)`."""
-        assert self.record.displacement_um is not None
-        return self.record.displacement_um
-
-    @property
-    def held_out(self) -> np.ndarray:
-        """Samples that are predicted, not fitted, shape `(n,)`."""
-        return self.known & ~self.fitted
-
-    @property
-    def rate_Hz(self) -> float:
-        """Sampling rate, the median if it is uneven."""
-        return float(1 / np.median(np.diff(self.record.time_s)))
-
-    def weighted(self, weight: np.ndarray) -> "StageRun":
-        """Weigh the samples, shape `(n,)`; those that are not fitted stay without weight."""
-        full = np.zeros(self.samples.weight.shape)
-        full[: len(weight)] = weight * self.fitted
-        return replace(self, samples=eqx.tree_at(lambda s: s.weight, self.samples, jnp.asarray(full)))
-
-
-def prepare_stage_run(
-    record: Record,
-    range_V: tuple[float, float],
-    initial: str,
-    holdout: float,
-    stride: int = 1,
-    gain: float | None = 1.0,
-    hold: Hold = "first",
-    usable: np.ndarray | None = None,
-) -> StageRun:
-    """Make a record ready.
-
-    Parameters
-    ----------
-    record
-        Measured voltage and displacement.
-    range_V
-        Range of the command.
-    initial
-        Memory before the first sample, one of `INITIAL_STATES`, or `VIRGIN`.
-    holdout
-        Fraction at the end that is kept out of the fit.
-    stride
-        Steps into which each interval is divided.
-    gain
-        Static gain ahead of the hysteresis, see `gain_ahead`. None where there is no hysteresis, whose unknown past
-        lasts until the voltage has been at both ends.
-    hold
-        How the command runs between samples, as in `Stage`.
-    usable
-        Which samples may be fitted, shape `(n,)`; by default all.
-
-    Raises
-    ------
-    DataError
-        If there is no displacement, or nothing is left to fit.
-    """
-    if record.displacement_um is None:
-        raise DataError(f"{record.source}: a displacement column is needed here")
-    if stride * len(record) > _MOST_STEPS:
-        raise DataError(
-            f"{record.source}: expected at most {_MOST_STEPS:,} steps, found {len(record):,} samples of {stride} "
-            "substeps each; split the record, or use a model of fewer substeps"
-        )
-    lower, upper = range_V
-    n, unknown = len(record), initial in ("unknown", VIRGIN)
-    known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
-    fitted = known.copy() if usable is None else known & usable
-    if holdout > 0:
-        fitted[n - round(holdout * n) :] = False
-    if holdout < 1 and fitted.sum() < 50:
-        raise DataError(
-            f"{record.source}: only {fitted.sum()} samples are left to fit, 50 are needed: the others come before "
-            "the voltage has been at both ends of its range, where its unknown history still counts, or are held "
-            "out; state the initial state with --initial, hold out less, or start each run with a full loop"
-        )
-    samples = refine(record.time_s, record.voltage_V, record.displacement_um, fitted, stride, unknown, hold)
-    share = np.arange(samples.voltage_V.shape[0]) / stride
-    beside = {name: jnp.asarray(np.interp(share, np.arange(n), v)) for name, v in columns_beside(record).items()}
-    samples = eqx.tree_at(lambda s: s.beside, samples, beside)
-    ahead = 1.0 if gain is None else gain
-    memory = _roomy(initial_state(initial, ahead * lower, ahead * upper))
-    return StageRun(record, eqx.tree_at(lambda s: s.start.memory, samples, memory, is_leaf=_none), known, fitted)
-
-
-def _none(value: Any) -> bool:
-    return value is None
-
-
-def refine(
-    time_s: np.ndarray,
-    voltage_V: np.ndarray,
-    displacement_um: np.ndarray,
-    fitted: np.ndarray,
-    stride: int,
-    moving: bool,
-    hold: Hold,
-) -> Samples:
-    """Fill up and refine the arrays of a record."""
-    n = len(time_s)
-    pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
-    step = (time_s[-1] - time_s[0]) / (n - 1)
-    voltage, weight = np.pad(voltage_V, pad, mode="edge"), np.pad(fitted.astype(float), pad)
-    share = np.arange((n + pad[1] - 1) * stride + 1) / stride
-    _, fine_V = refined(jnp.ones(()), jnp.asarray(voltage), stride, hold)
-    if np.max(np.abs(np.diff(time_s) - step)) <= _EVEN * step:
-        time: Any = np.asarray(step / stride)
-    else:
-        longer = np.concatenate([time_s, time_s[-1] + step * np.arange(1, pad[1] + 1)])
-        time = np.interp(share, np.arange(n + pad[1]), longer)
-    return Samples(
-        jnp.asarray(time),
-        fine_V,
-        jnp.asarray(np.pad(displacement_um, pad, mode="edge")),
-        jnp.asarray(weight),
-        Start(),
-        stride,
-        moving,
-    )
-
-
-def _roomy(start: Staircase) -> Staircase:
-    pad = jnp.full(_EXTREMES - start.extremes_V.shape[0], start.extremes_V[0])
-    return Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
 
 
 def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
@@ -230,7 +39,7 @@ def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
     return stage(samples.time_s, samples.voltage_V, start, samples.beside)[:: samples.stride]
 
 
-def lead_ins(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
+def nuisance_columns(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, shape `(n, k)`: an offset in um, and how the stage moved before.
 
     The latter are the free motions of what follows the hysteresis, or of the whole chain without one. A voltage at
@@ -250,7 +59,7 @@ def lead_ins(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
     return jnp.concatenate([offset, jax.vmap(free)(jnp.eye(system.order)).T], axis=1)
 
 
-def without(
+def project_out(
     columns: Float[Array, "n k"], weight: Float[Array, " n"], values: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Take the best combination of some columns off, by weighted least squares."""
@@ -264,15 +73,15 @@ def without(
 @eqx.filter_jit
 def _compare(stage: Stage, samples: Samples) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     out = respond(stage, samples)
-    return out, without(lead_ins(stage, samples), samples.weight, samples.displacement_um - out)
+    return out, project_out(nuisance_columns(stage, samples), samples.weight, samples.displacement_um - out)
 
 
-def simulate_stage(stage: Stage, run: StageRun) -> np.ndarray:
+def simulate_stage(stage: Stage, run: Run) -> np.ndarray:
     """Predict the displacement of a run, in um, shape `(n,)`."""
     return np.asarray(_compare(stage, run.samples)[0])[: len(run.record)]
 
 
-def residual_of(stage: Stage, run: StageRun) -> np.ndarray:
+def residual_of(stage: Stage, run: Run) -> np.ndarray:
     """Measurement less prediction, the run's nuisance parameters taken off, in um, shape `(n,)`."""
     return np.asarray(_compare(stage, run.samples)[1])[: len(run.record)]
 
@@ -284,13 +93,7 @@ def place_of_hysteresis(stage: Stage) -> int | None:
 
 
 def gain_ahead(stage: Stage) -> float | None:
-    """Voltage at the hysteresis per command, at rest; None where there is no hysteresis.
-
-    Raises
-    ------
-    DataError
-        If it is not positive.
-    """
+    """Voltage at the hysteresis per command, at rest; None without one, a `DataError` where it is not positive."""
     place = place_of_hysteresis(stage)
     if place is None:
         return None
@@ -319,3 +122,43 @@ def ahead(stage: Stage, place: int, samples: Samples) -> Float[Array, " m"]:
     for part in stage.parts[:place]:
         signal = part.run(samples.time_s, signal)
     return signal.values
+
+
+def range_of(stage: Stage) -> tuple[float, float]:
+    """Commands that a stage was fitted on, in V; unlimited without a Preisach operator."""
+    place = place_of_hysteresis(stage)
+    law = None if place is None else innermost(stage.parts[place])
+    if isinstance(law, Preisach):
+        gain = gain_ahead(stage)
+        assert gain is not None
+        return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
+    return -np.inf, np.inf
+
+
+def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout: float) -> list[Run]:
+    """Make the records ready on which a stage was fitted; without a Preisach operator they give the range."""
+    range_V = range_of(stage)
+    if not np.isfinite(range_V[0]):
+        range_V = command_range_V(records)
+    settings = initial, holdout, stage.substeps, gain_ahead(stage), stage.hold
+    return [prepare_run(record, range_V, *settings) for record in records]
+
+
+def prepare_program(stage: Stage, record: Record, initial: str) -> tuple[Stage, Run]:
+    """Make a voltage program ready for a stage, and the stage for intervals that are divided already.
+
+    A `DataError` if the voltage leaves the range that the stage was fitted on, or the stage has an effect of another
+    column that the program lacks.
+    """
+    range_V = range_of(stage)
+    refuse_outside(record, *range_V)
+    needed = {name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs}
+    needed -= {name for name, column in COLUMNS.items() if column.optional}
+    program = replace(record, displacement_um=None, extra=dict(record.extra))
+    missing = sorted(needed - set(columns_beside(program)))
+    if missing:
+        raise DataError(
+            f"{record.source}: the model depends on {', '.join(missing)}: add a column of that name that varies"
+        )
+    run = prepare_run(program, range_V, initial, 1.0, stage.substeps, gain_ahead(stage), stage.hold)
+    return stage.with_substeps(1), run

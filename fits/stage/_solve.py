@@ -3,18 +3,21 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
+from fits.loop._design import Grid
 from fits.loop._grid import solve_grid
 from fits.loop._moments import Data, Moments
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
+from fits.loop._run import Run
 from fits.stage._moments import Chain, RunSums, run_sums, split_moments
-from fits.stage._run import StageRun, residual_of
+from fits.stage._run import residual_of
 from fits.stage._weighing import Weighing
 from fits.stats._noise import huber_weight
+from microid import Stage
 
 _ROUNDS, _ROUGH = 40, 12
 # Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
@@ -26,34 +29,76 @@ _ROUNDING = 1e-20
 
 
 @dataclass(frozen=True)
-class Solved:
-    """Where a fit ended.
+class Problem:
+    """A stage to be fitted, where its fit begins, and what the user should know.
 
-    Attributes
-    ----------
-    z
-        Coordinates, shape `(p,)`.
-    columns_um
-        Columns of the grid, shape `(D,)`.
-    hyper
-        Smoothness and noise of the grid; None without one.
-    runs
-        With the weights of their samples.
-    sums
-        Regression at the end, per run.
-    weighing
-        Noise of each run.
-    distance
-        How far the optimum may still be, in standard deviations of the coordinates.
+    The unit of the columns is `stroke_um`; `hyper` is their smoothness and noise to start from, None to leave them as
+    they are. No run counts as quieter than the part `least_noise_share` of the loudest: where more than noise is
+    left, one run would otherwise be fitted ever better, and so count for ever more, at the cost of the others. Where
+    a part was left out, `full` is the stage with it, roughly fitted.
     """
 
+    stage: Stage
+    chain: Chain
     z: np.ndarray
     columns_um: np.ndarray
     hyper: Hyper | None
-    runs: list[StageRun]
+    stroke_um: float
+    remarks: tuple[str, ...] = ()
+    least_noise_share: float = 0.0
+    full: "Solved | None" = None
+
+    @classmethod
+    def of(
+        cls, stage: Stage, grid: Grid | None, columns_um: np.ndarray, hyper: Hyper | None, stroke_um: float
+    ) -> "Problem":
+        """Begin at a stage, and at columns of the grid of its hysteresis."""
+        chain = Chain.of(stage, grid)
+        return cls(stage, chain, np.asarray(chain.coordinates.of(stage)), columns_um, hyper, stroke_um)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Where a fit ended: coordinates, shape `(p,)`, and columns of the grid, shape `(D,)`.
+
+    `hyper` is the smoothness and noise of the grid, None without one. The runs have the weights of their samples, and
+    the sums are the regression at the end.
+    """
+
+    problem: Problem
+    z: np.ndarray
+    columns_um: np.ndarray
+    hyper: Hyper | None
+    runs: list[Run]
     sums: list[RunSums]
     weighing: Weighing
-    distance: float
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that it stands for, without an offset."""
+        return self.problem.chain.stage(jnp.asarray(self.z), jnp.asarray(self.columns_um))
+
+    def parameters(self) -> tuple[list[tuple[str, str]], np.ndarray, np.ndarray]:
+        """Names and units of the parameters outside the grid, values, and derivatives by their own coordinates."""
+        stage, coordinates = self.stage, self.problem.chain.coordinates
+        named = [
+            (stage.named(info.path) + ("" if info.shape == () else str(list(place))), info.spec.unit)
+            for info in coordinates.table
+            for place in np.ndindex(info.shape)
+        ]
+        point = jnp.asarray(self.z)
+        value, slope = jax.jvp(coordinates.values, (point,), (jnp.ones_like(point),))
+        return named, np.asarray(value), np.asarray(slope)
+
+    @property
+    def onward(self) -> Problem:
+        """The problem of going on from here."""
+        return replace(self.problem, z=self.z, columns_um=self.columns_um, hyper=self.hyper)
+
+    @property
+    def residuals_um(self) -> list[np.ndarray]:
+        """Measurement less prediction of each run, its nuisance parameters taken off, shape `(n,)`."""
+        return [one.residual_um for one in self.sums]
 
     @property
     def cost(self) -> float:
@@ -63,57 +108,29 @@ class Solved:
 
 
 def solve_chain(
-    chain: Chain,
-    z: np.ndarray,
-    columns_um: np.ndarray,
-    runs: Sequence[StageRun],
-    hyper: Hyper | None,
-    stroke_um: float,
+    problem: Problem,
+    runs: Sequence[Run],
     loss: str,
     progress: Callable[[str], None],
     rough: bool = False,
-    anyway: bool = False,
-    even: float = 0.0,
+    accept_best: bool = False,
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
     Each round linearises the stage, eliminates the coordinates from the regression, solves it for non-negative smooth
     columns with the smoothness that maximises the evidence, and damps the step until the true cost falls (variable
-    projection; Golub & Pereyra 2003). Without columns these are Levenberg and Marquardt's steps.
+    projection; Golub & Pereyra 2003). Without columns these are Levenberg and Marquardt's steps. A library's solver
+    would hold the smoothness, the weights of the runs and the columns at zero fixed, which change with every step.
 
-    Parameters
-    ----------
-    chain
-        The stage.
-    z, columns_um
-        Start.
-    runs
-        Prepared.
-    hyper
-        Smoothness and noise of the columns to start from; None to leave the columns as they are.
-    stroke_um
-        Unit of the columns.
-    loss
-        One of `LOSSES`.
-    progress
-        Told what is being done.
-    rough
-        Whether the place found is only a start for another fit, so that it need not be stationary.
-    anyway
-        Whether the best place is an answer, too, if it does not become stationary: for those who go on from there.
-    even
-        No run counts as quieter than this part of the loudest. Where more than noise is left, one run would otherwise
-        be fitted ever better, and so count for ever more, at the cost of the others.
-
-    Raises
-    ------
-    FitError
-        If it does not become stationary and must.
+    A `rough` place is only a start for another fit, and need not be stationary. `accept_best` takes the best place
+    for an answer, too, for those who go on from there; otherwise a `FitError` says that it did not become stationary.
     """
+    chain, stroke_um = problem.chain, problem.stroke_um
+    z, columns_um, hyper = problem.z, problem.columns_um, problem.hyper
     damping = _DAMPING
     counted: tuple[float, ...] = ()
     for number in range(_ROUGH if rough else _ROUNDS):
-        runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
+        runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
@@ -129,10 +146,10 @@ def solve_chain(
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
-                if damping > _HIGHEST and not (anyway and number):
+                if damping > _HIGHEST and not (accept_best and number):
                     raise
                 if damping > _HIGHEST:
-                    return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+                    return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
                 continue
             hyper = better
             prior = prior_precision(chain, hyper, stroke_um)
@@ -148,7 +165,7 @@ def solve_chain(
             damping *= _FACTOR
             if damping > _HIGHEST:
                 break
-        if damping > _HIGHEST and anyway:
+        if damping > _HIGHEST and accept_best:
             break
         if damping > _HIGHEST and not rough:
             raise FitError(FitStatus.NOT_STATIONARY)
@@ -157,10 +174,10 @@ def solve_chain(
             counted = weighing.correlation
             continue
         if distance < _STATIONARY:
-            runs, sums, weighing = _gather(chain, z, columns_um, runs, loss, hyper is not None, counted, even)
-            return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
-    if rough or anyway:
-        return Solved(z, columns_um, hyper, list(runs), sums, weighing, distance)
+            runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
+            return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
+    if rough or accept_best:
+        return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
     raise FitError(FitStatus.MAX_STEPS)
 
 
@@ -172,39 +189,35 @@ def prior_precision(chain: Chain, hyper: Hyper | None, stroke_um: float) -> np.n
 
 
 def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
-    """Take off what a prior says of the scale of all columns together, shape `(D, D)`.
-
-    That is for the data alone to say: a gain beside the grid is not seen, however smooth the grid is.
-    """
+    """Take off what a prior says of the scale of all columns together, which is for the data to say; `(D, D)`."""
     pull = prior @ columns_um
     return prior - np.outer(pull, pull) / max(float(columns_um @ pull), 1e-300)
 
 
 def _gather(
-    chain: Chain,
+    problem: Problem,
     z: np.ndarray,
     columns_um: np.ndarray,
-    runs: Sequence[StageRun],
+    runs: Sequence[Run],
     loss: str,
     free: bool,
     counted: tuple[float, ...],
-    even: float,
-) -> tuple[Sequence[StageRun], list[RunSums], Weighing]:
+) -> tuple[Sequence[Run], list[RunSums], Weighing]:
+    chain = problem.chain
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
-        runs = [robust(run, residual) for run, residual in zip(runs, left, strict=True)]
+        # Outliers count linearly (Huber).
+        runs = [
+            replace(run, weight=huber_weight(residual, run.fitted)) for run, residual in zip(runs, left, strict=True)
+        ]
     sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
-    return runs, sums, replace(Weighing.of(runs, [one.residual_um for one in sums], *counted), even=even)
+    weighing = Weighing.of(runs, [one.residual_um for one in sums], *counted)
+    return runs, sums, replace(weighing, least_noise_share=problem.least_noise_share)
 
 
-def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[StageRun]) -> list[np.ndarray]:
+def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[Run]) -> list[np.ndarray]:
     stage = chain.stage(jnp.asarray(z), jnp.asarray(columns_um))
     return [residual_of(stage, run) for run in runs]
-
-
-def robust(run: StageRun, residual_um: np.ndarray) -> StageRun:
-    """Weigh a run's samples by what they leave: outliers count linearly (Huber)."""
-    return run.weighted(huber_weight(residual_um, run.fitted))
 
 
 def _step(
@@ -224,8 +237,6 @@ def _step(
         return step, columns_um, hyper, variance, float(step @ information @ step / len(step)) ** 0.5
     reduced, answer, follow = split_moments(total, chain.size, damping)
     solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, 1.0, hyper)
-    if solution.result != optx.RESULTS.successful:
-        raise FitError(FitStatus.MAX_STEPS)
     columns = np.asarray(solution.columns) * stroke_um
     step = answer - follow @ columns
     variance = float(jnp.exp(solution.hyper.log_variance)) * stroke_um**2
@@ -238,19 +249,7 @@ def _step(
 
 
 def marginal_information(total: Moments, size: int, prior: np.ndarray, variance: float) -> np.ndarray:
-    """Precision of the coordinates, whatever the columns may be, shape `(p, p)`.
-
-    Parameters
-    ----------
-    total
-        Of columns and coordinates.
-    size
-        Number of columns, `D`.
-    prior
-        Precision of the columns before the data, shape `(D, D)`.
-    variance
-        Of the noise.
-    """
+    """Precision of the coordinates, whatever the first `size` unknowns, the columns, may be, shape `(p, p)`."""
     gram = np.asarray(total.gram) / variance
     if size == 0:
         return gram

@@ -1,6 +1,6 @@
 """Where the fit of a stage begins: poles read off a measured frequency response, so that nobody has to guess them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -10,7 +10,7 @@ import numpy as np
 from scipy import signal
 from scipy.optimize import least_squares
 
-from fits.stage._run import StageRun
+from fits.loop._run import Run
 from microid import AbstractLinear, Driver, Mechanics, Stage
 
 # Segments whose spectra are averaged.
@@ -33,16 +33,10 @@ _LEADING, _REFINED, _KEPT = 200, 4, 3
 
 @dataclass(frozen=True)
 class MeasuredResponse:
-    """Frequency response of the linear part of a stage, as the runs show it.
+    """Frequency response of the linear part of a stage, as the runs show it, shape `(f,)` each.
 
-    Attributes
-    ----------
-    frequency_Hz
-        Shape `(f,)`.
-    response
-        Displacement per displacement that the hysteresis alone would give, complex, shape `(f,)`.
-    coherence
-        Share of the power that follows the input, shape `(f,)`.
+    It is the complex displacement per displacement that the hysteresis alone would give; the coherence is the share
+    of the power that follows the input.
     """
 
     frequency_Hz: np.ndarray
@@ -50,15 +44,10 @@ class MeasuredResponse:
     coherence: np.ndarray
 
 
-def measure_response(run: StageRun, drive: np.ndarray) -> MeasuredResponse:
-    """Estimate the frequency response from a drive to the displacement of a run (Welch).
+def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
+    """Estimate the frequency response from a drive, shape `(n,)`, to the displacement of a run (Welch).
 
-    Parameters
-    ----------
-    run
-        Its fitted samples are used, from the first to the last.
-    drive
-        What goes in, shape `(n,)`.
+    The fitted samples are used, from the first to the last.
     """
     which = np.flatnonzero(run.fitted)
     piece = slice(which[0], which[-1] + 1)
@@ -90,19 +79,10 @@ def _thinned(frequency: np.ndarray, size: np.ndarray, seen: np.ndarray) -> np.nd
 
 
 def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[Stage]:
-    """Find poles that explain measured frequency responses.
+    """Find poles that explain measured frequency responses, each of which has a gain of its own.
 
-    Parameters
-    ----------
-    stage
-        Its drivers and mechanics, where they are not frozen, are replaced; other linear parts are taken as they are.
-    responses
-        One per run; each has a gain of its own.
-
-    Returns
-    -------
-    list of Stage
-        Distinct candidates, the best first; the stage itself where the responses say nothing.
+    Drivers and mechanics that are not frozen are replaced; other linear parts are taken as they are. Returns distinct
+    candidates, the best first; the stage itself where the responses say nothing.
     """
     free = [
         (name, part)
@@ -119,9 +99,8 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
         if isinstance(part, AbstractLinear) and name not in moved
     ]
     problem = _LogResponse.of(responses, [isinstance(part, Driver) for _, part in free], fixed)
-    candidates = problem.candidates()
     found: list[tuple[float, np.ndarray]] = []
-    for x in _distinct(candidates[:_LEADING], _COARSE)[:_REFINED]:
+    for x in _distinct(problem.ranked()[1][:_LEADING], _COARSE)[:_REFINED]:
         low, high = problem.bounds()
         end: Any = least_squares(problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200)
         found.append((float(end.cost), end.x))
@@ -132,10 +111,7 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
 
 
 def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) -> list[float]:
-    """Order delays by how well some poles of a stage and the delay explain a measured response, the best first.
-
-    Of neighbours only the best is kept.
-    """
+    """Order delays, the best first, by how well they and some poles explain a response; of neighbours the best."""
     parts = [part for part in stage.parts if isinstance(part, Driver | Mechanics)]
     if not parts or len(response.frequency_Hz) < _LINES:
         return []
@@ -143,13 +119,13 @@ def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) 
     costs = []
     for shift in shifts_s:
         turned = problem.measured * np.exp(2j * np.pi * problem.frequency_Hz * shift)
-        costs.append(replace(problem, measured=turned).least())
+        costs.append(replace(problem, measured=turned).ranked()[0][0])
     cost = np.asarray(costs)
     low = np.flatnonzero((cost <= np.r_[np.inf, cost[:-1]]) & (cost <= np.r_[cost[1:], np.inf]))
     return [float(shifts_s[k]) for k in low[np.argsort(cost[low])]]
 
 
-def _distinct(points: Sequence[np.ndarray], apart: float) -> list[np.ndarray]:
+def _distinct(points: Iterable[np.ndarray], apart: float) -> list[np.ndarray]:
     kept: list[np.ndarray] = []
     for point in points:
         if all(np.max(np.abs(point - other)) > apart for other in kept):
@@ -221,15 +197,8 @@ class _LogResponse:
         pairs = [pair for one in self.drivers for pair in (driver if one else mechanics)]
         return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
 
-    def least(self) -> float:
-        """Misfit of the best candidate."""
-        return float(self._ranked()[0][0])
-
-    def candidates(self) -> list[np.ndarray]:
-        """All combinations of some poles for each part, the best first."""
-        return list(self._ranked()[1])
-
-    def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
+    def ranked(self) -> tuple[np.ndarray, np.ndarray]:
+        """All combinations of some poles for each part, the best first: their misfits and their coordinates."""
         low, high = float(self.frequency_Hz.min()), float(self.frequency_Hz.max())
         size = np.abs(self.measured) * np.minimum(self.weight, 1)
         peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] > size[2:])) + 1

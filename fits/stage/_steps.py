@@ -11,17 +11,23 @@ import numpy as np
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid
-from fits.loop._design import Grid
 from fits.loop._fit_checks import without_impulses
-from fits.loop._prior import Hyper
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import prepare_run, simulate_run
-from fits.stage._checks import UNSEEN, WORTH, compare_gains, gained, refuse_slopes, refuse_unseen, speed_Hz
-from fits.stage._moments import Chain
-from fits.stage._run import StageRun, place_of_hysteresis, prepare_stage_run, simulate_stage
-from fits.stage._solve import Solved, solve_chain
+from fits.loop._run import Run, prepare_run, simulate_run
+from fits.stage._checks import (
+    UNSEEN,
+    WORTH,
+    check_gains,
+    likelihood_ratio,
+    refuse_slopes,
+    refuse_unidentifiable,
+    speed_Hz,
+)
+from fits.stage._moments import offsets_out
+from fits.stage._run import place_of_hysteresis, simulate_stage
+from fits.stage._solve import Problem, Solved, solve_chain
 from fits.stage._start import measure_response, start_stages
-from fits.stage._uncertainty import Precision, offsets_out
+from fits.stage._uncertainty import Precision
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Stage
 
 # Runs whose voltage moves less than this many times faster than that of the slowest are slow.
@@ -34,7 +40,7 @@ _EVEN = 1.0
 # Samples that a driver lags by where its search begins.
 _LAG = 3.0
 # Parts of the sampling interval below which a driver has no time constant, and from which it may find one again.
-_ASLEEP, _WAKE = 1e-2, 0.3
+_VANISHED, _RESTARTED = 1e-2, 0.3
 
 
 @dataclass(frozen=True)
@@ -49,15 +55,15 @@ class Plan:
     progress: Callable[[str], None]
     gain: float | None
     hold: Hold
-    anyway: bool
+    accept_best: bool
     shifts_s: tuple[float, ...] = ()
 
-    def runs(self, stride: int) -> list[StageRun]:
+    def runs(self, stride: int) -> list[Run]:
         """The records, each interval divided into so many steps."""
         shifts = self.shifts_s or (0.0,) * len(self.records)
         return [self.run(k, stride, shift) for k, shift in enumerate(shifts)]
 
-    def run(self, k: int, stride: int, shift_s: float = 0.0) -> StageRun:
+    def run(self, k: int, stride: int, shift_s: float = 0.0) -> Run:
         """One of them, its command that much later."""
         record, usable = self.records[k], None
         if shift_s:
@@ -67,7 +73,7 @@ class Plan:
             later = np.interp(time, record.time_s, record.voltage_V)
             record = replace(record, voltage_V=later, extra=dict(record.extra))
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
-        return prepare_stage_run(record, *settings, usable)
+        return prepare_run(record, *settings, usable)
 
     def smoothed(self) -> "Plan":
         """The same without readings that jump out and back, of which a start must not be read off."""
@@ -78,25 +84,6 @@ class Plan:
         return replace(self, shifts_s=tuple(map(float, shifts_s)))
 
 
-@dataclass(frozen=True)
-class Problem:
-    """A stage to be fitted, and where its fit begins; where a part was left out, the same with it, roughly fitted."""
-
-    stage: Stage
-    chain: Chain
-    z: np.ndarray
-    columns_um: np.ndarray
-    hyper: Hyper | None
-    stroke_um: float
-    remarks: tuple[str, ...]
-    even: float = 0.0
-    full: "tuple[Problem, Solved] | None" = None
-
-    def at(self, solved: Solved) -> Stage:
-        """The stage that a solution stands for."""
-        return self.chain.stage(jnp.asarray(solved.z), jnp.asarray(solved.columns_um))
-
-
 def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> Problem:
     """Read a hysteresis off the slow runs and poles off the others."""
     plan, asked = plan.smoothed(), stage
@@ -105,7 +92,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     place = place_of_hysteresis(stage)
     law = None if place is None else stage.parts[place]
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
-    drives = [record.voltage_V for record in plan.records]
+    runs = plan.runs(1)
     name = stage.names[place or 0]
     if isinstance(law, Preisach) and isinstance(law.density, GridDensity) and name not in stage.frozen:
         refuse_slopes([plan.records[k] for k in slow])
@@ -115,66 +102,44 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
                 f"{', '.join(loose)} and the weights of {name} are both free, but only their product is seen, "
                 f"not each: freeze {loose[0]}, or the {name}"
             )
-        assert plan.gain is not None
-        lower, upper = plan.gain * plan.range_V[0], plan.gain * plan.range_V[1]
-        runs = [
-            prepare_run(replace(record, voltage_V=plan.gain * record.voltage_V), lower, upper, state, plan.fraction)
-            for record, state in zip(plan.records, plan.states, strict=True)
-        ]
         plan.progress(f"hysteresis from {', '.join(plan.records[k].source for k in slow)}")
         stroke, tried, _ = choose_grid([runs[k] for k in slow], levels, plan.progress, finest)
         grid, hyper = tried.data.grid, tried.solution.hyper
         columns = np.asarray(tried.solution.columns) * stroke
         law = grid.model(columns, np.zeros(()))
         stage = stage.swap(name, law)
-        drives = [simulate_run(law, run) for run in runs]
-    elif law is not None:
-        drives = [np.asarray(law(jnp.asarray(record.voltage_V))) for record in plan.records]  # type: ignore[operator]
-    runs_at_rate = plan.runs(1)
-    lively = [k for k in range(len(plan.records)) if k not in slow] or slow
-    responses = [measure_response(runs_at_rate[k], drives[k]) for k in lively]
+    drives = hysteresis_alone(stage, runs)
+    fast = [k for k in range(len(plan.records)) if k not in slow] or slow
+    responses = [measure_response(runs[k], drives[k]) for k in fast]
     candidates = start_stages(stage, responses)
-    place = place if grid is not None else None
-    best: tuple[float, Stage, Chain, Solved] | None = None
+    found: list[Solved] = []
     failure = FitError(FitStatus.NONFINITE)
     for number, candidate in enumerate(candidates):
         plan.progress(f"poles: start {number + 1} of {len(candidates)}")
-        chain = Chain(offsets_out(candidate, grid is not None), place, grid)
-        z = np.asarray(chain.coordinates.of(candidate))
+        problem = Problem.of(candidate, grid, columns, None, stroke)
         try:
-            solved = solve_chain(chain, z, columns, runs_at_rate, None, stroke, plan.loss, plan.progress, rough=True)
+            found.append(solve_chain(problem, runs, plan.loss, plan.progress, rough=True))
         except FitError as error:
             failure = error
-            continue
-        cost = solved.cost
-        if best is None or cost < best[0]:
-            best = cost, candidate, chain, solved
-    if best is None:
+    if not found:
         raise failure
-    _, stage, chain, solved = best
-    found = chain.stage(jnp.asarray(solved.z), jnp.asarray(columns))
-    shown = found, chain.coordinates, solved, drives
+    solved = min(found, key=lambda one: one.cost)
+    solved = replace(solved, hyper=hyper)
+    problem = solved.onward
     try:
-        spare = refuse_unseen(*shown, fast=lively != slow, spare=not plan.anyway)
+        dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
     except DataError:
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
-        lagging = (
-            None if plan.anyway or lively != slow else _lagging(plan, stage, columns, hyper, grid, stroke, drives)
-        )
+        lagging = None if plan.accept_best or fast != slow else _lagging(plan, problem, runs, drives)
         if lagging is None:
             raise
         return lagging
-    if spare is not None:
-        full = Problem(stage, chain, solved.z, columns, hyper, stroke, ()), solved
-        return replace(_spared(plan, asked, spare, levels, finest), full=full)
-    remarks = compare_gains(found, runs_at_rate)
-    return Problem(stage, chain, solved.z, columns, hyper, stroke, tuple(remarks))
-
-
-def _spared(plan: Plan, stage: Stage, name: str, levels: int | None, finest: int) -> Problem:
-    """Begin without a mechanics that the runs do not show."""
-    simpler = start_problem(plan, stage.without(name), levels, finest)
-    return replace(simpler, even=_EVEN, remarks=(_no_resonance(plan, name), *simpler.remarks))
+    if dropped is not None:
+        # Begin without a mechanics that the runs do not show.
+        simpler = start_problem(plan, asked.without(dropped), levels, finest)
+        remarks = (_no_resonance(plan, dropped), *simpler.remarks)
+        return replace(simpler, least_noise_share=_EVEN, remarks=remarks, full=solved)
+    return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
 
 
 def _no_resonance(plan: Plan, name: str) -> str:
@@ -185,95 +150,75 @@ def _no_resonance(plan: Plan, name: str) -> str:
     )
 
 
-def _lagging(
-    plan: Plan,
-    stage: Stage,
-    columns_um: np.ndarray,
-    hyper: Hyper | None,
-    grid: Grid | None,
-    stroke_um: float,
-    drives: Sequence[np.ndarray],
-) -> Problem | None:
+def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence[np.ndarray]) -> Problem | None:
     """Fit hysteresis and driver together, without mechanics; None where the driver's lag does not show."""
+    stage, grid = problem.stage, problem.chain.grid
     drivers, mechanics = (
         [n for n, p in zip(stage.names, stage.parts, strict=True) if isinstance(p, kind)]
         for kind in (Driver, Mechanics)
     )
-    if len(drivers) != 1 or len(mechanics) != 1 or grid is None or hyper is None:
+    if len(drivers) != 1 or len(mechanics) != 1 or grid is None or problem.hyper is None:
         return None
     interval_s = min(float(np.median(np.diff(record.time_s))) for record in plan.records)
     old: Any = stage[drivers[0]]
-    driver = Driver(jnp.asarray(_LAG * interval_s), old.gain)
-    simple = stage.without(mechanics[0]).swap(drivers[0], driver)
-    chain = Chain(offsets_out(simple, True), place_of_hysteresis(simple), grid)
-    z = np.asarray(chain.coordinates.of(simple))
-    start = z, columns_um, plan.runs(1), hyper, stroke_um
+    simple = stage.without(mechanics[0]).swap(drivers[0], Driver(jnp.asarray(_LAG * interval_s), old.gain))
+    simpler = Problem.of(simple, grid, problem.columns_um, problem.hyper, problem.stroke_um)
+    simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, mechanics[0]),))
     plan.progress("a lag without a resonance")
     try:
-        solved = solve_chain(chain, *start, plan.loss, plan.progress, even=_EVEN)
+        solved = solve_chain(simpler, runs, plan.loss, plan.progress)
     except (FitError, np.linalg.LinAlgError):
         return None
-    precision = Precision(chain, solved, stroke_um)
-    sd = np.sqrt(np.diagonal(precision.covariance(precision.influence())))
-    if gained(solved, drives) < WORTH or float(np.max(sd)) > UNSEEN:
+    if likelihood_ratio(solved, drives) < WORTH or float(np.max(Precision(solved).sd())) > UNSEEN:
         return None
-    remark = (_no_resonance(plan, mechanics[0]),)
-    return Problem(simple, chain, solved.z, solved.columns_um, solved.hyper, stroke_um, remark, _EVEN)
+    return solved.onward
 
 
-def hysteresis_alone(stage: Stage, plan: Plan) -> list[np.ndarray]:
-    """What the hysteresis of a stage would give by itself for each run of a plan, in um, shape `(n,)`."""
+def hysteresis_alone(stage: Stage, runs: Sequence[Run]) -> list[np.ndarray]:
+    """What the hysteresis of a stage would give by itself for each run, in um, shape `(n,)`."""
     place = place_of_hysteresis(stage)
-    if place is None:
-        return [record.voltage_V for record in plan.records]
-    law = stage.parts[place]
-    if not isinstance(law, Preisach) or plan.gain is None:
-        return [np.asarray(law(jnp.asarray(record.voltage_V))) for record in plan.records]  # type: ignore[operator]
-    lower, upper = plan.gain * plan.range_V[0], plan.gain * plan.range_V[1]
-    runs = [
-        prepare_run(replace(record, voltage_V=plan.gain * record.voltage_V), lower, upper, state, plan.fraction)
-        for record, state in zip(plan.records, plan.states, strict=True)
-    ]
-    return [simulate_run(law, run) for run in runs]
+    law: Any = None if place is None else stage.parts[place]
+    if isinstance(law, Preisach):
+        return [simulate_run(law, run) for run in runs]
+    commands = [run.record.voltage_V for run in runs]
+    return commands if law is None else [np.asarray(law(jnp.asarray(voltage))) for voltage in commands]
 
 
-def refine_problem(plan: Plan, problem: Problem) -> tuple[Problem, Solved, Precision]:
+def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
     """Fit, and fit again with the intervals divided if the finite step moves a parameter noticeably."""
     stride = 1
     while True:
         runs = plan.runs(stride)
-        start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
-        solved = solve_chain(problem.chain, *start, plan.loss, plan.progress, anyway=plan.anyway, even=problem.even)
-        problem = replace(problem, z=solved.z, columns_um=solved.columns_um, hyper=solved.hyper)
-        precision = Precision(problem.chain, solved, problem.stroke_um)
+        solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
+        precision = Precision(solved)
         if plan.gain is None or stride > 1:
-            return problem, solved, precision
-        influence, stage = precision.influence(), problem.at(solved)
+            return solved, precision
+        influence, stage = precision.influence(), solved.stage
         sd = np.sqrt(np.diagonal(precision.covariance(influence)))
         off = [simulate_stage(stage, a) - simulate_stage(stage, b) for a, b in zip(runs, plan.runs(2), strict=True)]
         moved = [own @ (o - o[run.fitted].mean()) for own, o, run in zip(influence, off, runs, strict=True)]
         # Halving the step takes three quarters of its error off, which falls with its square.
         excess = float(np.max(np.abs(np.sum(moved, axis=0)) / sd)) / (0.75 * _BIAS)
         if excess <= 1:
-            return problem, solved, precision
+            return solved, precision
         stride = min(_FINEST, 2 ** math.ceil(math.log2(excess) / 2))
         plan.progress(f"{stride} steps per sample")
-        problem = replace(problem, z=_awake(plan, problem, solved))
+        problem = replace(solved.onward, z=_restart_driver(plan, solved))
 
 
-def _awake(plan: Plan, problem: Problem, solved: Solved) -> np.ndarray:
+def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
 
     A command that jumps at every sample has all of the driver's answer between two: whole steps do not see it, and
     from no time constant at all there is no way back.
     """
-    stage = problem.at(solved)
+    stage = solved.stage
     interval_s = min(float(np.median(np.diff(record.time_s))) for record in plan.records)
     changed = False
     for name, part in zip(stage.names, stage.parts, strict=True):
-        if isinstance(part, Driver) and float(part.time_constant_s) < _ASLEEP * interval_s:
-            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_WAKE * interval_s)))
+        if isinstance(part, Driver) and float(part.time_constant_s) < _VANISHED * interval_s:
+            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_RESTARTED * interval_s)))
             changed = True
     if plan.hold != "zero" or not changed:
         return solved.z
-    return np.asarray(problem.chain.coordinates.of(stage))
+    return np.asarray(solved.problem.chain.coordinates.of(stage))

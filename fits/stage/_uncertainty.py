@@ -2,49 +2,32 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy import fft
 
+from fits.io._errors import DataError
+from fits.io._record import Record
 from fits.loop._design import Grid
 from fits.loop._prior import interpolation
+from fits.loop._run import Run
+from fits.loop._uncertainty import AbstractUncertainty, Prediction
 from fits.stage._moments import Chain, RunSums, along
-from fits.stage._run import StageRun, place_of_hysteresis
-from fits.stage._solve import Solved, prior_precision, scale_free
-from fits.stats._noise import correlation_samples, shared_square
-from microid import Coordinates, ParameterInfo, Stage
+from fits.stage._run import prepare_program, simulate_stage
+from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
+from fits.stats._noise import WHITE, correlation_samples, shared_square
+from microid import Preisach, Stage
 
 # Levels on which predictions are perturbed; finer ones move no displacement.
 _LEVELS = 16
 # Autocovariances are trusted up to so many correlation times.
 _LAGS = 6.0
-# A residual less correlated than this counts as white.
-_WHITE = 1.2
 # Precision, in scaled coordinates, that stands in for none.
-_FAINT = 1e-8
+_WEAK = 1e-8
 
 
-def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
-    """Coordinates of what a fit of a stage moves: all that is free, but for offsets and the grid's own parameters.
-
-    Raises
-    ------
-    ValueError
-        If nothing is left to move.
-    """
-    place = place_of_hysteresis(stage)
-    name = None if place is None or not grid else stage.names[place]
-
-    def moves(info: ParameterInfo) -> bool:
-        path = stage.named(info.path)
-        return stage.free(info) and not path.endswith("offset_um") and path.partition(".")[0] != name
-
-    return Coordinates(stage, moves)
-
-
-class StageUncertainty(eqx.Module):
+class StageUncertainty(AbstractUncertainty):
     """Independent perturbations of a stage, each one standard deviation long.
 
     The variance of a prediction is the sum of the squared changes under all of them, to first order; sensor noise is
@@ -70,59 +53,52 @@ class StageUncertainty(eqx.Module):
     discrepancy_um: Float[Array, ""]
     grid: Grid | None
 
-    def sd_um(self, stage: Stage, run: StageRun) -> np.ndarray:
+    def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
         """Standard deviation of the predicted displacement of a run, shape `(n,)`."""
-        coordinates = offsets_out(stage, self.grid is not None)
-        chain = Chain(coordinates, None if self.grid is None else place_of_hysteresis(stage), self.grid)
+        stage = _stage(model)
+        chain = Chain.of(stage, self.grid)
         mean = np.asarray(self.mean_um)
 
         def variance(moved: np.ndarray) -> np.ndarray:
             return np.asarray(np.sum((moved - mean) ** 2, axis=1))
 
         directions = np.asarray(self.columns_um).T, np.asarray(self.coordinates).T
-        square = along(chain, coordinates.of(stage), None, run, directions, variance)
+        square = along(chain, chain.coordinates.of(stage), None, run, directions, variance)
         return np.sqrt(square + float(self.discrepancy_um) ** 2)
+
+    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
+        """Predict the displacement of a voltage program; see `fits.predict`."""
+        stage, run = prepare_program(_stage(model), record, initial)
+        return Prediction(simulate_stage(stage, run), self.sd_um(stage, run))
+
+
+def _stage(model: Preisach | Stage) -> Stage:
+    if isinstance(model, Stage):
+        return model
+    raise DataError("the uncertainty is that of a stage, and the model is a hysteresis: fit it again")
 
 
 class Precision:
-    """What a fit knows: the precision of its columns and coordinates together, and what each sample contributes.
+    """What a fit knows: the precision of its columns and coordinates together, and what each sample contributes."""
 
-    Parameters
-    ----------
-    chain
-        The stage.
-    solved
-        Where its fit ended.
-    stroke_um
-        Unit of the columns.
-    """
-
-    def __init__(self, chain: Chain, solved: Solved, stroke_um: float):
-        self.chain, self.solved = chain, solved
+    def __init__(self, solved: Solved):
+        self.chain, self.solved = solved.problem.chain, solved
         total = solved.weighing.total(solved.sums)
-        size, count = chain.size, len(solved.z)
+        size = self.chain.size
         self.variance = solved.weighing.least_um**2
         self.gram = np.asarray(total.gram) / self.variance
         self.prior = np.zeros_like(self.gram)
         if solved.hyper is not None:
-            prior = prior_precision(chain, solved.hyper, stroke_um)
+            prior = prior_precision(self.chain, solved.hyper, solved.problem.stroke_um)
             self.prior[:size, :size] = scale_free(prior, solved.columns_um)
-        rest = np.arange(size), np.arange(size, size + count)
-        self.information = self._marginal(*rest)
-
-    def _marginal(self, columns: np.ndarray, own: np.ndarray) -> np.ndarray:
-        whole = self.gram + self.prior
-        if len(columns) == 0:
-            return whole
-        half = np.linalg.solve(np.linalg.cholesky(whole[np.ix_(columns, columns)]), whole[np.ix_(columns, own)])
-        return np.asarray(whole[np.ix_(own, own)] - half.T @ half)
+        self.information = marginal_information(total, size, self.prior[:size, :size], self.variance)
 
     def answer(self) -> np.ndarray:
         """Columns of the covariance that belong to the coordinates, shape `(D + p, p)`."""
         size, count = self.chain.size, len(self.solved.z)
         whole = self.gram + self.prior
         # Coordinates that nothing is known of must not spoil those that something is known of.
-        whole[np.arange(size, size + count), np.arange(size, size + count)] += _FAINT
+        whole[np.arange(size, size + count), np.arange(size, size + count)] += _WEAK
         return np.linalg.solve(whole, np.eye(size + count)[:, size:])
 
     def influence(self) -> list[np.ndarray]:
@@ -133,7 +109,7 @@ class Precision:
         weighing = self.solved.weighing
         for run, share in zip(self.solved.runs, weighing.shares, strict=True):
             slope = along(self.chain, *here, run, (answer[:size], answer[size:])).T
-            weight = np.asarray(run.samples.weight)[: len(run.record)]
+            weight = run.fit_weight
             slope = slope - np.average(slope, axis=1, weights=weight)[:, None]
             # The other half of the weight goes to the residual that this is multiplied by.
             out.append(slope * np.sqrt(weight) * share / weighing.least_um**2)
@@ -142,18 +118,19 @@ class Precision:
     def covariance(self, influence: Sequence[np.ndarray]) -> np.ndarray:
         """Covariance of the coordinates, the noise of each run as coloured as its residual is, shape `(p, p)`.
 
-        Notes
-        -----
         The estimate moves by the influence of each sample times its noise, so its covariance is a double sum over
         autocovariances (the sandwich of Newey & West 1987), to which comes what is not known of the columns.
         """
         size, answer = self.chain.size, self.answer()
         # What nothing is known of stays unknown, whatever the residual.
-        held = answer[:size].T @ self.prior[:size, :size] @ answer[:size] + _FAINT * answer[size:].T @ answer[size:]
+        held = answer[:size].T @ self.prior[:size, :size] @ answer[:size] + _WEAK * answer[size:].T @ answer[size:]
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
-            weight = np.asarray(run.samples.weight)[: len(run.record)]
-            held = held + sandwich(own, np.sqrt(weight) * one.residual_um, run.fitted)
+            held = held + sandwich(own, np.sqrt(run.fit_weight) * one.residual_um, run.fitted)
         return held
+
+    def sd(self) -> np.ndarray:
+        """Standard deviations of the coordinates, shape `(p,)`."""
+        return np.sqrt(np.diagonal(self.covariance(self.influence())))
 
     def uncertainty(self) -> StageUncertainty:
         """Perturbations for predictions."""
@@ -164,7 +141,7 @@ class Precision:
             basis = interpolation(_LEVELS, self.chain.levels)
         whole = np.zeros((size + count, basis.shape[1] + count))
         whole[:size, : basis.shape[1]], whole[size:, basis.shape[1] :] = basis, np.eye(count)
-        precision = whole.T @ (self.gram + self.prior) @ whole + _FAINT * np.eye(whole.shape[1])
+        precision = whole.T @ (self.gram + self.prior) @ whole + _WEAK * np.eye(whole.shape[1])
         root = np.linalg.cholesky(precision)
         factor = np.linalg.solve(root, np.eye(len(root)))
         shared = float(np.mean([shared_square(one.residual_um[run.fitted]) for one, run in self._pairs()]))
@@ -177,7 +154,7 @@ class Precision:
             grid,
         )
 
-    def _pairs(self) -> list[tuple[RunSums, StageRun]]:
+    def _pairs(self) -> list[tuple[RunSums, Run]]:
         return list(zip(self.solved.sums, self.solved.runs, strict=True))
 
 
@@ -188,7 +165,7 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
     size = fft.next_fast_len(2 * n)
     auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[:n] / fitted.sum()
     correlation = correlation_samples([residual_um[fitted]])
-    lags = 0 if correlation <= _WHITE else min(n - 1, int(np.ceil(_LAGS * correlation)))
+    lags = 0 if correlation <= WHITE else min(n - 1, int(np.ceil(_LAGS * correlation)))
     window = np.zeros(n)
     window[: lags + 1] = 1 - np.arange(lags + 1) / (lags + 1)
     kernel = np.zeros(size)

@@ -6,40 +6,31 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.loop._moments import Moments
+from fits.loop._run import Run
 from fits.stage._moments import RunSums
-from fits.stage._run import StageRun
 from fits.stats._noise import correlation_samples
 
 
 @dataclass(frozen=True)
 class Weighing:
-    """How much a sample of each run counts.
+    """How much a sample of each run counts, by the standard deviation of the run's residual.
 
-    Attributes
-    ----------
-    noise_um
-        Standard deviation of each run's residual.
-    correlation
-        Samples of each run that are worth one independent one.
-    counted
-        The same, as its samples are counted.
-    even
-        No run counts as quieter than this part of the loudest.
+    So many samples as `correlation` are worth one independent one; `counted` is the same as the samples are counted.
+    No run counts as quieter than the part `least_noise_share` of the loudest.
     """
 
     noise_um: tuple[float, ...]
     correlation: tuple[float, ...]
     counted: tuple[float, ...]
-    even: float = 0.0
+    least_noise_share: float = 0.0
 
     @classmethod
-    def of(cls, runs: Sequence[StageRun], residuals: Sequence[np.ndarray], *counted: float) -> "Weighing":
+    def of(cls, runs: Sequence[Run], residuals: Sequence[np.ndarray], *counted: float) -> "Weighing":
         """Weigh runs by what a fit leaves of them, all equally correlated unless `counted` is given."""
         noise, correlation = [], []
         for run, residual in zip(runs, residuals, strict=True):
             left = residual[run.fitted]
-            weight = np.asarray(run.samples.weight)[: len(residual)][run.fitted]
-            noise.append(float(np.sqrt(np.average(left**2, weights=weight))))
+            noise.append(float(np.sqrt(np.average(left**2, weights=run.fit_weight[run.fitted]))))
             correlation.append(correlation_samples([left]))
         each = float(np.exp(np.mean(np.log(correlation))))
         return cls(tuple(noise), tuple(correlation), counted or (each,) * len(noise))
@@ -52,7 +43,7 @@ class Weighing:
     @property
     def least_um(self) -> float:
         """The smallest noise, in which the joint problem is measured."""
-        return max(min(self.noise_um), self.even * max(self.noise_um))
+        return max(min(self.noise_um), self.least_noise_share * max(self.noise_um))
 
     @property
     def shares(self) -> list[float]:
@@ -65,7 +56,7 @@ class Weighing:
         first, *more = (one.moments.scaled(share, 1.0) for one, share in zip(sums, self.shares, strict=True))
         return sum(more, start=first)
 
-    def cost_um2(self, runs: Sequence[StageRun], residuals: Sequence[np.ndarray]) -> float:
+    def cost_um2(self, runs: Sequence[Run], residuals: Sequence[np.ndarray]) -> float:
         """Sum of squares that goes with `total`."""
         each = zip(runs, residuals, self.shares, strict=True)
-        return sum(s * float(np.sum(np.asarray(run.samples.weight)[: len(r)] * r**2)) for run, r, s in each)
+        return sum(share * float(np.sum(run.fit_weight * left**2)) for run, left, share in each)

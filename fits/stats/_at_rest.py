@@ -6,15 +6,19 @@ import numpy as np
 _REST = 24
 
 
+def stretches(flags: np.ndarray) -> list[tuple[int, int]]:
+    """First sample, and that after the last, of each stretch of flags that are set."""
+    edges = np.flatnonzero(np.diff(flags.astype(int), prepend=0, append=0))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
 def idle_stretches(voltage_V: np.ndarray, settling: int) -> list[slice]:
     """Stretches in which the command has rested for a while, and for so many samples at least."""
-    still = np.concatenate([[False], np.diff(voltage_V) == 0, [False]])
-    edges = np.flatnonzero(np.diff(still.astype(int)))
     found = []
-    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+    for first, stop in stretches(np.diff(voltage_V) == 0):
         begin = max(first + (stop - first) // 3, first + settling)
         if stop - begin >= 2 * _REST // 3:
-            found.append(slice(int(begin), int(stop)))
+            found.append(slice(begin, stop))
     return found
 
 

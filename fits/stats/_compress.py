@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 _SLOTS = 4
-_DUST = 1e-14
+_NEGLIGIBLE = 1e-14
 
 
 @dataclass(frozen=True)
@@ -19,22 +19,8 @@ class Compressed:
     """Groups of four voltages, in the order of the path.
 
     A group stands for samples by `mix @ response(voltage_V) ~ target_um`, whose sums of squares and products equal
-    those of the samples; the squares that no response could explain are in `residue_um2`.
-
-    Attributes
-    ----------
-    voltage_V
-        Shape `(groups, 4)`.
-    mix
-        Shape `(groups, 4, 4)`; zero where samples are not used.
-    target_um
-        Shape `(groups, 4)`.
-    block
-        Block of the record that the group belongs to, -1 where it is not used, shape `(groups,)`.
-    count
-        Number of samples in each group that are used, each as often as it counts, shape `(groups,)`.
-    residue_um2
-        Unexplainable sum of squares in each group, shape `(groups,)`.
+    those of the samples; the squares that no response could explain are in `residue_um2`. `block` is -1, and `mix`
+    zero, where samples are not used; `count` is their number, each as often as it counts.
     """
 
     voltage_V: np.ndarray
@@ -54,18 +40,9 @@ def compress(
     levels_V: np.ndarray,
     weight: np.ndarray | None = None,
 ) -> Compressed:
-    """Group the samples of a record.
+    """Group the samples of a record by their branches (see `fits.loop._run.Path`) and by evenly spaced levels.
 
-    Parameters
-    ----------
-    voltage_V, displacement_um, anchor_V, rising
-        Samples and their branches (see `Run`), shape `(n,)`.
-    block
-        Block that each sample belongs to, -1 where it is not used, shape `(n,)`.
-    levels_V
-        The switching voltages, evenly spaced.
-    weight
-        Of each sample in the sums, shape `(n,)`; 1 by default.
+    `block` numbers the part of the record that each sample belongs to, -1 where it is not used.
     """
     share = np.ones(len(voltage_V)) if weight is None else weight
     step = levels_V[1] - levels_V[0]
@@ -137,7 +114,7 @@ def _square_root(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Factor `gram = root' root` and solve `root' target = cross`, dropping directions that hold nothing."""
     value, vector = np.linalg.eigh(gram)
-    kept = value > _DUST * value[:, -1:]
+    kept = value > _NEGLIGIBLE * value[:, -1:]
     scale = np.sqrt(np.where(kept, value, 0.0))
     root = scale[:, :, None] * np.swapaxes(vector, 1, 2)
     seen = np.einsum("gij,gi->gj", vector, cross)

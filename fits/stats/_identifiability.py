@@ -13,21 +13,10 @@ _WHOLE = 0.1
 
 
 def unseen_directions(information: np.ndarray, names: Sequence[str], relative: np.ndarray) -> tuple[str, ...]:
-    """Name the combinations of parameters that the data leave open.
+    """Name the combinations of parameters that the data leave open, one sentence each, in the order of ignorance.
 
-    Parameters
-    ----------
-    information
-        Precision of the coordinates, whatever else is unknown, shape `(p, p)`.
-    names
-        Of the parameters, one per coordinate.
-    relative
-        Change of each parameter's logarithm per coordinate, shape `(p,)`.
-
-    Returns
-    -------
-    tuple of str
-        One sentence per combination that is not seen, in the order of ignorance.
+    `information` is the precision of the coordinates, whatever else is unknown, shape `(p, p)`; `relative` the change
+    of each parameter's logarithm per coordinate, shape `(p,)`.
     """
     values, vectors = np.linalg.eigh(information)
     sentences = []

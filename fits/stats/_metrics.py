@@ -1,6 +1,7 @@
 """The paper's error figures (Eq. 34-36)."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -84,26 +85,15 @@ def loop_width_pct(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float 
     near_low, near_high = voltage_V <= low + (1 - _SPAN) * span / 2, voltage_V >= high - (1 - _SPAN) * span / 2
     ends = np.flatnonzero(near_low | near_high)
     at_top = near_high[ends]
-    # Passages from one end of the range to the other.
-    turns = np.flatnonzero(np.diff(at_top))
-    up: list[tuple[int, int]] = [(ends[k], ends[k + 1]) for k in turns if at_top[k + 1]]
-    down: list[tuple[int, int]] = [(ends[k], ends[k + 1]) for k in turns if at_top[k]]
-    if not up or not down:
+    # Passages from one end of the range to the other; a loop is one and the next one back.
+    passages = [(ends[k], ends[k + 1]) for k in np.flatnonzero(np.diff(at_top))]
+    if len(passages) < 2:
         return None
     level = np.linspace(low + (1 - _SPAN) * span, high - (1 - _SPAN) * span, 201)
     widths = []
-    # A loop is a passage and the next one back.
-    for first, second in zip(*_paired(up, down), strict=True):
-        branches = [_branch(voltage_V, displacement_um, passage, level) for passage in (first, second)]
-        widths.append(np.max(np.abs(branches[0] - branches[1])))
+    for first, second in pairwise(_branch(voltage_V, displacement_um, passage, level) for passage in passages):
+        widths.append(np.max(np.abs(first - second)))
     return float(100 * np.median(widths) / np.ptp(displacement_um))
-
-
-def _paired(
-    up: list[tuple[int, int]], down: list[tuple[int, int]]
-) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    passages = sorted(up + down)
-    return passages[:-1], passages[1:]
 
 
 def _branch(

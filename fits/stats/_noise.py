@@ -7,6 +7,8 @@ from scipy import fft
 
 # Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
 _HUBER = 1.345
+# A residual less correlated than this counts as white.
+WHITE = 1.2
 LOSSES = ("squares", "huber")
 # Sokal's window: sum the correlations up to this many correlation times.
 _WINDOW = 5.0
@@ -19,8 +21,8 @@ _NEIGHBOURS = 10
 def shared_square(residual: np.ndarray) -> float:
     """Mean square of the part of a residual that neighbouring samples share, in its unit squared.
 
-    That is the mean of the autocovariances at lags 1 to 10, as far as there are so many: white noise has
-    none, errors of a model do. As an estimate it can come out negative.
+    That is the mean of the autocovariances at lags 1 to 10: white noise has none, model discrepancy has. As an
+    estimate it can come out negative.
     """
     centred = residual - residual.mean()
     furthest = min(_NEIGHBOURS, len(residual) - 1)
@@ -29,24 +31,10 @@ def shared_square(residual: np.ndarray) -> float:
 
 
 def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
-    """Estimate the integrated correlation time of residuals, in samples.
+    """Estimate the integrated correlation time of the residuals of some runs, in samples; 1 for white noise.
 
-    White noise gives 1: each sample counts. Misfit and coloured noise give more, and least squares then rests on
-    `n / correlation_samples` samples' worth of evidence.
-
-    Parameters
-    ----------
-    residuals
-        Of each run, shape `(n,)` each; runs are not continued into each other.
-
-    Returns
-    -------
-    float
-        At least 1.
-
-    Notes
-    -----
-    A. Sokal, "Monte Carlo Methods in Statistical Mechanics" (1997), section 3.
+    Least squares rests on `n / correlation_samples` samples' worth of evidence. See A. Sokal, "Monte Carlo Methods in
+    Statistical Mechanics" (1997), section 3.
     """
     longest = max(len(r) for r in residuals)
     total = np.zeros(longest)

@@ -50,30 +50,16 @@ class NoiseLine:
 
 
 def find_lines(residual_um: FloatArray, rate_Hz: float, false_alarm: float = 0.01) -> tuple[NoiseLine, ...]:
-    """Find sines in noise of any smooth spectrum.
+    """Find sines in evenly sampled readings without mean and drift, by falling amplitude.
 
     Each bin of the spectrum is compared with the median of up to 24 neighbours, half of them on either side, beyond
     the reach of a line and within half the bin's frequency, so that the colour of the noise cancels. For noise, power
     over that median has a distribution in closed form whatever the level (H. Rohling, "Radar CFAR Thresholding in
     Clutter and Multiple Target Situations", IEEE Trans. Aerosp. Electron. Syst. 19 (1983), 608-621). Its tail times
-    the number of bins looked at bounds the probability of any false line.
+    the number of bins looked at bounds the probability of any false line, which is `false_alarm`.
 
     What is narrower than about 50 / duration counts as a line, be it a sharp resonance. Lines within 4 / duration of
     each other are one, and one that completes fewer than 20 cycles in the record is not looked for.
-
-    Parameters
-    ----------
-    residual_um
-        Readings without mean and drift, shape `(n,)`, evenly sampled.
-    rate_Hz
-        Samples per second.
-    false_alarm
-        Probability of any line in a record of noise alone.
-
-    Returns
-    -------
-    tuple of NoiseLine
-        By falling amplitude.
     """
     n = len(residual_um)
     window = signal.windows.blackmanharris(n, sym=False)

@@ -30,17 +30,10 @@ class BlockPivoting(optx.AbstractMinimiser[Float[Array, " D"], Any, _State]):
 
     Every step solves for the variables that are free, the others being zero, and exchanges all those of either kind
     that violate their condition; where that stops helping, one at a time, which must end (Judice & Pires, Comput.
-    Oper. Res. 21, 1994; Kim & Park, SIAM J. Sci. Comput. 33, 2011). There is no line search to stall on an
-    ill-conditioned problem, and weights that the data want to be zero become exactly zero, which a bijection would
-    only approach. The function must be quadratic: its Hessian is taken once, at the start, or from
-    `options["hessian"]`. Variables that start above zero start free.
-
-    Attributes
-    ----------
-    rtol, norm
-        Part of every optimistix solver; not used.
-    atol
-        Largest violation of the optimality conditions, in the units of the variables and of the gradient.
+    Oper. Res. 21, 1994; Kim & Park, SIAM J. Sci. Comput. 33, 2011). Variables that the data want to be zero become
+    exactly zero. SciPy's `nnls` takes one at a time and runs neither compiled nor in batches. The Hessian is taken
+    once, at the start, or from `options["hessian"]`; variables that start above zero start free. `atol` is the
+    largest violation of the conditions; `rtol` and `norm`, part of every optimistix solver, are not used.
     """
 
     rtol: float

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
 
@@ -10,14 +11,8 @@ from scipy.signal import lfilter
 class Noise:
     """Noise of one run: its innovations' standard deviation, and how it depends on its past.
 
-    Attributes
-    ----------
-    innovation_um
-        Standard deviation of what is new in every sample.
-    past
-        Coefficients of the autoregression, shape `(order,)`; empty for white noise.
-    spread
-        Factor by which a sample is noisier than that, shape `(n,)`; None where all are alike.
+    `past` holds the coefficients of an autoregression, none for white noise. `spread` is the factor by which a sample
+    is noisier than that, shape `(n,)`; None where all are alike.
     """
 
     innovation_um: float
@@ -55,30 +50,19 @@ def rough_noise_um(residual_um: np.ndarray) -> float:
 
 
 def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Noise:
-    """Learn the noise of a run from what nothing explains.
+    """Learn the noise of a run from what nothing explains, `freedom` unknowns having been fitted to it.
 
-    Parameters
-    ----------
-    residual_um
-        Shape `(n,)`.
-    freedom
-        Unknowns that were fitted to it.
-    order
-        Largest order of the autoregression; the Bayesian information criterion chooses.
+    The Bayesian information criterion chooses the order of the autoregression (Yule-Walker).
     """
     n = len(residual_um)
     inflate = (n / max(n - freedom, n / 2)) ** 0.5
     lags = np.array([residual_um[: n - k] @ residual_um[k:] / n for k in range(order + 1)])
     best, past, variance = np.inf, np.zeros(0), lags[0]
-    coefficients, error = np.zeros(0), lags[0]
     for k in range(order + 1):
-        if k:
-            # Levinson and Durbin's recursion.
-            reflection = (lags[k] - coefficients @ lags[k - 1 : 0 : -1]) / error if k > 1 else lags[1] / error
-            coefficients = np.append(coefficients - reflection * coefficients[::-1], reflection)
-            error = error * (1 - reflection**2)
+        coefficients = solve_toeplitz(lags[:k], lags[1 : k + 1]) if k else np.zeros(0)
+        error = lags[0] - coefficients @ lags[1 : k + 1]
         score = n * np.log(error) + k * np.log(n)
         # A correlation too small to matter is not worth a filter.
         if score < best - 6:
-            best, past, variance = score, coefficients.copy(), error
+            best, past, variance = score, coefficients, error
     return Noise(float(np.sqrt(variance)) * inflate, past)

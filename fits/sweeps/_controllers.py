@@ -15,7 +15,7 @@ from fits.control._setup import setup
 from fits.control._tune_start import slope_array, steepest_slope
 from fits.io._errors import DataError, shown
 from fits.io._record import Reference
-from fits.machining._design import nearest
+from fits.io._typed import nearest
 from fits.sweeps._programs import Program
 from fits.sweeps._stages import memory_before, range_of
 from fits.sweeps._toml import number

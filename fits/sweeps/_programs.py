@@ -15,9 +15,10 @@ from fits.io._errors import DataError, shown
 from fits.io._plausible import SHORTEST_STEP_s
 from fits.io._read_csv import read_csv, read_reference
 from fits.io._table import open_table
+from fits.io._typed import check_keys
 from fits.io._units import recognise
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._toml import check_keys, in_a_file, number
+from fits.sweeps._toml import in_a_file, number
 from fits.sweeps._types import Block, FloatArray, Parameter
 
 # Parameters of each shape beside offset and amplitude.

@@ -12,8 +12,9 @@ import numpy as np
 from msgspec import Meta
 
 from fits.io._errors import DataError, shown
+from fits.io._typed import typed
 from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
-from fits.sweeps._toml import number, read_table
+from fits.sweeps._toml import number
 from fits.sweeps._types import Parameter, check_plain, code_of
 
 _PREFIXES = {"": 0, "k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
@@ -108,7 +109,7 @@ def _tables(table: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
 
 
 def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) -> tuple[Axis, np.ndarray | None]:
-    table = read_table(entry, _Axis, place)
+    table = typed(entry, _Axis, place)
     name, relative = table.parameter, table.relative
     if name not in known:
         close = get_close_matches(name, [*known], n=3, cutoff=0.4)
@@ -216,7 +217,7 @@ def _factor(unit: str | None, wanted: str, place: str, name: str) -> float:
 def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:
     if not isinstance(design, dict):
         raise DataError("design: expected how axes without a count are drawn; add [design] with method and rows.")
-    found = read_table(design, _Design, "design")
+    found = typed(design, _Design, "design")
     return Drawn(tuple(axes), found.method, found.rows, seed)
 
 

@@ -13,12 +13,13 @@ from msgspec import Meta
 from fits.io._errors import DataError, shown
 from fits.io._read_csv import read_csv
 from fits.io._record import Record
+from fits.io._typed import check_keys
 from fits.io._units import parse_columns
 from fits.loop._run import INITIAL_STATES
 from fits.sweeps._devices import place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
-from fits.sweeps._toml import check_keys, number
+from fits.sweeps._toml import number
 from fits.sweeps._types import Block, Parameter, Request
 from microid import Stage
 

@@ -15,10 +15,10 @@ from msgspec import Meta
 
 from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_CSV_BYTES, MOST_TOML_BYTES, parse_toml, read_bytes, read_text
+from fits.io._typed import typed
 from fits.sweeps import kinds
 from fits.sweeps._axes import Plan
 from fits.sweeps._read_axes import read_plan
-from fits.sweeps._toml import read_table
 from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request
 
 _COMMON = ("schema", "kind", "title", "seed", "axis", "design", "list", "run")
@@ -143,7 +143,7 @@ def _sweep(
     seed = table.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise DataError(f"seed: expected a whole number of 0 or more, found {shown(seed)}; correct it.")
-    options = read_table(table.get("run", {}), _Run, "run")
+    options = typed(table.get("run", {}), _Run, "run")
     chunk_rows = options.chunk_rows
     job = made_by.make(Request(table, load, folder))
     facts = job.facts

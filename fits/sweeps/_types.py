@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.io._errors import DataError, shown
-from fits.machining._design import nearest
+from fits.io._typed import nearest
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "microid.sweep/1"

@@ -7,10 +7,10 @@ from msgspec import Meta
 
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.io._typed import typed
 from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
-from fits.sweeps._toml import read_table
 from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows, choice
 
 KEYS = ("model", "initial", "program", "records", "diagnose")
@@ -88,5 +88,5 @@ def _diagnosed(
 def make(request: Request) -> DiagnoseJob:
     """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
     records = requested_records(request)
-    options = read_table(request.table.get("diagnose", {}), _Options, "diagnose")
+    options = typed(request.table.get("diagnose", {}), _Options, "diagnose")
     return DiagnoseJob(records, options, options.initial or assumed_initial(request, records))

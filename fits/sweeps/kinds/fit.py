@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.io._typed import typed
 from fits.loop._design import branch_table
 from fits.loop._fit import fit
 from fits.loop._prior import roughness
@@ -20,7 +21,6 @@ from fits.stats._metrics import errors
 from fits.sweeps._devices import in_turn, on_cpu, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
-from fits.sweeps._toml import read_table
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
 from microid import Staircase, node_areas
 
@@ -211,7 +211,7 @@ def _errors(measured: FloatArray, predicted: FloatArray, samples: Any, known: An
 def make(request: Request) -> FitJob:
     """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
     records, table = requested_records(request), request.table.get("fit", {})
-    options = read_table(table, _Options, "fit")
+    options = typed(table, _Options, "fit")
     if options.method == "batch" and options.levels is None:
         options.levels = _DEFAULT_LEVELS
     if options.weights and options.levels is None:
@@ -225,5 +225,5 @@ def make(request: Request) -> FitJob:
         if "samples" in table:
             raise DataError("fit.samples: simulated records have the samples of their program; leave it out.")
         samples = {"samples": records.program.samples}
-        options.samples = read_table(samples, _Options, "fit").samples
+        options.samples = typed(samples, _Options, "fit").samples
     return FitJob(records, options, options.initial or assumed_initial(request, records))

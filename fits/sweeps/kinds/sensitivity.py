@@ -13,10 +13,11 @@ from msgspec import Meta
 
 import microid as m
 from fits.io._errors import DataError, shown
+from fits.io._typed import typed
 from fits.machining._design import Design, paper_design
 from fits.machining._design_file import read_design
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._toml import in_a_file, read_table
+from fits.sweeps._toml import in_a_file
 from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows
 
 _Tree = TypeVar("_Tree", m.Geometry, m.Actuation)
@@ -93,7 +94,7 @@ def make(request: Request) -> SensitivityJob:
     if not isinstance(name, str):
         raise DataError(f'stage: expected "paper" or the name of the TOML of a stage, found {shown(name)}; give one.')
     design = paper_design() if name == "paper" else in_a_file(request.load(name), name, read_design)
-    axes = read_table(request.table.get("sensitivity", {}), _Options, "sensitivity").axes
+    axes = typed(request.table.get("sensitivity", {}), _Options, "sensitivity").axes
     return SensitivityJob(design, tuple(dict.fromkeys(axes)))
 
 

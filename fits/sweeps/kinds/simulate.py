@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 from msgspec import Meta
 
 from fits.io._errors import DataError
+from fits.io._typed import typed
 from fits.sweeps._devices import block_rows, by_rows, place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
-from fits.sweeps._toml import read_table
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Request, Rows
 from microid import Stage
 
@@ -85,7 +85,7 @@ def make(request: Request) -> SimulateJob:
     """Make the job that a sweep asks for; a `DataError` says what is wrong with it."""
     stage, initial = requested_stage(request)
     program = read_program(request.table.get("program", {"shape": "sine"}), "program", "V", request.load)
-    asked = read_table(request.table.get("outputs", {}), _Options, "outputs")
+    asked = typed(request.table.get("outputs", {}), _Options, "outputs")
     if not asked.from_s < program.last_s:
         raise DataError(f"outputs.from_s: expected a time within the program, found {asked.from_s:g}; correct it.")
     every = asked.every if asked.traces else 0

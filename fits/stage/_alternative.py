@@ -6,12 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.loop._fit_checks import outlying
-from fits.loop._result import FitError
-from fits.stage._moments import Chain
-from fits.stage._result import StageFit
+from fits.loop._result import FitError, FitResult
 from fits.stage._solve import Solved, solve_chain
-from fits.stage._steps import Plan, Problem
+from fits.stage._steps import Plan
 from fits.stage._uncertainty import Precision
+from microid import Stage
 
 # Half the width of a 95 % interval, in standard deviations.
 _NORMAL = 1.959964
@@ -20,34 +19,29 @@ _RUINED = 0.5
 
 
 @dataclass(frozen=True)
-class Reach:
-    """Where the parameters of a stage come out without something.
-
-    Attributes
-    ----------
-    values, low, high
-        The parameters and the ends of their 95 % intervals, shape `(p,)`.
-    """
+class Alternative:
+    """Where the parameters of a stage come out without something, and the ends of their 95 % intervals, `(p,)`."""
 
     values: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
     @classmethod
-    def of(cls, chain: Chain, solved: Solved, precision: Precision) -> "Reach":
+    def of(cls, precision: Precision) -> "Alternative":
         """Read it off a solution."""
-        sd = np.sqrt(np.diagonal(precision.covariance(precision.influence())))
-        ends = (np.asarray(chain.coordinates.values(jnp.asarray(solved.z + k * _NORMAL * sd))) for k in (0, -1, 1))
+        z, values = precision.solved.z, precision.chain.coordinates.values
+        sd = precision.sd()
+        ends = (np.asarray(values(jnp.asarray(z + k * _NORMAL * sd))) for k in (0, -1, 1))
         return cls(*ends)
 
     @classmethod
-    def in_unit(cls, fit: StageFit, factor: float) -> "Reach":
+    def in_unit(cls, fit: FitResult[Stage], factor: float) -> "Alternative":
         """Where a fit comes out if a unit of its times is so many s."""
         powers = np.asarray([{"s": 1.0, "Hz": -1.0}.get(p.unit, 0.0) for p in fit.parameters])
         figures = [[getattr(p, name) for p in fit.parameters] for name in ("value", "lower", "upper")]
         return cls(*(factor**powers * np.asarray(each) for each in figures))
 
-    def ruined(self, fit: StageFit) -> list[str]:
+    def contradicted(self, fit: FitResult[Stage]) -> list[str]:
         """Say which parameters of a fit are far from these, one sentence each."""
         return [
             f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
@@ -55,22 +49,11 @@ class Reach:
             if abs(v - p.value) > _RUINED * min(abs(v), abs(p.value))
         ]
 
-    def widen(self, fit: StageFit, said: str, remedy: str = "") -> StageFit:
-        """Let a fit's intervals reach these, and say so first.
-
-        Parameters
-        ----------
-        fit
-            With all that pulls it.
-        said, remedy
-            What pulls it, and what to do about that where no other remark says so.
-        """
+    def widen(self, fit: FitResult[Stage], said: str, remedy: str = "") -> FitResult[Stage]:
+        """Let a fit's intervals reach these, and say first what pulls it and what to do about that."""
         parameters = tuple(
             replace(
-                p,
-                sd=float(np.hypot(p.sd, v - p.value)),
-                lower=min(p.lower, float(a)),
-                upper=max(p.upper, float(b)),
+                p, sd=float(np.hypot(p.sd, v - p.value)), lower=min(p.lower, float(a)), upper=max(p.upper, float(b))
             )
             for p, v, a, b in zip(fit.parameters, self.values, self.low, self.high, strict=True)
         )
@@ -80,33 +63,19 @@ class Reach:
         return replace(fit, parameters=parameters, remarks=(remark, *fit.remarks))
 
 
-def leave_outliers(plan: Plan, problem: Problem, solved: Solved) -> tuple[list[str], Reach] | None:
+def fit_without_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Alternative] | None:
     """Fit again without readings that jump out; the files that have such, and where the parameters come out.
 
-    Parameters
-    ----------
-    plan, problem
-        What was asked for.
-    solved
-        The fit with all readings.
-
-    Returns
-    -------
-    tuple or None
-        None where there are none, or where a robust loss weighs them less already, or where that fit fails.
+    None where there are none, or where a robust loss weighs them less already, or where that fit fails.
     """
     bad = [outlying(one.residual_um, run.fitted) for one, run in zip(solved.sums, solved.runs, strict=True)]
     sources = [run.record.source for one, run in zip(bad, solved.runs, strict=True) if one.any()]
     if plan.loss != "squares" or not sources:
         return None
-    runs = []
-    for run, one in zip(solved.runs, bad, strict=True):
-        kept = replace(run, fitted=run.fitted & ~one)
-        runs.append(kept.weighted(np.ones(len(one))))
+    runs = [replace(run, fitted=run.fitted & ~one) for run, one in zip(solved.runs, bad, strict=True)]
     plan.progress(f"fitting without the outliers of {', '.join(sources)}")
-    start = problem.z, problem.columns_um, runs, problem.hyper, problem.stroke_um
     try:
-        found = solve_chain(problem.chain, *start, plan.loss, plan.progress, anyway=True, even=problem.even)
+        found = solve_chain(solved.onward, runs, plan.loss, plan.progress, accept_best=True)
     except (FitError, np.linalg.LinAlgError):
         return None
-    return sources, Reach.of(problem.chain, found, Precision(problem.chain, found, problem.stroke_um))
+    return sources, Alternative.of(Precision(found))

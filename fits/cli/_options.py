@@ -1,0 +1,76 @@
+"""Options that several commands have, each declared once.
+
+Each command is one file of this folder, named after it, and declares there what it has alone.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+_STATES = ["negative", "positive", "demagnetised"]
+SEEDS = click.IntRange(0, 2**32 - 1)
+
+model = click.argument("model", metavar="MODEL.json")
+reference = click.argument("reference", metavar="REFERENCE.csv")
+runs = click.argument("runs", metavar="RUN.csv [MORE.csv ...]", nargs=-1, required=True)
+out_folder = click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
+columns = click.option(
+    "--columns",
+    metavar="NAME=SOURCE,...",
+    default="",
+    help="Which columns to read, such as voltage_V=u1_V,displacement_um=-height[nm].",
+)
+limits = click.option("--limits", metavar="LOW,HIGH", help="Voltages allowed, in V; the model's range by default.")
+limit = click.option(
+    "--limit",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="What the rig may be asked for, such as displacement=0:40um or slew=2kV/s; again for more of voltage, slew, "
+    "displacement, velocity, acceleration and current (per farad of the piezo). By default what the runs reached.",
+)
+margin = click.option(
+    "--margin",
+    type=float,
+    default=0.02,
+    show_default=True,
+    help="Share of its range by which what is predicted may go beyond what the runs reached.",
+)
+axis = click.option(
+    "--axis",
+    type=click.Choice(["x", "y", "z", "alpha", "beta", "gamma", "all"]),
+    default="all",
+    show_default=True,
+    help="Which motion.",
+)
+json_output = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")
+
+
+def out_csv(metavar: str) -> Callable[[Any], Any]:
+    """Declare the option of the CSV that is written."""
+    return click.option("--out", required=True, metavar=metavar, help="CSV to write; .gz is compressed.")
+
+
+def plots(what: str) -> Callable[[Any], Any]:
+    """Declare the option of a folder for pictures."""
+    return click.option("--plots", metavar="DIR", help=f"Folder for {what}; it is made if need be.")
+
+
+def json_file(instead: str) -> Callable[[Any], Any]:
+    """Declare the option of a JSON file, which a `-` prints instead of something."""
+    words = f"JSON file to write; - prints it instead of the {instead}."
+    return click.option("--json", "json_file", metavar="FILE", help=words)
+
+
+def holdout(what: str) -> Callable[[Any], Any]:
+    """Declare the option of what is only predicted."""
+    return click.option("--holdout", multiple=True, metavar="FRACTION|FILE", help=what)
+
+
+def initial(what: str, default: str | None = "negative", **more: Any) -> Callable[[Any], Any]:
+    """Declare the option of the memory before something; one that may be unknown is by default."""
+    states = _STATES if default == "negative" else ["unknown", *_STATES]
+    if default:
+        more |= {"default": default, "show_default": True}
+    return click.option("--initial", type=click.Choice(states), help=f"Memory before {what}.", **more)

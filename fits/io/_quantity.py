@@ -1,0 +1,60 @@
+"""Measured quantities: the name of each, and the units it may come in."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+LENGTH = {"um": 0, "nm": -3, "mm": 3, "m": 6, "pm": -6}
+VOLTAGE = {"V": 0, "mV": -3, "uV": -6, "kV": 3}
+_PLAIN_SIGNS = {"µ": "u", "μ": "u", "°C": "degC"}  # both Unicode micro signs, and the degree sign
+BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]")
+_KELVIN_AT_0_DEGC = 273.15
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measured quantity: its name such as ``voltage``, and its canonical unit such as ``V``.
+
+    `powers` are those of ten that take each known unit to the canonical one.
+    """
+
+    stem: str
+    unit: str
+    powers: Mapping[str, int]
+
+    @property
+    def column(self) -> str:
+        """Canonical column name: stem and unit."""
+        return f"{self.stem}_{self.unit}"
+
+    def convert(self, values: Any, unit: str) -> Any:
+        """Values, or one, of a known unit in the canonical unit."""
+        if unit == "K":
+            return values - _KELVIN_AT_0_DEGC
+        # Dividing by an exact power is rounded once; multiplying by 1e-3 would be rounded twice.
+        power = self.powers[unit]
+        return values * 10.0**power if power >= 0 else values / 10.0**-power
+
+    def shifted(self, unit: str, power: int) -> str | None:
+        """Name the unit 10**power times as large as `unit`, if there is one."""
+        wanted = self.powers[unit] + power
+        return next((name for name, value in self.powers.items() if value == wanted), None)
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Split ``height_nm``, ``height[nm]`` or ``height (nm)`` into stem and unit; None where there is no unit."""
+    match = BRACKETS.fullmatch(name)
+    if match:
+        stem, unit = match["stem"], match["unit"]
+    else:
+        stem, _, unit = name.rpartition("_")
+        stem, unit = (stem, unit) if stem else (name, "")
+    for sign, plain in _PLAIN_SIGNS.items():
+        unit = unit.replace(sign, plain)
+    return stem, unit or None

@@ -1,0 +1,81 @@
+"""What a further column is: its name, its unit, how it is recognised, and how it is cleaned."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fits.io._quantity import FloatArray, Quantity, split_unit
+from fits.io._record import Record
+
+
+def _as_it_is(values: FloatArray, record: Record) -> FloatArray:
+    return values
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column besides time, voltage and displacement. To add one, put one file that registers it into this folder.
+
+    Attributes
+    ----------
+    quantity
+        Headers of its name in one of its units are recognised when a file is read, and converted.
+    name
+        What effects call it in `needs`; the name of the quantity if empty.
+    recognised
+        Whether a column of some header, with its values of shape `(n,)` in a record, is this one; by default one of
+        the name of this one is.
+    cleaned
+        What effects get: the values, shape `(n,)`, in the unit of the quantity, without what would mislead them.
+    shown_if_constant
+        Whether one that does not change says something.
+    optional
+        Whether effects that use it do without where it is missing.
+    title
+        As in "the residual goes with the temperature"; a diagnosis does not look whether it does if empty.
+    """
+
+    quantity: Quantity
+    name: str = ""
+    recognised: Callable[[str, FloatArray, Record], bool] | None = None
+    cleaned: Callable[[FloatArray, Record], FloatArray] = _as_it_is
+    shown_if_constant: bool = False
+    optional: bool = False
+    title: str = ""
+
+    @property
+    def key(self) -> str:
+        """The name that effects know."""
+        return self.name or self.quantity.column
+
+    def takes(self, header: str, values: FloatArray, record: Record) -> bool:
+        """Whether a column of a record is this one and shows something."""
+        if not np.all(np.isfinite(values)) or (np.ptp(values) == 0 and not self.shown_if_constant):
+            return False
+        if self.recognised is None:
+            return header in (self.key, self.quantity.column)
+        return self.recognised(header, values, record)
+
+
+# By the name that effects know, in the order of the files.
+COLUMNS: dict[str, Column] = {}
+
+
+def register(column: Column) -> Column:
+    """Make a column known."""
+    COLUMNS[column.key] = column
+    return column
+
+
+def columns_beside(record: Record) -> dict[str, FloatArray]:
+    """Further columns of a record under the names that effects know, shape `(n,)` each, in their own units."""
+    found: dict[str, FloatArray] = {}
+    for header, values in record.extra.items():
+        column = next((each for each in COLUMNS.values() if each.takes(header, values, record)), None)
+        if column is not None and column.key not in found:
+            unit = split_unit(header)[1]
+            if unit in column.quantity.powers:
+                values = column.quantity.convert(values, str(unit))
+            found[column.key] = column.cleaned(values, record)
+    return found

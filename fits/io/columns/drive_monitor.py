@@ -1,0 +1,6 @@
+"""The voltage at the piezo, as the amplifier's monitor shows it."""
+
+from fits.io._quantity import VOLTAGE, Quantity
+from fits.io.columns._base import Column, register
+
+register(Column(Quantity("drive_monitor", "V", VOLTAGE)))

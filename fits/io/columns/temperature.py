@@ -1,0 +1,36 @@
+"""The temperature of the stage's body."""
+
+import numpy as np
+
+from fits.io._quantity import FloatArray, Quantity
+from fits.io._record import Record
+from fits.io.columns._base import Column, register
+
+# Part of a record through which a temperature hardly bends.
+_BEGINNING = 0.02
+
+
+def _recognised(name: str, values: FloatArray, record: Record) -> bool:
+    return name.lower().startswith("temp") or name.lower().endswith(("_degc", "_temperature_k", "_temperature_c"))
+
+
+def _first_smoothed(values: FloatArray, record: Record) -> FloatArray:
+    """Replace the first value by that of a line through the first readings.
+
+    What lags behind the temperature starts from rest at it, so that its noise would act like a step.
+    """
+    count = int(_BEGINNING * len(values))
+    if count < 3:
+        return values
+    line = np.polynomial.Polynomial.fit(record.time_s[:count], values[:count], 1)
+    return np.concatenate([[line(record.time_s[0])], values[1:]])
+
+
+register(
+    Column(
+        Quantity("temperature", "degC", {"degC": 0, "C": 0, "K": 0}),
+        recognised=_recognised,
+        cleaned=_first_smoothed,
+        title="temperature",
+    )
+)

@@ -1,0 +1,269 @@
+"""The fit of a hysteresis or a stage in JSON values and in words."""
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from fits.io._limits import ranges_json
+from fits.loop._misfit import Misfit
+from fits.loop._result import FitResult, RunReport
+from fits.stage._run import place_of_hysteresis
+from fits.stats._metrics import Errors
+from fits.stats._noise import WHITE
+from microid import Preisach, Stage
+
+# Held-out errors up to this many times the fitted ones count as equal.
+_EQUAL = 1.1
+# Correlations between parameters from here on are worth a line.
+_WORTH_SAYING = 0.5
+# Of each run of a stage; None where it was not fitted.
+_OF_FITTED = ("noise_um", "correlation_samples", "substeps")
+
+
+def fit_report(result: FitResult[Any]) -> dict[str, Any]:
+    """Put what is known of a fit into JSON values.
+
+    Returns
+    -------
+    dict
+        What a model file keeps under `fit`. Errors and limits that do not exist are None.
+    """
+    model = result.model
+    law: Any = model
+    parts: dict[str, Any] = {}
+    if isinstance(model, Stage):
+        place = place_of_hysteresis(model)
+        law = None if place is None else model.parts[place]
+        named = zip(model.names, model.parts, strict=True)
+        parts["parts"] = [{"name": name, "type": type(part).__name__} for name, part in named]
+    density = law.density if isinstance(law, Preisach) else None
+    report = {
+        "status": result.status.name.lower(),
+        **parts,
+        "family": None if density is None else density.family,
+        "levels": None if density is None else density.levels,
+        "lower_V": None if density is None else float(density.lower_V),
+        "upper_V": None if density is None else float(density.upper_V),
+        **(_of_stage(result) if isinstance(model, Stage) else _of_hysteresis(result)),
+        "in_sample": _errors(result.in_sample),
+        "held_out": _errors(result.held_out),
+        "runs": [_run(run) for run in result.runs],
+        "remarks": [remark for remark in result.remarks if remark not in result.unseen],
+    }
+    if isinstance(model, Stage):
+        for entry, run in zip(report["runs"], result.runs, strict=True):
+            entry.update({key: getattr(run, key) for key in _OF_FITTED})
+    return report
+
+
+def _of_hysteresis(result: FitResult[Any]) -> dict[str, Any]:
+    return {
+        "noise_um": result.noise_um,
+        "correlation_samples": result.correlation_samples,
+        "discrepancy_um": float(result.uncertainty.discrepancy_um),
+        "smoothness": result.smoothness,
+        "trials": [{"levels": trial.levels, "error_um": trial.error_um} for trial in result.trials],
+        "misfit": _misfit(result.misfit),
+    }
+
+
+def _of_stage(result: FitResult[Any]) -> dict[str, Any]:
+    return {
+        "parameters": [
+            {
+                "name": parameter.name,
+                "unit": parameter.unit,
+                **{key: _finite(getattr(parameter, key)) for key in ("value", "sd", "lower", "upper")},
+            }
+            for parameter in result.parameters
+        ],
+        "correlation": [[_finite(value) for value in row] for row in np.asarray(result.correlation)],
+        "unseen": list(result.unseen),
+        "misfit": _misfit(result.misfit),
+        "discrepancy_um": float(result.uncertainty.discrepancy_um),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _misfit(misfit: Misfit | None) -> dict[str, Any] | None:
+    if misfit is None:
+        return None
+    return {
+        "source": misfit.source,
+        "residual_um": misfit.residual_um,
+        "share_pct": misfit.share_pct,
+        "noise_um": misfit.noise_um,
+        "noise_shown_by": misfit.shown_by,
+        "times_noise": misfit.times_noise,
+        "far": misfit.far,
+    }
+
+
+def _errors(errors: Errors | None) -> dict[str, Any] | None:
+    if errors is None:
+        return None
+    return {
+        "samples": errors.samples,
+        "rms_um": errors.rms_um,
+        "max_um": errors.max_um,
+        "range_um": errors.range_um,
+        "e_rms_pct": errors.e_rms_pct,
+        "e_max_pct": errors.e_max_pct,
+    }
+
+
+def _run(run: RunReport) -> dict[str, Any]:
+    return {
+        "source": run.source,
+        "offset_um": run.offset_um,
+        "in_sample": _errors(run.in_sample),
+        "held_out": _errors(run.held_out),
+        "unknown_samples": run.unknown,
+        "start_extremes_V": np.asarray(run.start.extremes_V)[: int(run.start.count)].tolist(),
+        "e_loop_measured_pct": run.loop_measured_pct,
+        "e_loop_model_pct": run.loop_model_pct,
+        "reached": ranges_json(run.reached),
+    }
+
+
+def describe(report: Mapping[str, Any]) -> str:
+    """Put a report from `fit_report` into words: some twenty lines, without a newline at the end."""
+    stage = "parts" in report
+    lines = _said_of_misfit(report.get("misfit"))
+    if stage:
+        chain = ", ".join(f"{part['name']} ({part['type']})" for part in report["parts"])
+        lines.append(f"stage          {chain}")
+    if report["family"] is not None:
+        lines.append(
+            f"density        {report['family']}, {report['levels']} levels from {report['lower_V']:g} to "
+            f"{report['upper_V']:g} V"
+        )
+    lines += _parameters(report) if stage else _resolution(report)
+    lines += ["", f"{'':14} {'samples':>8} {'e_rms':>10} {'':>12} {'e_max':>10}"]
+    lines += [_row("in-sample", report["in_sample"]), _row("held-out", report["held_out"])]
+    for run in report["runs"] if stage or len(report["runs"]) > 1 else ():
+        lines.append(f"  {run['source']}")
+        lines += [_row(f"    {key.replace('_', '-')}", run[key]) for key in ("in_sample", "held_out") if run[key]]
+        if run.get("noise_um") is not None:
+            steps = "" if run["substeps"] == 1 else f", {run['substeps']} steps per sample"
+            lines.append(f"    residual     {_residual(run)}{steps}")
+    lines += ["e_rms: root mean square error, e_max: largest error, both in % of the measured range (Eq. 35, 36)", ""]
+    lines += [_loop(run) for run in report["runs"]]
+    lines += ["e_loop: widest gap of the largest loop in % of its height (Eq. 34)", "", _verdict(report)]
+    lines += [f"Unseen: {sentence}" for sentence in (report["unseen"] if stage else ())]
+    return "\n".join(lines + [f"Note: {remark}" for remark in report["remarks"]])
+
+
+def _said_of_misfit(misfit: Mapping[str, Any] | None) -> list[str]:
+    """Say first how far a residual is from noise; nothing of models that were written before it was looked at."""
+    if misfit is None:
+        return []
+    figures = (
+        f"{misfit['residual_um']:.4g} um rms in {misfit['source']}, {misfit['share_pct']:.3g} % of its stroke and "
+        f"{misfit['times_noise']:.3g} times the sensor's noise ({misfit['noise_um']:.3g} um, by "
+        f"{misfit['noise_shown_by']})"
+    )
+    if not misfit["far"]:
+        return [f"left over      {figures}", ""]
+    return [f"FAR FROM NOISE {figures}: the model misses something, and all below is no better than that", ""]
+
+
+def _resolution(report: Mapping[str, Any]) -> list[str]:
+    levels = ", ".join(f"{trial['levels']:d}" for trial in report["trials"])
+    errors = ", ".join(f"{trial['error_um']:.4g}" for trial in report["trials"])
+    return [
+        f"levels tried   {levels}",
+        f"  their error  {errors} um, on blocks predicted from the others",
+        f"residual       {_residual(report)}",
+    ]
+
+
+def _residual(report: Mapping[str, Any]) -> str:
+    correlation = report["correlation_samples"]
+    colour = "white" if correlation <= WHITE else f"neighbours alike over {correlation:.0f} samples"
+    return f"{report['noise_um']:.4g} um standard deviation, {colour}"
+
+
+def _row(name: str, errors: Mapping[str, Any] | None) -> str:
+    if errors is None:
+        return f"{name:14} {'none':>8}"
+    return (
+        f"{name:14} {errors['samples']:8d} {errors['e_rms_pct']:8.4g} % {errors['rms_um']:9.4g} um "
+        f"{errors['e_max_pct']:8.4g} % {errors['max_um']:9.4g} um"
+    )
+
+
+def _loop(run: Mapping[str, Any]) -> str:
+    measured, model = run["e_loop_measured_pct"], run["e_loop_model_pct"]
+    if measured is None or model is None:
+        return f"e_loop         {run['source']}: no full loop in it"
+    return f"e_loop         {run['source']}: measured {measured:.4g} %, model {model:.4g} %"
+
+
+def _verdict(report: Mapping[str, Any]) -> str:
+    held_out, in_sample = report["held_out"], report["in_sample"]
+    if held_out is None:
+        return "Nothing was held out, so how well new voltages are predicted was not seen."
+    ratio = held_out["rms_um"] / max(in_sample["rms_um"], 1e-300)
+    misfit = report.get("misfit")
+    if ratio <= _EQUAL and misfit is not None and misfit["far"]:
+        return (
+            f"Samples that the fit never saw are off by {held_out['e_rms_pct']:.3g} % of the range, those it did by "
+            f"{in_sample['e_rms_pct']:.3g} %, where noise alone would leave "
+            f"{100 * misfit['noise_um'] / in_sample['range_um']:.2g} %: the model misses the same in both."
+        )
+    if ratio <= _EQUAL:
+        return "Samples that the fit never saw are predicted as well as those it did."
+    return (
+        f"Samples that the fit never saw are predicted {ratio:.3g} times worse than those it did: expect the "
+        "held-out figures, not the in-sample ones."
+    )
+
+
+def _parameters(report: Mapping[str, Any]) -> list[str]:
+    """A table of the parameters, and the pairs whose errors go together."""
+    rows = [
+        (
+            one["name"],
+            f"{_value(one)} ± {_sd(one)}",
+            f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})",
+            one["unit"],
+        )
+        for one in report["parameters"]
+    ]
+    widths = [max((len(row[column]) for row in rows), default=0) for column in range(3)]
+    table = [
+        f"{name:{widths[0]}}  {value:{widths[1]}}  {interval:{widths[2]}}  {'' if unit == '1' else unit}".rstrip()
+        for name, value, interval, unit in rows
+    ]
+    names = [each["name"] for each in report["parameters"]]
+    pairs = [(i, j, report["correlation"][i][j]) for i, j in combinations(range(len(names)), 2)]
+    return [
+        "",
+        *table,
+        *(
+            f"correlated     {names[i]} and {names[j]}: {value:+.2f}"
+            for i, j, value in pairs
+            if value is not None and abs(value) > _WORTH_SAYING
+        ),
+    ]
+
+
+def _sd(parameter: Mapping[str, Any]) -> str:
+    return "unknown" if parameter["sd"] is None else f"{parameter['sd']:.2g}"
+
+
+def _value(parameter: Mapping[str, Any], key: str = "value") -> str:
+    """Write a value down to the second digit of its standard deviation."""
+    value, sd = parameter[key], parameter["sd"]
+    if value is None:
+        return "unknown"
+    if not sd or value == 0:
+        return f"{value:.6g}"
+    digits = int(np.floor(np.log10(abs(value)))) - int(np.floor(np.log10(sd))) + 2
+    return f"{value:#.{min(max(digits, 2), 10)}g}".rstrip(".")
