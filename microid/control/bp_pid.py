@@ -172,7 +172,7 @@ class BPPID(AbstractController):
         hidden, output = jax.random.uniform(key, (2, 3, 3), kind, -0.5, 0.5)
         share = (1 - 1 / span) / (span - 1 / span)
         threshold = jnp.full(3, -jnp.log(share / (1 - share)) / 2, kind)
-        ends = jnp.asarray(jnp.stack([jnp.asarray(1 / span), jnp.asarray(span)]), kind)
+        ends = jnp.asarray([1 / span, span], kind)
         gain = pid.proportional_V_per_um
         return cls(
             GainNetwork(hidden, jnp.zeros(3, kind), output, threshold),
