@@ -40,20 +40,8 @@ class Controllers(eqx.Module):
     """Controllers of one kind that differ in some numbers, whose names in the sweep begin with `controller.`.
 
     What is found by the stage or the reference is found for the nominal ones: those differ from row to row, and the
-    controller does not know of it.
-
-    Attributes
-    ----------
-    kind
-        One of `microid.CONTROLLERS`.
-    numbers
-        Those of a row where they do not vary. What the controller finds by its plant is left out.
-    interval_s
-        Between two samples.
-    plant
-        The nominal one; None where the controller needs to find nothing by it.
-    delay
-        Samples by which readings are late.
+    controller does not know of it. `numbers` are those of a row where they do not vary, without what the controller
+    finds by the nominal plant; that is None where it needs to find nothing. Readings are late by `delay` samples.
     """
 
     kind: type[AbstractController] = eqx.field(static=True)
