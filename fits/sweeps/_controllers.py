@@ -75,13 +75,7 @@ def _parameter(setting: Setting, nominal: float, interval_s: float) -> Parameter
 
 
 def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, reference: Program) -> Controllers:
-    """Read the table `[controller]` of a sweep, for the nominal stage, its memory, and what it is to follow.
-
-    Raises
-    ------
-    DataError
-        For the first thing that is not as it should be.
-    """
+    """Read the table `[controller]` of a sweep, for the nominal stage, its memory, and what it is to follow."""
     name = given.get("kind", "pid")
     if not isinstance(name, str) or name not in CONTROLLERS:
         raise DataError(
