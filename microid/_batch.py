@@ -92,7 +92,7 @@ def _hysteresis(law: Preisach, signal: Signal, memory: Staircase | None) -> Sign
     """Pass a voltage on; see `Preisach.respond` and `Everett.respond`."""
     rows = signal.values.shape[0]
     # Where all rows share the law, its tables stay in the cache.
-    own = any(leaf.shape[0] > 1 for leaf in jax.tree.leaves((law.density, law.reversible)))
+    own = any(leaf.shape[0] > 1 for leaf in jax.tree.leaves(law))
     surface: Everett = jax.vmap(lambda law: law.everett)(_for_rows(law, rows if own else 1))
     axis: int | None = 0
     if not own:

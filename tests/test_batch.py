@@ -1,5 +1,6 @@
 """Many stages at once give what each gives by itself."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,8 +22,8 @@ def stages_of(rng, rows, hold, shared):
 
     drivers = [m.Driver(rng.uniform(1e-3, 3e-3)) for _ in range(rows)]
     masses = [m.Mechanics(rng.uniform(60, 90), rng.uniform(0.05, 0.3)) for _ in range(rows)]
-    laws = [law() for _ in range(1 if shared else rows)]
-    return m.Stage((joined(drivers), joined(laws), joined(masses)), ("driver", "law", "mechanics"), hold)
+    laws = joined([law() for _ in range(1 if shared else rows)])
+    return m.Stage((joined(drivers), laws, joined(masses)), ("driver", "law", "mechanics"), hold)
 
 
 @pytest.mark.parametrize(("hold", "shared"), [("first", True), ("zero", False)])
@@ -34,6 +35,15 @@ def test_rows_are_those_of_stages_by_themselves(rng, hold, shared):
         own = jax.tree.map(lambda leaf, row=row: leaf[row if leaf.shape[0] > 1 else 0], stages)
         alone = own(jnp.asarray(1e-3), voltage[row], m.Start(memory=memory))
         np.testing.assert_allclose(found[row], alone, rtol=0, atol=1e-11)
+
+
+def test_rows_may_differ_in_the_offset_alone(rng):
+    stages, voltage = stages_of(rng, 1, "first", True), jnp.asarray(rng.uniform(0, 100, (2, 20)))
+    offsets = jnp.asarray(rng.uniform(-1, 1, 2))
+    moved = eqx.tree_at(lambda stages: stages.parts[1].offset_um, stages, offsets)
+    respond = jax.jit(m.respond_all)
+    plain = respond(stages, 1e-3, voltage) - float(stages.parts[1].offset_um[0])
+    np.testing.assert_allclose(respond(moved, 1e-3, voltage), plain + offsets[:, None], rtol=0, atol=1e-11)
 
 
 def test_other_parts_are_mapped_over_the_rows(rng):

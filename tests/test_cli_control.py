@@ -12,6 +12,7 @@ from scipy.signal import cont2discrete, lfilter
 
 import microid as m
 from fits import save_model
+from fits.cli._main import cli
 
 T = 1e-3
 SAMPLES = 120
@@ -292,3 +293,9 @@ def test_references_that_stand_still_are_told_of_and_those_that_overflow_refused
     places = ["control", folder / "linear.json", tmp_path / "huge.csv", "--out", tmp_path / "huge_run.csv"]
     refused(run(*places, *GIVEN), "huge.csv, line 3, column 'displacement_um'", "from -1e+09 to 1e+09 um")
     assert not (tmp_path / "huge_run.csv").exists()
+
+
+def test_choices_in_the_help_are_those_of_the_library():
+    (kinds,) = (option.type.choices for option in cli.commands["control"].params if option.name == "controller")
+    assert kinds[0] == "pid"
+    assert sorted(kinds) == sorted(m.CONTROLLERS)

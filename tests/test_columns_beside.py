@@ -34,6 +34,15 @@ def test_columns_are_known_by_their_names_and_other_readings_are_not_taken(rng):
     assert columns_beside(record(rng, **others)) == {}
 
 
+def test_columns_come_in_the_units_that_effects_know(rng):
+    other = np.sin(np.arange(400) / 7)
+    taken = columns_beside(record(rng, y_nm=other, chamber_temperature_K=np.linspace(290.0, 291.0, 400)))
+    np.testing.assert_allclose(taken["other_um"], other / 1e3, rtol=1e-15)
+    np.testing.assert_allclose(taken["temperature_degC"][1:], np.linspace(16.85, 17.85, 400)[1:], rtol=1e-12)
+    travelled = np.full(400, 900.0)
+    assert columns_beside(record(rng, path_V=travelled))["path_V"].tolist() == travelled.tolist()
+
+
 def test_the_noise_of_the_first_temperature_is_no_step(rng):
     # The end of a line through n readings is off by 2 / sqrt(n) of their noise (ordinary least squares).
     time_s = np.arange(100_000) / 100

@@ -150,7 +150,9 @@ def test_the_command_takes_stages(rng, model_file, tmp_path, monkeypatch):
     law, path = model_file
     stage = stage_of(rng, law)
     loaded = load_model(path)
-    monkeypatch.setattr("fits.stage._model_file.load_model", lambda _: dataclasses.replace(loaded, model=stage))
+    monkeypatch.setattr(
+        "fits.stage._model_file.load_model", lambda _: dataclasses.replace(loaded, model=stage, uncertainty=None)
+    )
     wanted, stroke = smooth_reference(stage)
     csv, out = tmp_path / "r.csv", tmp_path / "v.csv"
     rows = zip(wanted.time_s.tolist(), wanted.displacement_um.tolist(), strict=True)

@@ -318,8 +318,8 @@ KIND = '''
         def facts(self):
             return Facts((Parameter("double.of_um", "um", 1.0),), (Output("twice_um", "um", "double"),), 4)
 
-        def compute(self, values, rows, sources, seed):
-            return Rows({"twice_um": 2 * values["double.of_um"]}, ("",) * len(rows))
+        def compute(self, block):
+            return Rows({"twice_um": 2 * block.values["double.of_um"]}, ("",) * len(block.rows))
 
     def make(request):
         return DoubleJob()

@@ -22,7 +22,7 @@ from fits.sweeps._store import opened
 from fits.sweeps._types import Rows
 from fits.sweeps.kinds import examples
 
-EXAMPLES = examples()
+EXAMPLES = {kind: file.read_text() for kind, file in examples().items()}
 HEAD = 'schema = "microid.sweep/1"\nkind = "simulate"\n'
 LIST = HEAD + '[list]\nfile = "rows.csv"\n'
 CONTROL = (

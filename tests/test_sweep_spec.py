@@ -8,7 +8,7 @@ from scipy.stats import qmc
 from fits import DataError
 from fits.sweeps.kinds import examples
 
-EXAMPLES = examples()
+EXAMPLES = {kind: file.read_text() for kind, file in examples().items()}
 HEAD = 'schema = "microid.sweep/1"\nkind = "simulate"\n'
 
 

@@ -33,7 +33,7 @@ def sweep(context: click.Context, example: str | None) -> None:
     --resume goes on. microid sweep show DIR says how far it is and what came out.
     """
     if example is not None:
-        click.echo(kinds.examples()[example], nl=False)
+        click.echo(kinds.examples()[example].read_text(encoding="utf-8"), nl=False)
         context.exit()
     if context.invoked_subcommand is None:
         click.echo(context.get_help())

@@ -8,11 +8,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import microid
-from fits.control._compensate_effects import plain_of
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._run import initial_state, prepare_run, simulate_run
-from microid import AbstractLinear, GridDensity, Preisach, Reversible, Stage, Staircase, Start, innermost
+from microid import (
+    AbstractEffect,
+    AbstractLinear,
+    GridDensity,
+    Preisach,
+    Reversible,
+    Stage,
+    Staircase,
+    Start,
+    innermost,
+)
 
 # Doubt about the displacement needed, or a start in motion, that is worth a remark: a fraction of the span.
 _WORTH_SAYING = 0.01
@@ -29,6 +38,18 @@ class Gains(NamedTuple):
     ahead: float
     behind: float
     offset_um: float
+
+
+def plain_of(stage: Stage) -> Stage:
+    """The same stage without effects of `microid.EFFECTS`; itself where it has none."""
+    if not any(isinstance(part, AbstractEffect) for part in stage.parts):
+        return stage
+    parts = {
+        name: innermost(part)
+        for name, part in zip(stage.names, stage.parts, strict=True)
+        if not isinstance(part, AbstractEffect) or hasattr(part, "inner")
+    }
+    return Stage(tuple(parts.values()), tuple(parts), stage.hold, stage.substeps)
 
 
 def hysteresis_of(stage: Stage) -> Preisach:

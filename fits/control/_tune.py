@@ -122,21 +122,25 @@ def tune_controller(
         which = np.flatnonzero(~np.asarray(figures.stable)) + 1
         detail = f"at the start, with plant {', '.join(map(str, which))} of {len(stages)}"
         raise FitError(FitStatus.UNSTABLE, detail, "tuning")
-    progress(f"start: cost {float(cost):.4g} um, {_said(over)}")
+    progress(f"start: cost {float(cost):.4g} um, {_excess_in_words(over)}")
     first = _worst(over)
     rng, ends = np.random.default_rng(seed), []
     for number in range(starts):
         y = origin if number == 0 else _stable_place(problem, rng)
-        ends.append(_search(problem, y, len(stages)))
-        progress(f"search {number + 1} of {starts}: cost {ends[-1].cost_um:.4g} um, {_said(ends[-1].over)}")
+        ends.append(_search(problem, y))
+        progress(
+            f"search {number + 1} of {starts}: cost {ends[-1].cost_um:.4g} um, {_excess_in_words(ends[-1].over)}"
+        )
     kept = [end for end in ends if end.kept]
     if not kept:
         nearest = min(ends, key=lambda end: _worst(end.over)[0])
-        raise FitError(FitStatus.LIMITS, _said(nearest.over), "tuning")
+        raise FitError(FitStatus.LIMITS, _excess_in_words(nearest.over), "tuning")
     best = min(kept, key=lambda end: end.cost_um)
     remarks = []
     if first[0] > _TOLERANCE:
-        remarks.append(f"the controller at the start was beyond a limit ({_said(over)}), so its cost is no bound")
+        remarks.append(
+            f"the controller at the start was beyond a limit ({_excess_in_words(over)}), so its cost is no bound"
+        )
     elif best.cost_um > float(cost) * (1 - 1e-9) or float(jnp.max(jnp.abs(best.y))) < _TOLERANCE:
         if not best.converged or best.cost_um > float(cost) * (1 + _TOLERANCE):
             detail = "no search found better gains than those at the start"
@@ -207,11 +211,11 @@ def _problem(
     )
 
 
-def parameter_values(controller: Any) -> dict[str, np.ndarray]:
-    """The parameters of a controller by their path, in their units."""
-    leaves = jax.tree_util.tree_flatten_with_path(controller)[0]
+def parameter_values(model: Any) -> dict[str, np.ndarray]:
+    """The parameters of a controller or a stage by their path, in their units."""
+    leaves = jax.tree_util.tree_flatten_with_path(model)[0]
     found = {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
-    return {row.path: np.asarray(found[row.path]) for row in parameter_table(controller)}
+    return {row.path: np.asarray(found[row.path]) for row in parameter_table(model)}
 
 
 def _moves(row: ParameterInfo, value: np.ndarray, free: Sequence[str] | None) -> bool:
@@ -236,7 +240,7 @@ def _stable_place(problem: Problem, rng: np.random.Generator) -> Any:
     return jnp.zeros_like(y)
 
 
-def _search(problem: Problem, y: Any, plants: int) -> _End:
+def _search(problem: Problem, y: Any) -> _End:
     over = judge(problem, y)[1]
     multipliers = {name: jnp.zeros_like(share) for name, share in over.items()}
     weight, worst, settled = _FIRST_WEIGHT, np.inf, False
@@ -262,7 +266,7 @@ def _worst(over: dict[str, Any]) -> tuple[float, str]:
     return found if np.isfinite(found[0]) else (np.inf, found[1])
 
 
-def _said(over: dict[str, Any]) -> str:
+def _excess_in_words(over: dict[str, Any]) -> str:
     share, name = _worst(over)
     # That of the overshoot is a logarithm.
     passed = np.expm1(share) if name == "overshoot_max_pct" else share

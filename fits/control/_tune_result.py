@@ -102,27 +102,20 @@ def passed_limits(goal: Goal, every: Sequence[Margins], runs: Sequence[Controlle
 
     There are margins of each plant, and runs of those whose overshoot counts.
     """
+    gain, phase = min(float(one.gain_margin) for one in every), min(float(one.phase_margin_deg) for one in every)
+    peak, overshoot = max(float(one.sensitivity_peak) for one in every), max(map(float, map(overshoot_pct, runs)))
     worst = {
-        "--gain-margin": min(float(one.gain_margin) for one in every),
-        "--phase-margin": min(float(one.phase_margin_deg) for one in every),
-        "--peak": max(float(one.sensitivity_peak) for one in every),
-        "--overshoot": max(float(overshoot_pct(run)) for run in runs),
-    }
-    words = {
-        "--gain-margin": (goal.gain_margin_min, "a gain margin of {} or more", ""),
-        "--phase-margin": (goal.phase_margin_min_deg, "a phase margin of {} degrees or more", " degrees"),
-        "--peak": (goal.sensitivity_peak_max, "a peak of the sensitivity of {} or less", ""),
-        "--overshoot": (goal.overshoot_max_pct, "an overshoot of {} % or less", " %"),
+        "--gain-margin": (goal.gain_margin_min, gain, "a gain margin of {} or more", ""),
+        "--phase-margin": (goal.phase_margin_min_deg, phase, "a phase margin of {} degrees or more", " degrees"),
+        "--peak": (goal.sensitivity_peak_max, peak, "a peak of the sensitivity of {} or less", ""),
+        "--overshoot": (goal.overshoot_max_pct, overshoot, "an overshoot of {} % or less", " %"),
     }
     out = {}
-    for option, (limit, expected, unit) in words.items():
+    for option, (limit, found, expected, unit) in worst.items():
         if limit is None:
             continue
-        found = worst[option]
-        if option == "--overshoot":
-            beyond = (found + 1) / (limit + 1) - 1
-        else:
-            beyond = found / limit - 1 if option == "--peak" else 1 - found / limit
-        if beyond > _TOLERANCE:
+        # An overshoot of nothing has no share.
+        share = (found + 1) / (limit + 1) if option == "--overshoot" else found / limit
+        if (1 - share if "margin" in option else share - 1) > _TOLERANCE:
             out[option] = f"expected {expected.format(f'{limit:g}')}, found {found:.4g}{unit}"
     return out

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.optimize import brentq
 
 from fits.io._errors import DataError
 from fits.stage._run import place_of_hysteresis
@@ -14,8 +15,6 @@ from microid import PID, PrandtlIshlinskii, Preisach, Stage, loop_gain, margins
 
 _DECADES = 5
 _POINTS = 4001
-# Each narrows the bracket of a crossing by the number of points.
-_ZOOMS = 3
 # Voltages per level on which the slope of a hysteresis is looked at.
 _FINE = 64
 # The start keeps at least this gain margin; ever smaller gains reach it on any stage that is stable by itself.
@@ -68,16 +67,17 @@ def steepest_slope(stage: Stage) -> float | None:
             f"{stage.names[place]!r} is a {type(law).__name__}, which has no form for single samples: "
             "control a stage with a Preisach or a PrandtlIshlinskii hysteresis"
         )
-    lower, upper = float(law.density.lower_V), float(law.density.upper_V)
-    rise = np.linspace(lower, upper, _FINE * law.density.levels)
-    out = np.asarray(_respond(law, jnp.asarray(np.append(rise, rise[::-1]))))
-    steps = np.abs(np.diff(out)) / (rise[1] - rise[0])
-    return float(steps.max())
+    return float(_compiled_slope(law, _FINE))
 
 
-@eqx.filter_jit
-def _respond(law: Preisach, voltage_V: Float[Array, " n"]) -> Float[Array, " n"]:
-    return law(voltage_V)
+def major_loop_slope(law: Preisach, fine: int) -> Float[Array, ""]:
+    """Slope in um/V of a hysteresis where it is steepest on its major loop, of so many voltages per level."""
+    rise = jnp.linspace(law.density.lower_V, law.density.upper_V, fine * law.density.levels)
+    output = law(jnp.append(rise, rise[::-1]))
+    return jnp.max(jnp.abs(jnp.diff(output))) / (rise[1] - rise[0])
+
+
+_compiled_slope = eqx.filter_jit(major_loop_slope)
 
 
 def slope_array(stage: Stage) -> Float[Array, ""] | None:
@@ -118,14 +118,8 @@ def ultimate_point(stage: Stage, interval_s: float, *, delay: int = 0) -> Ultima
         )
     candidates = [(grid[-1], whole[-1].real)]
     for k in np.flatnonzero(np.diff(np.sign(whole[:-1].imag))):
-        low, high = grid[k], grid[k + 1]
-        for _ in range(_ZOOMS):
-            fine = np.linspace(low, high, _POINTS)
-            values = response(fine)
-            turned = np.flatnonzero(np.diff(np.sign(values.imag)))
-            place = int(turned[0]) if len(turned) else 0
-            low, high = fine[place], fine[place + 1]
-        candidates.append((low, values[place].real))
+        crossing = brentq(lambda frequency: response(np.array([frequency]))[0].imag, grid[k], grid[k + 1])
+        candidates.append((crossing, response(np.array([crossing]))[0].real))
     frequency, depth = min(candidates, key=lambda one: one[1])
     if not depth < 0:
         raise DataError("no gain makes this loop oscillate: state its interval and the delay of the sensor")

@@ -1,5 +1,6 @@
 """JAX as the command needs it: double precision, and compiled functions kept between calls."""
 
+import itertools
 import os
 import stat
 from contextlib import suppress
@@ -71,19 +72,15 @@ def _open_to_others(folder: Path) -> tuple[str, str] | None:
         if not stat.S_ISLNK(mode) and mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
             return f"anyone can write to {place}", f"run chmod o-w {place}"
     remedy = f"delete {folder}, which is then made anew for you alone"
-    whole = real.stat()
-    if whole.st_uid != os.geteuid():
-        return f"{real} belongs to another user", remedy
-    if whole.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return f"other users can write to {real}", remedy
-    enterable = whole.st_mode & (stat.S_IXGRP | stat.S_IXOTH)
-    for above, folders, files in os.walk(real):
-        for path in (os.path.join(above, name) for name in (*folders, *files)):
-            with suppress(FileNotFoundError):  # deleted by another process of the user
-                found = os.lstat(path)
-                if found.st_uid != os.geteuid():
-                    return f"{path} belongs to another user", remedy
-                loose = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not stat.S_ISLNK(found.st_mode)
-                if enterable and loose:
-                    return f"other users can write to {path}", remedy
+    others = stat.S_IWGRP | stat.S_IWOTH
+    enterable = real.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH)
+    inside = (os.path.join(above, name) for above, folders, files in os.walk(real) for name in (*folders, *files))
+    for path in itertools.chain([str(real)], inside):
+        with suppress(FileNotFoundError):  # deleted by another process of the user
+            found = os.lstat(path)
+            if found.st_uid != os.geteuid():
+                return f"{path} belongs to another user", remedy
+            loose = found.st_mode & others and not stat.S_ISLNK(found.st_mode)
+            if loose and (enterable or path == str(real)):
+                return f"other users can write to {path}", remedy
     return None

@@ -15,6 +15,7 @@ from fits.io._record import Record
 
 # Range of each quantity, by name: lowest and highest value.
 Ranges = dict[str, tuple[float, float]]
+AnyRanges = Mapping[str, tuple[float, float]]
 
 UNITS = {
     "voltage": "V",
@@ -144,7 +145,7 @@ def reached_in(report: Mapping[str, Any]) -> Ranges:
     return joined(found)
 
 
-def joined(ranges: Iterable[Mapping[str, tuple[float, float]]]) -> Ranges:
+def joined(ranges: Iterable[AnyRanges]) -> Ranges:
     """The smallest ranges that hold all of several."""
     found: Ranges = {}
     for one in ranges:
@@ -154,9 +155,7 @@ def joined(ranges: Iterable[Mapping[str, tuple[float, float]]]) -> Ranges:
     return found
 
 
-def allowed(
-    reached: Mapping[str, tuple[float, float]], stated: Mapping[str, tuple[float, float]], margin: float
-) -> Ranges:
+def allowed(reached: AnyRanges, stated: AnyRanges, margin: float) -> Ranges:
     """Limits: what a user stated, or else what the records reached.
 
     Of what has no sign that matters, the larger size counts both ways. A predicted quantity may go by `margin` of its
@@ -178,13 +177,10 @@ def allowed(
     return found
 
 
-def compared(
-    predicted: Mapping[str, tuple[float, float]], limits: Mapping[str, tuple[float, float]]
-) -> tuple[Extreme, ...]:
+def compared(predicted: AnyRanges, limits: AnyRanges) -> tuple[Extreme, ...]:
     """What is predicted beside its limits, for all that is limited."""
-    return tuple(
-        Extreme(name, *predicted[name], *limits[name]) for name in UNITS if name in predicted and name in limits
-    )
+    both = [name for name in UNITS if name in predicted and name in limits]
+    return tuple(Extreme(name, *predicted[name], *limits[name]) for name in both)
 
 
 def beyond(extremes: Iterable[Extreme]) -> tuple[Extreme, ...]:
@@ -194,9 +190,9 @@ def beyond(extremes: Iterable[Extreme]) -> tuple[Extreme, ...]:
 
 def check_command(
     source: str,
-    predicted: Mapping[str, tuple[float, float]],
-    reached: Mapping[str, tuple[float, float]],
-    stated: Mapping[str, tuple[float, float]],
+    predicted: AnyRanges,
+    reached: AnyRanges,
+    stated: AnyRanges,
     margin: float,
     spared: Collection[str] = (),
 ) -> list[str]:
@@ -251,7 +247,7 @@ def _below(value: float) -> str:
     return f"{-float(_above(-value)):.4g}"
 
 
-def ranges_json(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
+def ranges_json(ranges: AnyRanges) -> dict[str, list[float]]:
     """Ranges as a model file keeps them, each under its name with the unit, as in `velocity_um_per_s`."""
     return {_key(name): [float(low), float(high)] for name, (low, high) in ranges.items()}
 

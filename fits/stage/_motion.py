@@ -11,7 +11,7 @@ import numpy as np
 from fits.io._limits import Ranges, joined, measured_ranges
 from fits.io._record import Record
 from fits.loop._run import Run, prepare_run
-from fits.stage._run import gain_ahead, place_of_hysteresis
+from fits.stage._run import place_of_hysteresis, range_of
 from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
 
 # Steps in a period of the resonance: a sampled sine misses less than 2 % of its peak.
@@ -125,15 +125,13 @@ def predicted_ranges(
     """
     ranges = measured_ranges(replace(program, displacement_um=displacement_um))
     stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
-    law = next((law for law in map(innermost, stage.parts) if isinstance(law, Preisach)), None)
-    if law is None or len(program) < 2:
+    range_V = range_of(stage)
+    if not np.isfinite(range_V[0]) or len(program) < 2:
         return ranges
     rings = fine_steps(stage, float(np.median(np.diff(program.time_s))), len(program)) > 1
     if not (rings or every):
         return ranges
-    gain = gain_ahead(stage) or 1.0
-    ends = float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
-    between, _ = motion(stage, program, ends, initial)
+    between, _ = motion(stage, program, range_V, initial)
     return joined([between, ranges]) if every else joined([ranges, {"displacement": between["displacement"]}])
 
 

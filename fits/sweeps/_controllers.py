@@ -40,20 +40,8 @@ class Controllers(eqx.Module):
     """Controllers of one kind that differ in some numbers, whose names in the sweep begin with `controller.`.
 
     What is found by the stage or the reference is found for the nominal ones: those differ from row to row, and the
-    controller does not know of it.
-
-    Attributes
-    ----------
-    kind
-        One of `microid.CONTROLLERS`.
-    numbers
-        Those of a row where they do not vary. What the controller finds by its plant is left out.
-    interval_s
-        Between two samples.
-    plant
-        The nominal one; None where the controller needs to find nothing by it.
-    delay
-        Samples by which readings are late.
+    controller does not know of it. `numbers` are those of a row where they do not vary, without what the controller
+    finds by the nominal plant; that is None where it needs to find nothing. Readings are late by `delay` samples.
     """
 
     kind: type[AbstractController] = eqx.field(static=True)
@@ -87,13 +75,7 @@ def _parameter(setting: Setting, nominal: float, interval_s: float) -> Parameter
 
 
 def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, reference: Program) -> Controllers:
-    """Read the table `[controller]` of a sweep, for the nominal stage, its memory, and what it is to follow.
-
-    Raises
-    ------
-    DataError
-        For the first thing that is not as it should be.
-    """
+    """Read the table `[controller]` of a sweep, for the nominal stage, its memory, and what it is to follow."""
     name = given.get("kind", "pid")
     if not isinstance(name, str) or name not in CONTROLLERS:
         raise DataError(

@@ -4,18 +4,20 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array, Float, Int
+from msgspec import Meta
 
 from fits.io._errors import DataError, shown
 from fits.io._plausible import SHORTEST_STEP_s
 from fits.io._read_csv import read_csv, read_reference
 from fits.io._table import open_table
-from fits.io._typed import check_keys
+from fits.io._typed import check_keys, typed
 from fits.io._units import recognise
 from fits.sweeps._devices import by_rows, place
 from fits.sweeps._toml import in_a_file, number
@@ -31,10 +33,24 @@ SHAPES: dict[str, tuple[str, ...]] = {
     "file": (),
 }
 _DEFAULTS = {"frequency_Hz": 10.0, "frequency_end_Hz": 100.0, "phase_rad": 0.0, "step_s": 0.0}
-_UNITS = {"frequency_Hz": "Hz", "frequency_end_Hz": "Hz", "phase_rad": "rad", "step_s": "s"}
+_UNITS = {"frequency_Hz": "Hz", "frequency_end_Hz": "Hz", "phase_rad": "rad", "step_s": "s", "gain": "1"}
 _SAMPLES, _LONGEST_s = 10_000_000, 1e4
 # Samples that differ by less from even intervals, as a fraction of one, count as even.
 _EVEN = 1e-3
+
+
+class _Times(msgspec.Struct):
+    """When a signal of a shape is sampled."""
+
+    samples: Annotated[int, Meta(ge=3, le=_SAMPLES, description=f"a number from 3 to {_SAMPLES:,}")] = 1000
+    interval_s: Annotated[
+        float,
+        Meta(
+            ge=SHORTEST_STEP_s,
+            le=_LONGEST_s,
+            description=f"a time from {SHORTEST_STEP_s:g} to {_LONGEST_s:g} s",
+        ),
+    ] = 1e-4
 
 
 @dataclass(frozen=True)
@@ -61,20 +77,17 @@ class Program:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """What may be varied."""
-        names = (f"offset_{self.unit}", f"amplitude_{self.unit}", *SHAPES[self.shape])
-        if self.shape == "file":
-            names = (f"offset_{self.unit}", "gain")
         lower = {"frequency_Hz": 0.0, "frequency_end_Hz": 0.0}
         upper = {"step_s": self.last_s}
         return tuple(
             Parameter(
                 f"{self.table}.{name}",
-                _UNITS.get(name, "1" if name == "gain" else self.unit),
-                dict(self.nominal)[name],
+                _UNITS.get(name, self.unit),
+                nominal,
                 lower.get(name, -math.inf),
                 upper.get(name, math.inf),
             )
-            for name in names
+            for name, nominal in self.nominal
         )
 
     def signal(self, values: Mapping[str, Float[Array, ""]], given: Float[Array, " t"] | None) -> Float[Array, " t"]:
@@ -112,24 +125,17 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
     shape = table.get("shape", "file" if "file" in table else None)
     if not isinstance(shape, str) or shape not in SHAPES:
         raise DataError(f"{name}.shape: expected one of {', '.join(SHAPES)}, found {shown(shape)}; choose one.")
-    own = [f"offset_{unit}", f"amplitude_{unit}", *SHAPES[shape]]
-    known = ["shape", "samples", "interval_s", *own]
-    if shape == "file":
-        known = ["shape", "file", f"offset_{unit}", "gain"]
-    check_keys(table, known, name)
-    if shape == "file":
-        return _from_file(table, name, unit, load)
-    nominal = {f"offset_{unit}": 0.0, f"amplitude_{unit}": 1.0} | {key: _DEFAULTS[key] for key in SHAPES[shape]}
+    nominal = {f"offset_{unit}": 0.0, "gain": 1.0}
+    if shape != "file":
+        nominal = {f"offset_{unit}": 0.0, f"amplitude_{unit}": 1.0} | {key: _DEFAULTS[key] for key in SHAPES[shape]}
+    times = ("file",) if shape == "file" else _Times.__struct_fields__
+    check_keys(table, ["shape", *times, *nominal], name)
     nominal |= {key: number(table[key], f"{name}.{key}") for key in nominal if key in table}
-    samples = table.get("samples", 1000)
-    if isinstance(samples, bool) or not isinstance(samples, int) or not 3 <= samples <= _SAMPLES:
-        raise DataError(f"{name}.samples: expected a number from 3 to {_SAMPLES:,}, found {shown(samples)}.")
-    interval = number(table.get("interval_s", 1e-4), f"{name}.interval_s")
-    if not SHORTEST_STEP_s <= interval <= _LONGEST_s:
-        raise DataError(
-            f"{name}.interval_s: expected a time from {SHORTEST_STEP_s:g} to {_LONGEST_s:g} s, found {interval:g}."
-        )
-    program = Program(name, unit, shape, samples, interval, tuple(nominal.items()))
+    if shape == "file":
+        given, interval_s = _read_signal(table.get("file"), name, unit, load)
+        return Program(name, unit, shape, len(given), interval_s, tuple(nominal.items()), given)
+    even = typed({key: table[key] for key in times if key in table}, _Times, name)
+    program = Program(name, unit, shape, even.samples, even.interval_s, tuple(nominal.items()))
     for parameter in program.parameters:
         value = dict(nominal)[parameter.name.removeprefix(f"{name}.")]
         if not parameter.lower <= value <= parameter.upper:
@@ -140,17 +146,15 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
     return program
 
 
-def _from_file(table: Mapping[str, Any], name: str, unit: str, load: Callable[[str], bytes]) -> Program:
-    path = table.get("file")
+def _read_signal(path: Any, name: str, unit: str, load: Callable[[str], bytes]) -> tuple[FloatArray, float]:
+    """The signal of a file, and its interval."""
     if not isinstance(path, str):
         raise DataError(f"{name}.file: expected the name of a CSV file, found {shown(path)}; give one.")
     time_s, given = in_a_file(load(path), path, _read_voltage if unit == "V" else _read_displacement)
     interval = np.diff(time_s)
     if np.ptp(interval) > _EVEN * np.mean(interval):
         raise DataError(f"{name}.file: {path} is not sampled evenly, which a sweep needs; resample it.")
-    nominal = {f"offset_{unit}": 0.0, "gain": 1.0}
-    nominal |= {key: number(table[key], f"{name}.{key}") for key in nominal if key in table}
-    return Program(name, unit, "file", len(given), float(np.mean(interval)), tuple(nominal.items()), given)
+    return given, float(np.mean(interval))
 
 
 def _needs(path: Path, *columns: str) -> None:

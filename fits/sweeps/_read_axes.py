@@ -17,7 +17,7 @@ from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
 from fits.sweeps._toml import number
 from fits.sweeps._types import Parameter, check_plain, code_of
 
-_PREFIXES = {"": 0, "k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
+_PREFIXES = {"k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
 _BASES = ("s", "V", "m", "Hz", "Pa", "rad")
 _MOST = 2**62
 # Values of a grid are held at once.
@@ -204,14 +204,16 @@ def _factor(unit: str | None, wanted: str, place: str, name: str) -> float:
     """What takes a unit to the parameter's own."""
     if unit is None or unit == wanted:
         return 1.0
-    plain = unit.replace("µ", "u").replace("μ", "u")
-    for mine, power in _PREFIXES.items():
-        for other, wanted_power in _PREFIXES.items():
-            base = plain.removeprefix(mine)
-            prefixed = plain.startswith(mine) and wanted == other + base
-            if prefixed and base in _BASES:
-                return float(10.0 ** (power - wanted_power))
-    raise DataError(f"{place}: {name} is in {wanted}, found {shown(unit)}; convert the values.")
+    (power, base), (own, other) = _split(unit.replace("µ", "u").replace("μ", "u")), _split(wanted)
+    if base != other or base not in _BASES:
+        raise DataError(f"{place}: {name} is in {wanted}, found {shown(unit)}; convert the values.")
+    return float(10.0 ** (power - own))
+
+
+def _split(unit: str) -> tuple[int, str]:
+    """Power of ten of a unit's prefix, and the unit without it."""
+    prefixed = unit[:1] in _PREFIXES and unit[1:] in _BASES
+    return (_PREFIXES[unit[0]], unit[1:]) if prefixed else (0, unit)
 
 
 def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:

@@ -7,28 +7,35 @@ from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from msgspec import Meta
 
 from fits.io._errors import DataError, shown
 from fits.io._read_csv import read_csv
 from fits.io._record import Record
-from fits.io._typed import check_keys
+from fits.io._typed import typed
 from fits.io._units import parse_columns
 from fits.loop._run import INITIAL_STATES
 from fits.sweeps._devices import place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
-from fits.sweeps._toml import number
 from fits.sweeps._types import Block, Parameter, Request
 from microid import Stage
 
-_KEYS = ("files", "columns", "noise_um")
 _NOISE = "records.noise_um"
 # Options of what is done with records.
 Holdout = Annotated[float, Meta(ge=0, le=0.9, description="a share between 0 and 0.9")]
 _Word = Literal["unknown", "negative", "positive", "demagnetised"]
 Initial = Annotated[_Word | None, Meta(description=f"one of {', '.join(INITIAL_STATES)}")]
+
+
+class _Table(msgspec.Struct):
+    """The table `[records]`."""
+
+    files: Annotated[str | None, Meta(description="a pattern such as data/*.csv")] = None
+    columns: str = ""
+    noise_um: Annotated[float, Meta(ge=0, le=1e30, description="0 um or more")] = 0.01
 
 
 @dataclass(frozen=True)
@@ -94,20 +101,16 @@ class Simulated:
 
 def requested_records(request: Request) -> Files | Simulated:
     """What a sweep says of its records; a `DataError` says what is wrong with it."""
-    table = request.table.get("records", {})
-    check_keys(table, _KEYS, "records")
-    if "files" not in table:
+    table = typed(request.table.get("records", {}), _Table, "records")
+    pattern = table.files
+    if pattern is None:
         stage, initial = requested_stage(request)
         program = read_program(request.table.get("program", {"shape": "sine"}), "program", "V", request.load)
-        noise = number(table.get("noise_um", 0.01), "records.noise_um")
-        if noise < 0:
-            raise DataError(f"records.noise_um: expected 0 um or more, found {noise:g}; correct it.")
-        return Simulated(stage, program, initial, noise)
+        return Simulated(stage, program, initial, table.noise_um)
     for key in ("model", "program"):
         if key in request.table:
             raise DataError(f"{key}: records come from files here; leave out {key}, or records.files.")
-    pattern = table["files"]
-    if not isinstance(pattern, str) or os.path.isabs(pattern) or request.folder is None:
+    if os.path.isabs(pattern) or request.folder is None:
         raise DataError(f"records.files: expected a pattern such as data/*.csv, found {shown(pattern)}; correct it.")
     try:
         files = [path for path in request.folder.glob(pattern) if path.is_file()]
@@ -118,7 +121,7 @@ def requested_records(request: Request) -> Files | Simulated:
         ) from None
     if not names:
         raise DataError(f"records.files: the axis is empty: no file matches {pattern}; correct the pattern.")
-    return Files(request.folder, names, parse_columns(str(table.get("columns", ""))))
+    return Files(request.folder, names, parse_columns(table.columns))
 
 
 def assumed_initial(request: Request, records: Files | Simulated) -> str:

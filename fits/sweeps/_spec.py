@@ -5,7 +5,6 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +14,7 @@ from msgspec import Meta
 
 from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_CSV_BYTES, MOST_TOML_BYTES, parse_toml, read_bytes, read_text
-from fits.io._typed import typed
+from fits.io._typed import check_keys, typed
 from fits.sweeps import kinds
 from fits.sweeps._axes import Plan
 from fits.sweeps._read_axes import read_plan
@@ -81,13 +80,7 @@ class Sweep:
 
 
 def read_sweep(path: str | os.PathLike[str]) -> Sweep:
-    """Read a sweep and all files it names.
-
-    Raises
-    ------
-    DataError
-        For the first thing that is not as it should be.
-    """
+    """Read a sweep and all files it names; a `DataError` says what is not as it should be."""
     name = os.fspath(path)
     text = read_text(path, "the TOML of a sweep, such as 'microid sweep --example simulate' prints", MOST_TOML_BYTES)
     folder = Path(path).resolve().parent
@@ -132,12 +125,8 @@ def _sweep(
         raise DataError(f"kind: expected one of {', '.join(kinds.names())}, found {shown(kind)}; choose one.")
     made_by = kinds.kind(kind)
     tables = made_by.KEYS
+    check_keys(table, [*_COMMON, *tables], "")
     for key in table:
-        known = [*_COMMON, *tables]
-        if key not in known:
-            close = get_close_matches(key, known, n=1, cutoff=0.5)
-            meant = f"did you mean {close[0]}?" if close else f"use some of {', '.join(known)}."
-            raise DataError(f"{key}: expected a known key, found {shown(key)}; {meant}")
         if key in tables and key not in _NO_TABLES and not isinstance(table[key], dict):
             raise DataError(f"{key}: expected a table, found {shown(table[key])}; write [{key}] and its keys below.")
     seed = table.get("seed", 0)

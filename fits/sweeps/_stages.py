@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits.control._tune import parameter_values
 from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
 from fits.sweeps._devices import by_rows
@@ -76,32 +77,28 @@ def requested_stage(request: Request) -> tuple[Stage, str]:
 
 def stage_parameters(stage: Stage) -> tuple[Parameter, ...]:
     """Everything about a stage that can be varied, by its name in the stage."""
-    leaves = _leaves(stage)
-    found = []
+    values, found = parameter_values(stage), []
     for info in parameter_table(stage):
-        value = leaves[info.path]
-        nominal = float(value) if info.shape == () else math.nan
-        spec = info.spec
+        nominal, spec = float(values[info.path]) if info.shape == () else math.nan, info.spec
         found.append(Parameter(stage.named(info.path), spec.unit, nominal, spec.lower, spec.upper))
     return tuple(found)
 
 
-def varied(stage: Stage, values: Mapping[str, Float[Array, ""]], relative: Sequence[str]) -> Stage:
-    """Return a stage with other values of some parameters; those that are relative are multiplied by theirs."""
-    paths = [info.path for info in parameter_table(stage) if stage.named(info.path) in values]
-    if not paths:
-        return stage
-    leaves, treedef = jax.tree_util.tree_flatten_with_path(stage)
-    changed = []
-    for path, leaf in leaves:
-        name = jax.tree_util.keystr(path).lstrip(".")
-        if name in paths:
-            value = values[stage.named(name)]
-            factor = jnp.reshape(value, value.shape + (1,) * (leaf.ndim - value.ndim))
-            changed.append(leaf * factor if stage.named(name) in relative else jnp.asarray(value, leaf.dtype))
-        else:
-            changed.append(leaf)
-    found: Stage = jax.tree_util.tree_unflatten(treedef, changed)
+def varied(stage: Stage, values: Mapping[str, Float[Array, "..."]], relative: Sequence[str]) -> Stage:
+    """Return a stage with other values of some parameters; those that are relative are multiplied by theirs.
+
+    Values may have rows, if all arrays of the stage have an axis for them in front.
+    """
+    names = {info.path: stage.named(info.path) for info in parameter_table(stage)}
+
+    def changed(path: Any, leaf: Any) -> Any:
+        name = names.get(jax.tree_util.keystr(path).lstrip("."), "")
+        if name not in values:
+            return leaf
+        factor = jnp.reshape(values[name], jnp.shape(values[name]) + (1,) * (leaf.ndim - jnp.ndim(values[name])))
+        return leaf * factor if name in relative else jnp.asarray(values[name], leaf.dtype)
+
+    found: Stage = jax.tree_util.tree_map_with_path(changed, stage)
     return found
 
 
@@ -137,8 +134,3 @@ def memory_before(stage: Stage, initial: str) -> Staircase | None:
     if initial == "positive":
         return positive_saturation(*limits, 2)
     return demagnetised(*limits, size=_EXTREMES)
-
-
-def _leaves(stage: Stage) -> dict[str, Array]:
-    found, _ = jax.tree_util.tree_flatten_with_path(stage)
-    return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in found if eqx.is_inexact_array(leaf)}

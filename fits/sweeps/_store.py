@@ -88,7 +88,9 @@ class Store:
                     attributes |= {"flag_values": [0, 1, 2], "flag_meanings": " ".join(STATUS_WORDS)}
                 array.attrs.update(attributes | {"_ARRAY_DIMENSIONS": ["row", *(name for name, _ in variable.dims)]})
             for name, (axis, unit, values) in self.sweep.facts.coordinates.items():
-                self._coordinate(group, name, axis, unit, np.asarray(values))
+                array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype)
+                array[:] = values
+                array.attrs.update({"units": unit, "_ARRAY_DIMENSIONS": [axis]})
             swept = [axis.parameter for axis in self.sweep.plan.axes]
             about = self._about()
             group.attrs.update(about | ({"coordinates": " ".join(swept)} if swept else {}))
@@ -96,11 +98,6 @@ class Store:
             atomic_write_text(self.folder / TEXT, self.sweep.text)
             # Last: a folder without it holds no sweep yet.
             atomic_write_text(self.folder / ABOUT, json.dumps(about, indent=1) + "\n")
-
-    def _coordinate(self, group: Any, name: str, axis: str, unit: str, values: np.ndarray) -> None:
-        array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype)
-        array[:] = values
-        array.attrs.update({"units": unit, "_ARRAY_DIMENSIONS": [axis]})
 
     def _about(self) -> dict[str, Any]:
         return {
@@ -129,13 +126,10 @@ class Store:
         try:
             json.loads((self.folder / RESULTS / ".zmetadata").read_text(encoding="utf-8"))
             arrays = {variable: self._open()[variable.name] for variable in self.variables}
+            rows = len(self.sweep.plan)
             return (self.folder / LEDGER).is_dir() and all(
-                (array.shape, array.chunks, array.dtype)
-                == (
-                    (len(self.sweep.plan), *variable.shape),
-                    (size, *variable.shape),
-                    np.dtype(variable.dtype),
-                )
+                (array.shape, array.chunks) == ((rows, *variable.shape), (size, *variable.shape))
+                and array.dtype == np.dtype(variable.dtype)
                 for variable, array in arrays.items()
             )
         except Exception:
@@ -251,9 +245,7 @@ def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
         store = Store(sweep, folder)
         with _sentences(folder):
             store.clear()
-        if not (folder / ABOUT).exists():
-            store.create()
-        elif not store.sound():
+        if not ((folder / ABOUT).exists() and store.sound()):
             store = Store(sweep, folder)
             store.create()
         yield store

@@ -21,22 +21,10 @@ STATUS_WORDS = ("pending", "done", "failed")
 
 @dataclass(frozen=True)
 class Parameter:
-    """Something a sweep may vary.
+    """Something a sweep may vary, such as `mechanics.natural_frequency_Hz`; the unit is `"1"` where there is none.
 
-    Attributes
-    ----------
-    name
-        With its unit as suffix, such as `mechanics.natural_frequency_Hz`.
-    unit
-        `"1"` where there is none.
-    nominal
-        What it is where the sweep says nothing; NaN for an array, which can only be varied relative to itself.
-    lower, upper
-        Bounds. A row outside fails with a reason.
-    words
-        Those it may be, where it is a choice: a word goes through a sweep as its place among them.
-    whole
-        Whether it is a whole number.
+    An array has a nominal value of NaN: it is only varied relative to itself. A row outside the bounds fails with a
+    reason. Where it is one of some words, its values are places among them.
     """
 
     name: str
@@ -85,16 +73,10 @@ def check_plain(parameter: Parameter, values: FloatArray | None, relative: bool,
 
 @dataclass(frozen=True)
 class Output:
-    """One number, text or trace per row.
+    """One number, text or trace per row, whose name ends in its unit.
 
-    Attributes
-    ----------
-    name, unit, meaning
-        The name ends in the unit.
-    dims
-        Axes beside that of the rows, by name and length.
-    dtype
-        `"f8"`, `"i4"`, or a text of fixed width such as `"U80"`.
+    It may have axes beside that of the rows, by name and length, and is `"f8"`, `"i4"`, or a text of fixed width such
+    as `"U80"`.
     """
 
     name: str
@@ -136,23 +118,12 @@ class Rows:
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known of a job before it runs.
+    """What is known of a job before it runs: all that may be varied, and all that comes out.
 
-    Attributes
-    ----------
-    parameters
-        All that may be varied.
-    outputs
-        All that comes out.
-    block
-        Rows that one device computes together. A row's numbers may depend on its place in the block, and on nothing
-        else of the rows beside it.
-    sources
-        Names of the rows there are by themselves, such as files; without them only the axes make rows.
-    coordinates
-        Values along the outputs' own axes: name to axis, unit and values.
-    alone
-        Whether rows go one by one, on one device whatever the number of devices.
+    So many rows as there are in a block are computed together by one device. A row's numbers may depend on its place
+    in the block, and on nothing else of the rows beside it; rows that go `alone` are on one device whatever the
+    number of devices. Sources are names of the rows there are by themselves, such as files; without them only the
+    axes make rows. Coordinates are values along the outputs' own axes: name to axis, unit and values.
     """
 
     parameters: tuple[Parameter, ...]
@@ -165,20 +136,9 @@ class Facts:
 
 @dataclass(frozen=True)
 class Block:
-    """Rows that are computed together, `n` in all.
+    """Rows that are computed together: values, numbers in the sweep, and places among the sources, shape `(n,)` each.
 
-    Attributes
-    ----------
-    values
-        Swept parameters by name, in their own units, shape `(n,)`.
-    relative
-        Names of those that are factors.
-    rows
-        Their numbers in the sweep, shape `(n,)`; numbers of filling are repeated.
-    sources
-        Which of `Facts.sources` each has, shape `(n,)`.
-    seed
-        Of the sweep.
+    The values are by parameter, in their own units, but for those that are factors. Rows of filling are repeated.
     """
 
     values: dict[str, FloatArray]
@@ -198,16 +158,9 @@ class Block:
 
 @dataclass(frozen=True)
 class Request:
-    """What a job is made from.
+    """What a job is made from: the sweep as TOML gives it, and what gives the content of a file by its name in it.
 
-    Attributes
-    ----------
-    table
-        The sweep as TOML gives it.
-    load
-        Gives the content of a file by its name in the sweep.
-    folder
-        Where patterns of file names start; None on a worker, where `sources` are given.
+    Patterns of file names start in the folder; it is None where there are none.
     """
 
     table: Mapping[str, Any]

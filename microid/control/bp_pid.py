@@ -139,6 +139,9 @@ class BPPID(AbstractController):
     @classmethod
     def of(cls, pid: PID, numbers: Mapping[str, Any], plant: ControlledPlant | None) -> Self:
         """Make it around a PID controller, with random weights; see `around`."""
+        gains = (pid.proportional_V_per_um, pid.integral_V_per_um_s, pid.derivative_V_s_per_um)
+        if not any(isinstance(gain, jax.core.Tracer) for gain in gains) and min(map(float, gains)) <= 0:
+            raise ValueError("expected three gains above 0 to learn around, found one of 0")
         others = dict(numbers)
         key = jax.random.key(jnp.asarray(others.pop("seed"), dtype=int))
         return cls.around(pid, key, others.pop("span"), **others)
@@ -161,18 +164,15 @@ class BPPID(AbstractController):
         Raises
         ------
         ValueError
-            If the span is not above one, or a gain not above zero.
+            If the span is not above one.
         """
         if not isinstance(span, jax.core.Tracer) and not span > 1:
             raise ValueError(f"span must be above 1, got {span}")
-        gains = (pid.proportional_V_per_um, pid.integral_V_per_um_s, pid.derivative_V_s_per_um)
-        if not any(isinstance(gain, jax.core.Tracer) for gain in gains) and min(map(float, gains)) <= 0:
-            raise ValueError("expected three gains above 0 to learn around, found one of 0")
         kind = pid.proportional_V_per_um.dtype
         hidden, output = jax.random.uniform(key, (2, 3, 3), kind, -0.5, 0.5)
         share = (1 - 1 / span) / (span - 1 / span)
         threshold = jnp.full(3, -jnp.log(share / (1 - share)) / 2, kind)
-        ends = jnp.asarray(jnp.stack([jnp.asarray(1 / span), jnp.asarray(span)]), kind)
+        ends = jnp.asarray([1 / span, span], kind)
         gain = pid.proportional_V_per_um
         return cls(
             GainNetwork(hidden, jnp.zeros(3, kind), output, threshold),

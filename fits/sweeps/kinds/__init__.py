@@ -20,7 +20,7 @@ def kind(name: str) -> Any:
     return importlib.import_module(f"{__name__}.{name}")
 
 
-def examples() -> dict[str, str]:
-    """Examples of sweeps that run as they are, by their kinds."""
+def examples() -> dict[str, Path]:
+    """Files of examples that run as they are, by their kinds."""
     files = {name: Path(__path__[0]) / f"{name}.toml" for name in names()}
-    return {name: file.read_text(encoding="utf-8") for name, file in files.items() if file.exists()}
+    return {name: file for name, file in files.items() if file.exists()}

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from fits.control._tune_start import major_loop_slope
 from fits.sweeps._controllers import Controllers, read_controllers
 from fits.sweeps._devices import block_rows, by_rows, in_turn, place
 from fits.sweeps._programs import Program, drive, read_program
@@ -46,7 +47,7 @@ _STEP = (
 _LOST_PCT = 1e4
 # References that move by less stand still.
 _STILL_um = 1e-9
-# Voltages between two switching voltages at which the slope of a hysteresis is looked at.
+# Voltages per level at which the slope of a hysteresis is looked at.
 _FINE = 8
 
 
@@ -147,18 +148,8 @@ def _radius(
 
     def one(values: Mapping[str, Float[Array, ""]]) -> Float[Array, ""]:
         changed = varied(stage, values, relative)
-        linear = controllers.at(values).linear()
-        return margins(linear, changed, delay=controllers.delay, slope_um_per_V=_slope(changed)).radius
+        slopes = [major_loop_slope(part, _FINE) for part in changed.parts if isinstance(part, Preisach)]
+        linear, slope = controllers.at(values).linear(), slopes[0] if slopes else None
+        return margins(linear, changed, delay=controllers.delay, slope_um_per_V=slope).radius
 
     return jax.vmap(one)(values)
-
-
-def _slope(stage: Stage) -> Float[Array, ""] | None:
-    """Slope in um/V of a hysteresis where it is steepest, somewhere on its major loop."""
-    for part in stage.parts:
-        if isinstance(part, Preisach):
-            lower, upper = part.density.lower_V, part.density.upper_V
-            rise = jnp.linspace(lower, upper, _FINE * part.density.levels)
-            output = part(jnp.append(rise, rise[::-1]))
-            return jnp.max(jnp.abs(jnp.diff(output))) / (rise[1] - rise[0])
-    return None
