@@ -10,7 +10,7 @@ from matplotlib.text import Text
 
 import fits
 import fits.plots._sensitivity
-from fits.plots._sensitivity import _apart
+from fits.plots._sensitivity import _spaced
 
 LEG = {"alpha1": "la1", "alpha2": "la2", "alpha3": "la3"}
 AXES = ("z", "alpha", "gamma")
@@ -166,8 +166,8 @@ def test_a_stage_without_tolerances_and_a_folder_that_is_missing(tmp_path):
 
 def test_labels_move_apart_by_no_more_than_they_must(rng):
     wanted = np.sort(rng.normal(size=8))
-    found = _apart(wanted, 0.5)
+    found = _spaced(wanted, 0.5)
     assert np.all(np.diff(found) > 0.5 - 1e-12)
     # The mean of labels that push each other stays; those far from all others do not move.
     assert found.mean() == pytest.approx(wanted.mean())
-    np.testing.assert_allclose(_apart(10 * np.arange(4.0), 0.5), 10 * np.arange(4.0))
+    np.testing.assert_allclose(_spaced(10 * np.arange(4.0), 0.5), 10 * np.arange(4.0))
