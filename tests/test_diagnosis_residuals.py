@@ -14,7 +14,15 @@ from fits import Record
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._projector import Projector, smoothed
 from fits.diagnosis._regression import Regression
-from fits.diagnosis._residual_tests import View, _bands, cycles, irregular, look, together, views
+from fits.diagnosis._residual_tests import (
+    Regressors,
+    _bands,
+    cycles,
+    explain,
+    explain_together,
+    irregular,
+    run_regressors,
+)
 from fits.stats._narrow_band import Band
 from fits.stats._whiten import Noise
 
@@ -36,23 +44,28 @@ def test_regressors_explain_what_least_squares_does(rng):
     known = np.linalg.qr(rng.standard_normal((sum(lengths), 2)))[0]
     residual = rng.standard_normal(sum(lengths)) + 0.2 * np.concatenate(columns[2])
     residual -= known @ (known.T @ residual)
-    view = View("any", tuple(map(tuple, columns)), "")
-    (seen,) = look(plain_projector(lengths), known, residual, [view])
+    view = Regressors("any", tuple(map(tuple, columns)), "")
+    (seen,) = explain(plain_projector(lengths), known, residual, [view])
     design = np.column_stack([*(np.concatenate(column) for column in columns), known])
     left = residual - design @ np.linalg.lstsq(design, residual, rcond=None)[0]
     assert seen.drop == pytest.approx(residual @ residual - left @ left, rel=1e-9)
     assert (seen.freedom, seen.p) == (5, pytest.approx(stats.chi2.sf(seen.drop, 5)))
-    both = together(
-        plain_projector(lengths), known, residual, [View("a", view.columns[:3], ""), View("b", view.columns[3:], "")]
+    both = explain_together(
+        plain_projector(lengths),
+        known,
+        residual,
+        [Regressors("a", view.columns[:3], ""), Regressors("b", view.columns[3:], "")],
     )
     assert both == (pytest.approx(seen.drop), 5)
 
 
 def test_probabilities_of_structure_are_uniform_where_there_is_none(rng):
     lengths = (600, 800)
-    view = View("any", tuple(tuple(rng.standard_normal(n) for n in lengths) for _ in range(6)), "")
+    view = Regressors("any", tuple(tuple(rng.standard_normal(n) for n in lengths) for _ in range(6)), "")
     none = np.zeros((sum(lengths), 0))
-    found = [look(plain_projector(lengths), none, rng.standard_normal(sum(lengths)), [view])[0].p for _ in range(300)]
+    found = [
+        explain(plain_projector(lengths), none, rng.standard_normal(sum(lengths)), [view])[0].p for _ in range(300)
+    ]
     assert stats.kstest(found, "uniform").pvalue > 1e-4
 
 
@@ -81,10 +94,10 @@ def test_each_view_sees_its_own_structure(rng, name):
         "gain": place * np.cos(np.pi * 5 * time_s / time_s[-1]),
     }[name]
     residual = structure / np.std(structure) + 0.5 * rng.standard_normal(len(time_s))
-    (way,) = (one for one in views([run], [plain_um]) if one.name == name)
+    (way,) = (one for one in run_regressors([run], [plain_um]) if one.name == name)
     nothing = np.zeros((len(time_s), 0))
     (seen,), (other,) = (
-        look(plain_projector((len(time_s),)), nothing, values, [way])
+        explain(plain_projector((len(time_s),)), nothing, values, [way])
         for values in (residual, rng.standard_normal(len(time_s)))
     )
     assert seen.drop > 0.5 * len(time_s)
@@ -204,7 +217,7 @@ def test_spikes_are_taken_out_and_the_noise_is_what_is_left(rng):
     reg.baseline.runs, reg.baseline.stroke_um, reg.baseline.dynamic = (run,), 20.0, False
     reg.baseline.columns_um = np.zeros(12)
     whole = Regression(
-        reg.baseline, (run.fitted,), (0 * reg.rows[0],), reg.own, (), (clean + heights,), reg.root, ((),)
+        reg.baseline, (run.fitted,), (0 * reg.rows[0],), reg.nuisance, (), (clean + heights,), reg.root, ((),)
     )
     found = find_faults(whole)
     assert found.repaired

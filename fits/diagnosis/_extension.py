@@ -109,7 +109,7 @@ def _compare(
     for k, run in enumerate(ready.baseline.runs):
         plain = run.displacement_um - ready.regression.residuals[k]
         better = run.displacement_um - regression.residuals[k] + change[k]
-        own, using = ready.regression.own[k], run.fitted
+        own, using = ready.regression.nuisance[k], run.fitted
         found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), run.held_out))
     if ready.baseline.aside:
         behind = Bench(bench.baseline, aside=True, finest=finest)

@@ -11,7 +11,7 @@ from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._noise import find_faults
 from fits.diagnosis._projector import Projector, learn_roughness, smoothed
 from fits.diagnosis._refit import Refit, refit, relocate
-from fits.diagnosis._regression import passed, regress
+from fits.diagnosis._regression import regress, saturating
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _OFF = 1.0
@@ -219,7 +219,7 @@ def _linearised_at(
 ) -> tuple[Bench, Projector]:
     effects = [model.effects(run) for run in range(len(baseline.runs))]
     # What is finer than the grid hardly changes, but where derivatives go through effects.
-    plain = not any(projector.regression.through) and not any(map(passed, effects))
+    plain = not any(projector.regression.saturating) and not any(map(saturating, effects))
     regression = regress(baseline, projector.regression.finer if plain else None, effects)
     return Bench(regression.baseline, finest=finest), Projector(regression, projector.noise, projector.roughness)
 

@@ -6,10 +6,9 @@ from itertools import product
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import qr
 
 from fits.diagnosis._effects import Bench, Law, remembering, strength_of
-from fits.diagnosis._projector import Projector
+from fits.diagnosis._projector import Projector, orthonormal
 from fits.diagnosis._score import Scored, law_of
 from fits.io._columns import columns_beside
 from microid import AbstractEffect
@@ -134,11 +133,7 @@ class Refit:
 
     def basis(self) -> np.ndarray:
         """Orthonormal columns that span the tangent."""
-        if self.tangent.shape[1] == 0:
-            return self.tangent
-        scaled = self.tangent / (np.linalg.norm(self.tangent, axis=0) + 1e-300)
-        q, r, _ = qr(scaled, mode="economic", pivoting=True)
-        return q[:, np.abs(np.diagonal(r)) > 1e-6]
+        return orthonormal(self.tangent)
 
 
 def _strength(
