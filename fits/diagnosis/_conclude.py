@@ -29,9 +29,8 @@ from fits.diagnosis._residual_tests import (
     irregular,
     run_regressors,
 )
-from fits.diagnosis._result import Diagnosis, Gain, RunView, Test
+from fits.diagnosis._result import Diagnosis, Gain, RunView, Step, Test
 from fits.diagnosis._select import Selection
-from fits.diagnosis._steps import Step
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from microid.effects import card_of

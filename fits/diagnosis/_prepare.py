@@ -12,8 +12,8 @@ from fits.diagnosis._noise import Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness, orthonormal
 from fits.diagnosis._protocol import held_gain, is_virgin, virgin_columns
 from fits.diagnosis._regression import Regression, regress
+from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe, applicable, probes_of, rescore, scales_of, score
-from fits.diagnosis._steps import Step
 from fits.io._record import Record
 from fits.loop._run import VIRGIN
 from microid import EFFECTS, Hold, Scales, Stage

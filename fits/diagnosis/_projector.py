@@ -198,9 +198,7 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
 
 
 def learn_roughness(
-    projector: Projector,
-    candidates: Sequence[Sequence[np.ndarray]],
-    change_um: Sequence[np.ndarray] | None = None,
+    projector: Projector, candidates: Sequence[Sequence[np.ndarray]], change_um: Sequence[np.ndarray] | None = None
 ) -> tuple[float, ...]:
     """Find how rough the density is beyond its grid, from what neither the baseline nor any candidate explains.
 
