@@ -65,7 +65,7 @@ def compare_rivals(
     worth = {name: (_OF_CONFUSED if name in first.confusions else WORTH) * top for name in best}
     names = [name for name, one in best.items() if one.z > worth[name]][:_LEADERS]
     fitted: dict[str, Refit] = {}
-    bare = Projector(projector.regression, projector.noise)
+    bare = projector.bare
     before = bare.held_out_error(model.change_um)
     for name in names:
         own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)

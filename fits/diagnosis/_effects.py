@@ -101,7 +101,7 @@ def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float)
     seen = (shifted_Hz - effect.tolerance * lines_Hz) * duration_s > _PERIODS
     if seen.all():
         return effect
-    return replace(effect, **{name: getattr(effect, name) * seen.astype(float) for name in effect.strength})
+    return times(effect, seen.astype(float))
 
 
 class Law:
@@ -183,6 +183,27 @@ class Law:
         return _at(self.maps[run], jnp.asarray(self.vector(x, run)))
 
 
+def strength_of(law: Law, x: np.ndarray, run: int) -> np.ndarray:
+    effect = law.effect(x, run)
+    return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
+
+
+def remembering(law: Law, x: np.ndarray) -> Law:
+    """The same effects, what went on before the runs being unknown."""
+    return Law([law.effect(x, run) for run in range(len(law.maps))], True)
+
+
+def scaled(law: Law, x: np.ndarray, factor: float) -> Law:
+    """The same effects with larger or smaller strengths."""
+    here = [law.effect(x, run) for run in range(len(law.maps))]
+    return Law([times(effect, factor) for effect in here], law.remembers)
+
+
+def times(effect: AbstractEffect, factor: float | np.ndarray) -> AbstractEffect:
+    """The same effect with larger or smaller strengths."""
+    return replace(effect, **{name: factor * getattr(effect, name) for name in effect.strength})
+
+
 def _without_host(effect: AbstractEffect) -> AbstractEffect:
     anything = Sensor(jnp.ones(()), jnp.zeros(()))
     return replace(effect, inner=anything) if hasattr(effect, "inner") else effect  # type: ignore[call-arg]
@@ -195,13 +216,3 @@ def _free(info: ParameterInfo, closed: Sequence[str]) -> bool:
 @eqx.filter_jit
 def _at(coordinates: Coordinates[AbstractEffect], vector: Float[Array, " k"]) -> AbstractEffect:
     return coordinates(vector)
-
-
-def strength_of(law: Law, x: np.ndarray, run: int) -> np.ndarray:
-    effect = law.effect(x, run)
-    return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
-
-
-def remembering(law: Law, x: np.ndarray) -> Law:
-    """The same effects, what went on before the runs being unknown."""
-    return Law([law.effect(x, run) for run in range(len(law.maps))], True)

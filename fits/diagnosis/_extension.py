@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from fits.diagnosis._baseline import simulate, with_effects
 from fits.diagnosis._effects import Bench, at_samples
 from fits.diagnosis._prepare import Prepared
-from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
@@ -62,7 +61,7 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Exte
         stage = baseline.stage.with_substeps(plain_steps(ready))
         return Extension(stage, _compare(ready, ready.bench, None, ready.regression, (), False), ())
     # What followed along the tangent is put into the stage itself.
-    bare = Projector(found.projector.regression, found.projector.noise)
+    bare = found.projector.bare
     regression = regress(bare.move(bare.residual - bare.join(model.change_um)), ())
     effects = shared_effects(model, len(baseline.runs))
     steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))

@@ -200,9 +200,7 @@ def _profile_to(
         # One by itself has nothing beside it that is fitted again.
         only = sum(one.size for one in model.laws) == 1
         held = Law([law.effect(moved, run) for run in runs], law.remembers, () if only else (path,))
-        laws, starts = list(last.laws), list(last.x)
-        laws[which], starts[which] = held, held.start
-        there = refit(bench, projector, laws, starts, 0 if only else _ROUNDS)
+        there = refit(bench, projector, *last.with_law(which, held), 0 if only else _ROUNDS)
         found.append((there.cost, _law_of_model(there, which, law).start))
         away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR
         if 1 / _ABOUT < away < _ABOUT:

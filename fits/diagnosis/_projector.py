@@ -73,6 +73,11 @@ class Projector:
         self.residual[self.count : self.count + grid] = -root @ regression.baseline.columns_um
 
     @property
+    def bare(self) -> "Projector":
+        """The same without roughness of the density beyond its grid."""
+        return Projector(self.regression, self.noise)
+
+    @property
     def freedom(self) -> float:
         """Samples that are worth one of the unknowns: what is fitted takes so many degrees of freedom off."""
         return float(np.sum(self.orthonormal[: self.count] ** 2))

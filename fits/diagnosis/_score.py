@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._effects import Bench, Law, _without_host
+from fits.diagnosis._effects import Bench, Law, _without_host, times
 from fits.diagnosis._projector import Projector
 from fits.io._columns import columns_beside
 from fits.stage._encode import _spec
@@ -103,7 +103,7 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
             share = 1.0 if form.finite else _SHARE
-            change = [c / share for c in bench.change([_scaled(effect, share)])]
+            change = [c / share for c in bench.change([effect if form.finite else times(effect, share)])]
             if form.per_run and len(change) > 1:
                 for k in range(len(change)):
                     columns.append(tuple(c if i == k else np.zeros_like(c) for i, c in enumerate(change)))
@@ -111,12 +111,6 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
                 columns.append(tuple(change))
         if all(np.all(np.isfinite(c)) for column in columns for c in column):
             yield Probe(tuple(group), tuple(columns), one_sided(form))
-
-
-def _scaled(effect: AbstractEffect, share: float) -> AbstractEffect:
-    if share == 1.0 or not effect.strength:
-        return effect
-    return replace(effect, **{name: share * getattr(effect, name) for name in effect.strength})
 
 
 def one_sided(form: type[AbstractEffect]) -> bool:
