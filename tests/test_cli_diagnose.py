@@ -8,7 +8,7 @@ from _command import files, refused, run
 from _diagnosis import diagnosis
 
 from fits import DataError, FitError, FitStatus, read_csv
-from fits.diagnosis._steps import Step
+from fits.diagnosis._result import Step
 from fits.report._diagnosis import report_html
 
 

@@ -250,8 +250,8 @@ def test_an_effect_at_its_bound_is_a_cause_only_if_nothing_is_left(rng):
         for slope in (0.1, 0.8999)
     )
     tangent = rng.standard_normal((count, law.size))
-    assert law.pinned(law.start)
-    assert not weak.pinned(weak.start)
+    assert law.at_bound(law.start)
+    assert not weak.at_bound(weak.start)
     noise = SimpleNamespace(count=count, freedom=10.0)
     for cost, alone in ((1000.0, True), (1500.0, False)):
         one = Refit((law,), (law.start,), (), rng.standard_normal(count), tangent, cost)

@@ -12,7 +12,7 @@ from scipy.signal import fftconvolve, lsim
 from fits import Record, diagnose
 from fits.diagnosis._noise import Floor, pooled
 from fits.diagnosis._protocol import held_gain
-from fits.diagnosis._regression import _alive
+from fits.diagnosis._regression import _without_decayed
 from fits.loop import _grid as grid
 from fits.loop._evidence import Posterior
 from fits.loop._run import known_samples
@@ -124,7 +124,7 @@ def test_creep_under_a_controller(rng):
 def test_an_unknown_that_has_died_away_is_none():
     time = np.arange(2000) / 1000
     own = np.stack([np.ones(2000), np.exp(-time / 0.02), np.exp(-time / 0.5)], axis=1)
-    kept = _alive(own, time > 0.5)
+    kept = _without_decayed(own, time > 0.5)
     assert np.any(kept != 0, axis=0).tolist() == [True, False, True]
 
 

@@ -36,7 +36,7 @@ def regression(rng, lengths=(300, 400), columns=12, coordinates=3, kinds=2):
         baseline=baseline,
         masks=tuple(np.arange(n) >= 20 for n in lengths),
         rows=tuple(rng.standard_normal((n, columns + coordinates)) for n in lengths),
-        own=tuple(np.ones((n, 1)) for n in lengths),
+        nuisance=tuple(np.ones((n, 1)) for n in lengths),
         finer=tuple(tuple(rng.standard_normal((n, 5)) for n in lengths) for _ in range(kinds)),
         residuals=tuple(rng.standard_normal(n) for n in lengths),
         root=np.linalg.cholesky(prior).T,
@@ -71,7 +71,7 @@ def test_the_projection_is_generalised_least_squares(rng):
             prior.append(1 / size**2)
     for k in range(2):
         design.append(
-            np.concatenate([w @ o[:, 0] * (i == k) for i, (w, o) in enumerate(zip(white, reg.own, strict=True))])
+            np.concatenate([w @ o[:, 0] * (i == k) for i, (w, o) in enumerate(zip(white, reg.nuisance, strict=True))])
         )
         prior.append(0.0)
     design = np.stack(design, axis=1)
@@ -269,7 +269,7 @@ def test_evidence_beside_a_misfit_is_worth_less(rng):
         projector = Projector(reg, [Noise(1.0, WHITE)])
         (found,) = score(projector, [probe([(shape,)])], projector.off(projector.residual))
         assert found.z > 4
-        assert (found.sure > 0.6 * found.z) == trusted
+        assert (found.robust_z > 0.6 * found.z) == trusted
 
 
 def test_programs_make_room_where_records_are_long_and_those_of_the_host_stay(monkeypatch):

@@ -129,7 +129,7 @@ def test_what_ended_at_its_bound_is_tried_weaker_where_the_baseline_follows(way,
     stuck = at_slope(way * (0.9 - 1e-9), way * 2.0)
     freed = at_slope(way * 0.7, way * 0.7)[:2]
     monkeypatch.setattr("fits.diagnosis._joint_fit._follow", lambda *_: freed)
-    assert stuck[-1].laws[0].pinned(stuck[-1].x[0])
+    assert stuck[-1].laws[0].at_bound(stuck[-1].x[0])
     *at, model = leave_bounds(*stuck, False)
     assert float(model.laws[0].effect(model.x[0], 0).slope) == pytest.approx(way * 0.7, abs=1e-3)
     assert tuple(at) == freed

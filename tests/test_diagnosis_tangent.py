@@ -15,7 +15,7 @@ from fits.diagnosis._joint_fit import fit_jointly
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
-from fits.diagnosis._regression import passed, regress
+from fits.diagnosis._regression import regress, saturating
 from fits.loop._design import Grid
 from fits.loop._run import prepare_run
 from fits.stage._fit import default_stage
@@ -68,7 +68,7 @@ EFFECTS = {
 def test_the_tangent_goes_through_what_levels_off(name, rng):
     baseline, effect = baseline_of(rng), EFFECTS[name]
     dressed, plain = (regress(baseline, kinds, [own, own]) for kinds, own in ((None, [effect]), ((), [])))
-    assert dressed.through == ((effect,), (effect,))
+    assert dressed.saturating == ((effect,), (effect,))
     size, p = len(baseline.columns_um), len(baseline.z)
     # A smooth change of the density, and one of driver and mechanics.
     wave = np.sin(np.linspace(0, rng.uniform(2, 6), size) + rng.uniform(0, 6))
@@ -106,7 +106,7 @@ def test_what_is_finer_than_the_grid_goes_through_it_too(rng):
 
 def test_only_effects_that_level_off_ahead_of_the_mechanics_are_gone_through():
     late = TransportDelay(jnp.asarray(1e-3))
-    assert passed([*EFFECTS.values(), late]) == tuple(EFFECTS.values())
+    assert saturating([*EFFECTS.values(), late]) == tuple(EFFECTS.values())
 
 
 @pytest.mark.parametrize("effect", [TransportDelay(jnp.asarray(5e-4)), SensorLowpass(jnp.asarray(5e-4))])
@@ -224,8 +224,8 @@ def test_what_readings_at_jittering_instants_change_in_the_mean_is_followed(rng)
     off_s = jitter_s * rng.standard_normal((4000, 1))
     # In pairs that are as early as late, so that the first order is gone.
     mean = np.mean([spline(time_s + d) + spline(time_s - d) for d in off_s], axis=0) / 2
-    own = regression.own[1]
-    assert own.shape[1] == regress(replace(baseline, blurred=False)).own[1].shape[1] + 1
+    own = regression.nuisance[1]
+    assert own.shape[1] == regress(replace(baseline, blurred=False)).nuisance[1].shape[1] + 1
     inside = slice(20, -20)
     change, column = (mean - plain)[inside], own[inside, -1]
     size = column @ change / (column @ column)

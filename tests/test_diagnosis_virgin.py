@@ -90,8 +90,8 @@ def test_what_shows_nothing_does_not_move_the_baseline(rng):
     noise = [Noise(0.01, np.zeros(0))] * len(left)
     plain = Projector(replace(regression, residuals=left), noise)
     # Unknowns of the runs that died away before the samples that count.
-    own = tuple(np.concatenate([one, np.zeros((len(one), 2))], axis=1) for one in regression.own)
-    dead = Projector(replace(regression, residuals=left, own=own), noise)
+    own = tuple(np.concatenate([one, np.zeros((len(one), 2))], axis=1) for one in regression.nuisance)
+    dead = Projector(replace(regression, residuals=left, nuisance=own), noise)
     expected, moved = (projector.move(projector.residual) for projector in (plain, dead))
     np.testing.assert_allclose(moved.z, expected.z, atol=1e-6)
     np.testing.assert_allclose(moved.columns_um, expected.columns_um, atol=1e-6)

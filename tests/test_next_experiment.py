@@ -177,8 +177,8 @@ def by_least_squares(made, true, other, time_s, voltage_V):
     rows = []
     for k, run in enumerate(runs):
         own = [
-            regression.own[i] if i == k else np.zeros((len(run.record), o.shape[1]))
-            for i, o in enumerate(regression.own)
+            regression.nuisance[i] if i == k else np.zeros((len(run.record), o.shape[1]))
+            for i, o in enumerate(regression.nuisance)
         ]
         block = np.concatenate(
             [regression.rows[k], *(kind[k] for kind in regression.finer), *own, np.stack([t[k] for t in tangent], 1)],

@@ -46,7 +46,6 @@ def diagnose(given: Given) -> None:
     Name the runs in the order in which they were taken. A column that begins with temp, and one of a second axis in
     um, nm, mm or m, are used. The end of every run is kept aside to check what is found.
     """
-    from fits.diagnosis._steps import Step
     from fits.io._jax_setup import start_jax
     from fits.io._limits import parse_limits
     from fits.io._places import usable_folder
@@ -70,6 +69,8 @@ def diagnose(given: Given) -> None:
     # Before the work, so that a place that cannot be written to is refused before the wait.
     usable_folder(given.out, "--out")
     start_jax()
+    from fits.diagnosis._result import Step
+
     progress = bar_to_stderr(given.quiet, tuple(Step))
     records = read_runs(given.runs, mapping)
     aside = [read_csv(file, mapping) for file in files]

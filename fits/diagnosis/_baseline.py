@@ -20,7 +20,7 @@ from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
 from fits.stage._solve import prior_precision
 from fits.stats._whiten import rough_noise_um
-from microid import AbstractEffect, Hold, Stage, extend, host
+from microid import AbstractEffect, Hold, Mechanics, Stage, extend, host
 
 # What a finer grid would follow has a prior of its own in the projection.
 _FINEST = 32
@@ -77,6 +77,12 @@ class Baseline:
     def stage(self) -> Stage:
         """The fitted stage, without an offset."""
         return self.chain.stage(jnp.asarray(self.z), jnp.asarray(self.columns_um))
+
+    @property
+    def resonance_Hz(self) -> float | None:
+        """Of the fitted stage; None without mechanics."""
+        mechanics = [part for part in self.stage.parts if isinstance(part, Mechanics)]
+        return float(mechanics[0].natural_frequency_Hz) if mechanics else None
 
     def moved(self, dz: np.ndarray, dcolumns_um: np.ndarray | float) -> "Baseline":
         """The same at other coordinates and columns."""

@@ -65,7 +65,7 @@ def compare_rivals(
     worth = {name: (_OF_CONFUSED if name in first.confusions else WORTH) * top for name in best}
     names = [name for name, one in best.items() if one.z > worth[name]][:_LEADERS]
     fitted: dict[str, Refit] = {}
-    bare = Projector(projector.regression, projector.noise)
+    bare = projector.bare
     before = bare.held_out_error(model.change_um)
     for name in names:
         own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
@@ -79,9 +79,9 @@ def compare_rivals(
             if not all(np.all(np.isfinite(change)) for change in found.change_um):
                 continue
             # What does not stand out of the rest of the misfit must show in what was kept aside.
-            plain = one.sure > (_SURE if one.z > 2 * MODEL_ERROR * explained else 2 * _SURE)
+            plain = one.robust_z > (_SURE if one.z > 2 * MODEL_ERROR * explained else 2 * _SURE)
             most = _WORSE if plain else _BETTER
-            if one.sure > _PLAIN and model.cost - found.cost > _MOST * (model.cost - projector.count):
+            if one.robust_z > _PLAIN and model.cost - found.cost > _MOST * (model.cost - projector.count):
                 most = np.inf
             alone = found.is_noise(projector) and not model.is_noise(projector)
             if not found.determined(alone=alone):

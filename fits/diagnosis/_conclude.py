@@ -20,10 +20,17 @@ from fits.diagnosis._findings import bounds, causes_of
 from fits.diagnosis._noise import SPIKE, Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
 from fits.diagnosis._protocol import held_gain, with_held_gain
-from fits.diagnosis._residual_tests import Cycles, cycles, further_views, irregular, look, together, views
-from fits.diagnosis._result import Diagnosis, Gain, RunView, Test
+from fits.diagnosis._residual_tests import (
+    Cycles,
+    cycles,
+    explain,
+    explain_together,
+    further_regressors,
+    irregular,
+    run_regressors,
+)
+from fits.diagnosis._result import Diagnosis, Gain, RunView, Step, Test
 from fits.diagnosis._select import Selection
-from fits.diagnosis._steps import Step
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from microid.effects import card_of
@@ -195,8 +202,8 @@ def conclude(
 
 def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, Cycles]:
     """What there is to be explained, and what repeats itself with the position, which counts unless `rounded`."""
-    regressors = views(ready.baseline.runs, ready.bench.plain)
-    rest, freedom = together(found.projector, found.model.basis(), found.model.residual, regressors)
+    regressors = run_regressors(ready.baseline.runs, ready.bench.plain)
+    rest, freedom = explain_together(found.projector, found.model.basis(), found.model.residual, regressors)
     repeated = cycles(found.projector, found.model.residual, ready.bench.plain)
     rest = max(rest, 0.0 if rounded else repeated.drop)
     return Misfit(found.explained, rest, freedom, found.first.count), repeated
@@ -205,11 +212,11 @@ def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, C
 def _tests(ready: Prepared, found: Selection) -> tuple[Test, ...]:
     """What the residual of the plain stage depends on."""
     runs, residual = ready.baseline.runs, found.plain.residual
-    regressors = [*views(runs, ready.bench.plain), *further_views(runs)]
-    seen = look(found.first, np.zeros((len(residual), 0)), residual, regressors)
+    regressors = [*run_regressors(runs, ready.bench.plain), *further_regressors(runs)]
+    seen = explain(found.first, np.zeros((len(residual), 0)), residual, regressors)
     cost = max(found.plain.cost, 1e-300)
     return tuple(
-        Test.of(one.view.name, one.z, one.p, max(one.drop - one.freedom, 0.0) / cost, one.view.sentence)
+        Test.of(one.regressors.name, one.z, one.p, max(one.drop - one.freedom, 0.0) / cost, one.regressors.sentence)
         for one in seen
     )
 

@@ -11,9 +11,8 @@ import numpy as np
 from fits.diagnosis._conclude import conclude
 from fits.diagnosis._experiment import Request
 from fits.diagnosis._prepare import HOLDS, Prepared, Reading, prepare_diagnosis
-from fits.diagnosis._result import Diagnosis
+from fits.diagnosis._result import Diagnosis, Step
 from fits.diagnosis._select import Selection, select
-from fits.diagnosis._steps import Step
 from fits.io._errors import DataError
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import Record, refuse_repeats

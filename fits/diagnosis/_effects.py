@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from fits.diagnosis._baseline import Baseline, with_effects
 from fits.io._record import Record
 from fits.stage._motion import Prepared, pass_signal, prepare, programs, signals
-from microid import AbstractEffect, Coordinates, Mechanics, ParameterInfo, Sensor, Signal, Stage
+from microid import AbstractEffect, Coordinates, ParameterInfo, Sensor, Signal, Stage
 
 # Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
 _LONG, _MANY = 20_000, 500
@@ -38,8 +38,7 @@ class Bench:
         self.stage = stage.thaw(*stage.frozen)
         few, many = (baseline.coarse_aside, baseline.finest_aside) if aside else (baseline.coarse, baseline.finest)
         runs = many if finest else few
-        mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
-        self.resonance_Hz = float(mechanics[0].natural_frequency_Hz) if mechanics else 0.0
+        self.resonance_Hz = baseline.resonance_Hz or 0.0
         self.prepared = [prepare(self.stage, run) for run in runs]
         self.known = [signals(self.stage, one) for one in self.prepared]
         self.plain = [at_samples(known[-1], one) for known, one in zip(self.known, self.prepared, strict=True)]
@@ -102,7 +101,7 @@ def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float)
     seen = (shifted_Hz - effect.tolerance * lines_Hz) * duration_s > _PERIODS
     if seen.all():
         return effect
-    return replace(effect, **{name: getattr(effect, name) * seen.astype(float) for name in effect.strength})
+    return times(effect, seen.astype(float))
 
 
 class Law:
@@ -121,6 +120,15 @@ class Law:
         vectors = [np.asarray(one.of(_without_host(effect))) for one, effect in zip(self.maps, effects, strict=True)]
         self.each = self.differs if len(effects) > 1 else np.zeros(len(vectors[0]), dtype=bool)
         self.start = np.concatenate([vectors[0][~self.each], *(v[self.each] for v in vectors)])
+        # Which of them are those of a run, shape `(runs, k)`.
+        shared, own = np.cumsum(~self.each) - 1, np.cumsum(self.each) - 1
+        first = np.arange(len(effects))[:, None] * int(self.each.sum()) + int(np.sum(~self.each))
+        self.places = np.where(self.each, first + own, shared)
+        stops = np.cumsum([math.prod(info.shape) for info in self.maps[0].table])
+        self.entries = [
+            (info, slice(int(stop) - math.prod(info.shape), int(stop)))
+            for info, stop in zip(self.maps[0].table, stops, strict=True)
+        ]
 
     @property
     def differs(self) -> np.ndarray:
@@ -131,23 +139,16 @@ class Law:
     def strengths(self) -> np.ndarray:
         """Which coordinates are strengths, shape `(size,)`."""
         strong = self._of(self.form.strength)
-        if not self.each.any():
-            return strong
         return np.concatenate([strong[~self.each], np.tile(strong[self.each], len(self.maps))])
 
     @property
     def common(self) -> dict[str, int]:
         """Numbers of the coordinates that all runs share, by parameter; without what went on before the runs."""
-        found, at, own = {}, 0, self.each.any()
-        for info in self.maps[0].table:
-            differs = info.path in self.form.history or (info.path in self.form.strength and self.form.per_run)
-            if own and differs:
-                continue
-            size = math.prod(info.shape)
-            if size == 1 and info.path not in self.form.history:
-                found[info.path] = at
-            at += size
-        return found
+        return {
+            info.path: int(self.places[0, at.start])
+            for info, at in self.entries
+            if at.stop - at.start == 1 and not self.each[at.start] and info.path not in self.form.history
+        }
 
     def _of(self, paths: Sequence[str]) -> np.ndarray:
         return np.concatenate([np.full(math.prod(info.shape), info.path in paths) for info in self.maps[0].table])
@@ -159,21 +160,13 @@ class Law:
 
     def vector(self, x: np.ndarray, run: int) -> np.ndarray:
         """Coordinates of the effect in one run."""
-        if not self.each.any():
-            return x
-        shared, own = int(np.sum(~self.each)), int(np.sum(self.each))
-        full = np.empty(len(self.each))
-        full[~self.each] = x[:shared]
-        full[self.each] = x[shared + run * own : shared + (run + 1) * own]
-        return full
+        return x[self.places[run]]
 
     def at_bound(self, x: np.ndarray) -> bool:
         """Whether a strength is at its bound, or a time constant at its lower one: another effect may look so."""
-        values, at = np.asarray(self.maps[0].values(jnp.asarray(self.vector(x, 0)))), 0
-        for info in self.maps[0].table:
-            size, spec = math.prod(info.shape), info.spec
-            here = values[at : at + size]
-            at += size
+        values = self.values(x, 0)
+        for info, at in self.entries:
+            here, spec = values[at], info.spec
             below = spec.lower * (1 - _BOUND) if spec.lower < 0 else -np.inf
             if info.path in self.form.strength and np.any((here > spec.upper * (1 - _BOUND)) | (here < below)):
                 return True
@@ -181,9 +174,34 @@ class Law:
                 return True
         return False
 
+    def values(self, x: np.ndarray, run: int) -> np.ndarray:
+        """Parameters of the effect in one run, in their units."""
+        return np.asarray(self.maps[run].values(jnp.asarray(self.vector(x, run))))
+
     def effect(self, x: np.ndarray, run: int) -> AbstractEffect:
         """The effect in one run."""
         return _at(self.maps[run], jnp.asarray(self.vector(x, run)))
+
+
+def strength_of(law: Law, x: np.ndarray, run: int) -> np.ndarray:
+    effect = law.effect(x, run)
+    return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
+
+
+def remembering(law: Law, x: np.ndarray) -> Law:
+    """The same effects, what went on before the runs being unknown."""
+    return Law([law.effect(x, run) for run in range(len(law.maps))], True)
+
+
+def scaled(law: Law, x: np.ndarray, factor: float) -> Law:
+    """The same effects with larger or smaller strengths."""
+    here = [law.effect(x, run) for run in range(len(law.maps))]
+    return Law([times(effect, factor) for effect in here], law.remembers)
+
+
+def times(effect: AbstractEffect, factor: float | np.ndarray) -> AbstractEffect:
+    """The same effect with larger or smaller strengths."""
+    return replace(effect, **{name: factor * getattr(effect, name) for name in effect.strength})
 
 
 def _without_host(effect: AbstractEffect) -> AbstractEffect:
@@ -198,13 +216,3 @@ def _free(info: ParameterInfo, closed: Sequence[str]) -> bool:
 @eqx.filter_jit
 def _at(coordinates: Coordinates[AbstractEffect], vector: Float[Array, " k"]) -> AbstractEffect:
     return coordinates(vector)
-
-
-def strength_of(law: Law, x: np.ndarray, run: int) -> np.ndarray:
-    effect = law.effect(x, run)
-    return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
-
-
-def remembering(law: Law, x: np.ndarray) -> Law:
-    """The same effects, what went on before the runs being unknown."""
-    return Law([law.effect(x, run) for run in range(len(law.maps))], True)

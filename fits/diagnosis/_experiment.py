@@ -15,7 +15,6 @@ from fits.diagnosis._safe import guard_of
 from fits.diagnosis._score import best_of, law_of
 from fits.diagnosis._select import Selection
 from fits.io._limits import MARGIN
-from microid import Mechanics
 from microid.effects import card_of
 
 # Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
@@ -86,11 +85,9 @@ def suggest(
     names, hypotheses, pairs = question
     progress("looking for the experiment that tells " + (" from ".join(names) if len(names) > 1 else names[0]))
     baseline = ready.baseline
-    resonance = next((float(p.natural_frequency_Hz) for p in baseline.stage.parts if isinstance(p, Mechanics)), None)
     guard = guard_of(ready, found, hypotheses, request.limits, request.margin)
-    limits = guard.narrowed(
-        limits_of([run.record for run in baseline.runs], baseline.range_V, resonance, request.duration_s)
-    )
+    records = [run.record for run in baseline.runs]
+    limits = guard.narrowed(limits_of(records, baseline.range_V, baseline.resonance_Hz, request.duration_s))
     if limits is None:
         return None
     predictor = Predictor(found.bench, found.projector, hypotheses, pairs)

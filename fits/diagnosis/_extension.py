@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from fits.diagnosis._baseline import simulate, with_effects
 from fits.diagnosis._effects import Bench, at_samples
 from fits.diagnosis._prepare import Prepared
-from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
@@ -63,7 +62,7 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Exte
         stage = baseline.stage.with_substeps(plain_steps(ready))
         return Extension(stage, _compare(ready, ready.bench, None, ready.regression, (), False), ())
     # What followed along the tangent is put into the stage itself.
-    bare = Projector(found.projector.regression, found.projector.noise)
+    bare = found.projector.bare
     regression = regress(bare.move(bare.residual - bare.join(model.change_um)), ())
     effects = shared_effects(model, len(baseline.runs))
     steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))
@@ -110,7 +109,7 @@ def _compare(
     for k, run in enumerate(ready.baseline.runs):
         plain = run.displacement_um - ready.regression.residuals[k]
         better = run.displacement_um - regression.residuals[k] + change[k]
-        own, using = ready.regression.own[k], run.fitted
+        own, using = ready.regression.nuisance[k], run.fitted
         found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), run.held_out))
     if ready.baseline.aside:
         behind = Bench(bench.baseline, aside=True, finest=finest)

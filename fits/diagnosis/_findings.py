@@ -6,7 +6,6 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from scipy import stats
 
 from fits.diagnosis._effects import Bench, Law
@@ -124,21 +123,20 @@ def _parameters(
     shared: list[EffectParameter] = []
     own: list[list[EffectParameter]] = []
     for run in range(runs):
-        slope = np.asarray(jax.jacfwd(lambda v, run=run: law.maps[run].values(_vector(law, v, run)))(jnp.asarray(x)))
-        values = np.asarray(law.maps[run].values(jnp.asarray(law.vector(x, run))))
+        slope = np.asarray(jax.jacfwd(lambda v, run=run: law.maps[run].values(v[law.places[run]]))(jnp.asarray(x)))
+        values = law.values(x, run)
         sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
         below = above = sd
         for away, there in along:
-            moved = np.asarray(law.maps[run].values(jnp.asarray(law.vector(there, run))))
+            moved = law.values(there, run)
             below, above = np.maximum(below, (values - moved) / away), np.maximum(above, (moved - values) / away)
-        at, mine = 0, []
-        for info in law.maps[run].table:
-            size = int(np.prod(info.shape)) if info.shape else 1
+        mine = []
+        for info, place in law.entries:
             differs = runs > 1 and info.path in law.form.strength
             # What went on before a run is no property of the rig.
-            for k in range(size if info.path not in law.form.history else 0):
-                name = info.path if size == 1 else f"{info.path}[{k}]"
-                value, less, more = float(values[at + k]), float(below[at + k]), float(above[at + k])
+            for at in range(place.start, place.stop) if info.path not in law.form.history else ():
+                name = info.path if place.stop - place.start == 1 else f"{info.path}[{at - place.start}]"
+                value, less, more = float(values[at]), float(below[at]), float(above[at])
                 low, high = value - _TWO_SIDED * less, value + _TWO_SIDED * more
                 one = EffectParameter(
                     f"{name} in run {run + 1}" if differs else name,
@@ -152,20 +150,10 @@ def _parameters(
                     mine.append(one)
                 elif run == 0:
                     shared.append(one)
-            at += size
         own.append(mine)
     # At its bound a strength has no standard deviation to speak of: a run without the effect says nothing of it.
     showing = [mine for mine in own if any(abs(one.value) > _SHOWS * one.sd for one in mine)] or own
     return (*(one for mine in showing for one in mine), *shared)
-
-
-def _vector(law: Law, x: Float[Array, " k"], run: int) -> Float[Array, " c"]:
-    if not law.each.any():
-        return x
-    shared, own = int(np.sum(~law.each)), int(np.sum(law.each))
-    full = jnp.zeros(len(law.each))
-    full = full.at[np.flatnonzero(~law.each)].set(x[:shared])
-    return full.at[np.flatnonzero(law.each)].set(x[shared + run * own : shared + (run + 1) * own])
 
 
 def profile_likelihood(
@@ -191,10 +179,8 @@ def profile_likelihood(
 
 def _is_nonlinear(law: Law, x: np.ndarray, at: int, sd: float) -> bool:
     """Whether a parameter is far from proportional to its coordinate, within a standard deviation."""
-    ends = [np.array(x), np.array(x), np.array(x)]
-    for end, way in zip(ends, (-1, 0, 1), strict=True):
-        end[at] += way * sd
-    below, here, above = (np.asarray(law.maps[0].values(jnp.asarray(law.vector(end, 0)))) for end in ends)
+    step = sd * (np.arange(len(x)) == at)
+    below, here, above = (law.values(end, 0) for end in (x - step, x, x + step))
     less, more = float(np.abs(here - below).max()), float(np.abs(above - here).max())
     return max(less, more) > _NONLINEAR * min(less, more)
 
@@ -214,9 +200,7 @@ def _profile_to(
         # One by itself has nothing beside it that is fitted again.
         only = sum(one.size for one in model.laws) == 1
         held = Law([law.effect(moved, run) for run in runs], law.remembers, () if only else (path,))
-        laws, starts = list(last.laws), list(last.x)
-        laws[which], starts[which] = held, held.start
-        there = refit(bench, projector, laws, starts, 0 if only else _ROUNDS)
+        there = refit(bench, projector, *last.with_law(which, held), 0 if only else _ROUNDS)
         found.append((there.cost, _law_of_model(there, which, law).start))
         away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR
         if 1 / _ABOUT < away < _ABOUT:

@@ -7,11 +7,11 @@ from typing import TypeAlias
 import numpy as np
 
 from fits.diagnosis._baseline import Baseline, simulate
-from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._effects import Bench, scaled
 from fits.diagnosis._noise import find_faults
 from fits.diagnosis._projector import Projector, learn_roughness, smoothed
 from fits.diagnosis._refit import Refit, refit, relocate
-from fits.diagnosis._regression import passed, regress
+from fits.diagnosis._regression import regress, saturating
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _OFF = 1.0
@@ -88,11 +88,7 @@ def try_larger_strengths(bench: Bench, projector: Projector, model: Refit) -> St
     """Try effects that saturate at larger strengths: a baseline that has taken part of one hardly gives it up."""
     for k in range(len(model.laws)):
         while (form := model.laws[k].form).finite and form.strength:
-            here = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
-            more = [replace(one, **{name: _LARGER * getattr(one, name) for name in form.strength}) for one in here]
-            law = Law(more, model.laws[k].remembers)
-            laws, x = list(model.laws), list(model.x)
-            laws[k], x[k] = law, law.start
+            laws, x = model.with_law(k, scaled(model.laws[k], model.x[k], _LARGER))
             trial = alternate(bench, projector, refit(bench, projector, laws, x, 0))
             if trial[-1].cost > model.cost - _BETTER:
                 break
@@ -104,8 +100,7 @@ def relearn_roughness(bench: Bench, projector: Projector, model: Refit) -> State
     """Fit the causes again where beside them the density is less rough than was learnt without them."""
     if not model.laws or not any(projector.roughness):
         return bench, projector, model
-    bare = Projector(projector.regression, projector.noise)
-    rough = learn_roughness(bare, (), model.change_um)
+    rough = learn_roughness(projector.bare, (), model.change_um)
     if not any(new < _LESS * old for new, old in zip(rough, projector.roughness, strict=True)):
         return bench, projector, model
     less = tuple(map(min, rough, projector.roughness))
@@ -121,10 +116,7 @@ def relearn_smoothness(bench: Bench, projector: Projector, model: Refit) -> Stat
         # What the causes leave is no roughness.
         return bench, projector, model
     moved = fit_jointly(Bench(afresh.regression.baseline), afresh, model)
-    before, after = (
-        Projector(there.regression, there.noise).held_out_error(one.change_um)
-        for there, one in ((projector, model), moved[1:])
-    )
+    before, after = (at.bare.held_out_error(one.change_um) for at, one in ((projector, model), moved[1:]))
     return (bench, projector, model) if after > before else moved
 
 
@@ -148,11 +140,7 @@ def leave_bounds(bench: Bench, projector: Projector, model: Refit, finest: bool)
     for k, law in enumerate(model.laws):
         if not (law.form.strength and law.at_bound(model.x[k])):
             continue
-        effects = [law.effect(model.x[k], run) for run in range(len(law.maps))]
-        less = [replace(one, **{name: _WEAKER * getattr(one, name) for name in law.form.strength}) for one in effects]
-        laws, x = list(model.laws), list(model.x)
-        laws[k] = Law(less, law.remembers)
-        x[k] = laws[k].start
+        laws, x = model.with_law(k, scaled(law, model.x[k], _WEAKER))
         trial = bench, projector, refit(bench, projector, laws, x, 0)
         for _ in range(_FIRST):
             there = _follow(*trial, finest)
@@ -210,7 +198,7 @@ def is_smoothness_confirmed(projector: Projector, model: Refit) -> bool:
 def _follow(bench: Bench, projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
     """Move the baseline to where the causes leave it."""
     # What roughness beyond the grid would explain is not put into the grid.
-    bare = Projector(projector.regression, projector.noise)
+    bare = projector.bare
     return _linearised_at(bare.move(bare.residual - bare.join(model.change_um)), projector, model, finest)
 
 
@@ -219,7 +207,7 @@ def _linearised_at(
 ) -> tuple[Bench, Projector]:
     effects = [model.effects(run) for run in range(len(baseline.runs))]
     # What is finer than the grid hardly changes, but where derivatives go through effects.
-    plain = not any(projector.regression.through) and not any(map(passed, effects))
+    plain = not any(projector.regression.saturating) and not any(map(saturating, effects))
     regression = regress(baseline, projector.regression.finer if plain else None, effects)
     return Bench(regression.baseline, finest=finest), Projector(regression, projector.noise, projector.roughness)
 

@@ -234,7 +234,7 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     settling_s = float(_SETTLED / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
     for run, rows, own, residual in zip(
-        baseline.runs, regression.rows, regression.own, regression.residuals, strict=True
+        baseline.runs, regression.rows, regression.nuisance, regression.residuals, strict=True
     ):
         moved = residual - rows @ np.concatenate([dw, dz])
         mask = run.fitted

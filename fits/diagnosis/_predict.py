@@ -9,7 +9,7 @@ from scipy.linalg import qr
 
 from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._regression import Kinds, Regression, passed, regress
+from fits.diagnosis._regression import Kinds, Regression, regress, saturating
 from fits.io._record import Record
 from fits.loop._run import prepare_run
 from fits.stats._whiten import Noise
@@ -164,7 +164,7 @@ class Predictor:
             last = regress(alone, None if last is None else _same(last, effects), effects)
             shared = [last.rows[0], *(last.finer[kind][0] for kind in self._kinds)]
             rows = noise.whiten(np.concatenate([*shared, np.stack(columns, axis=1)], axis=1))[run.fitted]
-            own, _ = qr(noise.whiten(last.own[0])[run.fitted], mode="economic")
+            own, _ = qr(noise.whiten(last.nuisance[0])[run.fitted], mode="economic")
             rows -= own @ (own.T @ rows)
             grams[k] = rows.T @ rows
         return grams
@@ -218,7 +218,7 @@ def next_record(
 
 def _same(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -> Kinds | None:
     """What is finer than the grid, if it is the same beside other effects."""
-    return None if any(regression.through) or any(map(passed, effects)) else regression.finer
+    return None if any(regression.saturating) or any(map(saturating, effects)) else regression.finer
 
 
 def _in_order(law: Law, moved: Sequence[np.ndarray]) -> list[np.ndarray]:

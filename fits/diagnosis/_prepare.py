@@ -5,16 +5,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import qr
 
 from fits.diagnosis._baseline import Baseline, along_curves, fit_baseline, simulate
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
-from fits.diagnosis._projector import Projector, learn_roughness
+from fits.diagnosis._projector import Projector, learn_roughness, orthonormal
 from fits.diagnosis._protocol import held_gain, is_virgin, virgin_columns
 from fits.diagnosis._regression import Regression, regress
+from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe, applicable, probes_of, rescore, scales_of, score
-from fits.diagnosis._steps import Step
 from fits.io._record import Record
 from fits.loop._run import VIRGIN
 from microid import EFFECTS, Hold, Scales, Stage
@@ -29,8 +28,6 @@ _SKEWED = (
     "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
 )
-# Part of a direction that must be its own.
-_SEEN = 1e-6
 # Part of the difference between curves and lines that must be there for it to be looked into.
 _NOTICEABLE = 0.2
 HOLDS: tuple[Hold, ...] = ("first", "smooth", "zero")
@@ -120,13 +117,9 @@ class _Fit:
     @cached_property
     def beside(self) -> np.ndarray:
         """Orthonormal columns along which initial curves may differ from loops."""
-        joined = self.projector.off(virgin_columns(self.projector))
-        if joined.shape[1] == 0:
-            return joined
-        q, r, _ = qr(joined / (np.linalg.norm(joined, axis=0) + 1e-300), mode="economic", pivoting=True)
-        return q[:, np.abs(np.diagonal(r)) > _SEEN]
+        return orthonormal(self.projector.off(virgin_columns(self.projector)))
 
-    def left(self) -> float:
+    def remaining(self) -> float:
         """Sum of squares that is left, whatever the initial curves are."""
         left = self.projector.off(self.projector.residual)
         return float(left @ left) - float(np.sum((self.beside.T @ left) ** 2))
@@ -142,12 +135,12 @@ class _Fit:
         best = max(scores, key=lambda one: one.drop)
         return best.drop, float(best.coefficients[0] * getattr(best.probe.effects[0], form.delay))
 
-    def behind(self) -> float:
+    def delay_drop(self) -> float:
         """The same decrease, if that is a delay and no lead."""
         drop, late_s = self.late()
         return drop if late_s > 0 else 0.0
 
-    def bent(self) -> float:
+    def curve_drop(self) -> float:
         """Decrease of that by a command along curves, as far as the stage's answer to it is in proportion."""
         baseline = self.regression.baseline
         curved = [along_curves(run) for run in baseline.finest]
@@ -161,7 +154,7 @@ class _Fit:
         along = float(column @ left)
         return along**2 / size if size > 0 and _NOTICEABLE * size < along else 0.0
 
-    def highest(self) -> float:
+    def largest_z(self) -> float:
         """Evidence of the effect that has most."""
         scores = score(self.projector, self.probed[0], self.projector.off(self.projector.residual))
         return max((one.z for one in scores), default=0.0)
@@ -194,24 +187,24 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
         if hold != "first":
             if not here.regression.baseline.dynamic:
                 break
-            drop = here.bent() if hold == "smooth" else here.behind()
+            drop = here.curve_drop() if hold == "smooth" else here.delay_drop()
             if drop <= _LATE:
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
             drop_programs(records)
             other = fitted(hold, initial)
             drop_programs(records)
-            if not (_curved(here, other) if hold == "smooth" else _held(here, other, drop)):
+            if not (_runs_along_curves(here, other) if hold == "smooth" else _is_held_in_steps(here, other, drop)):
                 continue
-            doubted = doubted or drop < here.highest() ** 2
+            doubted = doubted or drop < here.largest_z() ** 2
             here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
-        if initial == "unknown" and is_virgin(here.projector, here.highest()):
+        if initial == "unknown" and is_virgin(here.projector, here.largest_z()):
             progress("fitting the plain stage again, without the initial curve of each run")
             initial = VIRGIN
             here, said = fitted(hold, initial), (*said, _FIRST)
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
-        if drop > max(_LATE, (_ABOUT * here.highest()) ** 2) and late_s < _SKEW * here.scales.interval_s:
+        if drop > max(_LATE, (_ABOUT * here.largest_z()) ** 2) and late_s < _SKEW * here.scales.interval_s:
             here = _Fit(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
     if here.faults.jitter_s > 0:
@@ -231,20 +224,20 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped), doubted)
 
 
-def _curved(lines: _Fit, curves: _Fit) -> bool:
+def _runs_along_curves(lines: _Fit, curves: _Fit) -> bool:
     """Whether a command along curves leaves less than one in lines, beyond chance and beside the best effect, too."""
     # With the same noise, they compare.
     same = _Fit(curves.regression, lines.faults)
-    beside = (lines.left() - lines.highest() ** 2) - (same.left() - same.highest() ** 2)
-    return lines.left() - same.left() > _LATE and beside > 0
+    beside = (lines.remaining() - lines.largest_z() ** 2) - (same.remaining() - same.largest_z() ** 2)
+    return lines.remaining() - same.remaining() > _LATE and beside > 0
 
 
-def _held(lines: _Fit, steps: _Fit, late: float) -> bool:
+def _is_held_in_steps(lines: _Fit, steps: _Fit, late: float) -> bool:
     """Whether a command held in steps explains what a delay, behind lines, takes so much off."""
     # With the same noise, they compare: by themselves, and with a delay beside each.
     same = _Fit(steps.regression, lines.faults)
-    gained = lines.left() - same.left()
-    return gained > _AS_WELL * late or gained - late + same.behind() > _BETTER * late
+    gained = lines.remaining() - same.remaining()
+    return gained > _AS_WELL * late or gained - late + same.delay_drop() > _BETTER * late
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:

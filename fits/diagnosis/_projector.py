@@ -23,6 +23,8 @@ from fits.stats._whiten import Noise
 _ROUGHEST = 0.5
 # Squares of singular values of the tangent, over the largest, below which the runs show nothing.
 _SHOWN = 1e-10
+# Part of a direction that must be its own.
+_INDEPENDENT = 1e-6
 # The farthest that a coordinate moves at a time.
 _FARTHEST = 3.0
 
@@ -47,7 +49,7 @@ class Projector:
         shared = self.join(
             [np.concatenate([rows, *(k[i] for k in rough)], axis=1) for i, rows in enumerate(regression.rows)]
         )
-        matrix = np.concatenate([shared, self.own_rows], axis=1)
+        matrix = np.concatenate([shared, self.nuisance_rows], axis=1)
         root = regression.root
         matrix[self.count : self.count + grid, :grid] = root
         at, row = regression.size, self.count + grid
@@ -71,6 +73,11 @@ class Projector:
         self.residual[self.count : self.count + grid] = -root @ regression.baseline.columns_um
 
     @property
+    def bare(self) -> "Projector":
+        """The same without roughness of the density beyond its grid."""
+        return Projector(self.regression, self.noise)
+
+    @property
     def freedom(self) -> float:
         """Samples that are worth one of the unknowns: what is fitted takes so many degrees of freedom off."""
         return float(np.sum(self.orthonormal[: self.count] ** 2))
@@ -89,9 +96,9 @@ class Projector:
         return self._root * self._scale
 
     @property
-    def own_rows(self) -> np.ndarray:
+    def nuisance_rows(self) -> np.ndarray:
         """The runs' nuisance parameters, whitened and joined, shape `(rows, k)`."""
-        own = self.regression.own
+        own = self.regression.nuisance
         out = np.zeros((self.count + self._priors, sum(o.shape[1] for o in own)))
         row = at = 0
         for o, noise, mask in zip(own, self.noise, self.masks, strict=True):
@@ -145,7 +152,7 @@ class Projector:
         square = count = 0.0
         for k, run in enumerate(regression.baseline.runs):
             left = regression.residuals[k] - change_um[k] - regression.rows[k] @ np.concatenate([columns, step])
-            own, mask, held = regression.own[k], self.masks[k], run.held_out
+            own, mask, held = regression.nuisance[k], self.masks[k], run.held_out
             if held.any():
                 left = left - own @ np.linalg.lstsq(own[mask], left[mask], rcond=None)[0]
                 square += float(np.sum(left[held] ** 2)) / self.noise[k].total_um ** 2
@@ -187,10 +194,16 @@ class Projector:
         return others[coordinate], np.asarray(kept)
 
 
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span others, shape `(rows, k)`, without those that the others make up."""
+    if columns.shape[1] == 0:
+        return columns
+    q, r, _ = qr(columns / (np.linalg.norm(columns, axis=0) + 1e-300), mode="economic", pivoting=True)
+    return q[:, np.abs(np.diagonal(r)) > _INDEPENDENT]
+
+
 def learn_roughness(
-    projector: Projector,
-    candidates: Sequence[Sequence[np.ndarray]],
-    change_um: Sequence[np.ndarray] | None = None,
+    projector: Projector, candidates: Sequence[Sequence[np.ndarray]], change_um: Sequence[np.ndarray] | None = None
 ) -> tuple[float, ...]:
     """Find how rough the density is beyond its grid, from what neither the baseline nor any candidate explains.
 
@@ -238,7 +251,7 @@ def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector
     size, stroke_um = len(baseline.columns_um), baseline.stroke_um
     joined = projector.join(list(regression.rows))[:count]
     target = (projector.residual - projector.join(change_um))[:count] + joined[:, :size] @ baseline.columns_um
-    others = np.concatenate([joined[:, size:], projector.own_rows[:count]], axis=1)
+    others = np.concatenate([joined[:, size:], projector.nuisance_rows[:count]], axis=1)
     scale = np.linalg.norm(others, axis=0)
     basis, _ = qr(others[:, scale > 0] / scale[scale > 0], mode="economic")
     columns = joined[:, :size] * stroke_um

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
@@ -164,10 +165,6 @@ def _regressed(along: np.ndarray, values: np.ndarray) -> tuple[float, float, flo
     seen = [k for k in range(_BLOCKS) if np.any(block == k)]
     x = np.array([along[block == k].mean() for k in seen])
     y = np.array([values[block == k].mean() for k in seen])
-    design = np.stack([np.ones_like(x), x - x.mean()], axis=1)
-    answer, *_ = np.linalg.lstsq(design, y, rcond=None)
-    left = y - design @ answer
+    line = stats.linregress(x, y)
     # Neighbouring blocks err alike: only every other is taken to be of its own.
-    variance = 2 * float(left @ left) / max(len(x) - 2, 1)
-    sd = float(np.sqrt(variance / np.sum((x - x.mean()) ** 2)))
-    return float(answer[1]), sd, 1 - float(left @ left) / float(np.sum((y - y.mean()) ** 2) + 1e-300)
+    return float(line.slope), float(2**0.5 * line.stderr), float(line.rvalue**2)

@@ -6,10 +6,9 @@ from itertools import product
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import qr
 
 from fits.diagnosis._effects import Bench, Law, remembering, strength_of
-from fits.diagnosis._projector import Projector
+from fits.diagnosis._projector import Projector, orthonormal
 from fits.diagnosis._score import Scored, law_of
 from fits.io.columns import columns_beside
 from microid import AbstractEffect
@@ -70,6 +69,12 @@ class Refit:
     def effects(self, run: int) -> list[AbstractEffect]:
         """The effects in one run."""
         return [law.effect(x, run) for law, x in zip(self.laws, self.x, strict=True)]
+
+    def with_law(self, k: int, law: Law) -> tuple[list[Law], list[np.ndarray]]:
+        """Laws and coordinates with one of them replaced, at its start."""
+        laws, x = list(self.laws), list(self.x)
+        laws[k], x[k] = law, law.start
+        return laws, x
 
     def covariance(self, robust: bool = True) -> np.ndarray:
         """Of all coordinates together.
@@ -134,11 +139,7 @@ class Refit:
 
     def basis(self) -> np.ndarray:
         """Orthonormal columns that span the tangent."""
-        if self.tangent.shape[1] == 0:
-            return self.tangent
-        scaled = self.tangent / (np.linalg.norm(self.tangent, axis=0) + 1e-300)
-        q, r, _ = qr(scaled, mode="economic", pivoting=True)
-        return q[:, np.abs(np.diagonal(r)) > 1e-6]
+        return orthonormal(self.tangent)
 
 
 def _strength(
@@ -211,11 +212,9 @@ def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -
 
 def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: float, least_s: float) -> Refit:
     """Fit a law at another instant; all others stay, and follow along their tangent."""
-    laws, x = list(model.laws), list(model.x)
-    here = [laws[k].effect(x[k], run) for run in range(len(bench.prepared))]
+    here = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
     later = [replace(one, after_s=jnp.maximum(one.after_s + way_s, least_s)) for one in here]  # type: ignore[attr-defined,call-arg]
-    laws[k] = Law(later, laws[k].remembers)
-    x[k] = laws[k].start
+    laws, x = model.with_law(k, Law(later, model.laws[k].remembers))
     order = [*(i for i in range(len(laws)) if i != k), k]
     owner = np.repeat(np.arange(len(laws)), [law.size for law in model.laws])
     basis = replace(model, tangent=model.tangent[:, owner != k]).basis()

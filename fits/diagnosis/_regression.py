@@ -39,21 +39,21 @@ class Regression:
     """Jacobian of a baseline in all runs, for all samples, and what it leaves.
 
     Per run: `masks` of the samples that are fitted, shape `(n,)`; `rows`, derivatives along columns and coordinates,
-    shape `(n, D + p)`; `own`, signals of the run's nuisance parameters, shape `(n, k)`; `residuals`, measurement less
-    simulation without effects, in um, shape `(n,)`; `through`, the effects that the derivatives go through. By kind
-    and run, `finer` is what relative roughness of the density changes that the grid cannot follow, shape `(n, k)`: of
-    loops of one width at all biases, as play operators are, and at single places of the half-plane. `root` is the
-    root of the prior precision of the columns, shape `(D, D)`.
+    shape `(n, D + p)`; `nuisance`, signals of the run's nuisance parameters, shape `(n, k)`; `residuals`, measurement
+    less simulation without effects, in um, shape `(n,)`; `saturating`, the effects that the derivatives go through.
+    By kind and run, `finer` is what relative roughness of the density changes that the grid cannot follow, shape `(n,
+    k)`: of loops of one width at all biases, as play operators are, and at single places of the half-plane. `root` is
+    the root of the prior precision of the columns, shape `(D, D)`.
     """
 
     baseline: Baseline
     masks: tuple[np.ndarray, ...]
     rows: tuple[np.ndarray, ...]
-    own: tuple[np.ndarray, ...]
+    nuisance: tuple[np.ndarray, ...]
     finer: Kinds
     residuals: tuple[np.ndarray, ...]
     root: np.ndarray
-    through: tuple[tuple[AbstractEffect, ...], ...]
+    saturating: tuple[tuple[AbstractEffect, ...], ...]
 
     @property
     def size(self) -> int:
@@ -72,14 +72,14 @@ def regress(
     """
     chain, runs, z = baseline.chain, baseline.runs, jnp.asarray(baseline.z)
     assert chain.grid is not None
-    through = tuple(map(passed, effects)) if effects else ((),) * len(runs)
+    levelling = tuple(map(saturating, effects)) if effects else ((),) * len(runs)
     bases = _bases(baseline) if finer is None else []
     rows, own, residuals = [], [], []
     kinds: list[list[np.ndarray]] = [[] for _ in bases]
     stage = baseline.stage
-    beside = tuple(map(answering, effects)) if effects else ((),) * len(runs)
-    for run, fine_run, there, own_effects in zip(runs, baseline.fine, through, beside, strict=True):
-        here = dressed(chain, baseline.z, there)
+    beside = tuple(map(dependent, effects)) if effects else ((),) * len(runs)
+    for run, fine_run, there, own_effects in zip(runs, baseline.fine, levelling, beside, strict=True):
+        here = with_effects_in(chain, baseline.z, there)
         _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
@@ -87,14 +87,14 @@ def regress(
         for first, columns in pieces(here, z, run, True):
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         around = both[:, : chain.size] @ baseline.columns_um
-        both[:, : chain.size] = behind(here, baseline.z, run, around, both[:, : chain.size])
+        both[:, : chain.size] = propagated(here, baseline.z, run, around, both[:, : chain.size])
         rows.append(both)
         plain = simulate(stage, fine_run)
         speed = np.gradient(plain, run.record.time_s)[:, None]
         late = [speed] if baseline.skewed else []
         # With an instant off by d, a reading is y + d y' + d^2 y'' / 2: the first is noise, the second is not.
         blur = [np.gradient(speed[:, 0], run.record.time_s)[:, None]] if baseline.blurred else []
-        own.append(_alive(np.concatenate([free[:n], *late, *blur], axis=1), run.fitted))
+        own.append(_without_decayed(np.concatenate([free[:n], *late, *blur], axis=1), run.fitted))
         residuals.append(run.displacement_um - plain)
         if finer is None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
@@ -102,7 +102,7 @@ def regress(
                 kind.append(part)
     masks, structure = tuple(run.fitted for run in runs), tuple(map(tuple, kinds)) if finer is None else finer
     data = tuple(rows), tuple(own), structure, tuple(residuals)
-    return Regression(baseline, masks, *data, root_of(baseline.prior), through)
+    return Regression(baseline, masks, *data, root_of(baseline.prior), levelling)
 
 
 def root_of(prior: np.ndarray) -> np.ndarray:
@@ -110,7 +110,7 @@ def root_of(prior: np.ndarray) -> np.ndarray:
     return cholesky(prior + 1e-12 * np.trace(prior) / len(prior) * np.eye(len(prior)))
 
 
-def _alive(own: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+def _without_decayed(own: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """A run's nuisance parameters without those whose signals have decayed before the samples that count.
 
     They would be fitted to noise there, and reach far beyond it where they begin.
@@ -154,11 +154,11 @@ def _along(
 ) -> list[np.ndarray]:
     joined = np.concatenate(bases, axis=1)
     parts = [columns @ joined for _, columns in pieces(finer, jnp.asarray(baseline.z), run, True)]
-    moved = behind(finer, baseline.z, run, around_um, np.concatenate(parts)[: len(run.record)])
+    moved = propagated(finer, baseline.z, run, around_um, np.concatenate(parts)[: len(run.record)])
     return np.split(moved, np.cumsum([base.shape[1] for base in bases])[:-1], axis=1)
 
 
-def passed(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
+def saturating(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
     """Those that derivatives along the density go through: a rail, say, beyond which nothing moves any more.
 
     They saturate, stand by themselves, and act before the mechanics has answered.
@@ -169,7 +169,7 @@ def passed(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
     )
 
 
-def answering(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
+def dependent(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
     """Those whose change depends on driver and mechanics.
 
     A lag of the sensor and one of the driver do nearly the same, so that telling them apart takes exact derivatives.
@@ -177,7 +177,7 @@ def answering(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
     return tuple(one for one in effects if one.place not in _ADDED)
 
 
-class _Dressed(eqx.Module):
+class _WithEffects(eqx.Module):
     """Coordinates of a plain stage, of which a stage with effects is made."""
 
     plain: Coordinates[Stage]
@@ -188,15 +188,15 @@ class _Dressed(eqx.Module):
         return with_effects(self.plain(z), self.effects)
 
 
-def dressed(chain: Chain, z: np.ndarray, effects: tuple[AbstractEffect, ...]) -> Chain:
+def with_effects_in(chain: Chain, z: np.ndarray, effects: tuple[AbstractEffect, ...]) -> Chain:
     """The chain of a stage with effects, in the same coordinates and columns."""
     if not effects:
         return chain
-    coordinates = _Dressed(chain.coordinates, effects)
+    coordinates = _WithEffects(chain.coordinates, effects)
     return Chain(coordinates, place_of_hysteresis(coordinates(jnp.asarray(z))), chain.grid)  # type: ignore[arg-type]
 
 
-def behind(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
+def propagated(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
     """Pass changes of the hysteresis, shape `(n, k)`, on through what follows it, to first order.
 
     Where all that follows is linear, they have been passed on already. `around_um` is what comes out of the
@@ -216,13 +216,13 @@ def behind(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, moved_u
         part = moved_um[:, first : first + _AT_ONCE].T
         more = _AT_ONCE - len(part)
         full = np.pad(part, ((0, more), (0, pad)))
-        answer = _behind(chain.coordinates, chain.place, jnp.asarray(z), time_s, signal, jnp.asarray(full))
+        answer = _propagated(chain.coordinates, chain.place, jnp.asarray(z), time_s, signal, jnp.asarray(full))
         out[:, first : first + _AT_ONCE] = np.asarray(answer)[: len(part), :n].T
     return out
 
 
 @eqx.filter_jit
-def _behind(
+def _propagated(
     coordinates: Coordinates[Stage],
     place: int,
     z: Float[Array, " p"],

@@ -38,7 +38,7 @@ _MOST = 37.0
 
 
 @dataclass(frozen=True)
-class View:
+class Regressors:
     """Regressors along which structure would lie, per column a list over runs, and what that would mean."""
 
     name: str
@@ -47,30 +47,30 @@ class View:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Explained:
     """What regressors explain: the decrease of the sum of squares in noise variances, and the columns that it takes.
 
     `z` is the evidence in standard deviations, `p` the probability of as much by chance.
     """
 
-    view: View
+    regressors: Regressors
     drop: float
     freedom: int
     z: float
     p: float
 
 
-def views(runs: Sequence[Run], plain_um: Sequence[np.ndarray]) -> list[View]:
+def run_regressors(runs: Sequence[Run], plain_um: Sequence[np.ndarray]) -> list[Regressors]:
     """Regressors whose structure counts as left over, each run by itself."""
     return _joined(runs, [_of_run(run, plain) for run, plain in zip(runs, plain_um, strict=True)])
 
 
-def further_views(runs: Sequence[Run]) -> list[View]:
+def further_regressors(runs: Sequence[Run]) -> list[Regressors]:
     """Regressors that say more of the cause: along the command and along what was measured besides."""
     return _joined(runs, [_beside(run) for run in runs])
 
 
-def _joined(runs: Sequence[Run], found: Sequence[dict[str, list[np.ndarray]]]) -> list[View]:
+def _joined(runs: Sequence[Run], found: Sequence[dict[str, list[np.ndarray]]]) -> list[Regressors]:
     kinds: dict[str, list[list[np.ndarray]]] = {}
     sizes = [len(run.record) for run in runs]
     for k, own in enumerate(found):
@@ -81,7 +81,7 @@ def _joined(runs: Sequence[Run], found: Sequence[dict[str, list[np.ndarray]]]) -
                 )
     return [
         # Further columns are called by their titles.
-        View(name, tuple(tuple(c) for c in columns), _SENTENCES.get(name, f"the residual goes with the {name}"))
+        Regressors(name, tuple(tuple(c) for c in columns), _SENTENCES.get(name, f"the residual goes with the {name}"))
         for name, columns in kinds.items()
     ]
 
@@ -154,11 +154,13 @@ def _bands(values: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def look(projector: Projector, basis: np.ndarray, residual: np.ndarray, ways: Sequence[View]) -> list[Seen]:
+def explain(
+    projector: Projector, basis: np.ndarray, residual: np.ndarray, groups: Sequence[Regressors]
+) -> list[Explained]:
     """Regress a residual on each, beside effects whose tangent `basis` spans."""
     found = []
-    for view in ways:
-        joined = projector.off(np.stack([projector.join(column) for column in view.columns], axis=1))
+    for regressors in groups:
+        joined = projector.off(np.stack([projector.join(column) for column in regressors.columns], axis=1))
         joined = joined - basis @ (basis.T @ joined)
         scale = np.linalg.norm(joined, axis=0) + 1e-300
         left, size, _ = np.linalg.svd(joined / scale, full_matrices=False)
@@ -168,16 +170,16 @@ def look(projector: Projector, basis: np.ndarray, residual: np.ndarray, ways: Se
         p = float(stats.chi2.sf(drop, freedom))
         # Fisher's root of a chi-square variable is nearly normal.
         z = float(max((2 * drop) ** 0.5 - (2 * freedom - 1) ** 0.5, 0.0))
-        found.append(Seen(view, drop, freedom, z, p))
+        found.append(Explained(regressors, drop, freedom, z, p))
     return found
 
 
-def together(
-    projector: Projector, basis: np.ndarray, residual: np.ndarray, ways: Sequence[View]
+def explain_together(
+    projector: Projector, basis: np.ndarray, residual: np.ndarray, groups: Sequence[Regressors]
 ) -> tuple[float, int]:
     """Decrease of the sum of squares by all regressors together, and the columns that it takes."""
-    columns = [column for view in ways for column in view.columns]
-    seen = look(projector, basis, residual, [View("together", tuple(columns), "")])[0]
+    columns = [column for regressors in groups for column in regressors.columns]
+    seen = explain(projector, basis, residual, [Regressors("together", tuple(columns), "")])[0]
     return seen.drop, seen.freedom
 
 
@@ -230,11 +232,7 @@ def irregular(projector: Projector, residual: np.ndarray) -> tuple[tuple[Test, .
         new = learn_noise(part, 0.0).whiten(part)[_LAGS:]
         size = np.abs(new)
         pieces = np.array_split(size, _STRETCHES)
-        means = np.array([piece.mean() for piece in pieces])
-        within = sum(float(np.sum((piece - mean) ** 2)) for piece, mean in zip(pieces, means, strict=True))
-        between = sum(len(piece) * (mean - size.mean()) ** 2 for piece, mean in zip(pieces, means, strict=True))
-        freedom = _STRETCHES - 1, len(size) - _STRETCHES
-        even[k] = stats.f.logsf(between / freedom[0] / (within / freedom[1]), *freedom)
+        even[k] = stats.f.logsf(stats.f_oneway(*pieces).statistic, _STRETCHES - 1, len(size) - _STRETCHES)
         heavy = float(stats.kurtosis(new))
         tails[k] = stats.norm.logsf(stats.kurtosistest(new).statistic) if heavy > 0 else 0.0
         stretches = np.array([np.sqrt(np.mean(piece**2)) for piece in np.array_split(part, _STRETCHES)])

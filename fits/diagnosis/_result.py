@@ -1,5 +1,6 @@
 """What a diagnosis gives back."""
 
+import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
@@ -13,6 +14,17 @@ Verdict = Literal["no_effect", "effect_found", "unexplained"]
 SCHEMA = "microid.diagnosis/1"
 # The residual depends on something below this probability by chance.
 _SIGNIFICANT = 1e-3
+
+
+class Step(enum.StrEnum):
+    """What a diagnosis is doing; in the order in which it is done, and at most once more each."""
+
+    BASELINE = "fitting the plain stage"
+    PROBES = "simulating every effect"
+    ROUGHNESS = "learning how rough the density is"
+    SELECTION = "asking for every effect"
+    EXTENSION = "extending the stage"
+    WRITING = "writing"
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._effects import Bench, Law, _without_host
+from fits.diagnosis._effects import Bench, Law, _without_host, times
 from fits.diagnosis._projector import Projector
 from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
-from microid import AbstractEffect, Coordinates, Mechanics, Scales, host
+from microid import AbstractEffect, Coordinates, Scales, host
 
 # Strength at which an effect's derivative is taken, as a share of that of its probe.
 _SHARE = 1e-2
@@ -55,8 +55,6 @@ def scales_of(bench: Bench, noise_um: float) -> Scales:
     """Measure how large things are in the runs."""
     baseline, plain = bench.baseline, bench.plain
     records = [run.record for run in baseline.runs]
-    stage = baseline.stage
-    mechanics = [part for part in stage.parts if isinstance(part, Mechanics)]
     fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
     columns: dict[str, tuple[float, float]] = {}
     for run in baseline.runs:
@@ -72,7 +70,7 @@ def scales_of(bench: Bench, noise_um: float) -> Scales:
         duration_s=max(r.duration_s for r in records),
         shortest_s=min(r.duration_s for r in records),
         noise_um=noise_um,
-        resonance_Hz=float(mechanics[0].natural_frequency_Hz) if mechanics else None,
+        resonance_Hz=baseline.resonance_Hz,
         columns=tuple((name, *value) for name, value in columns.items()),
     )
 
@@ -105,7 +103,7 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
             share = 1.0 if form.finite else _SHARE
-            change = [c / share for c in bench.change([_scaled(effect, share)])]
+            change = [c / share for c in bench.change([effect if form.finite else times(effect, share)])]
             if form.per_run and len(change) > 1:
                 for k in range(len(change)):
                     columns.append(tuple(c if i == k else np.zeros_like(c) for i, c in enumerate(change)))
@@ -113,12 +111,6 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
                 columns.append(tuple(change))
         if all(np.all(np.isfinite(c)) for column in columns for c in column):
             yield Probe(tuple(group), tuple(columns), one_sided(form))
-
-
-def _scaled(effect: AbstractEffect, share: float) -> AbstractEffect:
-    if share == 1.0 or not effect.strength:
-        return effect
-    return replace(effect, **{name: share * getattr(effect, name) for name in effect.strength})
 
 
 def one_sided(form: type[AbstractEffect]) -> bool:
@@ -135,14 +127,14 @@ class Scored:
     `columns` are its signatures off the baseline's tangent space, whitened and joined, shape `(rows, k)`, and
     `coefficients` their best multiples, shape `(k,)`; `share_left` is the norm of the columns over that of the raw
     signatures. `z` is the evidence in standard deviations, `drop` the decrease of the sum of squares in noise
-    variances. `sure` is the evidence where what is left counts as noise that stays alike for a while, as large as it
-    is where it is: little for an effect that only comes nearest to a misfit of another shape.
+    variances. `robust_z` is the evidence where what is left counts as noise that stays alike for a while, as large as
+    it is where it is: little for an effect that only comes nearest to a misfit of another shape.
     """
 
     probe: Probe
     columns: np.ndarray
     z: float
-    sure: float
+    robust_z: float
     coefficients: np.ndarray
     drop: float
     share_left: float
@@ -205,14 +197,14 @@ def _scored(probe: Probe, columns: np.ndarray, residual: np.ndarray, raw: float)
         # What the baseline follows but for rounding cannot be asked about.
         return Scored(probe, np.zeros_like(columns), 0.0, 0.0, np.zeros(columns.shape[1]), 0.0, left)
     z, coefficients, drop = evidence(columns, residual, probe.positive, _most(probe))
-    return Scored(probe, columns, z, _sure(columns @ coefficients, residual), coefficients, drop, left)
+    return Scored(probe, columns, z, _robust_z(columns @ coefficients, residual), coefficients, drop, left)
 
 
 def _squares(columns: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->j", columns, columns)
 
 
-def _sure(along: np.ndarray, residual: np.ndarray) -> float:
+def _robust_z(along: np.ndarray, residual: np.ndarray) -> float:
     """Size of a fitted signal over the standard deviation that blocks of what is left of the residual give it."""
     products = along * (residual - along)
     blocks = np.add.reduceat(products, np.arange(0, len(products), _BLOCK))

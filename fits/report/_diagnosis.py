@@ -61,22 +61,11 @@ def report_html(diagnosis: Diagnosis) -> str:
         bars=_bars(diagnosis),
         further=_further(diagnosis, length),
         bounds=[
-            (
-                plain(one.name).capitalize(),
-                sigmas(one.z),
-                percent(one.absorbed_fraction),
-                length.bare(one.bound_um),
-            )
+            (plain(one.name).capitalize(), sigmas(one.z), percent(one.absorbed_fraction), length.bare(one.bound_um))
             for one in asked
         ],
         tests=[
-            (
-                plain(one.name).capitalize(),
-                sigmas(one.statistic),
-                chance(one.p),
-                percent(one.share),
-                one.sentence,
-            )
+            (plain(one.name).capitalize(), sigmas(one.statistic), chance(one.p), percent(one.share), one.sentence)
             for one in diagnosis.tests
         ],
         program=None if ahead is None else program(ahead),

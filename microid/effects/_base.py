@@ -65,8 +65,7 @@ class AbstractEffect(AbstractPart):
     """One physical effect: a part of a stage that does nothing where its strength is zero.
 
     To add an effect, put one file with one final, registered subclass into `microid/effects/`. Its class variables
-    are all that the diagnosis and its report know of it; several forms of one effect agree in those from
-    `fingerprint` on, but for `source`.
+    are all that the diagnosis and its report know of it; several forms of one effect agree in those from `view` on.
 
     Attributes
     ----------
