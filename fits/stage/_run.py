@@ -15,6 +15,7 @@ from fits.io._columns import columns_beside
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._run import VIRGIN, initial_state, known_samples
+from fits.stage._lagging import known_behind_lag
 from microid import (
     AbstractHysteresis,
     AbstractLinear,
@@ -165,6 +166,8 @@ def prepare_stage_run(
     lower, upper = range_V
     n, unknown = len(record), initial in ("unknown", VIRGIN)
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
+    if unknown and gain is not None:
+        known = known_behind_lag(record.voltage_V, record.displacement_um, known)
     fitted = known.copy() if usable is None else known & usable
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False
