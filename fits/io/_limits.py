@@ -160,8 +160,8 @@ def reached_in(report: Mapping[str, Any]) -> Ranges:
     runs = (
         [run for run in listed if isinstance(run, Mapping) and run.get("reached")] if isinstance(listed, list) else []
     )
-    offsets_um = [run.get("offset_um") for run in runs]
-    offsets_um = [float(offset) if isinstance(offset, int | float) else 0.0 for offset in offsets_um]
+    stated = [run.get("offset_um") for run in runs]
+    offsets_um = [float(offset) if isinstance(offset, int | float) else 0.0 for offset in stated]
     found = []
     for run, offset_um in zip(runs, offsets_um, strict=True):
         ranges = ranges_of_json(run["reached"])
