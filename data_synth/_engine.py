@@ -20,7 +20,8 @@ AFTER = 40
 """Samples for which the chain goes on after the last: lost samples and clocks that run ahead look there."""
 
 _SPACING = 5e-4
-_MOST_STEPS = 1_500_000
+# Fine steps of a run, and of a sample: what a driver or a mass does within far less is a jump to all that follows.
+_MOST_STEPS, _FINEST = 1_500_000, 4096
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def refinement(plant: Plant, sample_rate_Hz: float, samples: int) -> int:
     if plant.natural_frequency_Hz is not None:
         longest_s = min(longest_s, 1 / (40 * plant.natural_frequency_Hz))
     steps = max(16, math.ceil(1 / (sample_rate_Hz * longest_s)))
-    return min(steps, max(16, _MOST_STEPS // samples))
+    return min(steps, _FINEST, max(16, _MOST_STEPS // samples))
 
 
 class Player:

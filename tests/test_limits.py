@@ -271,3 +271,8 @@ def test_no_program_leaves_the_limits_on_fifty_rigs():
     assert beyond_limits == []
     assert unguarded > 5
     assert refused < 5
+
+
+@pytest.mark.parametrize("runs", [1.5, "x", None, [1, "x"], [{"reached": 3.0}], [{"reached": {}, "offset_um": "x"}]])
+def test_a_model_file_that_says_nonsense_of_its_runs_says_nothing(runs):
+    assert reached_in({"runs": runs}) == {}

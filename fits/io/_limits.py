@@ -133,11 +133,16 @@ def reached_in(report: Mapping[str, Any]) -> Ranges:
 
     Displacements are as the sensor read them in the first run, whose offset is the model's.
     """
-    runs = [run for run in report.get("runs", ()) if isinstance(run, Mapping) and run.get("reached")]
+    listed = report.get("runs")
+    runs = (
+        [run for run in listed if isinstance(run, Mapping) and run.get("reached")] if isinstance(listed, list) else []
+    )
+    stated = [run.get("offset_um") for run in runs]
+    offsets_um = [float(offset) if isinstance(offset, int | float) else 0.0 for offset in stated]
     found = []
-    for run in runs:
+    for run, offset_um in zip(runs, offsets_um, strict=True):
         ranges = ranges_of_json(run["reached"])
-        shift_um = float(runs[0].get("offset_um", 0.0)) - float(run.get("offset_um", 0.0))
+        shift_um = offsets_um[0] - offset_um
         if "displacement" in ranges:
             low, high = ranges["displacement"]
             ranges["displacement"] = low + shift_um, high + shift_um

@@ -28,8 +28,9 @@ _ROUNDED = 1.2
 _REWEIGHED = 8
 # Correlation of displacement with voltage below which there is no loop.
 _CORRELATED = 0.3
-# Coherence from which on it follows all the same, and segments whose spectra are averaged.
-_COHERENT, _SEGMENTS = 0.3, 16
+# Coherence from which on it follows all the same, that of lines whose gain is believed, and segments whose spectra
+# are averaged: chance gives 1 / 16.
+_COHERENT, _CLEAR, _SEGMENTS = 0.2, 0.3, 16
 # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
 _LEADING = 0.5
 
@@ -144,10 +145,11 @@ def _refuse_ringing(run: Run) -> None:
     follows = float(np.average(shared, weights=power))
     if follows < _COHERENT:
         return
-    gain = np.where((shared > _COHERENT) & (power > np.median(power)), np.abs(cross) / (power + 1e-300), 0.0)
+    clear = (shared > min(_CLEAR, follows)) & (power > np.median(power))
+    gain = np.where(clear, np.abs(cross) / (power + 1e-300), 0.0)
     raise DataError(
         f"{run.record.source}: the displacement follows the voltage (coherence {follows:.2f}), but not at once, and "
-        f"most at {frequency[np.argmax(gain)]:.4g} Hz: this run plays up to a resonance and beyond, and shows no "
+        f"most near {frequency[np.argmax(gain)]:.4g} Hz: this run plays up to a resonance and beyond, and shows no "
         "hysteresis loop; give a slow run over the whole range of the voltage, beside this one for --model stage"
     )
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.loop._lagging import known_behind_lag
 from fits.loop._samples import Samples, refine, resized
 from microid import Hold, Preisach, Staircase, demagnetised, negative_saturation, positive_saturation, remember
 
@@ -130,6 +131,9 @@ def prepare_run(
     """
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
+    unknown = initial in ("unknown", VIRGIN)
+    if unknown and gain is not None and record.displacement_um is not None:
+        known = known_behind_lag(record.voltage_V, record.displacement_um, known)
     fitted = known.copy() if usable is None else known & usable
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False
@@ -141,7 +145,7 @@ def prepare_run(
         )
     ahead = 1.0 if gain is None else gain
     lower, upper = ahead * lower, ahead * upper
-    start, unknown = initial_state(initial, lower, upper), initial in ("unknown", VIRGIN)
+    start = initial_state(initial, lower, upper)
     return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown)
 
 
