@@ -1,8 +1,10 @@
-"""Running the `microid` command in tests."""
+"""Running the `microid` command in tests, and looking at what it writes."""
 
 import re
 
+import numpy as np
 from click.testing import CliRunner
+from matplotlib.image import imread
 
 from fits.cli._main import cli
 
@@ -15,6 +17,20 @@ def run(*arguments):
 
 def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def columns_of(path):
+    """Columns of numbers of a CSV by name."""
+    header, *rows = path.read_text().splitlines()
+    return dict(zip(header.split(","), np.array([row.split(",") for row in rows], dtype=float).T, strict=True))
+
+
+def whole_picture(path):
+    """Grey levels of a picture on which something is drawn and nothing is cut off: the rim stays white."""
+    image = imread(path)[..., :3].mean(axis=-1)
+    assert image.std() > 0.02
+    assert np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).min() > 0.99
+    return image
 
 
 def refused(result, *words):

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from _sweeps import small
 
 import fits
 import microid as m
@@ -43,31 +44,6 @@ kind = "steps"
 levels_V = [81.7, 31.3]
 dwell_s = 0.5
 rate_V_per_s = 600.0
-"""
-SWEEP = """
-schema = "microid.sweep/1"
-kind = "simulate"
-seed = 3
-[program]
-shape = "sine"
-samples = 60
-interval_s = 1e-3
-offset_V = 60.0
-amplitude_V = 40.0
-frequency_Hz = 40.0
-[design]
-method = "random"
-rows = 20
-[[axis]]
-parameter = "mechanics.natural_frequency_Hz"
-low = 80.0
-high = 160.0
-[[axis]]
-parameter = "mechanics.damping_ratio"
-mean = 0.05
-sd = 0.004
-[run]
-chunk_rows = 256
 """
 
 
@@ -116,7 +92,7 @@ def good_files(folder: Path, model: Path) -> dict[str, Path]:
         "model.json": model.read_bytes(),
         "design.toml": design_text(fits.paper_design()).encode(),
         "scenario.toml": SCENARIO.encode(),
-        "sweep.toml": SWEEP.encode(),
+        "sweep.toml": small(3, rows=20).encode(),
         "gains.json": json.dumps({"gains": dict.fromkeys(GAINS, 0.01)}).encode(),
     }
     for name, data in texts.items():

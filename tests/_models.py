@@ -3,6 +3,7 @@
 import functools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from _reference import interpolated
@@ -41,6 +42,41 @@ def stroke_um(model):
     """Largest change of the output: all weights of a grid, and the integral of the reversible slope."""
     slopes = np.asarray(model.reversible.slope_um_per_V)
     return float(np.sum(model.density.packed_um) + np.mean((slopes[1:] + slopes[:-1]) / 2) * np.ptp(limits_V(model)))
+
+
+def ends_um(model):
+    """Smallest and largest displacement."""
+    return float(model.offset_um), float(model.offset_um) + stroke_um(model)
+
+
+def starts(model, **size):
+    """Memories to begin with by name."""
+    lower_V, upper_V = limits_V(model)
+    return {
+        "negative": m.negative_saturation(lower_V, **size),
+        "positive": m.positive_saturation(lower_V, upper_V, **size),
+        "demagnetised": m.demagnetised(lower_V, upper_V, **size),
+    }
+
+
+def linear_stage_of(plant, gain_um_per_V, offset_um):
+    """A stage without hysteresis; a plant is a time constant in s, a natural frequency in Hz and a damping ratio."""
+    time_constant_s, natural_frequency_Hz, damping_ratio = map(float, plant)
+    return m.Stage.of(
+        driver=m.Driver(time_constant_s),
+        piezo=m.Piezo(gain_um_per_V, offset_um),
+        mechanics=m.Mechanics(natural_frequency_Hz, damping_ratio),
+    )
+
+
+def flat(tree):
+    """All numbers of a tree, shape `(k,)`."""
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+
+
+def matrix(jacobian):
+    """Derivatives of outputs of shape `(n,)` in all numbers of a tree, shape `(n, k)`."""
+    return np.concatenate([np.reshape(leaf, (len(leaf), -1)) for leaf in jax.tree.leaves(jacobian)], axis=1)
 
 
 @compiled

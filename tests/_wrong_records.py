@@ -109,3 +109,9 @@ def with_outliers(rng, record, share=0.03, size_um=50.0):
     """Some readings jump out; the record, and where."""
     hit = rng.random(len(record)) < share
     return read(record, record.displacement_um + np.where(hit, size_um * rng.choice([-1, 1], len(record)), 0.0)), hit
+
+
+def said(result, word):
+    """The only remark of a fit with a word in it."""
+    (remark,) = [remark for remark in result.remarks if word in remark]
+    return remark

@@ -56,6 +56,15 @@ def _few_mappings() -> Iterator[None]:
     _forget_beyond(_BETWEEN_TESTS)
 
 
+@pytest.fixture(scope="module")
+def compiled_fast() -> Iterator[None]:
+    """For programs that run for a second, and take much longer to optimise."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.fixture
 def seed(request: pytest.FixtureRequest) -> int:
     """The test's own seed, printed when the test fails; MICROID_SEED=fresh draws another, a number replays it."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from _command import OFF, files, refused, run
+from _command import OFF, columns_of, files, refused, run
 
 from fits.cli._main import cli
 from fits.io._jax_setup import _cache_folder
@@ -29,11 +29,6 @@ def shell(*arguments, **options):
     env = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"} | OFF | options.pop("env", {})
     command = [sys.executable, "-c", HEEDING, *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env, **options)
-
-
-def read(path):
-    header, *rows = path.read_text().splitlines()
-    return dict(zip(header.split(","), np.array([row.split(",") for row in rows], dtype=float).T, strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +66,7 @@ def test_prediction_agrees_with_the_truth_of_the_bench(bench, tmp_path):
     program = folder / "csv" / "heldout.csv"
     result = run("simulate", folder / "model.json", program, "--out", tmp_path / "p.csv", "--json")
     assert result.exit_code == 0, result.stderr
-    predicted, measured = read(tmp_path / "p.csv"), read(program)
+    predicted, measured = columns_of(tmp_path / "p.csv"), columns_of(program)
     assert list(predicted) == ["time_s", "voltage_V", "displacement_um", "displacement_sd_um"]
     for column in ("time_s", "voltage_V"):
         assert np.array_equal(predicted[column], measured[column])
@@ -96,7 +91,7 @@ def test_programs_need_no_displacement_and_initial_states_differ(bench, tmp_path
         )
         assert result.exit_code == 0, result.stderr
         assert str(out) in result.stdout
-        found[state] = read(out)
+        found[state] = columns_of(out)
     assert found["negative"]["voltage_V"].tolist() == [40.0, 50.0, 40.0]
     first = {state: columns["displacement_um"][0] for state, columns in found.items()}
     assert first["negative"] < first["demagnetised"] < first["positive"]
@@ -120,7 +115,7 @@ def test_json_and_info_agree(bench, tmp_path):
     assert info["fit"] == report
     assert {"path": "density.packed_um", "shape": [36], "unit": "um"} in info["parameters"]
 
-    measured = read(folder / "csv" / "heldout.csv")["displacement_um"]
+    measured = columns_of(folder / "csv" / "heldout.csv")["displacement_um"]
     assert report["held_out"]["range_um"] == np.ptp(measured)
     assert report["held_out"]["e_rms_pct"] == pytest.approx(100 * report["held_out"]["rms_um"] / np.ptp(measured))
     assert 0.05 < report["held_out"]["e_rms_pct"] < 0.15

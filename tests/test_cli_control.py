@@ -2,12 +2,11 @@
 
 import json
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _command import files, refused, run
-from matplotlib.image import imread
+from _command import columns_of, files, refused, run, whole_picture
+from _models import linear_stage_of
 from scipy.signal import cont2discrete, lfilter
 
 import microid as m
@@ -17,19 +16,9 @@ from fits.cli._main import cli
 T = 1e-3
 SAMPLES = 120
 TAU_s, NATURAL_Hz, DAMPING, GAIN, OFFSET = 2e-3, 60.0, 0.3, 0.12, 1.5
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled_fast():
-    """These programs run for a second, and take much longer to optimise."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 GIVEN = ("--gains", "0.5,80,1e-3")
 LIVELY = ("--gains", "0.5,1700,1e-3", "--feedforward", "none")
+pytestmark = pytest.mark.usefixtures("compiled_fast")
 
 
 def write(path, time_s, displacement_um):
@@ -37,18 +26,11 @@ def write(path, time_s, displacement_um):
     path.write_text("\n".join(["time_s,displacement_um", *rows]) + "\n")
 
 
-def read(path):
-    header, *rows = path.read_text().splitlines()
-    return dict(zip(header.split(","), np.array([row.split(",") for row in rows], dtype=float).T, strict=True))
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A linear model, a hysteresis, and references: a step, a sine, and uneven times."""
     place = tmp_path_factory.mktemp("control")
-    linear = m.Stage.of(
-        driver=m.Driver(TAU_s), piezo=m.Piezo(GAIN, OFFSET), mechanics=m.Mechanics(NATURAL_Hz, DAMPING)
-    )
+    linear = linear_stage_of((TAU_s, NATURAL_Hz, DAMPING), GAIN, OFFSET)
     save_model(place / "linear.json", linear, None, {})
     density = m.GridDensity(np.linspace(0.2, 0.8, 15), 0.0, 100.0)
     law = m.Preisach(density, m.Reversible(jnp.full(5, 0.05), 0.0, 100.0), jnp.asarray(2.0))
@@ -83,7 +65,7 @@ def test_given_gains_are_run_as_scipy_runs_them(folder, tmp_path):
         *("--feedforward", "none", "--json", "--plots", tmp_path / "plots"),
     )
     assert result.exit_code == 0, result.output
-    told, out = json.loads(result.stdout), read(tmp_path / "r.csv")
+    told, out = json.loads(result.stdout), columns_of(tmp_path / "r.csv")
     assert list(out) == ["time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um"]
     reference = 5.0 + 2 * (out["time_s"] > 0.0195)
     expected = closed_by_scipy(gains, reference, 5.0)
@@ -101,7 +83,7 @@ def test_given_gains_are_run_as_scipy_runs_them(folder, tmp_path):
     assert told["margins"]["stable"] is True
     assert [path.name for path in sorted((tmp_path / "plots").iterdir())] == ["margins.png", "run.png"]
     for place in told["plots"]:
-        assert imread(place)[..., :3].mean(axis=-1).std() > 0.02
+        whole_picture(place)
     # What --json printed is taken as gains again.
     (tmp_path / "gains.json").write_text(result.stdout)
     again = run(
@@ -120,7 +102,7 @@ def test_a_tuned_loop_follows_better_than_its_start_and_says_what_noise_hides(fo
         *(*options, "--feedforward", "dynamic", "--effort", "0.01"),
     )
     assert result.exit_code == 0, result.output
-    told, out = json.loads(result.stdout), read(tmp_path / "r.csv")
+    told, out = json.loads(result.stdout), columns_of(tmp_path / "r.csv")
     assert told["tuning"]["cost_after_um"] < told["tuning"]["cost_before_um"]
     assert told["margins_worst"]["gain_margin"] is None or told["margins_worst"]["gain_margin"] > 1.99
     kept = slice(20, None)
@@ -154,7 +136,7 @@ def test_the_other_controllers_run_on_a_hysteresis(folder, tmp_path, kind):
         *("--controller", kind, "--gains", "0.2,300,1e-5"),
     )
     assert result.exit_code == 0, result.output
-    told, out = json.loads(result.stdout), read(tmp_path / "r.csv")
+    told, out = json.loads(result.stdout), columns_of(tmp_path / "r.csv")
     assert told["controller"] == kind
     assert np.all((out["command_V"] >= 0) & (out["command_V"] <= 100))
     assert told["tracking"]["e_rms_pct"] < 60

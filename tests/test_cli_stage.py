@@ -2,11 +2,9 @@
 
 import json
 
-import jax
 import numpy as np
 import pytest
-from _command import files, refused, run
-from matplotlib.image import imread
+from _command import columns_of, files, refused, run, whole_picture
 from test_cli_refusals import bad_csv, write_csv
 
 from fits import FitError, FitStatus, StageUncertainty, describe, load_model
@@ -72,15 +70,7 @@ TRUTH = {
     "mechanics.damping_ratio": 0.05,
 }
 LEVELS = 6
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled_fast():
-    """These programs run for a second, and take much longer to optimise."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+pytestmark = pytest.mark.usefixtures("compiled_fast")
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +84,6 @@ def bench(tmp_path_factory):
     fit = run("fit", *runs, *options, "--out", out, "--json")
     assert fit.exit_code == 0, fit.output
     return folder, runs, out, json.loads(fit.stdout)
-
-
-def read(path):
-    header, *rows = path.read_text().splitlines()
-    return dict(zip(header.split(","), np.array([row.split(",") for row in rows], dtype=float).T, strict=True))
 
 
 def test_the_fit_finds_the_plant_of_the_bench(bench):
@@ -153,10 +138,7 @@ def test_the_pictures_are_drawn(bench):
     assert [path.name for path in sorted((folder / "plots").iterdir())] == ["loop.png", "response.png", "runs.png"]
     assert len(report["plots"]) == 3
     for place in report["plots"]:
-        image = imread(place)[..., :3].mean(axis=-1)
-        assert image.std() > 0.02  # something is drawn
-        # Nothing is cut off: the rim stays white.
-        assert np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).min() > 0.99
+        whole_picture(place)
 
 
 def test_info_names_the_parameters_of_the_parts(bench):
@@ -177,7 +159,7 @@ def test_simulate_predicts_the_bench_within_its_noise(bench, tmp_path):
     assert isinstance(loaded.uncertainty, StageUncertainty)
     result = run("simulate", out, folder / "fast.csv", "--out", tmp_path / "p.csv", "--json")
     assert result.exit_code == 0, result.output
-    predicted, measured = read(tmp_path / "p.csv"), read(folder / "fast.csv")
+    predicted, measured = columns_of(tmp_path / "p.csv"), columns_of(folder / "fast.csv")
     assert list(predicted) == ["time_s", "voltage_V", "displacement_um", "displacement_sd_um"]
     off = measured["displacement_um"] - predicted["displacement_um"]
     assert np.std(off) < 0.12
@@ -198,7 +180,7 @@ def test_compensate_leads_the_mechanics_and_says_how_sure_it_is(bench, tmp_path)
     told = json.loads(result.stdout)
     assert 0 < told["displacement_sd_median_um"] < 0.1
     assert told["error_max_within_reach_um"] < 0.3
-    assert np.ptp(read(tmp_path / "v.csv")["voltage_V"]) > 20
+    assert np.ptp(columns_of(tmp_path / "v.csv")["voltage_V"]) > 20
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _models import PLACES, compiled, limits_V, nested_voltages, play, random_model, stroke_um
+from _models import PLACES, compiled, limits_V, linear_stage_of, nested_voltages, play, random_model, stroke_um
 from _plant_reference import driver_and_mechanics, van_loan
 from _reference import central_differences
 
@@ -122,8 +122,7 @@ PLANT = (2e-3, 60.0, 0.2)
 
 
 def linear_stage():
-    tau_s, natural_Hz, damping = PLANT
-    return m.Stage.of(driver=m.Driver(tau_s), piezo=m.Piezo(GAIN, OFFSET), mechanics=m.Mechanics(natural_Hz, damping))
+    return linear_stage_of(PLANT, GAIN, OFFSET)
 
 
 def by_numpy(gains, reference, feedforward, noise, delay, resolution_um, resolution_V, limits, before_V):

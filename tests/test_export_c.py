@@ -12,10 +12,12 @@ from _models import (
     PLACES,
     SAMPLES,
     compiled,
+    ends_um,
     limits_V,
     nested_voltages,
     play,
     random_model,
+    starts,
     stroke_um,
 )
 
@@ -66,22 +68,9 @@ class Controller:
         return self._play(self.library.axis_z_inverse, reference_um)
 
 
-def started(model, state, size=64):
-    lower_V, upper_V = limits_V(model)
-    if state == "demagnetised":
-        return m.demagnetised(lower_V, upper_V, size=size)
-    return (
-        m.negative_saturation(lower_V, size) if state == "negative" else m.positive_saturation(lower_V, upper_V, size)
-    )
-
-
 @compiled
 def inverted(model, reference_um, start):
     return m.invert(model, reference_um, start).voltage_V
-
-
-def ends_um(model):
-    return float(model.offset_um), float(model.offset_um) + stroke_um(model)
 
 
 @needs_compiler
@@ -95,16 +84,16 @@ def test_it_does_what_jax_does(rng, tmp_path, levels):
         controller.start(state)
         displacement_um, status = controller.forward(voltage_V)
         assert not status.any()
-        expected_um, _ = play(model, voltage_V, started(model, state))
+        expected_um, _ = play(model, voltage_V, starts(model, size=64)[state])
         np.testing.assert_allclose(displacement_um, expected_um, rtol=0, atol=1e-12 * stroke_um(model))
 
         reference_um = nested_voltages(rng, *ends_um(model), SAMPLES)
         controller.start(state)
         found_V, status = controller.inverse(reference_um)
         assert not status.any()
-        expected_V = inverted(model, jnp.asarray(reference_um), started(model, state))
+        expected_V = inverted(model, jnp.asarray(reference_um), starts(model, size=64)[state])
         np.testing.assert_allclose(found_V, expected_V, rtol=0, atol=1e-9)
-        output_um, _ = play(model, found_V, started(model, state))
+        output_um, _ = play(model, found_V, starts(model, size=64)[state])
         np.testing.assert_allclose(output_um, reference_um, rtol=0, atol=1e-12 * stroke_um(model))
 
 
@@ -174,7 +163,7 @@ def test_a_full_memory_drops_the_smallest_swing(rng, tmp_path):
     reference_um = nested_voltages(rng, lowest_um, highest_um, 20)
     found_V, status = controller.inverse(reference_um)
     assert not status.any()
-    output_um, _ = play(model, found_V, started(model, "negative"))
+    output_um, _ = play(model, found_V, starts(model, size=64)["negative"])
     np.testing.assert_allclose(output_um, reference_um, rtol=0, atol=1e-12 * stroke_um(model))
 
 

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from _wrong_records import bench, delayed, in_ms, joined, read, stuck, thinned, with_outliers
+from _wrong_records import bench, delayed, in_ms, joined, read, said, stuck, thinned, with_outliers
 
 import fits
 from fits.loop._fit_checks import impulsive
@@ -22,11 +22,6 @@ def slow():
 
 def fit(*records, **options):
     return fits.fit(list(records), levels=LEVELS, initial="negative", **options)
-
-
-def said(result, word):
-    (remark,) = [remark for remark in result.remarks if word in remark]
-    return remark
 
 
 def test_a_clean_record_gets_no_such_remark_and_its_noise_is_known(slow):

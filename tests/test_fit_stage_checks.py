@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from _wrong_records import TRUTH, bench, delayed, in_ms, stuck, thinned, with_outliers
+from _wrong_records import TRUTH, bench, delayed, in_ms, said, stuck, thinned, with_outliers
 from scipy import signal
 
 import fits
@@ -20,11 +20,6 @@ def runs():
 
 def fit(slow, fast, **options):
     return fits.fit_stage([slow, fast], levels=LEVELS, initial="negative", **options)
-
-
-def said(result, word):
-    (remark,) = [remark for remark in result.remarks if word in remark]
-    return remark
 
 
 def named(slow, fast, word):

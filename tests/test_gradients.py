@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from _models import compiled, limits_V, play, random_model, stroke_um
+from _models import compiled, flat, limits_V, matrix, play, random_model, stroke_um
 from _reference import central_differences
 
 import microid as m
@@ -61,14 +61,6 @@ def jacobians(model, voltage_V):
 
     forward, reverse = (jac(function, argnums=(0, 1))(model, voltage_V) for jac in (jax.jacfwd, jax.jacrev))
     return function(model, voltage_V), forward, reverse
-
-
-def matrix(jacobian):
-    return np.concatenate([np.reshape(leaf, (SAMPLES, -1)) for leaf in jax.tree.leaves(jacobian)], axis=1)
-
-
-def flat(tree):
-    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
 
 
 def unflat(vector, like):

@@ -10,10 +10,14 @@ from _models import (
     SAMPLES,
     compiled,
     densities_of,
+    ends_um,
+    flat,
     limits_V,
+    matrix,
     nested_voltages,
     play,
     random_model,
+    starts,
     stroke_um,
 )
 from _reference import central_differences, invert_relays, relay_weights_um
@@ -30,24 +34,11 @@ def inverted(model, reference_um, start):
     return m.invert(model, reference_um, start)
 
 
-def starts(model):
-    lower_V, upper_V = limits_V(model)
-    return {
-        "negative": m.negative_saturation(lower_V, PLACES),
-        "positive": m.positive_saturation(lower_V, upper_V, PLACES),
-        "demagnetised": m.demagnetised(lower_V, upper_V, size=PLACES),
-    }
-
-
-def reachable_um(model):
-    return float(model.offset_um), float(model.offset_um) + stroke_um(model)
-
-
 def nested_references(rng, model):
     """Reversals, small moves, rests and both ends."""
-    reference_um = nested_voltages(rng, *reachable_um(model), SAMPLES)
-    reference_um[rng.integers(SAMPLES, size=6)] = reachable_um(model)[0]
-    reference_um[rng.integers(SAMPLES, size=6)] = reachable_um(model)[1]
+    reference_um = nested_voltages(rng, *ends_um(model), SAMPLES)
+    reference_um[rng.integers(SAMPLES, size=6)] = ends_um(model)[0]
+    reference_um[rng.integers(SAMPLES, size=6)] = ends_um(model)[1]
     return reference_um
 
 
@@ -55,10 +46,10 @@ def nested_references(rng, model):
 def test_the_output_is_the_reference(rng, state):
     for _ in range(3):
         model = random_model(rng)
-        start, reference_um = starts(model)[state], nested_references(rng, model)
+        start, reference_um = starts(model, size=PLACES)[state], nested_references(rng, model)
         found = inverted(model, reference_um, start)
         assert np.all(found.reachable)
-        np.testing.assert_allclose((found.lowest_um, found.highest_um), reachable_um(model), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose((found.lowest_um, found.highest_um), ends_um(model), rtol=1e-12, atol=1e-12)
         output_um, end = play(model, found.voltage_V, start)
         np.testing.assert_allclose(output_um, reference_um, rtol=0, atol=1e-12 * stroke_um(model))
         rests = np.diff(reference_um) == 0
@@ -77,7 +68,7 @@ def test_the_inverse_of_a_displacement_is_its_voltage(rng, state):
     lower_V, upper_V = limits_V(model)
     voltage_V = nested_voltages(rng, lower_V, upper_V, SAMPLES)
     voltage_V[rng.integers(SAMPLES, size=12)] = np.repeat([lower_V, upper_V], 6)
-    start = starts(model)[state]
+    start = starts(model, size=PLACES)[state]
     displacement_um, _ = play(model, voltage_V, start)
     found = inverted(model, displacement_um, start)
     # Even where the output at an end differs from the end by its last digit.
@@ -87,7 +78,7 @@ def test_the_inverse_of_a_displacement_is_its_voltage(rng, state):
 
 def test_it_goes_on_where_it_ended(rng):
     model = random_model(rng)
-    reference_um, start = nested_references(rng, model), starts(model)["demagnetised"]
+    reference_um, start = nested_references(rng, model), starts(model, size=PLACES)["demagnetised"]
     whole = inverted(model, reference_um, start)
     # The second half of the first record is filled with its last value, which moves nothing.
     cut = int(rng.integers(20, SAMPLES - 20))
@@ -100,8 +91,8 @@ def test_it_goes_on_where_it_ended(rng):
 def test_plain_relays_need_the_same_voltages(rng):
     model = random_model(rng)
     # Reversals far apart: what a cell is off at one shows in all that hangs from it.
-    reference_um = np.interp(np.linspace(0, 8, SAMPLES), np.arange(9), rng.uniform(*reachable_um(model), 9))
-    found = inverted(model, reference_um, starts(model)["negative"])
+    reference_um = np.interp(np.linspace(0, 8, SAMPLES), np.arange(9), rng.uniform(*ends_um(model), 9))
+    found = inverted(model, reference_um, starts(model, size=PLACES)["negative"])
     relays = 240
     weights_um, thresholds_V = relay_weights_um(*densities_of(model), *limits_V(model), relays)
     expected_V = invert_relays(weights_um, thresholds_V, reference_um - float(model.offset_um))
@@ -110,19 +101,19 @@ def test_plain_relays_need_the_same_voltages(rng):
 
 def test_what_is_out_of_reach_is_flagged_and_clipped(rng):
     model = random_model(rng)
-    lowest_um, highest_um = reachable_um(model)
+    lowest_um, highest_um = ends_um(model)
     reference_um = nested_references(rng, model)
     low, high, odd = rng.permutation(SAMPLES)[:18].reshape(3, 6)
     reference_um[low] = lowest_um - rng.exponential(1, 6) - 1e-6
     reference_um[high] = highest_um + rng.exponential(1, 6) + 1e-6
-    found = inverted(model, reference_um, starts(model)["negative"])
+    found = inverted(model, reference_um, starts(model, size=PLACES)["negative"])
     np.testing.assert_array_equal(found.reachable, ~np.isin(np.arange(SAMPLES), [*low, *high]))
     np.testing.assert_allclose(found.voltage_V[low], limits_V(model)[0], rtol=0, atol=1e-10)
     np.testing.assert_allclose(found.voltage_V[high], limits_V(model)[1], rtol=0, atol=1e-10)
     clipped_um = np.clip(reference_um, lowest_um, highest_um)
     np.testing.assert_allclose(play(model, found.voltage_V)[0], clipped_um, rtol=0, atol=1e-12 * stroke_um(model))
     reference_um[odd] = np.nan
-    found = inverted(model, reference_um, starts(model)["negative"])
+    found = inverted(model, reference_um, starts(model, size=PLACES)["negative"])
     assert not np.any(found.reachable[odd])
     assert np.all(np.isnan(found.voltage_V[odd]))
 
@@ -133,14 +124,6 @@ def jacobians(model, reference_um):
         return m.invert(model, reference_um).voltage_V
 
     return [jac(voltage, argnums=(0, 1))(model, reference_um) for jac in (jax.jacfwd, jax.jacrev)]
-
-
-def flat(tree):
-    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
-
-
-def matrix(jacobian):
-    return np.concatenate([np.reshape(leaf, (FEW, -1)) for leaf in jax.tree.leaves(jacobian)], axis=1)
 
 
 def spread_references(rng, model):
@@ -197,7 +180,7 @@ def test_second_derivatives_agree_with_differences_of_the_first(rng):
 
 def test_derivatives_at_rests_and_ends_are_finite(rng):
     model = random_model(rng, levels=4)
-    lowest_um, highest_um = reachable_um(model)
+    lowest_um, highest_um = ends_um(model)
     share = np.array([0, 0, 0.4, 0.4, 0.2, 0.4, 0.2, 0.2, 1, 1, 0.5, 1, 0, 1])
     assert len(share) == FEW
     forward, reverse = jacobians(model, lowest_um * (1 - share) + highest_um * share)
@@ -221,20 +204,20 @@ def test_float32_and_many_models_and_references_at_once(rng):
 
 
 def test_other_numbers_compile_nothing_new(rng):
-    inverted(*(lambda p: (p, nested_references(rng, p), starts(p)["negative"]))(random_model(rng)))
+    inverted(*(lambda p: (p, nested_references(rng, p), starts(p, size=PLACES)["negative"]))(random_model(rng)))
     before = len(TRACES)
     for state in ("positive", "negative"):
         model = random_model(rng)
-        inverted(model, nested_references(rng, model), starts(model)[state])
+        inverted(model, nested_references(rng, model), starts(model, size=PLACES)[state])
     assert len(TRACES) == before
 
 
 def test_a_memory_that_is_too_small_says_so(rng):
     model = random_model(rng)
-    lowest_um, highest_um = reachable_um(model)
+    lowest_um, highest_um = ends_um(model)
     swings = np.where(np.arange(SAMPLES) % 2, 0.99, -0.99) * np.linspace(0.5, 0.1, SAMPLES)
     reference_um = (lowest_um + highest_um) / 2 + swings * (highest_um - lowest_um)
-    found = inverted(model, reference_um, starts(model)["negative"])
+    found = inverted(model, reference_um, starts(model, size=PLACES)["negative"])
     assert np.all(np.isfinite(found.voltage_V))
     assert np.all(np.isnan(found.end.extremes_V))
     assert np.all(np.isnan(inverted(model, nested_references(rng, model), found.end).voltage_V))

@@ -4,13 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _models import compiled
+from _models import compiled, linear_stage_of
 from _plant_reference import driver_and_mechanics, states, van_loan
 from jax import lax
 from scipy.interpolate import CubicSpline
 from scipy.signal import cont2discrete, lfilter
 
-import microid as m
 import microid.control as c
 
 T = 1e-3
@@ -28,8 +27,7 @@ def play(controller, reference_um, measured_um, feedforward_V):
 
 
 def linear_stage(plant=PLANT, gain=GAIN):
-    tau_s, natural_Hz, damping = plant
-    return m.Stage.of(driver=m.Driver(tau_s), piezo=m.Piezo(gain, OFFSET), mechanics=m.Mechanics(natural_Hz, damping))
+    return linear_stage_of(plant, gain, OFFSET)
 
 
 def random_pid(rng, **others):

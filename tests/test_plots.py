@@ -8,7 +8,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.image import imread
+from _command import whole_picture
 
 import fits
 import microid
@@ -50,14 +50,6 @@ def waves(samples, cycles):
     return UPPER_V / 2 * (1 - np.cos(np.linspace(0, 2 * np.pi * cycles, samples)))
 
 
-def pixels(path):
-    image = imread(path)[..., :3].mean(axis=-1)
-    assert image.std() > 0.02  # something is drawn
-    # Nothing is cut off: the rim stays white.
-    assert np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).min() > 0.99
-    return image
-
-
 def test_a_fit_is_drawn_in_four_pictures_that_fit_columns(tmp_path, rng, model):
     settings = dict(mpl.rcParams)
     measured = record(rng, model, waves(3000, 3))
@@ -66,7 +58,7 @@ def test_a_fit_is_drawn_in_four_pictures_that_fit_columns(tmp_path, rng, model):
     assert sorted(path.name for path in paths) == ["density.png", "everett.png", "heldout.png", "loops.png"]
     assert sorted(paths) == sorted(tmp_path.iterdir())
     for path in paths:
-        width_mm = pixels(path).shape[1] / 200 * 25.4
+        width_mm = whole_picture(path).shape[1] / 200 * 25.4
         assert min(abs(width_mm - 90), abs(width_mm - 180)) < 1
     assert dict(mpl.rcParams) == settings
     assert plt.get_fignums() == []

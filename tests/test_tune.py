@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _models import densities_of, limits_V, random_model
+from _models import densities_of, limits_V, linear_stage_of, random_model
 from _plant_reference import driver_and_mechanics, van_loan
 from _reference import central_differences
 from _seed import seed_of
@@ -21,18 +21,11 @@ SAMPLES = 160
 PLANT, GAIN, OFFSET = np.array([2e-3, 60.0, 0.3]), 0.12, 1.5
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_fast():
-    """These programs run for a second, and take much longer to optimise."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+pytestmark = pytest.mark.usefixtures("compiled_fast")
 
 
 def stage_of(plant, gain=GAIN):
-    tau_s, natural_Hz, damping = (float(x) for x in plant)
-    return m.Stage.of(driver=m.Driver(tau_s), piezo=m.Piezo(gain, OFFSET), mechanics=m.Mechanics(natural_Hz, damping))
+    return linear_stage_of(plant, gain, OFFSET)
 
 
 def drawn(rng, count=3):

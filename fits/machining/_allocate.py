@@ -10,8 +10,7 @@ from scipy.optimize import NonlinearConstraint, minimize, nnls
 
 from fits.io._errors import DataError
 from fits.machining._design import Design, lever_mm
-from fits.machining._gains import gain_model, gradient, inputs_of, twin
-from fits.machining._second_order import second_order
+from fits.machining._gains import gain_model, gradient, hessian, inputs_of, twin
 from fits.machining._tolerances import check, check_independent, tolerances
 from microid import DIMENSIONS, Axis
 
@@ -106,7 +105,7 @@ def allocate(
         If the solver fails.
     """
     _check(design, budget_pct, cost or {}, limit, bounds_mm)
-    axes = _tightest(budget_pct)
+    axes = _lowest_budgets(budget_pct)
     names = tuple(dict.fromkeys(name for axis in axes for name in inputs_of(axis, voltage)))
     tolerance = tolerances(design, names)
     if not np.all(tolerance > 0):
@@ -115,12 +114,13 @@ def allocate(
     price = np.array([(cost or {}).get(name, 1.0) for name in names])
     lever = np.array([lever_mm(design.geometry, name) for name in names])
     lower, upper = (np.log(bound / lever / tolerance) for bound in bounds_mm)
-    for axis in axes:
-        straight = np.log(_straight(design, axis, names, voltage, curvature_share * budget_pct[axis]) / tolerance)
-        upper = np.maximum(lower, np.minimum(upper, straight))
-    effect = np.array([_effect_pct(design, axis, names, voltage) for axis in axes]) * tolerance
-    wanted = np.array([budget_pct[axis] for axis in axes])
-    problem = _Problem(price, effect / wanted[:, None], lower, upper, _POWERS[limit])
+    pairs = [_derivatives_pct(design, axis, names, voltage) for axis in axes]
+    first, second = (np.array(each) for each in zip(*pairs, strict=True))
+    budget = np.array([[budget_pct[axis]] for axis in axes])
+    # Where the second order of a dimension alone comes to its share of a budget.
+    curved = np.sqrt(2 * curvature_share * budget / np.maximum(np.abs(second), 1e-300)).min(axis=0)
+    upper = np.maximum(lower, np.minimum(upper, np.log(curved / tolerance)))
+    problem = _Problem(price, first * tolerance / budget, lower, upper, _POWERS[limit])
     for axis, excess in zip(axes, problem.excess(lower), strict=True):
         if excess > 0:
             raise DataError(
@@ -202,23 +202,14 @@ class _Problem:
         return found, dict(zip(tight.tolist(), weights[: len(tight)].tolist(), strict=True))
 
 
-def _effect_pct(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool) -> _Vector:
-    """Relative derivatives of a gain with respect to all names, in percent per mm or rad."""
-    value, slopes = gradient(gain_model(design, voltage), twin(axis), names)
-    return np.asarray(100 * slopes / value)
+def _derivatives_pct(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool) -> tuple[_Vector, _Vector]:
+    """First and second derivatives with respect to each dimension alone, in percent of the gain per mm or rad."""
+    at = gain_model(design, voltage), twin(axis), names
+    value, slopes = (np.asarray(found) for found in gradient(*at))
+    return 100 * slopes / value, 100 * np.diagonal(hessian(*at)) / value
 
 
-def _straight(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool, share_pct: float) -> _Vector:
-    """Tolerances at which the second order of each dimension alone comes to so much."""
-    if not np.isfinite(share_pct):
-        return np.full(len(names), np.inf)
-    expanded = second_order(design, axis, voltage=voltage)
-    bend = np.abs(np.diagonal(expanded.hessian)) / abs(expanded.gain) / 2
-    allowed = dict(zip(expanded.names, np.sqrt(share_pct / 100 / np.maximum(bend, 1e-300)), strict=True))
-    return np.array([allowed.get(name, np.inf) for name in names])
-
-
-def _tightest(budget_pct: Mapping[Axis, float]) -> tuple[Axis, ...]:
+def _lowest_budgets(budget_pct: Mapping[Axis, float]) -> tuple[Axis, ...]:
     """Of axes that are one function of the same dimensions, the one with the lower budget."""
     found: dict[Axis, Axis] = {}
     for axis, budget in budget_pct.items():

@@ -194,7 +194,9 @@ def budget(
         raise DataError(f"expected an arm above 0 mm, found {arm_mm:g}; give the distance from the axis of rotation.")
     driving = _driving(design, model, measures, arm_mm)
     noise_um = idle.error_um(zeroed)
-    found = once_per_function(axes, lambda axis: _of_axis(design, axis, driving, _reading(axis, noise_um, arm_mm)))
+    found = once_per_function(
+        axes, lambda axis: _of_axis(design, axis, driving, _measuring_error(axis, noise_um, arm_mm))
+    )
     remarks = (*_remarks(design, found, driving, arm_mm), *(f"Idle record: {remark}" for remark in idle.remarks))
     return Budget(found, driving, measures, noise_um, zeroed, arm_mm, design.level, remarks)
 
@@ -244,8 +246,8 @@ def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | 
     derived = derivatives_of(design, axis, actuation)
     stroke = scale * float(derived.stroke)
     slope = scale * float(derived.by_voltage.piezo) * free_um / driving.stroke_um
-    signed, worst, squares = _sums(design, derived.slopes_at_full_stroke, scale)
-    _, voltage_worst, voltage_squares = _sums(design, derived.by_voltage.dimensions, scale)
+    signed, worst, squares = _combined(design, derived.slopes_at_full_stroke, scale)
+    _, voltage_worst, voltage_squares = _combined(design, derived.by_voltage.dimensions, scale)
     refuse_infinite(axis, (stroke, slope, worst, voltage_worst))
     return AxisBudget(
         axis=axis,
@@ -263,14 +265,14 @@ def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | 
     )
 
 
-def _sums(design: Design, slopes: Mapping[str, Array], scale: float) -> tuple[float, float, float]:
+def _combined(design: Design, slopes: Mapping[str, Array], scale: float) -> tuple[float, float, float]:
     """Sum of the errors at plus one tolerance, of their sizes, and the root of their squares with correlations."""
     changes = scale * np.array([float(slopes[name]) * design.tolerance[name] for name in slopes])
     variance = float(changes @ design.correlation([*slopes]) @ changes)
     return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
 
 
-def _reading(axis: m.Axis, noise_um: float, arm_mm: float | None) -> float | None:
+def _measuring_error(axis: m.Axis, noise_um: float, arm_mm: float | None) -> float | None:
     """Measuring error in um, or in urad where the arm is known."""
     if m.MOTIONS[axis].unit == "um":
         return noise_um

@@ -148,14 +148,14 @@ def _leaders_of_x(x: AxisSensitivity) -> _Judgement:
     verdict, share = _leaders(x, ("t1", "t2", "l1", "la1"))
     reason = (
         f"The largest among the lengths are {_changes(_lengths(x)[:4])}; the four named make up {share:.1f} % of the "
-        f"variance. alpha1, for which the paper gives no tolerance, has place {_place(x, 'alpha1')}."
+        f"variance. alpha1, for which the paper gives no tolerance, has place {_rank(x, 'alpha1')}."
     )
     return verdict, share, "%", reason
 
 
 def _t1(design: Design, x: AxisSensitivity) -> _Judgement:
     guides, change = sign_change_guides(design), x["t1"].relative_change_pct
-    severe = _part(x, "t1") >= _NEGLIGIBLE
+    severe = _share_of_largest(x, "t1") >= _NEGLIGIBLE
     if guides is None:
         reason = f"{change:+.3f} % at plus one tolerance, and no number of guiding legs makes it vanish."
         return _verdict(severe), change, "%", reason
@@ -174,12 +174,12 @@ def _t4_of_z(z: AxisSensitivity) -> _Judgement:
 
 
 def _gradual(design: Design, z: AxisSensitivity) -> _Judgement:
-    _, one_way, reason = _curve(design, z["t4"])
+    _, one_way, reason = _shape_of_curve(design, z["t4"])
     return _verdict(one_way), z["t4"].relative_change_exact_pct, "%", reason
 
 
 def _rise_and_fall(design: Design, z: AxisSensitivity) -> _Judgement:
-    bend, one_way, reason = _curve(design, z["la2"])
+    bend, one_way, reason = _shape_of_curve(design, z["la2"])
     reason += " The first-order differential that the paper draws is straight and can do neither."
     return _verdict(not one_way), bend, "%", reason
 
@@ -195,9 +195,9 @@ def _l(alpha: AxisSensitivity) -> _Judgement:
 
 
 def _negligible(alpha: AxisSensitivity, name: str) -> _Judgement:
-    part = _part(alpha, name)
+    part = _share_of_largest(alpha, name)
     reason = (
-        f"{name} has place {_place(alpha, name)}, with {alpha[name].relative_change_pct:+.3f} % or {100 * part:.3g} "
+        f"{name} has place {_rank(alpha, name)}, with {alpha[name].relative_change_pct:+.3f} % or {100 * part:.3g} "
         "% of the largest effect."
     )
     return _verdict(part < _NEGLIGIBLE, part < _SEVERE), 100 * part, "%", reason
@@ -209,7 +209,7 @@ def _same_amplifiers(z: AxisSensitivity, alpha: AxisSensitivity) -> _Judgement:
         f"d ln z / d t4 = {of_z:+.6g} per mm and d ln alpha / d t4 = {of_alpha:+.6g} per mm: the same amplifiers "
         "drive both, so that the paper contradicts itself."
     )
-    agree = z.dimensions[0].name == "t4" and _part(alpha, "t4") < _NEGLIGIBLE
+    agree = z.dimensions[0].name == "t4" and _share_of_largest(alpha, "t4") < _NEGLIGIBLE
     return _verdict(agree), _ratio(of_alpha, of_z), "", reason
 
 
@@ -219,12 +219,12 @@ def _leaders_of_gamma(gamma: AxisSensitivity) -> _Judgement:
     return verdict, share, "%", f"Among the lengths {changes}; the three named make up {share:.1f} % of the variance."
 
 
-def _place(axis: AxisSensitivity, name: str) -> str:
+def _rank(axis: AxisSensitivity, name: str) -> str:
     """Rank of a dimension by its effect, such as `2 of 5`."""
     return f"{[effect.name for effect in axis.dimensions].index(name) + 1} of {len(axis.dimensions)}"
 
 
-def _part(axis: AxisSensitivity, name: str) -> float:
+def _share_of_largest(axis: AxisSensitivity, name: str) -> float:
     """Effect of a dimension over the largest."""
     return _ratio(axis[name].relative_change_pct, axis.dimensions[0].relative_change_pct)
 
@@ -242,7 +242,7 @@ def _ratio(one: float, other: float) -> float:
     return abs(one / other) if other else float("inf")
 
 
-def _curve(design: Design, effect: DimensionEffect) -> tuple[float, bool, str]:
+def _shape_of_curve(design: Design, effect: DimensionEffect) -> tuple[float, bool, str]:
     """How far the output in z over errors of a dimension is off a line, in %; whether it goes one way; in words."""
     names = m.MOTIONS["z"].dimensions
     width = effect.tolerance or TOLERANCE_MM

@@ -180,7 +180,7 @@ def _draw_curves(axes: Axes, design: Design, panel: _Panel) -> None:
     axes.axhline(0, color=LIGHT, linewidth=0.6)
     axes.axvline(0, color=LIGHT, linewidth=0.6)
     gap = _LABEL_GAP * 2 * reach
-    heights = _apart(np.array([curve[-1] for curve in curves.values()]), gap)
+    heights = _spaced(np.array([curve[-1] for curve in curves.values()]), gap)
     for effect, height in zip(effects, heights, strict=True):
         curve, end_mm = curves[effect.name], ends_mm[effect.name]
         style = "-" if effect.unit == "mm" else "--"
@@ -198,7 +198,7 @@ def _draw_curves(axes: Axes, design: Design, panel: _Panel) -> None:
     label(axes, "machining error (mm)", f"output error ({unit})")
 
 
-def _apart(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
+def _spaced(wanted: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
     """Places nearest to increasing ones, at least a gap from each other."""
     steps = gap * np.arange(len(wanted))
     return np.asarray(isotonic_regression(wanted - steps).x) + steps
