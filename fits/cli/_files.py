@@ -53,19 +53,19 @@ def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], Non
     return tell
 
 
-def answer(given: Given, content: Any, lines: Iterable[str]) -> None:
+def print_result(given: Given, content: Any, lines: Iterable[str]) -> None:
     """Print a result: as JSON where that is asked for, else in lines."""
     from fits.io._atomic import finite_json
 
     click.echo(finite_json(content) if given.as_json else "\n".join(lines))
 
 
-def put_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
+def paths_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
     """Names of the files that were made for a folder, as the user named it."""
     return [str(Path(folder or "") / Path(file).name) for file in made]
 
 
-def told_with_places(words: str, places: Iterable[tuple[str, str | None]]) -> str:
+def with_paths(words: str, places: Iterable[tuple[str, str | None]]) -> str:
     """Words, then what was written where; what was not has no place."""
     written = [f"{what:5}  {place}" for what, place in places if place is not None]
     return "\n".join([words, *([""] if written else []), *written])
@@ -107,14 +107,14 @@ def length_mm(option: str, text: str, units: Sequence[str], example: str) -> flo
     return float(length.convert(number, found[2]))
 
 
-def keep_inputs(out: str, inputs: Iterable[str]) -> None:
+def refuse_overwriting(out: str, inputs: Iterable[str]) -> None:
     """Refuse to overwrite what is read."""
     for path in inputs:
         if os.path.realpath(path) == os.path.realpath(out):
             raise DataError(f"--out: {out} would overwrite what is read; choose another name.")
 
 
-def keep_apart(places: dict[str, str | None]) -> None:
+def refuse_clashes(places: dict[str, str | None]) -> None:
     """Refuse to write where is read, or twice to one place."""
     seen: dict[str, str] = {}
     for option, place in places.items():

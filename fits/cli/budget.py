@@ -8,7 +8,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import keep_apart, length_mm, put_in, told_with_places
+from fits.cli._files import length_mm, paths_in, refuse_clashes, with_paths
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -60,7 +60,7 @@ def budget(given: Given) -> None:
     printed = given.json_file == "-"
     out = None if printed else given.json_file
     for what, path in {"STAGE.toml": given.stage, "MODEL.json": given.model, "IDLE.csv": given.idle}.items():
-        keep_apart({what: None if path == _PAPER else path, "--json": out})
+        refuse_clashes({what: None if path == _PAPER else path, "--json": out})
     arm_mm = None if given.arm is None else length_mm("--arm", given.arm, ("mm", "m"), "50mm")
     if arm_mm is None and given.model_measures in m.AXES and m.MOTIONS[given.model_measures].unit == "rad":
         raise DataError(
@@ -87,8 +87,8 @@ def budget(given: Given) -> None:
     if printed:
         click.echo(text)
         return
-    places = [("json", out), *(("plot", place) for place in put_in(given.plots, drawn))]
-    click.echo(told_with_places(describe_budget(found), places))
+    places = [("json", out), *(("plot", place) for place in paths_in(given.plots, drawn))]
+    click.echo(with_paths(describe_budget(found), places))
 
 
 def _law(path: str) -> m.Preisach:

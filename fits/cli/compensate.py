@@ -4,7 +4,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import answer, keep_inputs, put_in
+from fits.cli._files import paths_in, print_result, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -48,7 +48,7 @@ def compensate(given: Given) -> None:
     from fits.stage._motion import predicted_ranges
     from microid import Preisach, Stage
 
-    keep_inputs(given.out, [given.model, given.reference])
+    refuse_overwriting(given.out, [given.model, given.reference])
     volts, stated = parse_rig_limits(given.limits, given.limit, given.margin)
     start_jax()
     loaded = load_model(given.model)
@@ -77,7 +77,7 @@ def compensate(given: Given) -> None:
         table = {"time_s": wanted.time_s, "voltage_V": found.voltage_V, "displacement_um": found.displacement_um}
         write_csv(unfinished, table)
     off = np.abs(found.displacement_um - found.reference_um)
-    places = put_in(given.plots, drawn)
+    places = paths_in(given.plots, drawn)
     remarks = [*wanted.warnings, *found.remarks, *said]
     summary = {
         "out": given.out,
@@ -104,4 +104,5 @@ def compensate(given: Given) -> None:
     if summary["clipped"]:
         lines.append(f"clipped        at {summary['clipped']} of the samples, off by at most {off.max():.3g} um")
     lines += [f"Note: {remark}" for remark in remarks]
-    answer(given, summary, [*lines, f"voltage        {given.out}", *(f"plot           {place}" for place in places)])
+    lines += [f"voltage        {given.out}", *(f"plot           {place}" for place in places)]
+    print_result(given, summary, lines)

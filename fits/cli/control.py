@@ -11,7 +11,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import keep_inputs, progress_to_stderr, put_in
+from fits.cli._files import paths_in, progress_to_stderr, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -143,7 +143,7 @@ def control(given: Given) -> None:
             f"--frequency: expected --controller {' or '.join(tuned_to)} with it, found {given.controller}; leave it "
             "out."
         )
-    keep_inputs(given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])])
+    refuse_overwriting(given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])])
     tell = progress_to_stderr(given.quiet)
     known_gains = None if given.gains is None else read_gains(given.gains)
     loaded = load_model(given.model)
@@ -210,7 +210,7 @@ def control(given: Given) -> None:
             from fits.plots._control import plot_control
 
             drawn = plot_control(run, made.controller, loop.plants, drawings, delay=given.delay)
-        about = {"controller": given.controller, "out": given.out, "plots": put_in(given.plots, drawn)}
+        about = {"controller": given.controller, "out": given.out, "plots": paths_in(given.plots, drawn)}
         # Before the file is in its place: what cannot be told is not left behind either.
         summary = control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
         told = finite_json(summary) if given.as_json else describe_control(summary)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from fits.diagnosis._result import Diagnosis, EffectParameter
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import answer, bar_to_stderr, fraction_or_files, keep_inputs, put_in
+from fits.cli._files import bar_to_stderr, fraction_or_files, paths_in, print_result, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -65,7 +65,7 @@ def diagnose(given: Given) -> None:
     mapping = parse_columns(given.columns)
     fraction, files = fraction_or_files(given.holdout)
     for name in _FILES:
-        keep_inputs(os.path.join(given.out, name), [*given.runs, *files])
+        refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
     # Before the work, so that a place that cannot be written to is refused before the wait.
     usable_folder(given.out, "--out")
     start_jax()
@@ -95,7 +95,7 @@ def diagnose(given: Given) -> None:
 
     content = diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)
-    answer(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
+    print_result(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
 
 
 def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[str]:
@@ -135,7 +135,7 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
         else:
             # One of an earlier diagnosis would pass for this one's.
             files.absent(Path(out) / _PROGRAM)
-    return put_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
+    return paths_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
 
 
 def _lines(diagnosis: "Diagnosis") -> list[str]:

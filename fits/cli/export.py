@@ -4,7 +4,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import answer
+from fits.cli._files import print_result
 
 _STATIC_ONLY = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
 
@@ -36,4 +36,4 @@ def export(given: Given) -> None:
     files = [str(file) for file in made]
     # The inverse of mechanics needs the samples to come, which a controller does not have.
     remarks = [_STATIC_ONLY] if isinstance(stage, Stage) else []
-    answer(given, {"files": files, "remarks": remarks}, [*(f"Note: {remark}" for remark in remarks), *files])
+    print_result(given, {"files": files, "remarks": remarks}, [*(f"Note: {remark}" for remark in remarks), *files])

@@ -8,7 +8,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import answer, fraction_or_files, keep_inputs, progress_to_stderr, put_in
+from fits.cli._files import fraction_or_files, paths_in, print_result, progress_to_stderr, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -85,7 +85,7 @@ def fit(given: Given) -> None:
     progress = progress_to_stderr(given.quiet)
     mapping = parse_columns(given.columns)
     fraction, files = fraction_or_files(given.holdout)
-    keep_inputs(given.out, [*given.runs, *files])
+    refuse_overwriting(given.out, [*given.runs, *files])
     # Entered before the fit, so that a place that cannot be written to is refused before the wait.
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
@@ -101,9 +101,9 @@ def fit(given: Given) -> None:
             progress("drawing")
             drawn = draw(result, records, drawings, **same)
         unfinished.write_text(model_text(result.model, result.uncertainty, report), encoding="utf-8")
-    places = put_in(given.plots, drawn)
+    places = paths_in(given.plots, drawn)
     lines = [describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)]
-    answer(given, {"out": given.out, "plots": places, **report}, lines)
+    print_result(given, {"out": given.out, "plots": places, **report}, lines)
 
 
 def _for_loop(given: Given) -> dict[str, Any]:

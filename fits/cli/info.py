@@ -8,7 +8,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import answer
+from fits.cli._files import print_result
 from fits.io._errors import DataError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def info(given: Given) -> None:
     if not given.as_json:
         lines += ["", _known_of_fit(given.model, loaded)]
     content = {"written_by": loaded.written_by, "model": kind, "parameters": parameters, "fit": loaded.report}
-    answer(given, content, lines)
+    print_result(given, content, lines)
 
 
 def _known_of_fit(path: str, loaded: ModelFile) -> str:

@@ -4,7 +4,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import progress_to_stderr, put_in
+from fits.cli._files import paths_in, progress_to_stderr
 from fits.io._file_set import file_set
 
 
@@ -29,5 +29,5 @@ def paper(given: Given) -> None:
     tell = progress_to_stderr(given.quiet)
     with file_set() as files:
         result = paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), tell)
-    page, figures = put_in(given.out, ("paper.md", "paper.json"))
+    page, figures = paths_in(given.out, ("paper.md", "paper.json"))
     click.echo(f"page   {page}\njson   {figures}\nworse than the paper: {'; '.join(result.worse()) or 'no row'}")

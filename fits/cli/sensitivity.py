@@ -9,7 +9,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import keep_apart, length_mm, put_in, told_with_places
+from fits.cli._files import length_mm, paths_in, refuse_clashes, with_paths
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -48,7 +48,7 @@ def sensitivity(given: Given) -> None:
     start_jax()
     printed = given.json_file == "-"
     out = None if printed else given.json_file
-    keep_apart({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
+    refuse_clashes({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
     design = _design(given.stage, given.tolerance, given.level)
     axes = tuple(name for name in m.AXES if given.axis in (name, "all"))
     with file_set() as files:
@@ -76,8 +76,8 @@ def sensitivity(given: Given) -> None:
     words = describe_sensitivity(report, given.voltage)
     if claims:
         words += f"\n\n{describe_claims(claims)}"
-    places = [("json", out), ("stage", given.write_stage), *(("plot", each) for each in put_in(given.plots, drawn))]
-    click.echo(told_with_places(words, places))
+    places = [("json", out), ("stage", given.write_stage), *(("plot", each) for each in paths_in(given.plots, drawn))]
+    click.echo(with_paths(words, places))
 
 
 def _design(stage: str | None, tolerance: str | None, level: int | None) -> Design:

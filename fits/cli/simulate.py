@@ -4,7 +4,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import answer, keep_inputs
+from fits.cli._files import print_result, refuse_overwriting
 
 
 @click.command()
@@ -31,7 +31,7 @@ def simulate(given: Given) -> None:
     from fits.stage._model_file import load_model
 
     start_jax()
-    keep_inputs(given.out, [given.model, given.program])
+    refuse_overwriting(given.out, [given.model, given.program])
     loaded = load_model(given.model)
     record = read_csv(given.program, parse_columns(given.columns), required=("time_s", "voltage_V"))
     prediction = predicted_by(given.model, loaded, record, given.initial)
@@ -56,4 +56,4 @@ def simulate(given: Given) -> None:
         *(f"Note: {remark}" for remark in record.warnings),
         f"prediction  {given.out}",
     ]
-    answer(given, summary, lines)
+    print_result(given, summary, lines)

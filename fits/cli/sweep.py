@@ -4,7 +4,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences, stopped
-from fits.cli._files import answer, progress_to_stderr, put_in
+from fits.cli._files import paths_in, print_result, progress_to_stderr
 from fits.io._file_set import file_set
 from fits.sweeps import kinds
 
@@ -75,11 +75,11 @@ def run(given: Given) -> None:
         "computed": outcome.computed,
         "chunks_computed_again": outcome.again,
         "seconds": outcome.seconds,
-        "files": put_in(given.out, (RESULTS, TABLE)),
+        "files": paths_in(given.out, (RESULTS, TABLE)),
     }
     failed = f", {outcome.failed:,} of them failed" if outcome.failed else ""
     line = f"{outcome.rows:,} rows{failed}; {outcome.computed:,} computed in {outcome.seconds:.1f} s"
-    answer(given, content, [line, *(f"results  {name}" for name in content["files"])])
+    print_result(given, content, [line, *(f"results  {name}" for name in content["files"])])
 
 
 @sweep.command()
@@ -100,4 +100,4 @@ def show(given: Given) -> None:
             from fits.plots._sweep import plot_sweep
 
             drawn = plot_sweep(given.folder, drawings, given.best)
-    answer(given, summary, [describe(summary), *(f"plot  {place}" for place in put_in(given.plots, drawn))])
+    print_result(given, summary, [describe(summary), *(f"plot  {place}" for place in paths_in(given.plots, drawn))])

@@ -4,7 +4,7 @@ import click
 
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences
-from fits.cli._files import answer, put_in
+from fits.cli._files import paths_in, print_result
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -49,5 +49,5 @@ def synth(given: Given) -> None:
         contents = data_synth.files(bench)
         for name, text in contents.items():
             (folder / name).write_bytes(text.encode())
-    files = put_in(given.out, contents)
-    answer(given, {"seed": bench.seed, "files": files}, [f"seed {bench.seed}", *files])
+    files = paths_in(given.out, contents)
+    print_result(given, {"seed": bench.seed, "files": files}, [f"seed {bench.seed}", *files])

@@ -99,7 +99,7 @@ class FileSet:
         _refuse_twice(target, folder.shown, self._all())
         # Known before it is there, so that an interruption at any moment finds it.
         self._folders.append(folder)
-        with _told(folder):
+        with _explained(folder):
             files.mkdir(parents=True)
         return files
 
@@ -123,7 +123,7 @@ class FileSet:
                 # an interruption comes.
                 if len(moves) > 1:
                     undo.callback(self._undoing(move))
-                with _told(move):
+                with _explained(move):
                     if move.staged is None:
                         move.target.unlink(missing_ok=True)
                     else:
@@ -135,7 +135,7 @@ class FileSet:
     def _from_folders(self) -> list[_Move]:
         moves = []
         for folder in self._folders:
-            with _told(folder):
+            with _explained(folder):
                 files = sorted(folder.files.iterdir())
                 if not os.path.lexists(folder.first):
                     for file in files:
@@ -155,7 +155,7 @@ class FileSet:
             return partial(_take_back, move.target, move.staged)
         kept = move.target.with_name(temporary_name())
         self._scraps.append(kept)
-        with _told(move):
+        with _explained(move):
             try:
                 # A second name: at no moment there is no file under the first.
                 os.link(move.target, kept)
@@ -256,7 +256,7 @@ def _flush_folder(path: Path) -> None:
 
 
 @contextmanager
-def _told(place: _Move | _Folder) -> Iterator[None]:
+def _explained(place: _Move | _Folder) -> Iterator[None]:
     try:
         yield
     except OSError as error:
