@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from _command import columns_of, files, refused, run, whole_picture
 from _models import linear_stage_of
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import TransferFunction, cont2discrete, lfilter, step
 
 import microid as m
 from fits import save_model
@@ -281,3 +281,23 @@ def test_choices_in_the_help_are_those_of_the_library():
     (kinds,) = (option.type.choices for option in cli.commands["control"].params if option.name == "controller")
     assert kinds[0] == "pid"
     assert sorted(kinds) == sorted(m.CONTROLLERS)
+
+
+def test_a_loop_that_rings_beyond_a_limit_between_its_samples_is_refused(tmp_path):
+    # Read every second period, a light resonance seems to stand still.
+    natural_Hz, interval_s, step_um = 200.0, 0.01, 5.0
+    stage = m.Stage.of(piezo=m.Piezo(0.1), mechanics=m.Mechanics(natural_Hz, 0.02))
+    save_model(tmp_path / "light.json", stage, None, {})
+    at = interval_s * np.arange(40)
+    write(tmp_path / "jump.csv", at, step_um * (at > 0.045))
+    rate = 2 * np.pi * natural_Hz
+    fine_s = np.linspace(0, interval_s, 400)
+    peak_um = step_um * step(TransferFunction([rate**2], [1, 0.04 * rate, rate**2]), T=fine_s)[1].max()
+    out = tmp_path / "run.csv"
+    play = ("control", tmp_path / "light.json", tmp_path / "jump.csv", "--gains", "0,1e-9,0", "--out", out)
+    lowest = -3 * step_um
+    refused(run(*play, "--limit", f"displacement={lowest}:{0.95 * peak_um}um"), "--limit allows")
+    assert not out.exists()
+    done = run(*play, "--limit", f"displacement={lowest}:{1.05 * peak_um}um", "--limit", "velocity=1m/s")
+    assert done.exit_code == 0, done.stderr
+    assert columns_of(out)["displacement_um"].max() < 0.95 * peak_um

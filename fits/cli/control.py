@@ -115,7 +115,7 @@ def control(given: Given) -> None:
     from fits.control._tune_result import passed_limits
     from fits.io._atomic import finite_json, write_csv
     from fits.io._jax_setup import start_jax
-    from fits.io._limits import check_command, joined, measured_ranges, reached_in
+    from fits.io._limits import check_command, joined, reached_in
     from fits.io._read_csv import read_reference
     from fits.io._record import Record
     from fits.io._units import parse_columns
@@ -123,6 +123,7 @@ def control(given: Given) -> None:
     from fits.report._control import control_json, describe_control
     from fits.stage._draw_plants import draw_plants
     from fits.stage._model_file import load_model
+    from fits.stage._motion import predicted_ranges
     from microid import CONTROLLERS, Stage
 
     for name, least in _LEAST.items():
@@ -193,9 +194,16 @@ def control(given: Given) -> None:
         if not all(np.all(np.isfinite(one.error_um)) for one in played):
             raise DataError(f"{given.model}: the loop is unstable, its displacement has no bounds; lower --gains.")
         passed = passed_limits(goal, every, runs)
+        every = bool({"velocity", "acceleration", "current"} & set(allowed_here))
         predicted = joined(
-            measured_ranges(Record(wanted.time_s, np.asarray(one.command_V), np.asarray(one.displacement_um)))
-            for one in played
+            predicted_ranges(
+                one,
+                Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source),
+                np.asarray(ran.displacement_um),
+                given.initial,
+                every,
+            )
+            for one, ran in zip(loop.plants, played, strict=True)
         )
         # Sensor noise alone makes a loop's command jump from sample to sample.
         said = check_command(

@@ -125,9 +125,12 @@ def predicted_ranges(
     """
     ranges = measured_ranges(replace(program, displacement_um=displacement_um))
     stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
-    range_V = range_of(stage)
-    if not np.isfinite(range_V[0]) or len(program) < 2:
+    if len(program) < 2:
         return ranges
+    range_V = range_of(stage)
+    if not np.isfinite(range_V[0]):
+        # No hysteresis remembers anything of it.
+        range_V = _range(program.voltage_V)
     rings = fine_steps(stage, float(np.median(np.diff(program.time_s))), len(program)) > 1
     if not (rings or every):
         return ranges
