@@ -12,6 +12,7 @@ from scipy.signal import TransferFunction, cont2discrete, lfilter, step
 import microid as m
 from fits import save_model
 from fits.cli._main import cli
+from microid.effects.slew_limit import SlewLimit
 
 T = 1e-3
 SAMPLES = 120
@@ -35,7 +36,7 @@ def folder(tmp_path_factory):
     density = m.GridDensity(np.linspace(0.2, 0.8, 15), 0.0, 100.0)
     law = m.Preisach(density, m.Reversible(jnp.full(5, 0.05), 0.0, 100.0), jnp.asarray(2.0))
     save_model(place / "loop.json", law, None, {})
-    save_model(place / "dahl.json", m.Stage.of(law=m.Dahl(0.1, 0.05, 1.0, 1.0)), None, {})
+    save_model(place / "slew.json", m.Stage.of(slew=SlewLimit(1e4), piezo=m.Piezo(0.1)), None, {})
     at = T * np.arange(SAMPLES)
     write(place / "step.csv", at, 5.0 + 2 * (at > 0.0195))
     write(place / "sine.csv", at, 7.0 - 2 * np.cos(2 * np.pi * 25 * at))
@@ -171,7 +172,7 @@ def test_the_other_controllers_run_on_a_hysteresis(folder, tmp_path, kind):
         ("linear.json", "short.csv", [], ["16 samples"]),
         ("linear.json", "none.csv", [], ["no such file"]),
         ("none.json", "step.csv", [], ["none.json"]),
-        ("dahl.json", "step.csv", [], ["Dahl", "no form for single samples"]),
+        ("slew.json", "step.csv", [], ["SlewLimit", "no form for single samples"]),
         ("loop.json", "sine.csv", ["--feedforward", "dynamic"], ["dynamic", "hysteresis alone"]),
         ("loop.json", "sine.csv", ["--limits", "0,500"], ["--limits"]),
         ("linear.json", "step.csv", ["--limits", "60,10"], ["--limits: expected", "60,10"]),
