@@ -99,3 +99,13 @@ def test_other_mistakes_are_not_hidden(good_csv, monkeypatch):
     monkeypatch.setattr("fits.loop._fit.fit", lambda *_, **__: 1 / 0)
     assert isinstance(run("fit", good_csv, "--out", good_csv.parent / "m.json").exception, ZeroDivisionError)
     assert files(good_csv.parent) == ["good.csv"]
+
+
+@pytest.mark.parametrize(
+    "typed", [["{}"], ["fit", "a.csv", "--{}"], ["fit", "a.csv", "--out", "m.json", "--loss", "{}"]]
+)
+def test_what_was_typed_is_not_quoted_at_any_length(typed):
+    result = run(*(part.format("q" * 6000) for part in typed))
+    assert result.exit_code == 2
+    assert "qqq" in result.stderr
+    assert len(result.stderr) < 1300

@@ -9,11 +9,13 @@ import io
 import os
 import pkgutil
 import sys
+from typing import Any
 
 import click
 
 import fits.cli
 from fits.cli._common import Stopped, heed_signals, stopped, system_refuses
+from fits.io._errors import without_middle
 
 
 def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -24,7 +26,17 @@ def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> N
         context.exit()
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+class _Commands(click.Group):
+    """Commands whose refusals of options quote what was typed, but not at any length."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except click.UsageError as error:
+            raise click.UsageError(without_middle(error.format_message()), error.ctx) from None
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option(
     "--version",
     is_flag=True,

@@ -25,10 +25,12 @@ class DataError(ValueError):
 
     def __init__(self, sentence: object = "", *, of_model: bool = False) -> None:
         self.of_model = of_model
-        text = str(sentence)
-        if len(text) > _SENTENCE:
-            text = f"{text[: _SENTENCE - _END - 5]} ... {text[-_END:]}"
-        super().__init__(text)
+        super().__init__(without_middle(str(sentence)))
+
+
+def without_middle(sentence: str) -> str:
+    """Leave out what a sentence has beyond 1,000 characters, in its middle."""
+    return sentence if len(sentence) <= _SENTENCE else f"{sentence[: _SENTENCE - _END - 5]} ... {sentence[-_END:]}"
 
 
 def shown(found: Any) -> str:
