@@ -1,6 +1,6 @@
 """The next experiment: the voltage program that would tell apart best what the records leave open."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -15,6 +15,8 @@ from fits.diagnosis._safe import guard_of
 from fits.diagnosis._score import best_of, law_of
 from fits.diagnosis._select import Selection
 from fits.io._limits import MARGIN
+from fits.io._record import Record
+from fits.io.columns import COLUMNS, columns_beside
 from microid.effects import card_of
 
 # Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
@@ -35,18 +37,6 @@ _TOLD_APART = 3.0
 _OVER = {2: "twice", 3: "three times", 4: "four times"}
 # Names, hypotheses, and which is compared with which.
 Question: TypeAlias = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
-
-# Further columns by the names that effects know, the most telling first, and what is said of them.
-_COLUMNS = {
-    "temperature_degC": "temperature_degC: the temperature of the stage's body, which what the room does follows and "
-    "what the command does ignores.",
-    "monitor_V": "monitor_V: the voltage at the piezo, sampled with the displacement, which shows what the driver "
-    "does and nothing of the sensor.",
-    "other_um": "other_um: the position of the second axis, without which its share of this one looks like a drift.",
-    "time_stamps": "raw time stamps of both clocks, which show a lost sample or a wrong rate at once.",
-}
-# How a record's own name of such a column begins, or what is in it.
-_PRESENT = {"temperature_degC": "temp", "monitor_V": "monitor", "other_um": "other"}
 
 
 @dataclass(frozen=True)
@@ -91,12 +81,12 @@ def suggest(
     if limits is None:
         return None
     predictor = Predictor(found.bench, found.projector, hypotheses, pairs)
-    present = predictor.present_z
+    present_z = predictor.present_z
     programs = guard.menu(limits, _MOST)
     if not programs:
         return None
     scores = [predictor.predicted_z(*program.samples(program.start)) for program in programs]
-    column = further_column(names, {name for run in baseline.runs for name in run.record.extra})
+    column = further_column(names, records)
     asked = predictor
     if column and max(scores) < 1.0:
         # Only the column tells: what shows the first of them best is played with it.
@@ -125,12 +115,12 @@ def suggest(
     if asked is not predictor:
         z = predictor.predicted_z(time_s, voltage_V)
     # What tells nothing is not worth playing, but for a further column.
-    if not column and (z < 1.0 or z < _WORTH * present):
+    if not column and (z < 1.0 or z < _WORTH * present_z):
         return None
     words = program.words if times < 2 else f"{program.words}, {_OVER[times]} over"
-    purpose = _purpose(names, z, present, column)
+    purpose = _purpose(names, z, present_z, column)
     extremes = guard.extremes((time_s, voltage_V))
-    return Experiment(time_s, voltage_V, words, purpose, names, z, present, column, extremes)
+    return Experiment(time_s, voltage_V, words, purpose, names, z, present_z, column, extremes)
 
 
 def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, ...]) -> Question | None:
@@ -229,12 +219,16 @@ def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> s
     )
 
 
-def further_column(names: tuple[str, ...], present: Collection[str]) -> str:
-    """Which further column helps most of the suspects, and why; empty if none does, or it is `present` already."""
-    wanted = [card_of(name).column for name in names]
-    known = [*_COLUMNS, *(column for column in wanted if column and column not in _COLUMNS)]
-    column = max(known, key=wanted.count)
-    there = _PRESENT.get(column)
-    if column not in wanted or (there is not None and any(there in name.lower() for name in present)):
+def further_column(names: tuple[str, ...], records: Sequence[Record]) -> str:
+    """Which further column helps most of the suspects, and why; empty if none does, or the records have it.
+
+    Of several that help as many, it is that of the first.
+    """
+    wanted = [column for name in names if (column := card_of(name).column)]
+    if not wanted:
         return ""
-    return _COLUMNS.get(column, column)
+    column = max(wanted, key=wanted.count)
+    # One that shows nothing is there all the same.
+    if any(column in record.extra or column in columns_beside(record) for record in records):
+        return ""
+    return f"{column}: {COLUMNS[column].use}" if column in COLUMNS else column

@@ -11,6 +11,7 @@ from fits.diagnosis._effects import Bench, Law, remembering, strength_of
 from fits.diagnosis._projector import Projector, orthonormal
 from fits.diagnosis._score import Scored, law_of
 from fits.io.columns import columns_beside
+from fits.io.columns.temperature import TEMPERATURE
 from microid import AbstractEffect
 
 _STEP = 1e-3
@@ -125,7 +126,7 @@ class Refit:
         if not law.form.moved or not law.remembers:
             return True
         columns = [columns_beside(run.record) for run in bench.baseline.runs]
-        room_K = max(_ROOM_K, *(float(np.ptp(beside.get("temperature_degC", 0.0))) for beside in columns))
+        room_K = max(_ROOM_K, *(float(np.ptp(beside.get(TEMPERATURE, 0.0))) for beside in columns))
         spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": room_K}
         before = self.tangent.shape[1] - law.size
         covariance = self.covariance(robust=False)[before:, before:]

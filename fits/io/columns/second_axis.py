@@ -18,4 +18,12 @@ def _recognised(name: str, values: FloatArray, record: Record) -> bool:
     return not any(abs(np.corrcoef(values, one)[0, 1]) > _ALIKE for one in own if one is not None and np.ptp(one) > 0)
 
 
-register(Column(Quantity("y_displacement", "um", LENGTH), "other_um", _recognised, title="second axis"))
+register(
+    Column(
+        Quantity("y_displacement", "um", LENGTH),
+        "other_um",
+        _recognised,
+        title="second axis",
+        use="the position of the second axis, without which its share of this one looks like a drift.",
+    )
+)
