@@ -7,7 +7,7 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._evidence import posterior
+from fits.loop._evidence import posterior_of
 from fits.loop._fit_checks import remarks_on
 from fits.loop._grid import non_negative, solve_grid
 from fits.loop._misfit import Misfit, compare_gains, misfits, worst
@@ -83,7 +83,7 @@ class SeparateFits:
         """What a run leaves that is fitted alone as smoothly as all are, at its fitted samples, in um."""
         data = gather(grid_of([run], _LEVELS), [run])
         moments = data.total.scaled(1.0, self.stroke_um)
-        columns, _ = non_negative(posterior(moments, roughness(_LEVELS), self.hyper))
+        columns, _ = non_negative(posterior_of(moments, roughness(_LEVELS), self.hyper))
         return left_of(data.grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
 
 
