@@ -153,11 +153,11 @@ def test_a_regression_is_bounded_where_block_pivoting_gives_up(rng, monkeypatch)
     posterior = Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
     asked = SimpleNamespace(count=0)
 
-    def gives_up(posterior, which):
+    def gives_up(precision, mean):
         asked.count += 1
-        return posterior.mean, RESULTS.nonlinear_max_steps_reached
+        return mean, RESULTS.nonlinear_max_steps_reached
 
-    monkeypatch.setattr(grid, "_bounded", gives_up)
+    monkeypatch.setattr(grid, "_pivot", gives_up)
     found, result = grid.non_negative(posterior)
     assert asked.count == 1
     assert result == RESULTS.successful

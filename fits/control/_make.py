@@ -32,7 +32,7 @@ from microid import (
 
 _MOST_PEAK, _HALVINGS = 4.0, 20
 # Resonators that are nearer to each other than this share of their frequency fight.
-_ALIKE = 1e-3
+_SAME_FREQUENCY = 1e-3
 
 
 def own_settings(controller: type[AbstractController]) -> list[Setting]:
@@ -251,7 +251,7 @@ class Maker:
         if len(bad):
             raise DataError(f"--frequency: expected one between 0 and {highest:g} Hz, found {bad[0]:g} Hz.")
         near = np.sort(frequency_Hz)
-        if np.any(np.diff(near) <= _ALIKE * near[1:]):
+        if np.any(np.diff(near) <= _SAME_FREQUENCY * near[1:]):
             raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
 
 

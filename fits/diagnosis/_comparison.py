@@ -21,7 +21,7 @@ WORTH, _OF_CONFUSED = 0.4, 0.2
 SAME, _APART = 10.0, 4.0
 # Effects that the baseline follows to tell them apart, and part of what the best explains by which one that it is
 # mistaken for may be behind before: the plain stage has already given way to the one and not to the other.
-_NEAREST, _BEHIND = 4, 0.1
+_NEAREST, _BEHIND_SHARE = 4, 0.1
 # Part of a cause's signature by which its model may be off.
 MODEL_ERROR = 0.06
 # An effect that makes the square of the errors in what was held out so many times larger is none, and one with
@@ -29,14 +29,14 @@ MODEL_ERROR = 0.06
 _WORSE, _BETTER, _SHOWN = 1.2, 0.85, 1.0
 # Evidence that a cause must have against what else is left, in standard deviations; and what is beyond doubt: so
 # many of them, and so much of what there is to be explained. A second cause may show in what was held out most.
-_SURE, _PLAIN, _MOST = 3.0, 30.0, 0.5
+_SURE_Z, _PLAIN_Z, _PLAIN_SHARE = 3.0, 30.0, 0.5
 # Standard deviations beyond which effects are told apart if one of them leaves no more than noise.
 _CLEAR = 5.0
 # Part of a cause's signature by which its model may be off along its confusions, and along any column of the records:
 # what is slow in both agrees by chance.
 _CONFUSED_ERROR, _COLUMN_ERROR = 0.6, 0.15
 # Scores above this share of the best may be those of the cause, if so much of what it explains is left for another.
-_NEAR, _FURTHER = 0.95, 0.15
+_NEAR_BEST, _LEFT_SHARE = 0.95, 0.15
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ def compare_rivals(
             if not all(np.all(np.isfinite(change)) for change in found.change_um):
                 continue
             # What does not stand out of the rest of the misfit must show in what was kept aside.
-            plain = one.robust_z > (_SURE if one.z > 2 * MODEL_ERROR * explained else 2 * _SURE)
+            plain = one.robust_z > (_SURE_Z if one.z > 2 * MODEL_ERROR * explained else 2 * _SURE_Z)
             most = _WORSE if plain else _BETTER
-            if one.robust_z > _PLAIN and model.cost - found.cost > _MOST * (model.cost - projector.count):
+            if one.robust_z > _PLAIN_Z and model.cost - found.cost > _PLAIN_SHARE * (model.cost - projector.count):
                 most = np.inf
             alone = found.is_noise(projector) and not model.is_noise(projector)
             if not found.determined(alone=alone):
@@ -134,7 +134,7 @@ def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: flo
     def reach(one: Rival) -> float:
         form = one.refit.laws[-1].form
         alike = form.name in first.confusions or first.name in form.confusions
-        return max(tolerance(drop) ** 2, _BEHIND * drop if alike else 0.0)
+        return max(tolerance(drop) ** 2, _BEHIND_SHARE * drop if alike else 0.0)
 
     near = [one for one in order if one.cost - order[0].cost < reach(one)][:_NEAREST]
     if len(near) < 2:
@@ -175,7 +175,7 @@ def choose_cause(
     """
     best, chosen = fitted[0], fit_jointly(bench, projector, fitted[0].refit)
     highest = max(scores[one.name].z for one in fitted)
-    near = [one for one in fitted if scores[one.name].z > _NEAR * highest]
+    near = [one for one in fitted if scores[one.name].z > _NEAR_BEST * highest]
 
     def further(one: Rival, at: State) -> tuple[float, float]:
         there, beside, own = at
@@ -191,7 +191,7 @@ def choose_cause(
     if len(near) < 2 or best not in near:
         return best, chosen
     left, cost = further(best, chosen)
-    if left < _FURTHER * max(model.cost - chosen[-1].cost, 0.0) ** 0.5:
+    if left < _LEFT_SHARE * max(model.cost - chosen[-1].cost, 0.0) ** 0.5:
         return best, chosen
     for one in near:
         if one is best:

@@ -22,13 +22,13 @@ from microid.effects import card_of
 # Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
 # is repeated if it is short, so often at most, until it tells by so many standard deviations: by chance it may be
 # a few less in the end.
-_MOST, _TIMES, _PLENTY = 4096, 4, 12.0
+_MOST_SAMPLES, _MOST_REPEATS, _ENOUGH_Z = 4096, 4, 12.0
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
 # A class of effects that cannot be told apart counts so many others.
 _OTHERS = 2
 # Programs about as good as the best, of which the shortest is taken, and what an experiment must add to be worth it.
-_ALIKE, _WORTH = 0.95, 1.02
+_NEARLY_BEST, _LEAST_GAIN = 0.95, 1.02
 # Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
 _PROBE, _LENGTHS = 0.05, (0.4, 0.15)
 _ROUNDS = 2
@@ -82,7 +82,7 @@ def suggest(
         return None
     predictor = Predictor(found.bench, found.projector, hypotheses, pairs)
     present_z = predictor.present_z
-    programs = guard.menu(limits, _MOST)
+    programs = guard.menu(limits, _MOST_SAMPLES)
     if not programs:
         return None
     scores = [predictor.predicted_z(*program.samples(program.start)) for program in programs]
@@ -92,7 +92,7 @@ def suggest(
         # Only the column tells: what shows the first of them best is played with it.
         asked = Predictor(found.bench, found.projector, (hypotheses[0], hypotheses[0].without(names[0])), ((0, 1),))
         scores = [asked.predicted_z(*program.samples(program.start)) for program in programs]
-    near = [k for k, z in enumerate(scores) if z >= _ALIKE * max(scores)]
+    near = [k for k, z in enumerate(scores) if z >= _NEARLY_BEST * max(scores)]
     chosen = min(near, key=lambda k: (programs[k].limits.duration_s, -scores[k]))
     program, z = programs[chosen], scores[chosen]
     progress(f"refining {program.words}")
@@ -104,8 +104,8 @@ def suggest(
     parameters, z = refine(program, gain, z)
     time_s, voltage_V = program.samples(parameters)
     times, once = 1, (time_s, voltage_V)
-    most = min(_TIMES, int(limits.duration_s / (1.1 * program.limits.duration_s)))
-    while times < most and z < _PLENTY:
+    most = min(_MOST_REPEATS, int(limits.duration_s / (1.1 * program.limits.duration_s)))
+    while times < most and z < _ENOUGH_Z:
         longer = repeated(program.limits, once, times + 1)
         if not guard.allows(longer):
             break
@@ -115,7 +115,7 @@ def suggest(
     if asked is not predictor:
         z = predictor.predicted_z(time_s, voltage_V)
     # What tells nothing is not worth playing, but for a further column.
-    if not column and (z < 1.0 or z < _WORTH * present_z):
+    if not column and (z < 1.0 or z < _LEAST_GAIN * present_z):
         return None
     words = program.words if times < 2 else f"{program.words}, {_OVER[times]} over"
     purpose = _purpose(names, z, present_z, column)

@@ -23,12 +23,12 @@ from microid import AbstractEffect, Stage
 _BLOCKS = 24
 _ROUNDS = 6
 # Relative spread of strengths that are the same in all runs.
-_ALIKE = 0.3
-# What was kept aside must not be predicted so many times worse, in squares; or not worse beyond chance by causes with
-# less evidence than this, in standard deviations: what else is not simulated may lend them as much.
-_WORSE, _WEAK = 1.1, 8.0
+_SAME_IN_ALL_RUNS = 0.3
+# What was kept aside must not be predicted so many times worse, in squares; by causes with weak evidence, not worse
+# beyond chance.
+_MOST_WORSE = 1.1
 # Standard deviations from which on a difference counts, and samples that are taken to err alike.
-_SURELY, _BLOCK = 1.5, 25
+_SURE_Z, _BLOCK = 1.5, 25
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def _common(each: Sequence[AbstractEffect], name: str) -> Float[Array, "..."]:
     values = jnp.stack([getattr(effect, name) for effect in each])
     mean = jnp.mean(values, axis=0)
     # What one run had says nothing of the next.
-    return jnp.where(jnp.std(values, axis=0) < _ALIKE * jnp.abs(mean), mean, 0.0)
+    return jnp.where(jnp.std(values, axis=0) < _SAME_IN_ALL_RUNS * jnp.abs(mean), mean, 0.0)
 
 
 def _compare(
@@ -140,10 +140,10 @@ def predicts_worse(compared: Sequence[Compared], weak: bool) -> bool:
         np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)]) ** 2
         for pick in ([one.before_um for one in held], [one.after_um for one in held])
     )
-    if np.sum(after) > _WORSE * np.sum(before):
+    if np.sum(after) > _MOST_WORSE * np.sum(before):
         return True
     sums = np.add.reduceat(after - before, np.arange(0, len(before), _BLOCK))
-    return bool(weak and np.sum(sums) > _SURELY * np.linalg.norm(sums - np.mean(sums)))
+    return bool(weak and np.sum(sums) > _SURE_Z * np.linalg.norm(sums - np.mean(sums)))
 
 
 def gain_of(compared: Sequence[Compared], noise_um: float, source: str) -> Gain:

@@ -30,7 +30,7 @@ _OTHERS = 2
 _NONLINEAR, _STEP, _STEPS, _LARGEST, _ROUNDS = 1.3, 0.5, 10, 30.0, 3
 # Standard deviations up to which the sum of squares may do what it likes: a place that costs less is as far away.
 # Where that is off by less than this factor, it is far enough known.
-_FAR, _ABOUT = 3.0, 1.4
+_FAR_Z, _FAR_WITHIN = 3.0, 1.4
 
 
 def causes_of(
@@ -174,7 +174,7 @@ def profile_likelihood(
             for way in (-1, 1):
                 found += _profile_to(bench, projector, model, which, path, at, way)
     lowest = min([model.cost, *(cost for cost, _ in found)])
-    return [(max((cost - lowest) ** 0.5, _FAR), there) for cost, there in found]
+    return [(max((cost - lowest) ** 0.5, _FAR_Z), there) for cost, there in found]
 
 
 def _is_nonlinear(law: Law, x: np.ndarray, at: int, sd: float) -> bool:
@@ -202,8 +202,8 @@ def _profile_to(
         held = Law([law.effect(moved, run) for run in runs], law.remembers, () if only else (path,))
         there = refit(bench, projector, *last.with_law(which, held), 0 if only else _ROUNDS)
         found.append((there.cost, _law_of_model(there, which, law).start))
-        away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR
-        if 1 / _ABOUT < away < _ABOUT:
+        away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR_Z
+        if 1 / _FAR_WITHIN < away < _FAR_WITHIN:
             break
         if away > 1:
             outside = place

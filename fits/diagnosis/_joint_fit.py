@@ -14,7 +14,7 @@ from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
-_OFF = 1.0
+_LARGEST_DIFFERENCE = 1.0
 # Multiple of a strength that is tried, and the gain in chi-square for which it is taken.
 _LARGER, _BETTER = 1.5, 10.0
 # Part of its bound from which what ended there is tried again, and rounds in which the baseline follows that first.
@@ -22,10 +22,10 @@ _WEAKER, _FIRST = 0.8, 2
 # Further rounds in which baseline and causes follow each other, at most.
 _AGAIN = 8
 # Rounds beside a density whose zeros stay, and standard deviations below which a coordinate has not moved.
-_BOUNDED, _MOVED = 4, 0.1
+_BOUNDED, _MOVED_SD = 4, 0.1
 # Derivative of all samples along a coordinate, in noise, that does not show, and what a change must change in them to
 # be seen; the distance to its scale is halved at most so often for that.
-_INSENSITIVE, _SEEN, _HALVES = 1.0, 5.0, 16
+_INSENSITIVE, _SEEN_CHANGE, _HALVES = 1.0, 5.0, 16
 # A sum of squares that grows by this factor there is that of a fit gone astray.
 _ASTRAY = 1.5
 # Noise or roughness that falls by less than this factor is the same.
@@ -127,7 +127,7 @@ def refine_steps(bench: Bench, projector: Projector, model: Refit) -> tuple[Refi
     finer = Bench(bench.baseline, finest=True)
     better = refit(finer, projector, model.laws, model.x, 0)
     off = [a - b for a, b in zip(better.change_um, model.change_um, strict=True)]
-    if float(np.linalg.norm(projector.join(off))) < _OFF:
+    if float(np.linalg.norm(projector.join(off))) < _LARGEST_DIFFERENCE:
         return model, False
     return refit(finer, projector, model.laws, model.x, 4), True
 
@@ -171,7 +171,7 @@ def keep_density_positive(bench: Bench, projector: Projector, model: Refit, fine
         if not model.cost < _ASTRAY * last[-1].cost:
             return last
         sd = np.sqrt(np.diagonal(model.covariance()))
-        if np.all(np.abs(np.concatenate(model.x) - before) <= _MOVED * sd):
+        if np.all(np.abs(np.concatenate(model.x) - before) <= _MOVED_SD * sd):
             break
     return bench, projector, model
 
@@ -227,7 +227,7 @@ def _made_sensitive(projector: Projector, model: Refit) -> Baseline | None:
     for k in range(1, _HALVES):
         there = baseline.moved(back * (1 - 0.5**k), 0.0)
         off = [simulate(there.stage, run) - one for run, one in zip(baseline.fine, plain, strict=True)]
-        if float(np.linalg.norm(projector.join(off))) > _SEEN:
+        if float(np.linalg.norm(projector.join(off))) > _SEEN_CHANGE:
             return there
     return None
 

@@ -19,7 +19,7 @@ from microid.effects import card_of
 _WAVES, _EVIDENT, _NEARLY, _WHOLE_RANGE = 12, 5.5, 0.8, 1.0
 # A hold lasts so long and has so many samples; meanwhile the displacement keeps within this part of its range, and
 # the voltage moves by more than that part of its own.
-_LONG_s, _SAMPLES, _AT_REST, _MOVES = 1.0, 200, 3e-3, 5e-3
+_LONG_s, _SAMPLES, _AT_REST_SHARE, _MOVED_SHARE = 1.0, 200, 3e-3, 5e-3
 # Times of a hold over which the voltage is read: from so many intervals after its beginning on, in blocks evenly
 # spaced in the logarithm of time, and two decades at least.
 _AFTER, _BLOCKS, _DECADES = 8, 24, 2.0
@@ -117,7 +117,7 @@ def held_gain(records: Sequence[Record]) -> Held | None:
 def _holds(record: Record) -> list[Held]:
     assert record.displacement_um is not None
     time, voltage, place = record.time_s, record.voltage_V, record.displacement_um
-    close, apart = _AT_REST * float(np.ptp(place)), _MOVES * float(np.ptp(voltage))
+    close, apart = _AT_REST_SHARE * float(np.ptp(place)), _MOVED_SHARE * float(np.ptp(voltage))
     out = []
     for first, stop in _stretches_at_rest(place, close):
         if stop - first < _SAMPLES or time[stop - 1] - time[first] < _LONG_s:

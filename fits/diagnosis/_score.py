@@ -15,7 +15,7 @@ from fits.stage._encode import spec_of
 from microid import AbstractEffect, Coordinates, Scales, host
 
 # Strength at which an effect's derivative is taken, as a share of that of its probe.
-_SHARE = 1e-2
+_STRENGTH_SHARE = 1e-2
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
@@ -102,7 +102,7 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
     for group in form.probes(scales, inner):
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
-            share = 1.0 if form.finite else _SHARE
+            share = 1.0 if form.finite else _STRENGTH_SHARE
             change = [c / share for c in bench.change([effect if form.finite else times(effect, share)])]
             if form.per_run and len(change) > 1:
                 for k in range(len(change)):

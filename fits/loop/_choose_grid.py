@@ -19,7 +19,7 @@ from fits.stats._noise import WHITE, correlation_samples, huber_weight
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
 # Refining goes on while it takes this fraction off the error of predicted blocks.
-_WORTH = 0.005
+_LEAST_GAIN = 0.005
 # From so many levels on more, by the square of their number.
 _COSTLY = 32
 # Errors up to so many times what a last digit rounds off are rounding.
@@ -85,7 +85,7 @@ def _resolve(
             break
         trials.append(LevelTrial(n, finer.error_um))
         # A fit takes eight times as long for twice the levels, and must be worth it.
-        pays = finer.error_um < (1 - _WORTH * max(1.0, n / _COSTLY) ** 2) * best.error_um
+        pays = finer.error_um < (1 - _LEAST_GAIN * max(1.0, n / _COSTLY) ** 2) * best.error_um
         best = finer if finer.error_um <= best.error_um else best
         if not pays:
             break

@@ -25,12 +25,12 @@ _TIMES = 2.0
 # Gains that differ by more than this are not those of one rig.
 _REFUSED = 0.1
 # Places, in parts of a run, at which it may have changed, samples that a part needs, and rounds of moving the place.
-_PLACES, _FEWEST, _ROUNDS = 5, 200, 4
+_PLACES, _FEWEST_SAMPLES, _ROUNDS = 5, 200, 4
 # Shifts, in samples, at which a delay is looked for first, and how far.
 _FARTHEST = 64
 # Twice the logarithm of how much likelier a delay makes a run, and the part of the residual that it must take away
 # where more than so many times the noise stays.
-_WORTH, _MUCH, _NEAR = 30.0, 0.4, 2.0
+_LEAST_GAIN, _LEFT_SHARE, _NEAR_NOISE = 30.0, 0.4, 2.0
 # What is so near the noise, and as white, holds no delay.
 _QUIET = 1.3
 # A hysteresis takes part of a delay for width: it is known to half a sample at best.
@@ -139,11 +139,11 @@ def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
 
     for k in range(1, _PLACES):
         place = int(np.searchsorted(order, total * k / _PLACES))
-        if min(order[place], total - order[place]) < _FEWEST:
+        if min(order[place], total - order[place]) < _FEWEST_SAMPLES:
             continue
         for _ in range(_ROUNDS):
             first, second = parts(place)
-            if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST:
+            if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST_SAMPLES:
                 break
             models = separate.fit([first]), separate.fit([second])
             squares = [
@@ -193,9 +193,9 @@ def delays(
             continue
         samples, sd, before, after, gained = found
         if (
-            gained < _WORTH
+            gained < _LEAST_GAIN
             or abs(samples) < 5 * sd
-            or after > (_MUCH if after > _NEAR * miss.noise_um else 1.0) * before
+            or after > (_LEFT_SHARE if after > _NEAR_NOISE * miss.noise_um else 1.0) * before
         ):
             continue
         sd = max(sd, _ROUGHLY)

@@ -21,7 +21,7 @@ _STAIRCASES = (64, 512, 4096)
 # A record has met an end of the range, or an extreme of its own, once it comes this close, as a fraction of the
 # range: the first of these that does not cost most of the samples, as peaks of a smooth command miss an end by a
 # little.
-_NEAR = (1e-3, 3e-3, 1e-2)
+_END_SHARES = (1e-3, 3e-3, 1e-2)
 # Samples that a run must leave to fit.
 _FEWEST = 50
 
@@ -182,7 +182,7 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
         return np.ones(len(voltage), dtype=bool)
     highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
     found: list[np.ndarray] = []
-    for share in _NEAR:
+    for share in _END_SHARES:
         near = share * (upper_V - lower_V)
         saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
         own = near if found else 0.0

@@ -22,7 +22,7 @@ from microid import Preisach, Stage
 
 # A delay counts from so many standard deviations on, if it is as many samples long, and moves a parameter by so many
 # of its own; from there on it is followed until it changes by less than a part of its standard deviation.
-_SURE, _LEAST, _MOVED = 5.0, 0.02, 0.5
+_SURE_Z, _LEAST_SAMPLES, _MOVED_SD = 5.0, 0.02, 0.5
 _ROUNDS, _SETTLED = 10, 0.3
 # A step is halved so often where it leaves more of its run.
 _HALVED, _NO_WORSE = 4, 1.01
@@ -30,11 +30,11 @@ _HALVED, _NO_WORSE = 4, 1.01
 _STEP = 0.25
 # Runs that leave so many times the noise are searched for delays up to so many samples either way, and so many of
 # these are tried.
-_LOUD, _FARTHEST, _TRIED = 1.5, 64, 3
+_SEARCHED_NOISE, _FARTHEST_SAMPLES, _MOST_TRIED = 1.5, 64, 3
 # What is as much likelier as leaving this part of a run's residual is a better answer.
 _BETTER = 0.7
 # Where more than so many times the noise is left, a delay counts if it takes all but this part away.
-_NEAR, _MUCH = 2.0, 0.4
+_NEAR_NOISE, _LEFT_SHARE = 2.0, 0.4
 # Precision, in scaled coordinates, that stands in for none.
 _WEAK = 1e-8
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
@@ -60,7 +60,7 @@ class Delay:
     @property
     def seen(self) -> bool:
         """Whether it is no chance."""
-        return abs(self.delay_s) > _SURE * self.sd_s and abs(self.samples) > _LEAST
+        return abs(self.delay_s) > _SURE_Z * self.sd_s and abs(self.samples) > _LEAST_SAMPLES
 
     def words(self) -> str:
         """Say what the columns look like."""
@@ -108,7 +108,7 @@ def fit_without_delays(
         gross = max(one.share_pct for one in left) > GROSS_PCT
         return fit_without_delays(plan, start.full, None, left) if gross and start.full is not None else None
     shifts = np.zeros(len(plan.records))
-    far = [k for k, one in enumerate(left) if one.times_noise > _LOUD]
+    far = [k for k, one in enumerate(left) if one.times_noise > _SEARCHED_NOISE]
     searched = _search(plan, solved, far)
     if searched is not None:
         shifts, start = searched
@@ -150,11 +150,11 @@ def fit_without_delays(
             known, shifts, left, solved.weighing.noise_um, found.weighing.noise_um, strict=True
         )
         # Where much is left with it as without it, it is something else.
-        if one.seen and shift and after < (_MUCH if after > miss.noise_um * _NEAR else 1.0) * before
+        if one.seen and shift and after < (_LEFT_SHARE if after > miss.noise_um * _NEAR_NOISE else 1.0) * before
     )
     if not seen:
         return None
-    if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd()) < _MOVED:
+    if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd()) < _MOVED_SD:
         return None
     return WithoutDelays(seen, found, sure)
 
@@ -233,7 +233,9 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
         if not len(response.frequency_Hz):
             continue
         step = min(1.0 / run.rate_Hz, 0.1 / response.frequency_Hz.max())
-        tried = best_shifts(stage, response, step * np.arange(-_FARTHEST, _FARTHEST + 1))[:_TRIED]
+        tried = best_shifts(stage, response, step * np.arange(-_FARTHEST_SAMPLES, _FARTHEST_SAMPLES + 1))[
+            :_MOST_TRIED
+        ]
         for shift in (shift for shift in tried if shift):
             there = shifts.copy()
             there[k] = shift

@@ -20,7 +20,7 @@ from microid import Stage
 # Half the width of a 95 % interval, in standard deviations.
 _NORMAL = 1.959964
 # A coordinate, of the order of 1, that is known no better than this is hardly seen.
-_UNSEEN = 0.5
+_UNSEEN_SD = 0.5
 
 
 def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
@@ -35,7 +35,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     names, value, slope = solved.parameters()
     ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * _NORMAL * sd))) for sign in (-1, 1)]
     # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
-    width = np.where(sd > _UNSEEN, np.abs(ends[1] - ends[0]) / (2 * _NORMAL), np.abs(slope) * sd)
+    width = np.where(sd > _UNSEEN_SD, np.abs(ends[1] - ends[0]) / (2 * _NORMAL), np.abs(slope) * sd)
     parameters = tuple(
         ParameterEstimate(name, unit, *map(float, figures))
         for (name, unit), *figures in zip(names, value, width, *ends, strict=True)
