@@ -194,14 +194,14 @@ def control(given: Given) -> None:
         if not all(np.all(np.isfinite(one.error_um)) for one in played):
             raise DataError(f"{given.model}: the loop is unstable, its displacement has no bounds; lower --gains.")
         passed = passed_limits(goal, every, runs)
-        every = bool({"velocity", "acceleration", "current"} & set(allowed_here))
+        in_motion = bool({"velocity", "acceleration", "current"} & set(allowed_here))
         predicted = joined(
             predicted_ranges(
                 one,
                 Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source),
                 np.asarray(ran.displacement_um),
                 given.initial,
-                every,
+                in_motion,
             )
             for one, ran in zip(loop.plants, played, strict=True)
         )

@@ -6,6 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fits.diagnosis._findings import MOST_RIVALS
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._programs import Program, limits_of, repeated
@@ -25,8 +26,6 @@ from microid.effects import card_of
 _MOST_SAMPLES, _MOST_REPEATS, _ENOUGH_Z = 4096, 4, 12.0
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
-# A class of effects that cannot be told apart counts so many others.
-_OTHERS = 2
 # Programs about as good as the best, of which the shortest is taken, and what an experiment must add to be worth it.
 _NEARLY_BEST, _LEAST_GAIN = 0.95, 1.02
 # Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
@@ -130,7 +129,7 @@ def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, .
     for at, cause in enumerate(found.causes):
         if cause.name not in named or not cause.rivals:
             continue
-        rivals = cause.rivals[:_OTHERS]
+        rivals = cause.rivals[:MOST_RIVALS]
         others = [
             Hypothesis(
                 (*best.laws[:at], rival.refit.laws[-1], *best.laws[at + 1 :]),

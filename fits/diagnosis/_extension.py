@@ -14,6 +14,7 @@ from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
+from fits.diagnosis._score import BLOCK
 from fits.diagnosis._select import Selection
 from fits.loop._run import Run
 from fits.stage._motion import signals
@@ -27,8 +28,8 @@ _SAME_IN_ALL_RUNS = 0.3
 # What was kept aside must not be predicted so many times worse, in squares; by causes with weak evidence, not worse
 # beyond chance.
 _MOST_WORSE = 1.1
-# Standard deviations from which on a difference counts, and samples that are taken to err alike.
-_SURE_Z, _BLOCK = 1.5, 25
+# Standard deviations from which on a difference counts.
+_SURE_Z = 1.5
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,7 @@ def predicts_worse(compared: Sequence[Compared], weak: bool) -> bool:
     )
     if np.sum(after) > _MOST_WORSE * np.sum(before):
         return True
-    sums = np.add.reduceat(after - before, np.arange(0, len(before), _BLOCK))
+    sums = np.add.reduceat(after - before, np.arange(0, len(before), BLOCK))
     return bool(weak and np.sum(sums) > _SURE_Z * np.linalg.norm(sums - np.mean(sums)))
 
 

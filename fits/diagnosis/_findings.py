@@ -16,14 +16,14 @@ from fits.diagnosis._refit import Refit, refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
 from fits.diagnosis._score import Scored, best_of
 from fits.diagnosis._select import Cause, Selection
+from fits.stats._metrics import TWO_SIDED_95
 from microid import EFFECTS, AbstractEffect
 from microid.effects import Statistic
 
-_TWO_SIDED = 1.96
 # Standard deviations from zero beyond which a run shows an effect.
 _SHOWS = 2.0
 # A class of effects that cannot be told apart names at most so many others.
-_OTHERS = 2
+MOST_RIVALS = 2
 # A parameter that a standard deviation of its coordinate moves so many times as far to one side as to the other is
 # followed: by steps that double, from the first on, until it costs too much, and then between the last two; in so
 # many steps at most, and coordinates no larger than this. All others are fitted again in so many rounds.
@@ -62,7 +62,7 @@ def causes_of(
         if count > 1:
             found[cause.name] = _with_occurrence(found[cause.name], parameters, count, share, rms_um)
             continue
-        rivals = tuple(rival.name for rival in cause.rivals[:_OTHERS])
+        rivals = tuple(rival.name for rival in cause.rivals[:MOST_RIVALS])
         found[cause.name] = described(law.form, rivals, cause.z, cause.p_family, parameters, share, rms_um)
     forms: dict[Statistic, type[AbstractEffect]] = {form.statistic: form for form in EFFECTS if form.statistic}
     total = float(np.mean([n.total_um**2 for n in noise.noise]))
@@ -70,7 +70,7 @@ def causes_of(
         form = forms[fault.statistic]
         weight[form.name] = fault.variance_um2
         parameters = tuple(
-            EffectParameter(name, value, sd, unit, value - _TWO_SIDED * sd, value + _TWO_SIDED * sd)
+            EffectParameter(name, value, sd, unit, value - TWO_SIDED_95 * sd, value + TWO_SIDED_95 * sd)
             for name, value, sd, unit in fault.parameters
         )
         chance, share = float(2 * stats.norm.sf(fault.z)), fault.variance_um2 / max(total, fault.variance_um2, 1e-300)
@@ -137,7 +137,7 @@ def _parameters(
             for at in range(place.start, place.stop) if info.path not in law.form.history else ():
                 name = info.path if place.stop - place.start == 1 else f"{info.path}[{at - place.start}]"
                 value, less, more = float(values[at]), float(below[at]), float(above[at])
-                low, high = value - _TWO_SIDED * less, value + _TWO_SIDED * more
+                low, high = value - TWO_SIDED_95 * less, value + TWO_SIDED_95 * more
                 one = EffectParameter(
                     f"{name} in run {run + 1}" if differs else name,
                     value,
@@ -233,7 +233,7 @@ def bounds(found: Selection, ready: Prepared, left: Sequence[Scored], named: Col
             continue
         # The largest multiple that would not have been noticed, by the size that it has in the displacement.
         raw = float(np.linalg.norm([_rms(column, found.first) for column in one.probe.signatures]))
-        bound = (one.z + _TWO_SIDED) / size * raw
+        bound = (one.z + TWO_SIDED_95) / size * raw
         out.append(Bound(name, one.z, 1.0 - one.share_left, bound))
     asked = {bound.name for bound in out} | set(named)
     for name, reason in dict(ready.skipped).items():

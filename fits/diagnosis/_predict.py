@@ -17,7 +17,7 @@ from microid import AbstractEffect
 
 _STEP = 1e-3
 # The farthest that a draw moves a coordinate, which are of the order of one.
-_FARTHEST = 1.0
+FARTHEST_DRAW = 1.0
 # Relative precision below which a direction counts as not seen.
 _RIDGE = 1e-10
 # Noise that was learnt at a sampling interval so many times longer or shorter says nothing of its colour.
@@ -59,7 +59,7 @@ class Hypothesis:
         for at, covariance in zip(self.x, self.covariances, strict=True):
             value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
             moved = vector @ (np.sqrt(np.maximum(value, 0.0)) * rng.standard_normal(len(value)))
-            x.append(at + np.clip(moved, -_FARTHEST, _FARTHEST))
+            x.append(at + np.clip(moved, -FARTHEST_DRAW, FARTHEST_DRAW))
         return replace(self, x=tuple(x))
 
 

@@ -12,6 +12,7 @@ from fits.diagnosis._result import EffectParameter, FoundCause
 from fits.diagnosis._score import evidence
 from fits.io._record import Record
 from fits.loop._run import VIRGIN, known_samples
+from fits.stats._metrics import TWO_SIDED_95
 from microid.effects import card_of
 
 # Waves over an initial curve, evidence from which it counts, the share of that for the best effect from which it is
@@ -25,7 +26,6 @@ _LONG_s, _SAMPLES, _AT_REST_SHARE, _MOVED_SHARE = 1.0, 200, 3e-3, 5e-3
 _AFTER, _BLOCKS, _DECADES = 8, 24, 2.0
 # Part of the scatter about its mean that a line over the logarithm of time must explain.
 _STRAIGHT = 0.97
-_TWO_SIDED = 1.96
 
 
 def is_virgin(projector: Projector, highest: float, model: Refit | None = None) -> bool:
@@ -100,7 +100,7 @@ def with_held_gain(held: Held, causes: Sequence[FoundCause]) -> tuple[FoundCause
     out = []
     for cause in causes:
         if name := card_of(cause.name).held:
-            low, high = (max(held.gain_per_decade + way * _TWO_SIDED * held.sd, 0.0) for way in (-1, 1))
+            low, high = (max(held.gain_per_decade + way * TWO_SIDED_95 * held.sd, 0.0) for way in (-1, 1))
             shown = EffectParameter(name, held.gain_per_decade, held.sd, "1", low, high)
             fitted = (replace(one, name=f"{one.name}, of the fit") for one in cause.parameters)
             cause = replace(cause, parameters=(shown, *fitted))

@@ -9,7 +9,7 @@ import numpy as np
 
 from fits.diagnosis._effects import Bench, Law, remembering, strength_of
 from fits.diagnosis._projector import Projector, orthonormal
-from fits.diagnosis._score import Scored, law_of
+from fits.diagnosis._score import BLOCK, Scored, law_of
 from fits.io.columns import columns_beside
 from fits.io.columns.temperature import TEMPERATURE
 from microid import AbstractEffect
@@ -28,8 +28,6 @@ _SHORTER = 4.0
 _ROUNDING_SHARE, _UNKNOWN_VARIANCE = 1e-4, 1e6
 # Multiple of its range in the runs by which a rig may have moved at most before one, and the least of a room's.
 _FARTHER, _ROOM_K = 2.0, 0.5
-# Samples that are taken to err alike.
-_BLOCK = 25
 # Part of the shortest record by which another instant is tried at first.
 _FIRST_SHIFT = 0.05
 # Displacements beyond this are those of a model that runs away.
@@ -89,7 +87,7 @@ class Refit:
         # What the runs do not show may be anything.
         spread = vector / np.sqrt(np.maximum(value, _ROUNDING_SHARE**2)) / scale[:, None]
         plain = spread @ spread.T
-        sums = np.add.reduceat(self.tangent * self.residual[:, None], np.arange(0, len(self.residual), _BLOCK))
+        sums = np.add.reduceat(self.tangent * self.residual[:, None], np.arange(0, len(self.residual), BLOCK))
         spread_out = np.sum((sums @ plain) ** 2, axis=0)
         wider = np.sqrt(np.maximum(spread_out / np.maximum(np.diagonal(plain), 1e-300), 1.0))
         seen = size > 0

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._baseline import Baseline, with_effects
-from fits.diagnosis._predict import Hypothesis, next_record
+from fits.diagnosis._predict import FARTHEST_DRAW, Hypothesis, next_record
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._programs import Limits, Path, Program, Samples, menu
 from fits.diagnosis._projector import Projector
@@ -18,8 +18,6 @@ from microid import Stage
 
 # Draws of the plain stage, and of the stage with each hypothesis.
 _DRAWS, _EACH = 4, 2
-# The farthest that a draw moves a coordinate, which are of the order of one.
-_FARTHEST = 1.0
 # Shares of the fastest slew that a program is tried with, until it is inside.
 _SLEWS = tuple(0.5**k for k in range(8))
 # Rounds in which the range of the voltage is narrowed, what each takes off beyond the excess, and the share of the
@@ -145,4 +143,4 @@ def _drawn(baseline: Baseline, projector: Projector, rng: np.random.Generator) -
     """A plain stage out of those that the records allow."""
     dz, dcolumns_um = projector.draw(rng)
     kept = np.maximum(baseline.columns_um + dcolumns_um, 0.0)
-    return baseline.moved(np.clip(dz, -_FARTHEST, _FARTHEST), kept - baseline.columns_um)
+    return baseline.moved(np.clip(dz, -FARTHEST_DRAW, FARTHEST_DRAW), kept - baseline.columns_um)

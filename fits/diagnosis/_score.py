@@ -20,7 +20,7 @@ _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
 # Samples that are taken to err alike.
-_BLOCK = 25
+BLOCK = 25
 # Rounds in which signatures whose multiples are not negative follow each other.
 _SWEEPS = 30
 # Multiple of a signature of finite size, as of a gap, beyond which it is none: what would have to be so much larger
@@ -207,7 +207,7 @@ def _squares(columns: np.ndarray) -> np.ndarray:
 def _robust_z(along: np.ndarray, residual: np.ndarray) -> float:
     """Size of a fitted signal over the standard deviation that blocks of what is left of the residual give it."""
     products = along * (residual - along)
-    blocks = np.add.reduceat(products, np.arange(0, len(products), _BLOCK))
+    blocks = np.add.reduceat(products, np.arange(0, len(products), BLOCK))
     return float(along @ along / max(float(np.linalg.norm(blocks)), 1e-300)) if np.any(along) else 0.0
 
 

@@ -17,7 +17,7 @@ from fits.stage._run import nuisance_columns, project_out, simulate_stage
 from fits.stage._solve import Problem, Solved, solve_chain
 from fits.stage._start import best_shifts, measure_response, start_stages
 from fits.stage._steps import Plan, hysteresis_alone
-from fits.stage._uncertainty import Precision, sandwich
+from fits.stage._uncertainty import NO_PRECISION, Precision, sandwich
 from microid import Preisach, Stage
 
 # A delay counts from so many standard deviations on, if it is as many samples long, and moves a parameter by so many
@@ -35,8 +35,6 @@ _SEARCHED_NOISE, _FARTHEST_SAMPLES, _MOST_TRIED = 1.5, 64, 3
 _BETTER = 0.7
 # Where more than so many times the noise is left, a delay counts if it takes all but this part away.
 _NEAR_NOISE, _LEFT_SHARE = 2.0, 0.4
-# Precision, in scaled coordinates, that stands in for none.
-_WEAK = 1e-8
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
 _REMEDY = (
@@ -191,7 +189,7 @@ def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray
     here, stage = (jnp.asarray(solved.z), jnp.asarray(solved.columns_um)), solved.stage
     whole = precision.gram + precision.prior
     # What nothing is known of must not spoil the rest.
-    whole = whole + _WEAK * np.eye(len(whole))
+    whole = whole + NO_PRECISION * np.eye(len(whole))
     out = []
     for k, (run, one) in enumerate(zip(solved.runs, solved.sums, strict=True)):
         n, step, weight = len(run.record), _STEP / run.rate_Hz, run.fit_weight
