@@ -68,11 +68,11 @@ def compare_rivals(
     bare = projector.bare
     before = bare.held_out_error(model.change_um)
     for name in names:
-        own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
+        scored = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
         tried: dict[type, int] = {}
-        for one in own:
+        for one in scored:
             form = one.form
-            if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < WORTH * own[0].z:
+            if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < WORTH * scored[0].z:
                 continue
             tried[form] = tried.get(form, 0) + 1
             found = relocate(bench, projector, refit_beside(bench, projector, model, one), len(model.laws))
@@ -93,18 +93,18 @@ def compare_rivals(
                 or not _has_occurred(bench, found)
             ):
                 continue
-            found = _add_occurrences(bench, projector, found, own, len(model.laws) + laws)
+            found = _add_occurrences(bench, projector, found, scored, len(model.laws) + laws)
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
     rivals = [Rival(name, one, one.criterion(projector.count), 0.0, one.cost) for name, one in fitted.items()]
     return _ranked(bench, projector, rivals, model.cost)
 
 
-def _add_occurrences(bench: Bench, projector: Projector, found: Refit, own: Sequence[Scored], most: int) -> Refit:
+def _add_occurrences(bench: Bench, projector: Projector, found: Refit, scored: Sequence[Scored], most: int) -> Refit:
     """Add occurrences of what is counted, as a loss of samples, while that pays: several look like a drift."""
     first = len(found.laws) - 1
     while found.laws[-1].form.counted and len(found.laws) < most:
-        more = _one_more(bench, projector, found, own)
+        more = _one_more(bench, projector, found, scored)
         if not (more.determined() and _has_occurred(bench, more)):
             break
         if more.criterion(projector.count) > found.criterion(projector.count) - SAME:
@@ -112,14 +112,14 @@ def _add_occurrences(bench: Bench, projector: Projector, found: Refit, own: Sequ
         for _ in range(first, len(more.laws)):
             # Alone it stood for all of them: each in turn is put where the others leave most.
             laws, x = ([*one[:first], *one[first + 1 :]] for one in (more.laws, more.x))
-            moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), own)
+            moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), scored)
             more = min(more, moved, key=lambda one: one.cost)
         found = relocate(bench, projector, more, first)
     return found
 
 
-def _one_more(bench: Bench, projector: Projector, model: Refit, own: Sequence[Scored]) -> Refit:
-    left = rescore(own, model.basis(), model.residual)
+def _one_more(bench: Bench, projector: Projector, model: Refit, scored: Sequence[Scored]) -> Refit:
+    left = rescore(scored, model.basis(), model.residual)
     more = refit_beside(bench, projector, model, max(left, key=lambda one: one.z))
     return relocate(bench, projector, more, len(model.laws))
 

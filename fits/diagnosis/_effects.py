@@ -46,8 +46,8 @@ class Bench:
     def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
         """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
         return [
-            _respond(with_effects(self.stage, self._seen(own, one)), self.stage, known, one)
-            for own, known, one in zip(effects, self.known, self.prepared, strict=True)
+            _respond(with_effects(self.stage, self._seen(acting, one)), self.stage, known, one)
+            for acting, known, one in zip(effects, self.known, self.prepared, strict=True)
         ]
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:

@@ -110,23 +110,27 @@ def _compare(
     for k, run in enumerate(ready.baseline.runs):
         plain = run.displacement_um - ready.regression.residuals[k]
         better = run.displacement_um - regression.residuals[k] + change[k]
-        own, using = ready.regression.nuisance[k], run.fitted
-        found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), run.held_out))
+        nuisance, using = ready.regression.nuisance[k], run.fitted
+        found.append(
+            Compared(run, left_of(run, nuisance, plain, using), left_of(run, nuisance, better, using), run.held_out)
+        )
     if ready.baseline.aside:
         behind = Bench(bench.baseline, aside=True, finest=finest)
         for run, change_um in zip(ready.baseline.fine_aside, behind.change(effects), strict=True):
             plain = simulate(ready.baseline.stage, run)
             better = simulate(bench.baseline.stage, run) + change_um
-            own, using = np.ones((len(run.record), 1)), run.known
-            found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), using))
+            nuisance, using = np.ones((len(run.record), 1)), run.known
+            found.append(
+                Compared(run, left_of(run, nuisance, plain, using), left_of(run, nuisance, better, using), using)
+            )
     return tuple(found)
 
 
-def left_of(run: Run, own: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
+def left_of(run: Run, nuisance: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
     """Measurement less response, less the run's nuisance parameters fitted to the samples in use, shape `(n,)`."""
     off = run.displacement_um - response_um
     weight = jnp.asarray(using.astype(float))
-    return np.asarray(_without(jnp.asarray(own), weight, jnp.asarray(off)))
+    return np.asarray(_without(jnp.asarray(nuisance), weight, jnp.asarray(off)))
 
 
 _without = eqx.filter_jit(project_out)

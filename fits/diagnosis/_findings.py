@@ -49,7 +49,7 @@ def causes_of(
     covariance, at = model.covariance(), 0
     total = float(np.mean([n.total_um**2 for n in projector.noise]))
     for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
-        own = covariance[at : at + law.size, at : at + law.size]
+        block = covariance[at : at + law.size, at : at + law.size]
         at += law.size
         changed = [[law.effect(x, run)] for run in range(len(bench.prepared))]
         alone = [a - b for a, b in zip(bench.respond(changed), bench.plain, strict=True)]
@@ -58,7 +58,7 @@ def causes_of(
         rms_um, share = seen * _rms(alone, projector), cause.drop / misfit
         occurrences[cause.name] = count = occurrences.get(cause.name, 0) + 1
         weight[cause.name] = weight.get(cause.name, 0.0) + cause.drop / projector.count * total
-        parameters = _parameters(law, x, own, profile_likelihood(bench, projector, model, number, own))
+        parameters = _parameters(law, x, block, profile_likelihood(bench, projector, model, number, block))
         if count > 1:
             found[cause.name] = _with_occurrence(found[cause.name], parameters, count, share, rms_um)
             continue

@@ -233,13 +233,13 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
     floors, found, heights, jitters, bands = [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     settling_s = float(_SETTLED / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
-    for run, rows, own, residual in zip(
+    for run, rows, nuisance, residual in zip(
         baseline.runs, regression.rows, regression.nuisance, regression.residuals, strict=True
     ):
         moved = residual - rows @ np.concatenate([dw, dz])
         mask = run.fitted
-        free = np.linalg.lstsq(own[mask], moved[mask], rcond=None)[0]
-        left = moved - own @ free
+        free = np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
+        left = moved - nuisance @ free
         bad = spikes(run, left, 2 * quantum)
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)

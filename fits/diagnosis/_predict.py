@@ -164,8 +164,8 @@ class Predictor:
             last = regress(alone, None if last is None else _same(last, effects), effects)
             shared = [last.rows[0], *(last.finer[kind][0] for kind in self._kinds)]
             rows = noise.whiten(np.concatenate([*shared, np.stack(columns, axis=1)], axis=1))[run.fitted]
-            own, _ = qr(noise.whiten(last.nuisance[0])[run.fitted], mode="economic")
-            rows -= own @ (own.T @ rows)
+            nuisance, _ = qr(noise.whiten(last.nuisance[0])[run.fitted], mode="economic")
+            rows -= nuisance @ (nuisance.T @ rows)
             grams[k] = rows.T @ rows
         return grams
 
@@ -227,8 +227,8 @@ def _in_order(law: Law, moved: Sequence[np.ndarray]) -> list[np.ndarray]:
     shared = ~each
     out = [np.zeros_like(moved[0])] * law.size
     # With one run so far, its strengths stand among the others.
-    own = np.flatnonzero(shared).tolist()
-    for place, i in enumerate(own) if law.each.any() else zip(own, own, strict=True):
+    places = np.flatnonzero(shared).tolist()
+    for place, i in enumerate(places) if law.each.any() else zip(places, places, strict=True):
         out[place] = moved[i]
     return out + [moved[i] for i in np.flatnonzero(each).tolist()]
 

@@ -257,9 +257,9 @@ def _probed(bench: Bench, scales: Scales) -> tuple[list[Probe], list[tuple[str, 
         if reason is not None:
             skipped.append((form.name, reason))
             continue
-        own = list(probes_of(bench, form, scales))
-        if not own:
+        found = list(probes_of(bench, form, scales))
+        if not found:
             why = "the runs are too short or too plain to show it"
             skipped.append((form.name, "nothing of it was found, sample by sample" if form.statistic else why))
-        probes += own
+        probes += found
     return probes, skipped

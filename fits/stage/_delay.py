@@ -196,8 +196,8 @@ def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray
         late, early = (simulate_stage(stage, plan.run(k, run.stride, shifts[k] + sign * step)) for sign in (1, -1))
         full = np.zeros(run.samples.weight.shape[0])
         full[:n] = (late - early) / (2 * step)
-        own = jnp.asarray(nuisance_columns(stage, run.samples))
-        late_um_per_s = np.asarray(project_out(own, run.samples.weight, jnp.asarray(full)))[:n]
+        nuisance = jnp.asarray(nuisance_columns(stage, run.samples))
+        late_um_per_s = np.asarray(project_out(nuisance, run.samples.weight, jnp.asarray(full)))[:n]
         worth = solved.weighing.shares[k] / precision.variance
         weighed = worth * weight * late_um_per_s
         _, slope, _ = linearise(chain, *here, run)
