@@ -12,31 +12,46 @@ from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
 from fits.diagnosis._score import Probe, Scored, best_of, rescore, score
 from microid import EFFECTS, AbstractEffect
 
-# Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
-_LEADERS, _FORMS = 5, 2
-# Scores below this share of the best are not worth a fit, or below that of an effect that the best is mistaken for.
-WORTH, _OF_CONFUSED = 0.4, 0.2
-# Differences of the criterion, and standard deviations after projecting one effect off another, within which two
-# effects are not told apart.
-SAME, _APART = 10.0, 4.0
-# Effects that the baseline follows to tell them apart, and part of what the best explains by which one that it is
-# mistaken for may be behind before: the plain stage has already given way to the one and not to the other.
-_NEAREST, _BEHIND_SHARE = 4, 0.1
+# So many effects, the best by their scores, are fitted to choose among them.
+_LEADERS = 5
+# An effect without a strength is fitted in so many of its forms at most.
+_FORMS = 2
+# Scores below this share of the best are not worth a fit.
+WORTH = 0.4
+# The same for an effect that the best is mistaken for.
+_OF_CONFUSED = 0.2
+# Difference of the information criterion below which two effects are not told apart.
+SAME = 10.0
+# The same in standard deviations, after projecting one effect off another.
+_APART = 4.0
+# The baseline is fitted again beside so many of the best effects at most.
+_NEAREST = 4
+# Part of the explained sum of squares by which an effect that the best is mistaken for may be behind before that: the
+# plain stage has already given way to the one and not to the other.
+_BEHIND_SHARE = 0.1
 # Part of a cause's signature by which its model may be off.
 MODEL_ERROR = 0.06
-# An effect that makes the square of the errors in what was held out so many times larger is none, and one with
-# little evidence against the rest of the misfit is one if it makes it so much smaller.
-_WORSE, _BETTER, _SHOWN = 1.2, 0.85, 1.0
-# Evidence that a cause must have against what else is left, in standard deviations; and what is beyond doubt: so
-# many of them, and so much of what there is to be explained. A second cause may show in what was held out most.
-_SURE_Z, _PLAIN_Z, _PLAIN_SHARE = 3.0, 30.0, 0.5
+# The same along its confusions.
+_CONFUSED_ERROR = 0.6
+# The same along a column of the records: what is slow in both agrees by chance.
+_COLUMN_ERROR = 0.15
+# An effect with clear evidence may raise the squared error of what was held out by this factor at most.
+_WORSE = 1.2
+# An effect with little evidence against the rest of the misfit must lower it to this share.
+_BETTER = 0.85
+# An effect whose strength is not determined must not raise it.
+_NOT_WORSE = 1.0
+# Evidence against the rest of the misfit, in standard deviations, that is clear.
+_SURE_Z = 3.0
+# A cause with so much evidence, that explains so much of what there is to be explained, needs none from what was held
+# out: a second cause may show most there.
+_PLAIN_Z, _PLAIN_SHARE = 30.0, 0.5
 # Standard deviations beyond which effects are told apart if one of them leaves no more than noise.
 _CLEAR = 5.0
-# Part of a cause's signature by which its model may be off along its confusions, and along any column of the records:
-# what is slow in both agrees by chance.
-_CONFUSED_ERROR, _COLUMN_ERROR = 0.6, 0.15
-# Scores above this share of the best may be those of the cause, if so much of what it explains is left for another.
-_NEAR_BEST, _LEFT_SHARE = 0.95, 0.15
+# Effects whose score is above this share of the best may be the cause instead.
+_NEAR_BEST = 0.95
+# They are looked into where yet another effect shows beside the best by more than this share of what that explains.
+_LEFT_SHARE = 0.15
 
 
 @dataclass(frozen=True)
@@ -86,7 +101,7 @@ def compare_rivals(
             alone = found.is_noise(projector) and not model.is_noise(projector)
             if not found.determined(alone=alone):
                 # Of what is only there, what was kept aside must show something, too.
-                most = _SHOWN
+                most = _NOT_WORSE
             if (
                 bare.held_out_error(found.change_um) > most * before
                 or not found.determined(False, alone)

@@ -35,17 +35,22 @@ from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from microid.effects import card_of
 
-# Causes explain at least this part of what is reproducible, or the true ones are not in the library; with less than
-# the second part they have nothing to do with it.
-_EXPLAINED_SHARE, _UNRELATED_SHARE = 0.65, 0.3
+# Causes that explain less than this part of what is reproducible are not named: the true ones are not in the library.
+_EXPLAINED_SHARE = 0.65
+# Causes that explain less than this part have nothing to do with it.
+_UNRELATED_SHARE = 0.3
 # Standard deviations by which a sum of squares exceeds its mean by chance.
 _SPREAD = 3.0
-# What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
-_REST_NOISE, _CHANCE = 0.3, 1e-6
-# Part of the noise above which a narrow band is what is seen in every way of looking.
+# What is left counts as unexplained where its root mean square is above this part of the noise.
+_REST_NOISE = 0.3
+# It must be less probable than this by chance, too.
+_CHANCE = 1e-6
+# A narrow band that is more than this part of the misfit is what is seen in every way of looking.
 _BAND = 0.75
-# Evidence for a period in the position, in e-folds of chance, and the part of what is left that it explains.
-_CYCLIC_Z, _CYCLIC_SHARE = 50.0, 0.3
+# A residual repeats itself with the position where the evidence of a period, in e-folds of chance, is above this.
+_CYCLIC_EVIDENCE = 50.0
+# The period must explain this part of what is left, too.
+_CYCLIC_SHARE = 0.3
 # Part of the stroke below which a change of the feedforward is rounding.
 _MET = 1e-9
 # Part of the noise variance from which on it is that of rounding.
@@ -135,7 +140,9 @@ def conclude(
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
     cyclic = (
-        not rounded and repeated.z > _CYCLIC_Z and repeated.drop > _CYCLIC_SHARE * max(misfit.excess, repeated.drop)
+        not rounded
+        and repeated.z > _CYCLIC_EVIDENCE
+        and repeated.drop > _CYCLIC_SHARE * max(misfit.excess, repeated.drop)
     )
     if cyclic:
         remarks.append(

@@ -15,31 +15,36 @@ from fits.stats._narrow_band import DRIFT, Band, MAINS_Hz, band_of
 from fits.stats._whiten import Noise, learn_noise, rough_noise_um
 from microid.effects import Statistic
 
-# So many idle samples are a floor.
+# So many samples at rest are enough to read the noise from.
 _IDLE = 150
 # Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
 _COLOURED = 4.0
-# Standard deviations by which noise of runs may differ that is the same.
+# Standard deviations by which estimates of one noise may differ from run to run.
 _SAME_NOISE_Z = 4.0
-# Lines of mains are looked for in stretches of so many samples, and count where no more than this part of the
-# variance is left without them.
-_LONG, _MOSTLY = 60, 0.7
+# Lines of mains are looked for in stretches of at least so many samples.
+_LONG = 60
+# They count where no more than this part of the variance is left without them.
+_LEFT_WITHOUT_LINES = 0.7
 # Lines drift out of step with their frequency after so many s.
 _STEADY_s = 1.5
-# A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
-# so far away are much smaller.
-SPIKE, _MOST_TOGETHER, _COMPARED_SAMPLES = 7.0, 3, 16
-# A command that moves, or turns, by more than these parts of its range at one of some samples may cause what looks
+# A sample is a spike beyond so many standard deviations.
+SPIKE = 7.0
+# At most so many spikes stand together, and the other samples up to so far away are much smaller.
+_MOST_TOGETHER, _COMPARED_SAMPLES = 3, 16
+# A command that moves, or turns, by more than these parts of its range within so many samples may cause what looks
 # like a spike.
 _MOVED_SHARE, _TURNED_SHARE, _SAMPLES_AROUND = 0.02, 0.004, 6
+# There a spike is larger than this multiple of the quantile at which nearly all samples lie.
+_OUTLYING, _NEARLY_ALL = 4.0, 0.98
+# So many spikes are no chance.
+_FEWEST_SPIKES = 3
 # Jitter beside rounding has at least so many times its variance.
 _ROUNDING = 10.0
-# Standard deviations beyond which the variance that a jitter makes is not.
+# The jitter is at most what is found and so many standard errors.
 _MOST_JITTER_Z = 4.0
-# It is one all the same beyond such a multiple of what nearly all of these samples are off by.
-_MOSTLY_NEAR, _OUTLYING = 0.98, 4.0
-# So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
-_FEWEST_SPIKES, _LEAST_VARIANCE_SHARE = 3, 0.3
+# A last digit or jitter counts above this part of the noise variance.
+_LEAST_VARIANCE_SHARE = 0.3
+# Evidence of jitter and of a narrow band, in standard deviations.
 _JITTER_Z, _BAND_Z = 8.0, 8.0
 # A band is one of a resonance from this quality on; what is broader wanders, or jumps.
 _NARROW = 1.5
@@ -110,7 +115,7 @@ def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarr
     if sum(len(piece) for piece in long) < _IDLE:
         return pieces
     before = sum(float(piece @ piece) for piece in long)
-    best, found = _MOSTLY * before, pieces
+    best, found = _LEFT_WITHOUT_LINES * before, pieces
     for mains in MAINS_Hz:
         for frequency in mains * (1 + np.linspace(-DRIFT, DRIFT, 9)):
             left = []
@@ -141,7 +146,7 @@ def spikes(run: Run, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarr
     moved = (np.abs(change) > _MOVED_SHARE * float(np.ptp(voltage))) | turned
     near = np.convolve(moved, np.ones(2 * _SAMPLES_AROUND + 1), mode="same") > 0.5
     # Where it may, others do so, too.
-    usual = float(np.quantile(size[near], _MOSTLY_NEAR)) if near.any() else 0.0
+    usual = float(np.quantile(size[near], _NEARLY_ALL)) if near.any() else 0.0
     far &= ~near | (size > _OUTLYING * usual)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     for first, stop in zip(edges[::2], edges[1::2], strict=True):

@@ -18,12 +18,16 @@ from fits.io._record import Record
 from fits.loop._run import VIRGIN
 from microid import EFFECTS, Hold, Scales, Stage
 
-# Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
-# command held in steps must explain to be taken for it: then what looked like a delay is half a sample. Or steps
-# leave, beside a delay of their own, less than lines do, by such a part.
-_LATE, _AS_WELL, _BETTER = 25.0, 0.97, 0.03
-# Part of the sampling interval below which what is late is no effect, where that has about as much evidence as any.
-_SKEW, _ABOUT = 0.04, 0.8
+# A delay that lowers the sum of squares by less than this, in noise variances, is none.
+_LATE = 25.0
+# A command held in steps explains a delay of half a sample where it lowers the sum of squares by this part as much.
+_AS_WELL = 0.97
+# Or where, beside a delay of its own, it lowers it by this part more.
+_BETTER = 0.03
+# A delay below this part of the sampling interval is no effect.
+_SKEW = 0.04
+# Unless an effect has more evidence than the delay: than this part of it, to be exact.
+_ABOUT = 0.8
 _SKEWED = (
     "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
