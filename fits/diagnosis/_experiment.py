@@ -20,14 +20,16 @@ from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
 from microid.effects import card_of
 
-# Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
-# is repeated if it is short, so often at most, until it tells by so many standard deviations: by chance it may be
-# a few less in the end.
-_MOST_SAMPLES, _MOST_REPEATS, _ENOUGH_Z = 4096, 4, 12.0
+# Samples of a program: as many as are simulated some twenty times in a bearable time.
+_MOST_SAMPLES = 4096
+# A short program is repeated, so often at most, until it tells the suspects apart by so many standard deviations.
+_MOST_REPEATS, _ENOUGH_Z = 4, 12.0
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
-# Programs about as good as the best, of which the shortest is taken, and what an experiment must add to be worth it.
-_NEARLY_BEST, _LEAST_GAIN = 0.95, 1.02
+# The shortest of the programs that are at least this part as good as the best is taken.
+_NEARLY_BEST = 0.95
+# An experiment that tells less than so many times what the records at hand do is not worth it.
+_LEAST_GAIN = 1.02
 # Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
 _PROBE, _LENGTHS = 0.05, (0.4, 0.15)
 _ROUNDS = 2

@@ -24,12 +24,17 @@ from microid.effects import Statistic
 _SHOWS = 2.0
 # A class of effects that cannot be told apart names at most so many others.
 MOST_RIVALS = 2
-# A parameter that a standard deviation of its coordinate moves so many times as far to one side as to the other is
-# followed: by steps that double, from the first on, until it costs too much, and then between the last two; in so
-# many steps at most, and coordinates no larger than this. All others are fitted again in so many rounds.
-_NONLINEAR, _STEP, _STEPS, _LARGEST, _ROUNDS = 1.3, 0.5, 10, 30.0, 3
-# Standard deviations up to which the sum of squares may do what it likes: a place that costs less is as far away.
-# Where that is off by less than this factor, it is far enough known.
+# The likelihood is profiled along a parameter that one standard deviation of its coordinate moves so many times as
+# far to one side as to the other.
+_NONLINEAR = 1.3
+# The first step of a profile along the coordinate; steps double until the cost is high enough, and then halve the
+# interval.
+_STEP = 0.5
+# So many steps at most, and coordinates no larger than this.
+_STEPS, _LARGEST = 10, 30.0
+# Rounds in which all other coordinates are fitted again at each step.
+_ROUNDS = 3
+# A profile ends where the cost says so many standard deviations, within this factor.
 _FAR_Z, _FAR_WITHIN = 3.0, 1.4
 
 

@@ -18,15 +18,15 @@ from fits.io._record import Record
 from fits.loop._run import VIRGIN
 from microid import EFFECTS, Hold, Scales, Stage
 
-# A delay that lowers the sum of squares by less than this, in noise variances, is none.
+# Curves, steps or a delay that lower the sum of squares by less than this, in noise variances, are not looked into.
 _LATE = 25.0
 # A command held in steps explains a delay of half a sample where it lowers the sum of squares by this part as much.
 _AS_WELL = 0.97
 # Or where, beside a delay of its own, it lowers it by this part more.
 _BETTER = 0.03
-# A delay below this part of the sampling interval is no effect.
+# A delay below this part of the sampling interval is no effect, but one of each run's own.
 _SKEW = 0.04
-# Unless an effect has more evidence than the delay: than this part of it, to be exact.
+# It must have at least this part of the evidence of the strongest effect.
 _ABOUT = 0.8
 _SKEWED = (
     "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "

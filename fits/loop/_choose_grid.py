@@ -28,9 +28,12 @@ _ROUNDED = 1.2
 _REWEIGHED = 8
 # Correlation of displacement with voltage below which there is no loop.
 _CORRELATED = 0.3
-# Coherence from which on it follows all the same, that of lines whose gain is believed, and segments whose spectra
-# are averaged: chance gives 1 / 16.
-_COHERENT, _CLEAR, _SEGMENTS = 0.2, 0.3, 16
+# Coherence from which on it follows all the same.
+_COHERENT = 0.2
+# Coherence of lines whose gain is trusted.
+_CLEAR = 0.3
+# Segments whose spectra are averaged: chance gives a coherence of 1 / 16.
+_SEGMENTS = 16
 # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
 _LEADING = 0.5
 

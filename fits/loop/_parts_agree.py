@@ -24,13 +24,16 @@ _LEVELS = 16
 _TIMES = 2.0
 # Gains that differ by more than this are not those of one rig.
 _REFUSED = 0.1
-# Places, in parts of a run, at which it may have changed, samples that a part needs, and rounds of moving the place.
-_PLACES, _FEWEST_SAMPLES, _ROUNDS = 5, 200, 4
+# A change is looked for at so many places of a run, and the best one is moved in so many rounds.
+_PLACES, _ROUNDS = 5, 4
+# Samples that each part of a run needs.
+_FEWEST_SAMPLES = 200
 # Shifts, in samples, at which a delay is looked for first, and how far.
 _FARTHEST = 64
-# Twice the logarithm of how much likelier a delay makes a run, and the part of the residual that it must take away
-# where more than so many times the noise stays.
-_LEAST_GAIN, _LEFT_SHARE, _NEAR_NOISE = 30.0, 0.4, 2.0
+# A delay must raise twice the log likelihood of a run by this.
+_LEAST_GAIN = 30.0
+# It must leave no more than this part of the residual where that is more than so many times the noise.
+_LEFT_SHARE, _NEAR_NOISE = 0.4, 2.0
 # What is so near the noise, and as white, holds no delay.
 _QUIET = 1.3
 # A hysteresis takes part of a delay for width: it is known to half a sample at best.

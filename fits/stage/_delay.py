@@ -20,17 +20,20 @@ from fits.stage._steps import Plan, hysteresis_alone
 from fits.stage._uncertainty import NO_PRECISION, Precision, sandwich
 from microid import Preisach, Stage
 
-# A delay counts from so many standard deviations on, if it is as many samples long, and moves a parameter by so many
-# of its own; from there on it is followed until it changes by less than a part of its standard deviation.
-_SURE_Z, _LEAST_SAMPLES, _MOVED_SD = 5.0, 0.02, 0.5
+# A delay counts from so many standard deviations, and so many samples, on.
+_SURE_Z, _LEAST_SAMPLES = 5.0, 0.02
+# It must move a parameter by so many of that one's standard deviations, too.
+_MOVED_SD = 0.5
+# It is followed for so many rounds at most, until it changes by less than this part of its standard deviation.
 _ROUNDS, _SETTLED = 10, 0.3
 # A step is halved so often where it leaves more of its run.
 _HALVED, _NO_WORSE = 4, 1.01
 # Part of a sample by which a command is shifted to see what a delay does.
 _STEP = 0.25
-# Runs that leave so many times the noise are searched for delays up to so many samples either way, and so many of
-# these are tried.
-_SEARCHED_NOISE, _FARTHEST_SAMPLES, _MOST_TRIED = 1.5, 64, 3
+# Runs that leave so many times the noise are searched for delays.
+_SEARCHED_NOISE = 1.5
+# The search goes so many samples either way, and so many of the delays are tried.
+_FARTHEST_SAMPLES, _MOST_TRIED = 64, 3
 # What is as much likelier as leaving this part of a run's residual is a better answer.
 _BETTER = 0.7
 # Where more than so many times the noise is left, a delay counts if it takes all but this part away.
