@@ -146,7 +146,7 @@ class Maker:
     starts: int
     seed: int
     noise_um: np.ndarray | None
-    tell: Callable[[str], None]
+    progress: Callable[[str], None]
 
     def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
         """Make a controller by the name of its kind, with its tuning and what is to be said of it.
@@ -158,7 +158,7 @@ class Maker:
         loop, kind = self.loop, CONTROLLERS[name]
         tuning: Tuning[Any] | None = None
         if given is None:
-            self.tell("start by Ziegler and Nichols")
+            self.progress("start by Ziegler and Nichols")
             begin = relay_start(loop.plants, loop.ready.interval_s, delay=loop.delay)
             tuning = self._tuned(_limited(begin, loop.ready.limits_V))
             pid = tuning.controller
@@ -212,7 +212,7 @@ class Maker:
             skip=self.loop.skip,
             starts=self.starts,
             seed=self.seed,
-            progress=self.tell,
+            progress=self.progress,
         )
 
     def _calmed(self, controller: Any) -> Any:

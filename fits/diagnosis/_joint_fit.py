@@ -17,15 +17,21 @@ from fits.diagnosis._regression import regress, saturating
 _LARGEST_DIFFERENCE = 1.0
 # Multiple of a strength that is tried, and the gain in chi-square for which it is taken.
 _LARGER, _BETTER = 1.5, 10.0
-# Part of its bound from which what ended there is tried again, and rounds in which the baseline follows that first.
-_WEAKER, _FIRST = 0.8, 2
+# What ended at its bound is tried again from this part of it.
+_WEAKER = 0.8
+# Rounds in which the baseline follows that first.
+_FIRST = 2
 # Further rounds in which baseline and causes follow each other, at most.
 _AGAIN = 8
-# Rounds beside a density whose zeros stay, and standard deviations below which a coordinate has not moved.
-_BOUNDED, _MOVED_SD = 4, 0.1
-# Derivative of all samples along a coordinate, in noise, that does not show, and what a change must change in them to
-# be seen; the distance to its scale is halved at most so often for that.
-_INSENSITIVE, _SEEN_CHANGE, _HALVES = 1.0, 5.0, 16
+# Rounds beside a density whose zeros stay.
+_BOUNDED = 4
+# A coordinate that moves by less than this, in standard deviations, has not moved.
+_MOVED_SD = 0.1
+# A derivative of all samples along a coordinate below this, in noise, does not show.
+_INSENSITIVE = 1.0
+# A change of all samples above this, in noise, is seen; the distance to the coordinate's scale is halved at most so
+# often for that.
+_SEEN_CHANGE, _HALVES = 5.0, 16
 # A sum of squares that grows by this factor there is that of a fit gone astray.
 _ASTRAY = 1.5
 # Noise or roughness that falls by less than this factor is the same.

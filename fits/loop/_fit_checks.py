@@ -10,12 +10,14 @@ from fits.io._record import Record
 from fits.loop._run import Run
 from fits.stats._at_rest import quantum_um, stretches
 
-# A sensor sticks where so many readings in a row are the same to the last bit, while the stage, by its mean gain,
-# moves by such a part of its stroke, and by so many last digits.
-_STUCK_SAMPLES, _MOVED_SHARE, _DIGITS = 8, 0.05, 3.0
-# Readings count as impulses beyond so many deviations from their neighbours, where at most so many stand together and
-# nearly all others so near are much smaller.
-_IMPULSE, _MOST_TOGETHER, _COMPARED_SAMPLES, _LEAST_RATIO = 8.0, 3, 16, 4.0
+# A sensor sticks where so many readings in a row are the same to the last bit.
+_STUCK_SAMPLES = 8
+# Meanwhile the stage, by its mean gain, moves by such a part of its stroke, and by so many last digits.
+_MOVED_SHARE, _DIGITS = 0.05, 3.0
+# Readings count as impulses beyond so many deviations from their neighbours, where at most so many stand together.
+_IMPULSE, _MOST_TOGETHER = 8.0, 3
+# They are so many times as large as the median of those within so many samples.
+_LEAST_RATIO, _COMPARED_SAMPLES = 4.0, 16
 # So many impulses are no chance; so many are listed.
 _FEW, _LISTED = 3, 6
 # Impulses count where they make such a part of the residual's squares.
