@@ -66,10 +66,10 @@ def alternate(bench: Bench, projector: Projector, model: Refit, rounds: Sequence
     on for as long as that pays.
     """
     for count in rounds:
-        bench, projector = _follow(bench, projector, model)
+        bench, projector = _follow(projector, model)
         model = refit(bench, projector, model.laws, model.x, count)
     for _ in range(_AGAIN if model.laws else 0):
-        there, beside = _follow(bench, projector, model)
+        there, beside = _follow(projector, model)
         moved = refit(there, beside, model.laws, model.x, rounds[-1])
         if moved.cost > model.cost - _BETTER:
             break
@@ -149,7 +149,7 @@ def leave_bounds(bench: Bench, projector: Projector, model: Refit, finest: bool)
         laws, x = model.with_law(k, scaled(law, model.x[k], _WEAKER))
         trial = bench, projector, refit(bench, projector, laws, x, 0)
         for _ in range(_FIRST):
-            there = _follow(*trial, finest)
+            there = _follow(*trial[1:], finest)
             trial = *there, refit(*there, laws, x, 0)
         trial = *there, refit(*there, laws, x, 4)
         if trial[-1].cost < model.cost:
@@ -164,7 +164,7 @@ def keep_density_positive(bench: Bench, projector: Projector, model: Refit, fine
     rail in those beyond it.
     """
     for _ in range(_BOUNDED if model.laws else 0):
-        moved = _follow(bench, projector, model, finest)
+        moved = _follow(projector, model, finest)
         columns_um, regression = moved[0].baseline.columns_um, moved[1].regression
         free = np.concatenate([columns_um > 0, np.ones(regression.size - len(columns_um), dtype=bool)])
         if free.all():
@@ -201,7 +201,7 @@ def is_smoothness_confirmed(projector: Projector, model: Refit) -> bool:
     return bool(_SMOOTHER * _prior_precision(smoothed(projector, model.change_um)) > _prior_precision(projector))
 
 
-def _follow(bench: Bench, projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
+def _follow(projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
     """Move the baseline to where the causes leave it."""
     # What roughness beyond the grid would explain is not put into the grid.
     bare = projector.bare

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._effects import Bench, Law, _without_host, times
+from fits.diagnosis._effects import Bench, Law, times, without_host
 from fits.diagnosis._projector import Projector
 from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
@@ -293,7 +293,7 @@ def law_of(scored: Scored, runs: int, more: float = 1.0) -> Law:
         first = scored.probe.effects[0]
         values = {}
         for name in form.strength:
-            spec = next(i.spec for i in Coordinates(_without_host(first)).table if i.path == name)
+            spec = next(i.spec for i in Coordinates(without_host(first)).table if i.path == name)
             total = np.zeros(np.shape(getattr(first, name)))
             for k, effect in enumerate(scored.probe.effects):
                 share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]
