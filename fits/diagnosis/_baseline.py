@@ -184,7 +184,8 @@ def _prepared(
     stride: int,
     hold: Hold = "first",
 ) -> tuple[Run, ...]:
-    return tuple(prepare_run(record, range_V, initial, holdout, stride, hold=hold) for record in records)
+    settings = range_V, initial, holdout, stride
+    return tuple(prepare_run(record, *settings, hold=hold, lags=True) for record in records)
 
 
 def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:
