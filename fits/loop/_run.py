@@ -128,8 +128,8 @@ def prepare_run(
 
     The memory before the first sample is `initial`, one of `INITIAL_STATES`, or `VIRGIN`; a fraction at the end is
     held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Of the samples only those
-    that are `usable` may be fitted, shape `(n,)`. Where the hysteresis `lags` the command, an unknown past lasts until
-    it has turned, too. For the others see `Run`.
+    that are `usable` may be fitted, shape `(n,)`. Where the hysteresis `lags` the command, an unknown past lasts
+    until it has turned, too. For the others see `Run`.
     """
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
