@@ -185,7 +185,7 @@ def _prepared(
     hold: Hold = "first",
 ) -> tuple[Run, ...]:
     settings = range_V, initial, holdout, stride
-    return tuple(prepare_run(record, *settings, hold=hold, lags=True) for record in records)
+    return tuple(prepare_run(record, *settings, hold=hold) for record in records)
 
 
 def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:

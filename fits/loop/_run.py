@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._lagging import known_behind_lag
 from fits.loop._samples import Samples, refine, resized
 from microid import Hold, Preisach, Staircase, demagnetised, negative_saturation, positive_saturation, remember
 
@@ -122,20 +121,16 @@ def prepare_run(
     gain: float | None = 1.0,
     hold: Hold = "first",
     usable: np.ndarray | None = None,
-    lags: bool = False,
 ) -> Run:
     """Make a record ready whose command stays in a range; a `DataError` if nothing of it is left to fit.
 
     The memory before the first sample is `initial`, one of `INITIAL_STATES`, or `VIRGIN`; a fraction at the end is
     held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Of the samples only those
-    that are `usable` may be fitted, shape `(n,)`. Where the hysteresis `lags` the command, an unknown past lasts
-    until it has turned, too. For the others see `Run`.
+    that are `usable` may be fitted, shape `(n,)`. For the others see `Run`.
     """
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
     unknown = initial in ("unknown", VIRGIN)
-    if lags and unknown and gain is not None and record.displacement_um is not None:
-        known = known_behind_lag(record.voltage_V, record.displacement_um, known)
     fitted = known.copy() if usable is None else known & usable
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False

@@ -64,12 +64,12 @@ def plot_stage(
     voltages = np.concatenate([record.voltage_V for record in (*records, *aside)])
     range_V = float(voltages.min()), float(voltages.max())
     runs = [
-        prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold, lags=True)
+        prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold)
         for record, state, report in zip(records, states, known, strict=True)
     ]
     before_aside = initial if isinstance(initial, str) else "unknown"
     for record in aside:
-        run = prepare_run(record, range_V, before_aside, 1.0, known[-1].substeps or 1, gain, stage.hold, lags=True)
+        run = prepare_run(record, range_V, before_aside, 1.0, known[-1].substeps or 1, gain, stage.hold)
         runs.append(replace(run, fitted=run.known))
     noises = [report.noise_um or 0.0 for report in known]
     noises += [max(noises)] * len(aside)

@@ -123,7 +123,7 @@ def fit_stage(
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
     before, stage = initial if isinstance(initial, str) else "unknown", solved.stage
     settings = before, 1.0, runs[-1].stride, gain_ahead(stage), stage.hold
-    held = [prepare_run(record, found.plan.range_V, *settings, lags=True) for record in aside]
+    held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
     summary = summarise(found.precision, held)
     if undelayed is not None:
         summary = widen_for_delays(summary, undelayed)

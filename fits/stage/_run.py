@@ -141,7 +141,7 @@ def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout
     if not np.isfinite(range_V[0]):
         range_V = command_range_V(records)
     settings = initial, holdout, stage.substeps, gain_ahead(stage), stage.hold
-    return [prepare_run(record, range_V, *settings, lags=True) for record in records]
+    return [prepare_run(record, range_V, *settings) for record in records]
 
 
 def prepare_program(stage: Stage, record: Record, initial: str) -> tuple[Stage, Run]:

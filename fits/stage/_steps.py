@@ -63,8 +63,8 @@ class Plan:
         shifts = self.shifts_s or (0.0,) * len(self.records)
         return [self.run(k, stride, shift) for k, shift in enumerate(shifts)]
 
-    def run(self, k: int, stride: int, shift_s: float = 0.0, lags: bool = True) -> Run:
-        """One of them, its command that much later; whether its hysteresis `lags` the command."""
+    def run(self, k: int, stride: int, shift_s: float = 0.0) -> Run:
+        """One of them, its command that much later."""
         record, usable = self.records[k], None
         if shift_s:
             time = record.time_s - shift_s
@@ -73,7 +73,7 @@ class Plan:
             later = np.interp(time, record.time_s, record.voltage_V)
             record = replace(record, voltage_V=later, extra=dict(record.extra))
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
-        return prepare_run(record, *settings, usable, lags)
+        return prepare_run(record, *settings, usable)
 
     def smoothed(self) -> "Plan":
         """The same without readings that jump out and back, of which a start must not be read off."""
@@ -103,8 +103,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
                 f"not each: freeze {loose[0]}, or the {name}"
             )
         plan.progress(f"hysteresis from {', '.join(plan.records[k].source for k in slow)}")
-        static = [plan.run(k, 1, lags=False) for k in slow]
-        stroke, tried, _ = choose_grid(static, levels, plan.progress, finest)
+        stroke, tried, _ = choose_grid([runs[k] for k in slow], levels, plan.progress, finest)
         grid, hyper = tried.data.grid, tried.solution.hyper
         columns = np.asarray(tried.solution.columns) * stroke
         law = grid.model(columns, np.zeros(()))
