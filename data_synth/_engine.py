@@ -75,28 +75,28 @@ class Player:
     def respond(self, effects: Sequence[Acting] = ()) -> tuple[FloatArray, FloatArray]:
         """The reading without noise, and the displacement itself, both of shape (n,), in um."""
         situation = self.situation
-        history_V = _through(effects, "history", self._history_V, situation)
-        command_V = _through(effects, "command", self._command_V, situation)
-        tau_s = _through(effects, "driver", situation.plant.time_constant_s, situation)
+        history_V = _apply(effects, "history", self._history_V, situation)
+        command_V = _apply(effects, "command", self._command_V, situation)
+        tau_s = _apply(effects, "driver", situation.plant.time_constant_s, situation)
         situation.voltage_V = _drive(command_V, tau_s, situation)
-        operate: Operator = _through(effects, "hysteresis", lambda path_V: self._play(history_V, path_V), situation)
+        operate: Operator = _apply(effects, "hysteresis", lambda path_V: self._play(history_V, path_V), situation)
         static_um = situation.rig.reversible(situation.voltage_V) + operate(situation.voltage_V)
-        static_um = _through(effects, "static", static_um, situation)
+        static_um = _apply(effects, "static", static_um, situation)
         plant = situation.plant
         mode = None
         if plant.natural_frequency_Hz is not None and plant.damping_ratio is not None:
             mode = Mode(plant.natural_frequency_Hz, plant.damping_ratio)
-        mechanics: Mechanics = _through(effects, "mechanics", Mechanics(mode), situation)
+        mechanics: Mechanics = _apply(effects, "mechanics", Mechanics(mode), situation)
         displacement_um = mechanics.respond(static_um, situation.time_s)
-        reading_um = _through(effects, "environment", displacement_um, situation)
-        reading_um = _through(effects, "sensor", reading_um, situation)
+        reading_um = _apply(effects, "environment", displacement_um, situation)
+        reading_um = _apply(effects, "sensor", reading_um, situation)
         even = np.arange(self.samples) * situation.refinement
-        instants_s = _through(effects, "sampling", even * situation.step_s, situation)
+        instants_s = _apply(effects, "sampling", even * situation.step_s, situation)
         return np.interp(instants_s, situation.time_s, reading_um), displacement_um[even]
 
     def read(self, reading_um: FloatArray, effects: Sequence[Acting]) -> FloatArray:
         """What is written down, shape (n,), in um: the effects that come after the sensor's noise."""
-        return _through(effects, "reading", reading_um, self.situation)
+        return _apply(effects, "reading", reading_um, self.situation)
 
     def _play(self, history_V: FloatArray, path_V: FloatArray) -> FloatArray:
         for before_V, known_V, known_um in self._played:
@@ -125,7 +125,7 @@ def _glide(hysteresis: Hysteresis, voltage_V: FloatArray, spacing_V: float) -> F
     return np.interp(way, way[asked], hysteresis.glide(voltage_V[asked]))
 
 
-def _through(effects: Sequence[Acting], place: Place, signal: Any, situation: Situation) -> Any:
+def _apply(effects: Sequence[Acting], place: Place, signal: Any, situation: Situation) -> Any:
     for acting in effects:
         if acting.effect.place == place:
             signal = acting(signal, situation)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import fits
-from fits.io.columns import columns_beside
+from fits.diagnosis._experiment import further_column
+from fits.io.columns import COLUMNS, columns_beside
 from microid import Dahl, Driver, Mechanics, Sensor, Stage
 from microid.effects import EFFECTS, extend
 
@@ -41,6 +42,19 @@ def test_columns_come_in_the_units_that_effects_know(rng):
     np.testing.assert_allclose(taken["temperature_degC"][1:], np.linspace(16.85, 17.85, 400)[1:], rtol=1e-12)
     travelled = np.full(400, 900.0)
     assert columns_beside(record(rng, path_V=travelled))["path_V"].tolist() == travelled.tolist()
+
+
+def test_the_columns_that_effects_name_are_known():
+    named = {name for effect in EFFECTS for name in (*effect.needs, *effect.unless, effect.column)}
+    assert {name for name in named if name and " " not in name} <= set(COLUMNS)
+
+
+def test_a_column_that_is_there_is_not_asked_for_again(rng):
+    asked = further_column(("cross_coupling", "thermal_drift"), [record(rng)])
+    assert asked.startswith("other_um: the position of the second axis")
+    assert further_column(("cross_coupling",), [record(rng), record(rng, y_um=np.sin(np.arange(400) / 7))]) == ""
+    assert further_column(("thermal_drift",), [record(rng, temperature_degC=np.full(400, 20.0))]) == ""
+    assert further_column(("clock_mismatch",), [record(rng)]).startswith("raw time stamps of both clocks")
 
 
 def test_the_noise_of_the_first_temperature_is_no_step(rng):

@@ -150,15 +150,15 @@ def test_an_end_of_the_range_that_peaks_miss_by_a_little():
 def test_a_regression_is_bounded_where_block_pivoting_gives_up(rng, monkeypatch):
     root = rng.standard_normal((60, 12))
     precision, mean = root.T @ root, rng.standard_normal(12)
-    belief = Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
+    posterior = Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
     asked = SimpleNamespace(count=0)
 
-    def gives_up(belief, which):
+    def gives_up(precision, mean):
         asked.count += 1
-        return belief.mean, RESULTS.nonlinear_max_steps_reached
+        return mean, RESULTS.nonlinear_max_steps_reached
 
-    monkeypatch.setattr(grid, "_bounded", gives_up)
-    found, result = grid.non_negative(belief)
+    monkeypatch.setattr(grid, "_pivot", gives_up)
+    found, result = grid.non_negative(posterior)
     assert asked.count == 1
     assert result == RESULTS.successful
     slope = precision @ (np.asarray(found) - mean)

@@ -38,5 +38,5 @@ def test_amplitudes_of_a_picma_stack_held_out():
 
 
 def test_a_record_that_never_closes_a_loop_is_refused():
-    with pytest.raises(fits.DataError, match="record a full loop first"):
+    with pytest.raises(fits.DataError, match="start each run with a full loop"):
         fits.fit([measured("afm_z_piezo_50um_2rates.csv")], holdout=0.3)

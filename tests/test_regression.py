@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 import fits
 from fits.loop._design import Grid, columns_of
-from fits.loop._evidence import _negative_log, maximise_evidence, posterior
+from fits.loop._evidence import _negative_log, maximise_evidence, posterior_of
 from fits.loop._moments import gather
 from fits.loop._prior import Hyper, interpolation, roughness
 from fits.loop._run import prepare_run, simulate_run
@@ -97,13 +97,13 @@ def test_posterior_is_that_of_dense_bayesian_regression(problem):
     grid, runs, data = problem
     hyper = Hyper(*(jnp.asarray(v) for v in (-2.0, -3.0, -1.0, -4.0)))
     rough = roughness(LEVELS)
-    belief = posterior(data.total, rough, hyper)
+    posterior = posterior_of(data.total, rough, hyper)
     design = _dense(grid, runs)
     target = np.concatenate([run.displacement_um - run.displacement_um.mean() for run in runs])
     precision = design.T @ design * np.exp(4.0) + np.asarray(rough.precision(hyper))
     covariance = np.linalg.inv(precision)
-    np.testing.assert_allclose(belief.mean, covariance @ design.T @ target * np.exp(4.0), rtol=1e-6, atol=1e-8)
-    factor = np.asarray(belief.factor())
+    np.testing.assert_allclose(posterior.mean, covariance @ design.T @ target * np.exp(4.0), rtol=1e-6, atol=1e-8)
+    factor = np.asarray(posterior.factor())
     np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-5, atol=1e-9 * covariance.max())
 
 

@@ -145,7 +145,7 @@ def control(given: Given) -> None:
             "out."
         )
     refuse_overwriting(given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])])
-    tell = progress_to_stderr(given.quiet)
+    progress = progress_to_stderr(given.quiet)
     known_gains = None if given.gains is None else read_gains(given.gains)
     loaded = load_model(given.model)
     known = loaded.uncertainty is not None
@@ -174,7 +174,7 @@ def control(given: Given) -> None:
             given.starts,
             given.seed,
             rng.normal(0, given.noise, len(wanted)) if given.noise else None,
-            tell,
+            progress,
         )
         try:
             made = tune.make(given.controller, known_gains, given.frequency)
@@ -186,7 +186,7 @@ def control(given: Given) -> None:
                 f"{given.model}: the loop is unstable with these gains, its largest pole has modulus "
                 f"{max(float(one.radius) for one in every):.6g}; lower --gains, or leave them out to have them tuned."
             )
-        tell("run")
+        progress("run")
         heard = rng.normal(0, given.noise, len(wanted)) if given.noise else None
         asked = 1 if given.overshoot is None else len(loop.plants)
         played = [loop.run(made.controller, heard, given.resolution_voltage, k) for k in range(len(loop.plants))]
@@ -194,14 +194,14 @@ def control(given: Given) -> None:
         if not all(np.all(np.isfinite(one.error_um)) for one in played):
             raise DataError(f"{given.model}: the loop is unstable, its displacement has no bounds; lower --gains.")
         passed = passed_limits(goal, every, runs)
-        every = bool({"velocity", "acceleration", "current"} & set(allowed_here))
+        in_motion = bool({"velocity", "acceleration", "current"} & set(allowed_here))
         predicted = joined(
             predicted_ranges(
                 one,
                 Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source),
                 np.asarray(ran.displacement_um),
                 given.initial,
-                every,
+                in_motion,
             )
             for one, ran in zip(loop.plants, played, strict=True)
         )

@@ -26,8 +26,8 @@ def paper(given: Given) -> None:
     from fits.paper._regenerate import paper_result
 
     start_jax()
-    tell = progress_to_stderr(given.quiet)
+    progress = progress_to_stderr(given.quiet)
     with file_set() as files:
-        result = paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), tell)
+        result = paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), progress)
     page, figures = paths_in(given.out, ("paper.md", "paper.json"))
     click.echo(f"page   {page}\njson   {figures}\nworse than the paper: {'; '.join(result.worse()) or 'no row'}")

@@ -32,7 +32,7 @@ from microid import (
 
 _MOST_PEAK, _HALVINGS = 4.0, 20
 # Resonators that are nearer to each other than this share of their frequency fight.
-_ALIKE = 1e-3
+_SAME_FREQUENCY = 1e-3
 
 
 def own_settings(controller: type[AbstractController]) -> list[Setting]:
@@ -146,7 +146,7 @@ class Maker:
     starts: int
     seed: int
     noise_um: np.ndarray | None
-    tell: Callable[[str], None]
+    progress: Callable[[str], None]
 
     def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
         """Make a controller by the name of its kind, with its tuning and what is to be said of it.
@@ -158,7 +158,7 @@ class Maker:
         loop, kind = self.loop, CONTROLLERS[name]
         tuning: Tuning[Any] | None = None
         if given is None:
-            self.tell("start by Ziegler and Nichols")
+            self.progress("start by Ziegler and Nichols")
             begin = relay_start(loop.plants, loop.ready.interval_s, delay=loop.delay)
             tuning = self._tuned(_limited(begin, loop.ready.limits_V))
             pid = tuning.controller
@@ -212,7 +212,7 @@ class Maker:
             skip=self.loop.skip,
             starts=self.starts,
             seed=self.seed,
-            progress=self.tell,
+            progress=self.progress,
         )
 
     def _calmed(self, controller: Any) -> Any:
@@ -251,7 +251,7 @@ class Maker:
         if len(bad):
             raise DataError(f"--frequency: expected one between 0 and {highest:g} Hz, found {bad[0]:g} Hz.")
         near = np.sort(frequency_Hz)
-        if np.any(np.diff(near) <= _ALIKE * near[1:]):
+        if np.any(np.diff(near) <= _SAME_FREQUENCY * near[1:]):
             raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
 
 

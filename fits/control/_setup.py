@@ -18,7 +18,7 @@ Feedforward = Literal["none", "static", "dynamic"]
 
 _FEWEST = 16
 # Intervals that differ by less than this from their mean, as a fraction of it, count as even.
-_EVEN = 1e-3
+_EVEN_WITHIN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _interval_s(reference: Reference) -> float:
     steps = np.diff(reference.time_s)
     interval = float(steps.mean())
     worst = int(np.argmax(np.abs(steps - interval)))
-    if abs(steps[worst] - interval) > _EVEN * interval:
+    if abs(steps[worst] - interval) > _EVEN_WITHIN * interval:
         raise DataError(
             f"{reference.source}: expected even times, as of a controller, found a step of {steps[worst]:.6g} s "
             f"at sample {worst + 2} where the mean is {interval:.6g} s; resample the reference"

@@ -22,13 +22,13 @@ _ROUNDS = 12
 _FIRST_WEIGHT, _FACTOR, _MOST_WEIGHT = 10.0, 4.0, 1e6
 # Limits are kept to this share; the search stops where it moves no gain by more than this.
 _TOLERANCE = 2e-3
-_STILL = 1e-2
+_SMALLEST_MOVE = 1e-2
 # Relative change of the cost per e-fold of a gain that counts as none.
 _FLAT = 2e-2
 _SPREAD = 1.0
 _SHRINKS = 8
 _EDGE = 0.8 * REACH
-_ALIKE = 0.01
+_SAME_COST = 0.01
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ def _search(problem: Problem, y: Any) -> _End:
         now = _worst(over)[0]
         pressed = any(bool(jnp.any(one > 0)) for one in multipliers.values())
         # Without a limit that presses, nothing changes from here on.
-        settled = (now <= 0 and not pressed) or (now <= _TOLERANCE and distance < _STILL)
+        settled = (now <= 0 and not pressed) or (now <= _TOLERANCE and distance < _SMALLEST_MOVE)
         if settled or not np.isfinite(now):
             break
         multipliers = {name: jnp.maximum(one + weight * over[name], 0) for name, one in multipliers.items()}
@@ -275,7 +275,7 @@ def _excess_in_words(over: dict[str, Any]) -> str:
 
 def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> list[str]:
     out = []
-    alike = sum(end.kept and end.cost_um <= best.cost_um * (1 + _ALIKE) for end in ends)
+    alike = sum(end.kept and end.cost_um <= best.cost_um * (1 + _SAME_COST) for end in ends)
     if len(ends) > 1 and alike < len(ends):
         out.append(f"{alike} of {len(ends)} searches ended within 1 % of the best cost: the others at worse optima")
     place = 0

@@ -19,7 +19,7 @@ _TINY_um2 = 1e-12
 # A reference that covers less than this stands still.
 NO_RANGE_um = 1e-6
 _RTOL = _ATOL = 1e-4
-_FAR = 1e9
+_UNLIMITED = 1e9
 _STEPS = 80
 
 
@@ -63,11 +63,11 @@ class Goal:
         none = {
             "gain_margin_min": 0.0,
             "phase_margin_min_deg": 1e-3,
-            "sensitivity_peak_max": _FAR,
-            "overshoot_max_pct": _FAR,
-            "command_min_V": -_FAR,
-            "command_max_V": _FAR,
-            "command_step_max_V": _FAR,
+            "sensitivity_peak_max": _UNLIMITED,
+            "overshoot_max_pct": _UNLIMITED,
+            "command_min_V": -_UNLIMITED,
+            "command_max_V": _UNLIMITED,
+            "command_step_max_V": _UNLIMITED,
         }
         return {
             name: far if getattr(self, name) is None else float(getattr(self, name)) for name, far in none.items()

@@ -28,7 +28,7 @@ _FINEST = 32
 _COARSE = 4
 # Steps between samples in which the plain stage is simulated where those of its fit are off by more than this, in
 # all samples together, in noise.
-_FINE, _FINE_STEPS, _OFF = 16, 64, 1.0
+_FINE, _FINE_STEPS, _LARGEST_DIFFERENCE = 16, 64, 1.0
 
 
 class Fixed(eqx.Module):
@@ -184,7 +184,8 @@ def _prepared(
     stride: int,
     hold: Hold = "first",
 ) -> tuple[Run, ...]:
-    return tuple(prepare_run(record, range_V, initial, holdout, stride, hold=hold) for record in records)
+    settings = range_V, initial, holdout, stride
+    return tuple(prepare_run(record, *settings, hold=hold) for record in records)
 
 
 def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:
@@ -194,7 +195,7 @@ def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:
     better = simulate(stage, finer)
     noise_um = max(rough_noise_um(run.displacement_um - better), 1e-9 * float(np.ptp(run.displacement_um)))
     off = float(np.linalg.norm((better - simulate(stage, run))[run.fitted]))
-    return finer if off > _OFF * noise_um else run
+    return finer if off > _LARGEST_DIFFERENCE * noise_um else run
 
 
 def _static(

@@ -12,31 +12,46 @@ from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
 from fits.diagnosis._score import Probe, Scored, best_of, rescore, score
 from microid import EFFECTS, AbstractEffect
 
-# Effects that are fitted to choose among: the best by their scores, of each at most so many forms.
-_LEADERS, _FORMS = 5, 2
-# Scores below this share of the best are not worth a fit, or below that of an effect that the best is mistaken for.
-WORTH, _OF_CONFUSED = 0.4, 0.2
-# Differences of the criterion, and standard deviations after projecting one effect off another, within which two
-# effects are not told apart.
-SAME, _APART = 10.0, 4.0
-# Effects that the baseline follows to tell them apart, and part of what the best explains by which one that it is
-# mistaken for may be behind before: the plain stage has already given way to the one and not to the other.
-_NEAREST, _BEHIND = 4, 0.1
+# So many effects, the best by their scores, are fitted to choose among them.
+_LEADERS = 5
+# An effect without a strength is fitted in so many of its forms at most.
+_FORMS = 2
+# Scores below this share of the best are not worth a fit.
+WORTH = 0.4
+# The same for an effect that the best is mistaken for.
+_OF_CONFUSED = 0.2
+# Difference of the information criterion below which two effects are not told apart.
+SAME = 10.0
+# The same in standard deviations, after projecting one effect off another.
+_APART = 4.0
+# The baseline is fitted again beside so many of the best effects at most.
+_NEAREST = 4
+# Part of the explained sum of squares by which an effect that the best is mistaken for may be behind before that: the
+# plain stage has already given way to the one and not to the other.
+_BEHIND_SHARE = 0.1
 # Part of a cause's signature by which its model may be off.
 MODEL_ERROR = 0.06
-# An effect that makes the square of the errors in what was held out so many times larger is none, and one with
-# little evidence against the rest of the misfit is one if it makes it so much smaller.
-_WORSE, _BETTER, _SHOWN = 1.2, 0.85, 1.0
-# Evidence that a cause must have against what else is left, in standard deviations; and what is beyond doubt: so
-# many of them, and so much of what there is to be explained. A second cause may show in what was held out most.
-_SURE, _PLAIN, _MOST = 3.0, 30.0, 0.5
+# The same along its confusions.
+_CONFUSED_ERROR = 0.6
+# The same along a column of the records: what is slow in both agrees by chance.
+_COLUMN_ERROR = 0.15
+# An effect with clear evidence may raise the squared error of what was held out by this factor at most.
+_WORSE = 1.2
+# An effect with little evidence against the rest of the misfit must lower it to this share.
+_BETTER = 0.85
+# An effect whose strength is not determined must not raise it.
+_NOT_WORSE = 1.0
+# Evidence against the rest of the misfit, in standard deviations, that is clear.
+_SURE_Z = 3.0
+# A cause with so much evidence, that explains so much of what there is to be explained, needs none from what was held
+# out: a second cause may show most there.
+_PLAIN_Z, _PLAIN_SHARE = 30.0, 0.5
 # Standard deviations beyond which effects are told apart if one of them leaves no more than noise.
 _CLEAR = 5.0
-# Part of a cause's signature by which its model may be off along its confusions, and along any column of the records:
-# what is slow in both agrees by chance.
-_CONFUSED_ERROR, _COLUMN_ERROR = 0.6, 0.15
-# Scores above this share of the best may be those of the cause, if so much of what it explains is left for another.
-_NEAR, _FURTHER = 0.95, 0.15
+# Effects whose score is above this share of the best may be the cause instead.
+_NEAR_BEST = 0.95
+# They are looked into where yet another effect shows beside the best by more than this share of what that explains.
+_LEFT_SHARE = 0.15
 
 
 @dataclass(frozen=True)
@@ -68,43 +83,43 @@ def compare_rivals(
     bare = projector.bare
     before = bare.held_out_error(model.change_um)
     for name in names:
-        own = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
+        scored = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
         tried: dict[type, int] = {}
-        for one in own:
+        for one in scored:
             form = one.form
-            if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < WORTH * own[0].z:
+            if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < WORTH * scored[0].z:
                 continue
             tried[form] = tried.get(form, 0) + 1
             found = relocate(bench, projector, refit_beside(bench, projector, model, one), len(model.laws))
             if not all(np.all(np.isfinite(change)) for change in found.change_um):
                 continue
             # What does not stand out of the rest of the misfit must show in what was kept aside.
-            plain = one.robust_z > (_SURE if one.z > 2 * MODEL_ERROR * explained else 2 * _SURE)
+            plain = one.robust_z > (_SURE_Z if one.z > 2 * MODEL_ERROR * explained else 2 * _SURE_Z)
             most = _WORSE if plain else _BETTER
-            if one.robust_z > _PLAIN and model.cost - found.cost > _MOST * (model.cost - projector.count):
+            if one.robust_z > _PLAIN_Z and model.cost - found.cost > _PLAIN_SHARE * (model.cost - projector.count):
                 most = np.inf
             alone = found.is_noise(projector) and not model.is_noise(projector)
             if not found.determined(alone=alone):
                 # Of what is only there, what was kept aside must show something, too.
-                most = _SHOWN
+                most = _NOT_WORSE
             if (
                 bare.held_out_error(found.change_um) > most * before
                 or not found.determined(False, alone)
                 or not _has_occurred(bench, found)
             ):
                 continue
-            found = _add_occurrences(bench, projector, found, own, len(model.laws) + laws)
+            found = _add_occurrences(bench, projector, found, scored, len(model.laws) + laws)
             if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
                 fitted[name] = found
     rivals = [Rival(name, one, one.criterion(projector.count), 0.0, one.cost) for name, one in fitted.items()]
     return _ranked(bench, projector, rivals, model.cost)
 
 
-def _add_occurrences(bench: Bench, projector: Projector, found: Refit, own: Sequence[Scored], most: int) -> Refit:
+def _add_occurrences(bench: Bench, projector: Projector, found: Refit, scored: Sequence[Scored], most: int) -> Refit:
     """Add occurrences of what is counted, as a loss of samples, while that pays: several look like a drift."""
     first = len(found.laws) - 1
     while found.laws[-1].form.counted and len(found.laws) < most:
-        more = _one_more(bench, projector, found, own)
+        more = _one_more(bench, projector, found, scored)
         if not (more.determined() and _has_occurred(bench, more)):
             break
         if more.criterion(projector.count) > found.criterion(projector.count) - SAME:
@@ -112,14 +127,14 @@ def _add_occurrences(bench: Bench, projector: Projector, found: Refit, own: Sequ
         for _ in range(first, len(more.laws)):
             # Alone it stood for all of them: each in turn is put where the others leave most.
             laws, x = ([*one[:first], *one[first + 1 :]] for one in (more.laws, more.x))
-            moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), own)
+            moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), scored)
             more = min(more, moved, key=lambda one: one.cost)
         found = relocate(bench, projector, more, first)
     return found
 
 
-def _one_more(bench: Bench, projector: Projector, model: Refit, own: Sequence[Scored]) -> Refit:
-    left = rescore(own, model.basis(), model.residual)
+def _one_more(bench: Bench, projector: Projector, model: Refit, scored: Sequence[Scored]) -> Refit:
+    left = rescore(scored, model.basis(), model.residual)
     more = refit_beside(bench, projector, model, max(left, key=lambda one: one.z))
     return relocate(bench, projector, more, len(model.laws))
 
@@ -134,7 +149,7 @@ def _ranked(bench: Bench, projector: Projector, fitted: list[Rival], before: flo
     def reach(one: Rival) -> float:
         form = one.refit.laws[-1].form
         alike = form.name in first.confusions or first.name in form.confusions
-        return max(tolerance(drop) ** 2, _BEHIND * drop if alike else 0.0)
+        return max(tolerance(drop) ** 2, _BEHIND_SHARE * drop if alike else 0.0)
 
     near = [one for one in order if one.cost - order[0].cost < reach(one)][:_NEAREST]
     if len(near) < 2:
@@ -175,7 +190,7 @@ def choose_cause(
     """
     best, chosen = fitted[0], fit_jointly(bench, projector, fitted[0].refit)
     highest = max(scores[one.name].z for one in fitted)
-    near = [one for one in fitted if scores[one.name].z > _NEAR * highest]
+    near = [one for one in fitted if scores[one.name].z > _NEAR_BEST * highest]
 
     def further(one: Rival, at: State) -> tuple[float, float]:
         there, beside, own = at
@@ -191,7 +206,7 @@ def choose_cause(
     if len(near) < 2 or best not in near:
         return best, chosen
     left, cost = further(best, chosen)
-    if left < _FURTHER * max(model.cost - chosen[-1].cost, 0.0) ** 0.5:
+    if left < _LEFT_SHARE * max(model.cost - chosen[-1].cost, 0.0) ** 0.5:
         return best, chosen
     for one in near:
         if one is best:

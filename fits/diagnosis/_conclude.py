@@ -35,23 +35,28 @@ from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from microid.effects import card_of
 
-# Causes explain at least this part of what is reproducible, or the true ones are not in the library; with less than
-# the second part they have nothing to do with it.
-_SHARE, _RATHER = 0.65, 0.3
+# Causes that explain less than this part of what is reproducible are not named: the true ones are not in the library.
+_EXPLAINED_SHARE = 0.65
+# Causes that explain less than this part have nothing to do with it.
+_UNRELATED_SHARE = 0.3
 # Standard deviations by which a sum of squares exceeds its mean by chance.
 _SPREAD = 3.0
-# What is left counts as unexplained above this size, in noise, and with less than this probability by chance.
-_REST, _CHANCE = 0.3, 1e-6
-# Part of the noise above which a narrow band is what is seen in every way of looking.
+# What is left counts as unexplained where its root mean square is above this part of the noise.
+_REST_NOISE = 0.3
+# It must be less probable than this by chance, too.
+_CHANCE = 1e-6
+# A narrow band that is more than this part of the misfit is what is seen in every way of looking.
 _BAND = 0.75
-# Evidence for a period in the position, in e-folds of chance, and the part of what is left that it explains.
-_CYCLIC, _PART = 50.0, 0.3
+# A residual repeats itself with the position where the evidence of a period, in e-folds of chance, is above this.
+_CYCLIC_EVIDENCE = 50.0
+# The period must explain this part of what is left, too.
+_CYCLIC_SHARE = 0.3
 # Part of the stroke below which a change of the feedforward is rounding.
 _MET = 1e-9
 # Part of the noise variance from which on it is that of rounding.
 _ROUNDED = 0.5
 # Causes with less evidence than this, in standard deviations, may get it from what else is not simulated.
-_WEAK = 8.0
+_WEAK_Z = 8.0
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,7 @@ class Misfit:
     @property
     def is_left_over(self) -> bool:
         """Whether the rest is of a size that matters, and no chance."""
-        return self.rest_noise > _REST and bool(stats.chi2.sf(self.rest, self.freedom) < _CHANCE)
+        return self.rest_noise > _REST_NOISE and bool(stats.chi2.sf(self.rest, self.freedom) < _CHANCE)
 
     def unnamed(self, weak: bool) -> tuple[float, bool]:
         """Root mean square of what is left in noise, and whether that counts, where none of the causes is named.
@@ -98,7 +103,7 @@ class Misfit:
         What is beyond chance counts, however small it is, unless nearly all of the rest is of another kind.
         """
         rest = (max(self.explained + self.excess, 0.0) / self.count) ** 0.5
-        return rest, rest > _REST or not (weak or self.share < _RATHER)
+        return rest, rest > _REST_NOISE or not (weak or self.share < _UNRELATED_SHARE)
 
 
 def conclude(
@@ -124,17 +129,21 @@ def conclude(
     progress(Step.EXTENSION)
     extension = extend_stage(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
-    weak = max((cause.z for cause in kept), default=0.0) < _WEAK
-    if kept and (misfit.share < _SHARE or predicts_worse(extension.compared[: len(baseline.runs)], weak)):
+    weak = max((cause.z for cause in kept), default=0.0) < _WEAK_Z
+    if kept and (misfit.share < _EXPLAINED_SHARE or predicts_worse(extension.compared[: len(baseline.runs)], weak)):
         suspects = ", ".join(cause.name for cause in kept)
         why = "predicts what was kept aside worse"
-        if misfit.share < _SHARE:
+        if misfit.share < _EXPLAINED_SHARE:
             why = f"explains only {misfit.share:.0%} of what is left"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
-    cyclic = not rounded and repeated.z > _CYCLIC and repeated.drop > _PART * max(misfit.excess, repeated.drop)
+    cyclic = (
+        not rounded
+        and repeated.z > _CYCLIC_EVIDENCE
+        and repeated.drop > _CYCLIC_SHARE * max(misfit.excess, repeated.drop)
+    )
     if cyclic:
         remarks.append(
             f"what is left repeats itself every {repeated.period_um:.3g} um of the position, as the error of an "

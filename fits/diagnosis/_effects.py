@@ -46,8 +46,8 @@ class Bench:
     def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
         """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
         return [
-            _respond(with_effects(self.stage, self._seen(own, one)), self.stage, known, one)
-            for own, known, one in zip(effects, self.known, self.prepared, strict=True)
+            _respond(with_effects(self.stage, self._seen(acting, one)), self.stage, known, one)
+            for acting, known, one in zip(effects, self.known, self.prepared, strict=True)
         ]
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
@@ -116,8 +116,8 @@ class Law:
         self.form, self.remembers = type(effects[0]), remembers
         closed = (*held, *(() if remembers else self.form.history))
         # The part that an effect is put around is put in anew wherever it is simulated.
-        self.maps = [Coordinates(_without_host(effect), lambda info: _free(info, closed)) for effect in effects]
-        vectors = [np.asarray(one.of(_without_host(effect))) for one, effect in zip(self.maps, effects, strict=True)]
+        self.maps = [Coordinates(without_host(effect), lambda info: _free(info, closed)) for effect in effects]
+        vectors = [np.asarray(one.of(without_host(effect))) for one, effect in zip(self.maps, effects, strict=True)]
         self.each = self.differs if len(effects) > 1 else np.zeros(len(vectors[0]), dtype=bool)
         self.start = np.concatenate([vectors[0][~self.each], *(v[self.each] for v in vectors)])
         # Which of them are those of a run, shape `(runs, k)`.
@@ -204,7 +204,7 @@ def times(effect: AbstractEffect, factor: float | np.ndarray) -> AbstractEffect:
     return replace(effect, **{name: factor * getattr(effect, name) for name in effect.strength})
 
 
-def _without_host(effect: AbstractEffect) -> AbstractEffect:
+def without_host(effect: AbstractEffect) -> AbstractEffect:
     anything = Sensor(jnp.ones(()), jnp.zeros(()))
     return replace(effect, inner=anything) if hasattr(effect, "inner") else effect  # type: ignore[call-arg]
 

@@ -1,11 +1,12 @@
 """The next experiment: the voltage program that would tell apart best what the records leave open."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 
+from fits.diagnosis._findings import MOST_RIVALS
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._programs import Program, limits_of, repeated
@@ -15,18 +16,20 @@ from fits.diagnosis._safe import guard_of
 from fits.diagnosis._score import best_of, law_of
 from fits.diagnosis._select import Selection
 from fits.io._limits import MARGIN
+from fits.io._record import Record
+from fits.io.columns import COLUMNS, columns_beside
 from microid.effects import card_of
 
-# Samples of a program: as many as are played virtually, some twenty times, in a bearable time. The one that is chosen
-# is repeated if it is short, so often at most, until it tells by so many standard deviations: by chance it may be
-# a few less in the end.
-_MOST, _TIMES, _PLENTY = 4096, 4, 12.0
+# Samples of a program: as many as are simulated some twenty times in a bearable time.
+_MOST_SAMPLES = 4096
+# A short program is repeated, so often at most, until it tells the suspects apart by so many standard deviations.
+_MOST_REPEATS, _ENOUGH_Z = 4, 12.0
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
-# A class of effects that cannot be told apart counts so many others.
-_OTHERS = 2
-# Programs about as good as the best, of which the shortest is taken, and what an experiment must add to be worth it.
-_ALIKE, _WORTH = 0.95, 1.02
+# The shortest of the programs that are at least this part as good as the best is taken.
+_NEARLY_BEST = 0.95
+# An experiment that tells less than so many times what the records at hand do is not worth it.
+_LEAST_GAIN = 1.02
 # Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
 _PROBE, _LENGTHS = 0.05, (0.4, 0.15)
 _ROUNDS = 2
@@ -35,18 +38,6 @@ _TOLD_APART = 3.0
 _OVER = {2: "twice", 3: "three times", 4: "four times"}
 # Names, hypotheses, and which is compared with which.
 Question: TypeAlias = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
-
-# Further columns by the names that effects know, the most telling first, and what is said of them.
-_COLUMNS = {
-    "temperature_degC": "temperature_degC: the temperature of the stage's body, which what the room does follows and "
-    "what the command does ignores.",
-    "monitor_V": "monitor_V: the voltage at the piezo, sampled with the displacement, which shows what the driver "
-    "does and nothing of the sensor.",
-    "other_um": "other_um: the position of the second axis, without which its share of this one looks like a drift.",
-    "time_stamps": "raw time stamps of both clocks, which show a lost sample or a wrong rate at once.",
-}
-# How a record's own name of such a column begins, or what is in it.
-_PRESENT = {"temperature_degC": "temp", "monitor_V": "monitor", "other_um": "other"}
 
 
 @dataclass(frozen=True)
@@ -91,18 +82,18 @@ def suggest(
     if limits is None:
         return None
     predictor = Predictor(found.bench, found.projector, hypotheses, pairs)
-    present = predictor.present_z
-    programs = guard.menu(limits, _MOST)
+    present_z = predictor.present_z
+    programs = guard.menu(limits, _MOST_SAMPLES)
     if not programs:
         return None
     scores = [predictor.predicted_z(*program.samples(program.start)) for program in programs]
-    column = further_column(names, {name for run in baseline.runs for name in run.record.extra})
+    column = further_column(names, records)
     asked = predictor
     if column and max(scores) < 1.0:
         # Only the column tells: what shows the first of them best is played with it.
         asked = Predictor(found.bench, found.projector, (hypotheses[0], hypotheses[0].without(names[0])), ((0, 1),))
         scores = [asked.predicted_z(*program.samples(program.start)) for program in programs]
-    near = [k for k, z in enumerate(scores) if z >= _ALIKE * max(scores)]
+    near = [k for k, z in enumerate(scores) if z >= _NEARLY_BEST * max(scores)]
     chosen = min(near, key=lambda k: (programs[k].limits.duration_s, -scores[k]))
     program, z = programs[chosen], scores[chosen]
     progress(f"refining {program.words}")
@@ -114,8 +105,8 @@ def suggest(
     parameters, z = refine(program, gain, z)
     time_s, voltage_V = program.samples(parameters)
     times, once = 1, (time_s, voltage_V)
-    most = min(_TIMES, int(limits.duration_s / (1.1 * program.limits.duration_s)))
-    while times < most and z < _PLENTY:
+    most = min(_MOST_REPEATS, int(limits.duration_s / (1.1 * program.limits.duration_s)))
+    while times < most and z < _ENOUGH_Z:
         longer = repeated(program.limits, once, times + 1)
         if not guard.allows(longer):
             break
@@ -125,12 +116,12 @@ def suggest(
     if asked is not predictor:
         z = predictor.predicted_z(time_s, voltage_V)
     # What tells nothing is not worth playing, but for a further column.
-    if not column and (z < 1.0 or z < _WORTH * present):
+    if not column and (z < 1.0 or z < _LEAST_GAIN * present_z):
         return None
     words = program.words if times < 2 else f"{program.words}, {_OVER[times]} over"
-    purpose = _purpose(names, z, present, column)
+    purpose = _purpose(names, z, present_z, column)
     extremes = guard.extremes((time_s, voltage_V))
-    return Experiment(time_s, voltage_V, words, purpose, names, z, present, column, extremes)
+    return Experiment(time_s, voltage_V, words, purpose, names, z, present_z, column, extremes)
 
 
 def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, ...]) -> Question | None:
@@ -140,7 +131,7 @@ def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, .
     for at, cause in enumerate(found.causes):
         if cause.name not in named or not cause.rivals:
             continue
-        rivals = cause.rivals[:_OTHERS]
+        rivals = cause.rivals[:MOST_RIVALS]
         others = [
             Hypothesis(
                 (*best.laws[:at], rival.refit.laws[-1], *best.laws[at + 1 :]),
@@ -229,12 +220,16 @@ def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> s
     )
 
 
-def further_column(names: tuple[str, ...], present: Collection[str]) -> str:
-    """Which further column helps most of the suspects, and why; empty if none does, or it is `present` already."""
-    wanted = [card_of(name).column for name in names]
-    known = [*_COLUMNS, *(column for column in wanted if column and column not in _COLUMNS)]
-    column = max(known, key=wanted.count)
-    there = _PRESENT.get(column)
-    if column not in wanted or (there is not None and any(there in name.lower() for name in present)):
+def further_column(names: tuple[str, ...], records: Sequence[Record]) -> str:
+    """Which further column helps most of the suspects, and why; empty if none does, or the records have it.
+
+    Of several that help as many, it is that of the first.
+    """
+    wanted = [column for name in names if (column := card_of(name).column)]
+    if not wanted:
         return ""
-    return _COLUMNS.get(column, column)
+    column = max(wanted, key=wanted.count)
+    # One that shows nothing is there all the same.
+    if any(column in record.extra or column in columns_beside(record) for record in records):
+        return ""
+    return f"{column}: {COLUMNS[column].use}" if column in COLUMNS else column

@@ -14,6 +14,7 @@ from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
+from fits.diagnosis._score import BLOCK
 from fits.diagnosis._select import Selection
 from fits.loop._run import Run
 from fits.stage._motion import signals
@@ -23,12 +24,12 @@ from microid import AbstractEffect, Stage
 _BLOCKS = 24
 _ROUNDS = 6
 # Relative spread of strengths that are the same in all runs.
-_ALIKE = 0.3
-# What was kept aside must not be predicted so many times worse, in squares; or not worse beyond chance by causes with
-# less evidence than this, in standard deviations: what else is not simulated may lend them as much.
-_WORSE, _WEAK = 1.1, 8.0
-# Standard deviations from which on a difference counts, and samples that are taken to err alike.
-_SURELY, _BLOCK = 1.5, 25
+_SAME_IN_ALL_RUNS = 0.3
+# What was kept aside must not be predicted so many times worse, in squares; by causes with weak evidence, not worse
+# beyond chance.
+_MOST_WORSE = 1.1
+# Standard deviations from which on a difference counts.
+_SURE_Z = 1.5
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def _common(each: Sequence[AbstractEffect], name: str) -> Float[Array, "..."]:
     values = jnp.stack([getattr(effect, name) for effect in each])
     mean = jnp.mean(values, axis=0)
     # What one run had says nothing of the next.
-    return jnp.where(jnp.std(values, axis=0) < _ALIKE * jnp.abs(mean), mean, 0.0)
+    return jnp.where(jnp.std(values, axis=0) < _SAME_IN_ALL_RUNS * jnp.abs(mean), mean, 0.0)
 
 
 def _compare(
@@ -109,23 +110,27 @@ def _compare(
     for k, run in enumerate(ready.baseline.runs):
         plain = run.displacement_um - ready.regression.residuals[k]
         better = run.displacement_um - regression.residuals[k] + change[k]
-        own, using = ready.regression.nuisance[k], run.fitted
-        found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), run.held_out))
+        nuisance, using = ready.regression.nuisance[k], run.fitted
+        found.append(
+            Compared(run, left_of(run, nuisance, plain, using), left_of(run, nuisance, better, using), run.held_out)
+        )
     if ready.baseline.aside:
         behind = Bench(bench.baseline, aside=True, finest=finest)
         for run, change_um in zip(ready.baseline.fine_aside, behind.change(effects), strict=True):
             plain = simulate(ready.baseline.stage, run)
             better = simulate(bench.baseline.stage, run) + change_um
-            own, using = np.ones((len(run.record), 1)), run.known
-            found.append(Compared(run, left_of(run, own, plain, using), left_of(run, own, better, using), using))
+            nuisance, using = np.ones((len(run.record), 1)), run.known
+            found.append(
+                Compared(run, left_of(run, nuisance, plain, using), left_of(run, nuisance, better, using), using)
+            )
     return tuple(found)
 
 
-def left_of(run: Run, own: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
+def left_of(run: Run, nuisance: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
     """Measurement less response, less the run's nuisance parameters fitted to the samples in use, shape `(n,)`."""
     off = run.displacement_um - response_um
     weight = jnp.asarray(using.astype(float))
-    return np.asarray(_without(jnp.asarray(own), weight, jnp.asarray(off)))
+    return np.asarray(_without(jnp.asarray(nuisance), weight, jnp.asarray(off)))
 
 
 _without = eqx.filter_jit(project_out)
@@ -140,10 +145,10 @@ def predicts_worse(compared: Sequence[Compared], weak: bool) -> bool:
         np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)]) ** 2
         for pick in ([one.before_um for one in held], [one.after_um for one in held])
     )
-    if np.sum(after) > _WORSE * np.sum(before):
+    if np.sum(after) > _MOST_WORSE * np.sum(before):
         return True
-    sums = np.add.reduceat(after - before, np.arange(0, len(before), _BLOCK))
-    return bool(weak and np.sum(sums) > _SURELY * np.linalg.norm(sums - np.mean(sums)))
+    sums = np.add.reduceat(after - before, np.arange(0, len(before), BLOCK))
+    return bool(weak and np.sum(sums) > _SURE_Z * np.linalg.norm(sums - np.mean(sums)))
 
 
 def gain_of(compared: Sequence[Compared], noise_um: float, source: str) -> Gain:

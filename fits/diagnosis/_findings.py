@@ -16,21 +16,26 @@ from fits.diagnosis._refit import Refit, refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
 from fits.diagnosis._score import Scored, best_of
 from fits.diagnosis._select import Cause, Selection
+from fits.stats._metrics import TWO_SIDED_95
 from microid import EFFECTS, AbstractEffect
 from microid.effects import Statistic
 
-_TWO_SIDED = 1.96
 # Standard deviations from zero beyond which a run shows an effect.
 _SHOWS = 2.0
 # A class of effects that cannot be told apart names at most so many others.
-_OTHERS = 2
-# A parameter that a standard deviation of its coordinate moves so many times as far to one side as to the other is
-# followed: by steps that double, from the first on, until it costs too much, and then between the last two; in so
-# many steps at most, and coordinates no larger than this. All others are fitted again in so many rounds.
-_NONLINEAR, _STEP, _STEPS, _LARGEST, _ROUNDS = 1.3, 0.5, 10, 30.0, 3
-# Standard deviations up to which the sum of squares may do what it likes: a place that costs less is as far away.
-# Where that is off by less than this factor, it is far enough known.
-_FAR, _ABOUT = 3.0, 1.4
+MOST_RIVALS = 2
+# The likelihood is profiled along a parameter that one standard deviation of its coordinate moves so many times as
+# far to one side as to the other.
+_NONLINEAR = 1.3
+# The first step of a profile along the coordinate; steps double until the cost is high enough, and then halve the
+# interval.
+_STEP = 0.5
+# So many steps at most, and coordinates no larger than this.
+_STEPS, _LARGEST = 10, 30.0
+# Rounds in which all other coordinates are fitted again at each step.
+_ROUNDS = 3
+# A profile ends where the cost says so many standard deviations, within this factor.
+_FAR_Z, _FAR_WITHIN = 3.0, 1.4
 
 
 def causes_of(
@@ -49,7 +54,7 @@ def causes_of(
     covariance, at = model.covariance(), 0
     total = float(np.mean([n.total_um**2 for n in projector.noise]))
     for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
-        own = covariance[at : at + law.size, at : at + law.size]
+        block = covariance[at : at + law.size, at : at + law.size]
         at += law.size
         changed = [[law.effect(x, run)] for run in range(len(bench.prepared))]
         alone = [a - b for a, b in zip(bench.respond(changed), bench.plain, strict=True)]
@@ -58,11 +63,11 @@ def causes_of(
         rms_um, share = seen * _rms(alone, projector), cause.drop / misfit
         occurrences[cause.name] = count = occurrences.get(cause.name, 0) + 1
         weight[cause.name] = weight.get(cause.name, 0.0) + cause.drop / projector.count * total
-        parameters = _parameters(law, x, own, profile_likelihood(bench, projector, model, number, own))
+        parameters = _parameters(law, x, block, profile_likelihood(bench, projector, model, number, block))
         if count > 1:
             found[cause.name] = _with_occurrence(found[cause.name], parameters, count, share, rms_um)
             continue
-        rivals = tuple(rival.name for rival in cause.rivals[:_OTHERS])
+        rivals = tuple(rival.name for rival in cause.rivals[:MOST_RIVALS])
         found[cause.name] = described(law.form, rivals, cause.z, cause.p_family, parameters, share, rms_um)
     forms: dict[Statistic, type[AbstractEffect]] = {form.statistic: form for form in EFFECTS if form.statistic}
     total = float(np.mean([n.total_um**2 for n in noise.noise]))
@@ -70,7 +75,7 @@ def causes_of(
         form = forms[fault.statistic]
         weight[form.name] = fault.variance_um2
         parameters = tuple(
-            EffectParameter(name, value, sd, unit, value - _TWO_SIDED * sd, value + _TWO_SIDED * sd)
+            EffectParameter(name, value, sd, unit, value - TWO_SIDED_95 * sd, value + TWO_SIDED_95 * sd)
             for name, value, sd, unit in fault.parameters
         )
         chance, share = float(2 * stats.norm.sf(fault.z)), fault.variance_um2 / max(total, fault.variance_um2, 1e-300)
@@ -137,7 +142,7 @@ def _parameters(
             for at in range(place.start, place.stop) if info.path not in law.form.history else ():
                 name = info.path if place.stop - place.start == 1 else f"{info.path}[{at - place.start}]"
                 value, less, more = float(values[at]), float(below[at]), float(above[at])
-                low, high = value - _TWO_SIDED * less, value + _TWO_SIDED * more
+                low, high = value - TWO_SIDED_95 * less, value + TWO_SIDED_95 * more
                 one = EffectParameter(
                     f"{name} in run {run + 1}" if differs else name,
                     value,
@@ -174,7 +179,7 @@ def profile_likelihood(
             for way in (-1, 1):
                 found += _profile_to(bench, projector, model, which, path, at, way)
     lowest = min([model.cost, *(cost for cost, _ in found)])
-    return [(max((cost - lowest) ** 0.5, _FAR), there) for cost, there in found]
+    return [(max((cost - lowest) ** 0.5, _FAR_Z), there) for cost, there in found]
 
 
 def _is_nonlinear(law: Law, x: np.ndarray, at: int, sd: float) -> bool:
@@ -202,8 +207,8 @@ def _profile_to(
         held = Law([law.effect(moved, run) for run in runs], law.remembers, () if only else (path,))
         there = refit(bench, projector, *last.with_law(which, held), 0 if only else _ROUNDS)
         found.append((there.cost, _law_of_model(there, which, law).start))
-        away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR
-        if 1 / _ABOUT < away < _ABOUT:
+        away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR_Z
+        if 1 / _FAR_WITHIN < away < _FAR_WITHIN:
             break
         if away > 1:
             outside = place
@@ -233,7 +238,7 @@ def bounds(found: Selection, ready: Prepared, left: Sequence[Scored], named: Col
             continue
         # The largest multiple that would not have been noticed, by the size that it has in the displacement.
         raw = float(np.linalg.norm([_rms(column, found.first) for column in one.probe.signatures]))
-        bound = (one.z + _TWO_SIDED) / size * raw
+        bound = (one.z + TWO_SIDED_95) / size * raw
         out.append(Bound(name, one.z, 1.0 - one.share_left, bound))
     asked = {bound.name for bound in out} | set(named)
     for name, reason in dict(ready.skipped).items():

@@ -14,18 +14,24 @@ from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
-_OFF = 1.0
+_LARGEST_DIFFERENCE = 1.0
 # Multiple of a strength that is tried, and the gain in chi-square for which it is taken.
 _LARGER, _BETTER = 1.5, 10.0
-# Part of its bound from which what ended there is tried again, and rounds in which the baseline follows that first.
-_WEAKER, _FIRST = 0.8, 2
+# What ended at its bound is tried again from this part of it.
+_WEAKER = 0.8
+# Rounds in which the baseline follows that first.
+_FIRST = 2
 # Further rounds in which baseline and causes follow each other, at most.
 _AGAIN = 8
-# Rounds beside a density whose zeros stay, and standard deviations below which a coordinate has not moved.
-_BOUNDED, _MOVED = 4, 0.1
-# Derivative of all samples along a coordinate, in noise, that does not show, and what a change must change in them to
-# be seen; the distance to its scale is halved at most so often for that.
-_INSENSITIVE, _SEEN, _HALVES = 1.0, 5.0, 16
+# Rounds beside a density whose zeros stay.
+_BOUNDED = 4
+# A coordinate that moves by less than this, in standard deviations, has not moved.
+_MOVED_SD = 0.1
+# A derivative of all samples along a coordinate below this, in noise, does not show.
+_INSENSITIVE = 1.0
+# A change of all samples above this, in noise, is seen; the distance to the coordinate's scale is halved at most so
+# often for that.
+_SEEN_CHANGE, _HALVES = 5.0, 16
 # A sum of squares that grows by this factor there is that of a fit gone astray.
 _ASTRAY = 1.5
 # Noise or roughness that falls by less than this factor is the same.
@@ -60,10 +66,10 @@ def alternate(bench: Bench, projector: Projector, model: Refit, rounds: Sequence
     on for as long as that pays.
     """
     for count in rounds:
-        bench, projector = _follow(bench, projector, model)
+        bench, projector = _follow(projector, model)
         model = refit(bench, projector, model.laws, model.x, count)
     for _ in range(_AGAIN if model.laws else 0):
-        there, beside = _follow(bench, projector, model)
+        there, beside = _follow(projector, model)
         moved = refit(there, beside, model.laws, model.x, rounds[-1])
         if moved.cost > model.cost - _BETTER:
             break
@@ -127,7 +133,7 @@ def refine_steps(bench: Bench, projector: Projector, model: Refit) -> tuple[Refi
     finer = Bench(bench.baseline, finest=True)
     better = refit(finer, projector, model.laws, model.x, 0)
     off = [a - b for a, b in zip(better.change_um, model.change_um, strict=True)]
-    if float(np.linalg.norm(projector.join(off))) < _OFF:
+    if float(np.linalg.norm(projector.join(off))) < _LARGEST_DIFFERENCE:
         return model, False
     return refit(finer, projector, model.laws, model.x, 4), True
 
@@ -143,7 +149,7 @@ def leave_bounds(bench: Bench, projector: Projector, model: Refit, finest: bool)
         laws, x = model.with_law(k, scaled(law, model.x[k], _WEAKER))
         trial = bench, projector, refit(bench, projector, laws, x, 0)
         for _ in range(_FIRST):
-            there = _follow(*trial, finest)
+            there = _follow(*trial[1:], finest)
             trial = *there, refit(*there, laws, x, 0)
         trial = *there, refit(*there, laws, x, 4)
         if trial[-1].cost < model.cost:
@@ -158,7 +164,7 @@ def keep_density_positive(bench: Bench, projector: Projector, model: Refit, fine
     rail in those beyond it.
     """
     for _ in range(_BOUNDED if model.laws else 0):
-        moved = _follow(bench, projector, model, finest)
+        moved = _follow(projector, model, finest)
         columns_um, regression = moved[0].baseline.columns_um, moved[1].regression
         free = np.concatenate([columns_um > 0, np.ones(regression.size - len(columns_um), dtype=bool)])
         if free.all():
@@ -171,7 +177,7 @@ def keep_density_positive(bench: Bench, projector: Projector, model: Refit, fine
         if not model.cost < _ASTRAY * last[-1].cost:
             return last
         sd = np.sqrt(np.diagonal(model.covariance()))
-        if np.all(np.abs(np.concatenate(model.x) - before) <= _MOVED * sd):
+        if np.all(np.abs(np.concatenate(model.x) - before) <= _MOVED_SD * sd):
             break
     return bench, projector, model
 
@@ -195,7 +201,7 @@ def is_smoothness_confirmed(projector: Projector, model: Refit) -> bool:
     return bool(_SMOOTHER * _prior_precision(smoothed(projector, model.change_um)) > _prior_precision(projector))
 
 
-def _follow(bench: Bench, projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
+def _follow(projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
     """Move the baseline to where the causes leave it."""
     # What roughness beyond the grid would explain is not put into the grid.
     bare = projector.bare
@@ -227,7 +233,7 @@ def _made_sensitive(projector: Projector, model: Refit) -> Baseline | None:
     for k in range(1, _HALVES):
         there = baseline.moved(back * (1 - 0.5**k), 0.0)
         off = [simulate(there.stage, run) - one for run, one in zip(baseline.fine, plain, strict=True)]
-        if float(np.linalg.norm(projector.join(off))) > _SEEN:
+        if float(np.linalg.norm(projector.join(off))) > _SEEN_CHANGE:
             return there
     return None
 

@@ -15,31 +15,36 @@ from fits.stats._narrow_band import DRIFT, Band, MAINS_Hz, band_of
 from fits.stats._whiten import Noise, learn_noise, rough_noise_um
 from microid.effects import Statistic
 
-# So many idle samples are a floor.
+# So many samples at rest are enough to read the noise from.
 _IDLE = 150
 # Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
 _COLOURED = 4.0
-# Standard deviations by which noise of runs may differ that is the same.
-_ALIKE = 4.0
-# Lines of mains are looked for in stretches of so many samples, and count where no more than this part of the
-# variance is left without them.
-_LONG, _MOSTLY = 60, 0.7
+# Standard deviations by which estimates of one noise may differ from run to run.
+_SAME_NOISE_Z = 4.0
+# Lines of mains are looked for in stretches of at least so many samples.
+_LONG = 60
+# They count where no more than this part of the variance is left without them.
+_LEFT_WITHOUT_LINES = 0.7
 # Lines drift out of step with their frequency after so many s.
 _STEADY_s = 1.5
-# A sample is a spike beyond this many standard deviations, where at most so many stand together and the others up to
-# so far away are much smaller.
-SPIKE, _TOGETHER, _ALONE = 7.0, 3, 16
-# A command that moves, or turns, by more than these parts of its range at one of some samples may cause what looks
+# A sample is a spike beyond so many standard deviations.
+SPIKE = 7.0
+# At most so many spikes stand together, and the other samples up to so far away are much smaller.
+_MOST_TOGETHER, _COMPARED_SAMPLES = 3, 16
+# A command that moves, or turns, by more than these parts of its range within so many samples may cause what looks
 # like a spike.
-_EDGE, _TURN, _NEAR = 0.02, 0.004, 6
+_MOVED_SHARE, _TURNED_SHARE, _SAMPLES_AROUND = 0.02, 0.004, 6
+# There a spike is larger than this multiple of the quantile at which nearly all samples lie.
+_OUTLYING, _NEARLY_ALL = 4.0, 0.98
+# So many spikes are no chance.
+_FEWEST_SPIKES = 3
 # Jitter beside rounding has at least so many times its variance.
 _ROUNDING = 10.0
-# Standard deviations beyond which the variance that a jitter makes is not.
-_SURE = 4.0
-# It is one all the same beyond such a multiple of what nearly all of these samples are off by.
-_MOSTLY_NEAR, _BEYOND = 0.98, 4.0
-# So many spikes are no chance; a last digit or jitter counts above this part of the noise variance.
-_SPIKES, _SHARE = 3, 0.3
+# The jitter is at most what is found and so many standard errors.
+_MOST_JITTER_Z = 4.0
+# A last digit or jitter counts above this part of the noise variance.
+_LEAST_VARIANCE_SHARE = 0.3
+# Evidence of jitter and of a narrow band, in standard deviations.
 _JITTER_Z, _BAND_Z = 8.0, 8.0
 # A band is one of a resonance from this quality on; what is broader wanders, or jumps.
 _NARROW = 1.5
@@ -93,7 +98,7 @@ def pooled(floors: Sequence[Floor]) -> list[Floor]:
     counts = np.array([floor.idle for floor in white])
     levels = np.array([floor.noise.innovation_um for floor in white])
     level = float(np.sqrt(np.average(levels**2, weights=counts)))
-    if np.any(np.abs(levels / level - 1) > _ALIKE / np.sqrt(2 * counts)):
+    if np.any(np.abs(levels / level - 1) > _SAME_NOISE_Z / np.sqrt(2 * counts)):
         return list(floors)
     return [
         replace(one, noise=Noise(level, np.zeros(0))) if any(one is other for other in white) else one
@@ -110,7 +115,7 @@ def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarr
     if sum(len(piece) for piece in long) < _IDLE:
         return pieces
     before = sum(float(piece @ piece) for piece in long)
-    best, found = _MOSTLY * before, pieces
+    best, found = _LEFT_WITHOUT_LINES * before, pieces
     for mains in MAINS_Hz:
         for frequency in mains * (1 + np.linspace(-DRIFT, DRIFT, 9)):
             left = []
@@ -133,19 +138,19 @@ def spikes(run: Run, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarr
     # What rings has neighbours as large; what is alone has none, or one of its kind by chance.
     size = np.abs(off)
     # In two dimensions: in one, SciPy 1.17 takes a footprint with a gap for one without.
-    beside = np.abs(np.arange(-_ALONE, _ALONE + 1))[None] > _TOGETHER
+    beside = np.abs(np.arange(-_COMPARED_SAMPLES, _COMPARED_SAMPLES + 1))[None] > _MOST_TOGETHER
     far &= size > 3 * rank_filter(size[None], -2, footprint=beside, mode="nearest")[0]
     voltage = run.record.voltage_V
     change = np.diff(voltage, prepend=voltage[0])
-    turned = np.abs(np.diff(change, append=change[-1])) > _TURN * float(np.ptp(voltage))
-    moved = (np.abs(change) > _EDGE * float(np.ptp(voltage))) | turned
-    near = np.convolve(moved, np.ones(2 * _NEAR + 1), mode="same") > 0.5
+    turned = np.abs(np.diff(change, append=change[-1])) > _TURNED_SHARE * float(np.ptp(voltage))
+    moved = (np.abs(change) > _MOVED_SHARE * float(np.ptp(voltage))) | turned
+    near = np.convolve(moved, np.ones(2 * _SAMPLES_AROUND + 1), mode="same") > 0.5
     # Where it may, others do so, too.
-    usual = float(np.quantile(size[near], _MOSTLY_NEAR)) if near.any() else 0.0
-    far &= ~near | (size > _BEYOND * usual)
+    usual = float(np.quantile(size[near], _NEARLY_ALL)) if near.any() else 0.0
+    far &= ~near | (size > _OUTLYING * usual)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
-        if stop - first > _TOGETHER:
+        if stop - first > _MOST_TOGETHER:
             far[first:stop] = False
     return far
 
@@ -169,7 +174,7 @@ def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float
         return 0.0, 0.0, float("inf")
     # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
     error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
-    most = float((max(more + _SURE * error, 0.0) / faster) ** 0.5)
+    most = float((max(more + _MOST_JITTER_Z * error, 0.0) / faster) ** 0.5)
     # Rounding is less where nothing moves, and there its median is not that of normal noise.
     if more <= _ROUNDING * least_um**2:
         return 0.0, 0.0, most
@@ -199,7 +204,7 @@ class Faults:
     @property
     def repaired(self) -> bool:
         """Whether there are enough spikes to be taken out."""
-        return sum(int(s.sum()) for s in self.spikes) >= _SPIKES
+        return sum(int(s.sum()) for s in self.spikes) >= _FEWEST_SPIKES
 
     def clean(self, records: Sequence[Record]) -> list[Record]:
         """Take the spikes out of records."""
@@ -233,13 +238,13 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
     floors, found, heights, jitters, bands = [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     settling_s = float(_SETTLED / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
-    for run, rows, own, residual in zip(
+    for run, rows, nuisance, residual in zip(
         baseline.runs, regression.rows, regression.nuisance, regression.residuals, strict=True
     ):
         moved = residual - rows @ np.concatenate([dw, dz])
         mask = run.fitted
-        free = np.linalg.lstsq(own[mask], moved[mask], rcond=None)[0]
-        left = moved - own @ free
+        free = np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
+        left = moved - nuisance @ free
         bad = spikes(run, left, 2 * quantum)
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)
@@ -291,14 +296,14 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
     total = float(np.mean([n.total_um**2 for n in faults.noise]))
     count = sum(int(s.sum()) for s in faults.spikes)
     samples = sum(len(s) for s in faults.spikes)
-    if count >= _SPIKES:
+    if count >= _FEWEST_SPIKES:
         heights = np.concatenate([h[s] for h, s in zip(faults.heights_um, faults.spikes, strict=True)])
         size = float(np.sqrt(np.mean(heights**2)))
         share, z = count / samples, float(np.max(np.abs(heights)) / total**0.5)
         known = ("fraction", share, count**0.5 / samples, "1"), ("size_um", size, size / (2 * count) ** 0.5, "um")
         found.append(Fault("spikes", z, known, share * size**2))
     step = faults.quantum_um
-    if step**2 / 12 > _SHARE * total:
+    if step**2 / 12 > _LEAST_VARIANCE_SHARE * total:
         z = (samples * step**2 / 12 / total) ** 0.5
         found.append(Fault("rounding", z, (("step_um", step, 1e-6 * step, "um"),), step**2 / 12))
     if faults.jitter_s > 0 and not cyclic:
@@ -307,7 +312,7 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
         found.append(jitter)
     band = faults.band
     narrow = band.z > _BAND_Z and band.quality > _NARROW
-    if narrow and band.size_um**2 > _SHARE / 3 * total and not band.mains:
+    if narrow and band.size_um**2 > _LEAST_VARIANCE_SHARE / 3 * total and not band.mains:
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"
         size_of_band = "amplitude_um", band.size_um, band.sd_um, "um"
         found.append(Fault("band", band.z, (size_of_band, middle), band.size_um**2))

@@ -17,7 +17,7 @@ from microid import AbstractEffect
 
 _STEP = 1e-3
 # The farthest that a draw moves a coordinate, which are of the order of one.
-_FARTHEST = 1.0
+FARTHEST_DRAW = 1.0
 # Relative precision below which a direction counts as not seen.
 _RIDGE = 1e-10
 # Noise that was learnt at a sampling interval so many times longer or shorter says nothing of its colour.
@@ -59,7 +59,7 @@ class Hypothesis:
         for at, covariance in zip(self.x, self.covariances, strict=True):
             value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
             moved = vector @ (np.sqrt(np.maximum(value, 0.0)) * rng.standard_normal(len(value)))
-            x.append(at + np.clip(moved, -_FARTHEST, _FARTHEST))
+            x.append(at + np.clip(moved, -FARTHEST_DRAW, FARTHEST_DRAW))
         return replace(self, x=tuple(x))
 
 
@@ -164,8 +164,8 @@ class Predictor:
             last = regress(alone, None if last is None else _same(last, effects), effects)
             shared = [last.rows[0], *(last.finer[kind][0] for kind in self._kinds)]
             rows = noise.whiten(np.concatenate([*shared, np.stack(columns, axis=1)], axis=1))[run.fitted]
-            own, _ = qr(noise.whiten(last.nuisance[0])[run.fitted], mode="economic")
-            rows -= own @ (own.T @ rows)
+            nuisance, _ = qr(noise.whiten(last.nuisance[0])[run.fitted], mode="economic")
+            rows -= nuisance @ (nuisance.T @ rows)
             grams[k] = rows.T @ rows
         return grams
 
@@ -227,8 +227,8 @@ def _in_order(law: Law, moved: Sequence[np.ndarray]) -> list[np.ndarray]:
     shared = ~each
     out = [np.zeros_like(moved[0])] * law.size
     # With one run so far, its strengths stand among the others.
-    own = np.flatnonzero(shared).tolist()
-    for place, i in enumerate(own) if law.each.any() else zip(own, own, strict=True):
+    places = np.flatnonzero(shared).tolist()
+    for place, i in enumerate(places) if law.each.any() else zip(places, places, strict=True):
         out[place] = moved[i]
     return out + [moved[i] for i in np.flatnonzero(each).tolist()]
 

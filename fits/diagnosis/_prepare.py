@@ -18,12 +18,16 @@ from fits.io._record import Record
 from fits.loop._run import VIRGIN
 from microid import EFFECTS, Hold, Scales, Stage
 
-# Decrease of the sum of squares, in noise variances, from which on a delay is looked into, and the part of it that a
-# command held in steps must explain to be taken for it: then what looked like a delay is half a sample. Or steps
-# leave, beside a delay of their own, less than lines do, by such a part.
-_LATE, _AS_WELL, _BETTER = 25.0, 0.97, 0.03
-# Part of the sampling interval below which what is late is no effect, where that has about as much evidence as any.
-_SKEW, _ABOUT = 0.04, 0.8
+# Curves, steps or a delay that lower the sum of squares by less than this, in noise variances, are not looked into.
+_LATE = 25.0
+# A command held in steps explains a delay of half a sample where it lowers the sum of squares by this part as much.
+_AS_WELL = 0.97
+# Or where, beside a delay of its own, it lowers it by this part more.
+_BETTER = 0.03
+# A delay below this part of the sampling interval is no effect, but one of each run's own.
+_SKEW = 0.04
+# It must have at least this part of the evidence of the strongest effect.
+_ABOUT = 0.8
 _SKEWED = (
     "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
@@ -257,9 +261,9 @@ def _probed(bench: Bench, scales: Scales) -> tuple[list[Probe], list[tuple[str, 
         if reason is not None:
             skipped.append((form.name, reason))
             continue
-        own = list(probes_of(bench, form, scales))
-        if not own:
+        found = list(probes_of(bench, form, scales))
+        if not found:
             why = "the runs are too short or too plain to show it"
             skipped.append((form.name, "nothing of it was found, sample by sample" if form.statistic else why))
-        probes += own
+        probes += found
     return probes, skipped

@@ -13,7 +13,7 @@ _LOOP = 0.12
 PER_PERIOD = 12
 Samples = tuple[np.ndarray, np.ndarray]
 # A program with fewer samples than these decides nothing.
-_FEWEST = 200
+_FEWEST_SAMPLES = 200
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ def menu(limits: Limits, most: int) -> tuple[Program, ...]:
     """All programs that fit into the limits, with so many samples at most."""
     found = []
     for pace in paces(limits, most):
-        if pace.count < _FEWEST or 2 * pace.span_V / pace.fastest_V_per_s > 0.5 * pace.duration_s:
+        if pace.count < _FEWEST_SAMPLES or 2 * pace.span_V / pace.fastest_V_per_s > 0.5 * pace.duration_s:
             continue
         # What is fast is only seen finely, what is slow only in the whole time, and the same loop at several rates in
         # both.

@@ -98,10 +98,10 @@ class Projector:
     @property
     def nuisance_rows(self) -> np.ndarray:
         """The runs' nuisance parameters, whitened and joined, shape `(rows, k)`."""
-        own = self.regression.nuisance
-        out = np.zeros((self.count + self._priors, sum(o.shape[1] for o in own)))
+        nuisance = self.regression.nuisance
+        out = np.zeros((self.count + self._priors, sum(o.shape[1] for o in nuisance)))
         row = at = 0
-        for o, noise, mask in zip(own, self.noise, self.masks, strict=True):
+        for o, noise, mask in zip(nuisance, self.noise, self.masks, strict=True):
             stop = row + int(mask.sum())
             out[row:stop, at : at + o.shape[1]] = noise.whiten(o)[mask]
             row, at = stop, at + o.shape[1]
@@ -152,9 +152,9 @@ class Projector:
         square = count = 0.0
         for k, run in enumerate(regression.baseline.runs):
             left = regression.residuals[k] - change_um[k] - regression.rows[k] @ np.concatenate([columns, step])
-            own, mask, held = regression.nuisance[k], self.masks[k], run.held_out
+            nuisance, mask, held = regression.nuisance[k], self.masks[k], run.held_out
             if held.any():
-                left = left - own @ np.linalg.lstsq(own[mask], left[mask], rcond=None)[0]
+                left = left - nuisance @ np.linalg.lstsq(nuisance[mask], left[mask], rcond=None)[0]
                 square += float(np.sum(left[held] ** 2)) / self.noise[k].total_um ** 2
                 count += float(held.sum())
         return square / count if count else float("nan")
@@ -177,11 +177,11 @@ class Projector:
         cross = gram @ self._answer(joined)
         live = self._live[columns:]
         coordinate = np.arange(len(live)) < self.regression.size - columns
-        own = gram[columns:, columns:][np.ix_(live, live)]
-        own = own + np.diag(1e-12 * np.diagonal(own) + held * coordinate[live])
+        block = gram[columns:, columns:][np.ix_(live, live)]
+        block = block + np.diag(1e-12 * np.diagonal(block) + held * coordinate[live])
         alone, follow = np.zeros(len(live)), np.zeros((len(live), columns))
-        alone[live] = np.linalg.solve(own, cross[columns:][live])
-        follow[live] = np.linalg.solve(own, gram[columns:, :columns][live])
+        alone[live] = np.linalg.solve(block, cross[columns:][live])
+        follow[live] = np.linalg.solve(block, gram[columns:, :columns][live])
         precision = gram[:columns, :columns] - gram[:columns, columns:] @ follow
         precision = (precision + precision.T) / 2 + 1e-12 * np.diag(np.diagonal(precision))
         mean = baseline.columns_um + np.linalg.solve(precision, cross[:columns] - follow.T @ cross[columns:])

@@ -12,20 +12,29 @@ from fits.diagnosis._result import EffectParameter, FoundCause
 from fits.diagnosis._score import evidence
 from fits.io._record import Record
 from fits.loop._run import VIRGIN, known_samples
+from fits.stats._metrics import TWO_SIDED_95
 from microid.effects import card_of
 
-# Waves over an initial curve, evidence from which it counts, the share of that for the best effect from which it is
-# the likelier reason, and the part of the range through which the voltage goes up, and down, beside it.
-_WAVES, _EVIDENT, _NEARLY, _WHOLE_RANGE = 12, 5.5, 0.8, 1.0
-# A hold lasts so long and has so many samples; meanwhile the displacement keeps within this part of its range, and
-# the voltage moves by more than that part of its own.
-_LONG_s, _SAMPLES, _AT_REST, _MOVES = 1.0, 200, 3e-3, 5e-3
-# Times of a hold over which the voltage is read: from so many intervals after its beginning on, in blocks evenly
-# spaced in the logarithm of time, and two decades at least.
-_AFTER, _BLOCKS, _DECADES = 8, 24, 2.0
+# An initial curve is described by so many waves along the voltage.
+_WAVES = 12
+# It counts from this evidence on, in standard deviations.
+_EVIDENT = 5.5
+# It must have at least this share of the evidence of the best effect, too.
+_NEARLY = 0.8
+# The voltage must go up, and down, through so much of its range beside it.
+_WHOLE_RANGE = 1.0
+# A hold lasts so long and has so many samples.
+_LONG_s, _SAMPLES = 1.0, 200
+# Meanwhile the displacement keeps within this part of its range.
+_AT_REST_SHARE = 3e-3
+# The voltage moves by more than this part of its own.
+_MOVED_SHARE = 5e-3
+# The voltage of a hold is read from so many intervals after its beginning on.
+_AFTER = 8
+# It is read in so many blocks, evenly spaced in the logarithm of time, over so many decades at least.
+_BLOCKS, _DECADES = 24, 2.0
 # Part of the scatter about its mean that a line over the logarithm of time must explain.
 _STRAIGHT = 0.97
-_TWO_SIDED = 1.96
 
 
 def is_virgin(projector: Projector, highest: float, model: Refit | None = None) -> bool:
@@ -100,7 +109,7 @@ def with_held_gain(held: Held, causes: Sequence[FoundCause]) -> tuple[FoundCause
     out = []
     for cause in causes:
         if name := card_of(cause.name).held:
-            low, high = (max(held.gain_per_decade + way * _TWO_SIDED * held.sd, 0.0) for way in (-1, 1))
+            low, high = (max(held.gain_per_decade + way * TWO_SIDED_95 * held.sd, 0.0) for way in (-1, 1))
             shown = EffectParameter(name, held.gain_per_decade, held.sd, "1", low, high)
             fitted = (replace(one, name=f"{one.name}, of the fit") for one in cause.parameters)
             cause = replace(cause, parameters=(shown, *fitted))
@@ -117,7 +126,7 @@ def held_gain(records: Sequence[Record]) -> Held | None:
 def _holds(record: Record) -> list[Held]:
     assert record.displacement_um is not None
     time, voltage, place = record.time_s, record.voltage_V, record.displacement_um
-    close, apart = _AT_REST * float(np.ptp(place)), _MOVES * float(np.ptp(voltage))
+    close, apart = _AT_REST_SHARE * float(np.ptp(place)), _MOVED_SHARE * float(np.ptp(voltage))
     out = []
     for first, stop in _stretches_at_rest(place, close):
         if stop - first < _SAMPLES or time[stop - 1] - time[first] < _LONG_s:

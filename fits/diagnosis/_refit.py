@@ -9,8 +9,9 @@ import numpy as np
 
 from fits.diagnosis._effects import Bench, Law, remembering, strength_of
 from fits.diagnosis._projector import Projector, orthonormal
-from fits.diagnosis._score import Scored, law_of
+from fits.diagnosis._score import BLOCK, Scored, law_of
 from fits.io.columns import columns_beside
+from fits.io.columns.temperature import TEMPERATURE
 from microid import AbstractEffect
 
 _STEP = 1e-3
@@ -19,22 +20,20 @@ _DETERMINED = 3.0
 # Standard deviations by which a sum of squares of noise varies.
 _CHANCE = 3.0
 # Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
-_ROUNDS, _FARTHEST, _ENOUGH = 12, 3.0, 0.1
+_ROUNDS, _FARTHEST, _LEAST_GAIN = 12, 3.0, 0.1
 # Factor by which that is shortened where it was too far.
 _SHORTER = 4.0
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
 # the runs do not show.
-_UNSEEN, _ANYTHING = 1e-4, 1e6
+_ROUNDING_SHARE, _UNKNOWN_VARIANCE = 1e-4, 1e6
 # Multiple of its range in the runs by which a rig may have moved at most before one, and the least of a room's.
 _FARTHER, _ROOM_K = 2.0, 0.5
-# Samples that are taken to err alike.
-_BLOCK = 25
 # Part of the shortest record by which another instant is tried at first.
-_AROUND = 0.05
+_FIRST_SHIFT = 0.05
 # Displacements beyond this are those of a model that runs away.
 _AWAY_um = 1e9
 # Multiples of the linearised answer from which a fit may start.
-_MORE = (1.0, 3.0, 9.0)
+_MULTIPLES = (1.0, 3.0, 9.0)
 
 
 @dataclass(frozen=True)
@@ -86,14 +85,14 @@ class Refit:
         scale = np.where(size > 0, size, 1.0)
         value, vector = np.linalg.eigh((self.tangent / scale).T @ (self.tangent / scale))
         # What the runs do not show may be anything.
-        spread = vector / np.sqrt(np.maximum(value, _UNSEEN**2)) / scale[:, None]
+        spread = vector / np.sqrt(np.maximum(value, _ROUNDING_SHARE**2)) / scale[:, None]
         plain = spread @ spread.T
-        sums = np.add.reduceat(self.tangent * self.residual[:, None], np.arange(0, len(self.residual), _BLOCK))
+        sums = np.add.reduceat(self.tangent * self.residual[:, None], np.arange(0, len(self.residual), BLOCK))
         spread_out = np.sum((sums @ plain) ** 2, axis=0)
         wider = np.sqrt(np.maximum(spread_out / np.maximum(np.diagonal(plain), 1e-300), 1.0))
         seen = size > 0
         scaled = plain * wider * wider[:, None] if robust else plain
-        return np.where(seen[:, None] & seen, scaled, np.diag(np.where(seen, 0.0, _ANYTHING)))
+        return np.where(seen[:, None] & seen, scaled, np.diag(np.where(seen, 0.0, _UNKNOWN_VARIANCE)))
 
     def is_noise(self, projector: Projector) -> bool:
         """Whether what is left is no more than noise."""
@@ -125,7 +124,7 @@ class Refit:
         if not law.form.moved or not law.remembers:
             return True
         columns = [columns_beside(run.record) for run in bench.baseline.runs]
-        room_K = max(_ROOM_K, *(float(np.ptp(beside.get("temperature_degC", 0.0))) for beside in columns))
+        room_K = max(_ROOM_K, *(float(np.ptp(beside.get(TEMPERATURE, 0.0))) for beside in columns))
         spans = {"um": bench.baseline.stroke_um, "V": float(np.ptp(bench.baseline.range_V)), "K": room_K}
         before = self.tangent.shape[1] - law.size
         covariance = self.covariance(robust=False)[before:, before:]
@@ -176,7 +175,7 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
     def fit(law: Law, rounds: int) -> Refit:
         return _fit(bench, projector, [*model.laws, law], [*model.x, law.start], len(model.laws), basis, rounds)
 
-    laws = [law_of(scored, runs, more) for more in (_MORE if scored.form.strength else (1.0,))]
+    laws = [law_of(scored, runs, more) for more in (_MULTIPLES if scored.form.strength else (1.0,))]
     found = fit(min(laws, key=lambda law: fit(law, 0).cost), _ROUNDS)
     if not found.laws[-1].form.history:
         return found
@@ -197,7 +196,7 @@ def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -
         return model
     # So far some may only have been followed along their tangent, or beside another baseline.
     model = refit(bench, projector, model.laws, model.x, 2)
-    step_s = _AROUND * min(one.run.record.duration_s for one in bench.prepared)
+    step_s = _FIRST_SHIFT * min(one.run.record.duration_s for one in bench.prepared)
     least_s = min(float(np.median(np.diff(one.run.record.time_s))) for one in bench.prepared)
     while step_s > least_s:
         tried = [_moved(bench, projector, model, k, way, least_s) for k, way in product(at, (-step_s, step_s))]
@@ -266,7 +265,7 @@ def _fit(
         raw = np.stack([(joined(flat + step) - at) / _STEP for step in _STEP * np.eye(len(flat))], axis=1)
         raw = np.where(np.isfinite(raw), raw, 0.0)
         seen = -off(raw)
-        return np.where(np.linalg.norm(seen, axis=0) > _UNSEEN * np.linalg.norm(raw, axis=0), seen, 0.0)
+        return np.where(np.linalg.norm(seen, axis=0) > _ROUNDING_SHARE * np.linalg.norm(raw, axis=0), seen, 0.0)
 
     aim = target - basis @ (basis.T @ target)
     flat = np.concatenate(list(x[held:]))
@@ -292,7 +291,7 @@ def _fit(
                 break
             damping *= 10
             farthest = min(farthest, float(np.max(np.abs(step)))) / _SHORTER
-        if not moved or cost - float(residual @ residual) < _ENOUGH:
+        if not moved or cost - float(residual @ residual) < _LEAST_GAIN:
             break
         jacobian = slope(flat, at)
     cut = parts(flat)

@@ -74,7 +74,7 @@ def regress(
     assert chain.grid is not None
     levelling = tuple(map(saturating, effects)) if effects else ((),) * len(runs)
     bases = _bases(baseline) if finer is None else []
-    rows, own, residuals = [], [], []
+    rows, nuisance, residuals = [], [], []
     kinds: list[list[np.ndarray]] = [[] for _ in bases]
     stage = baseline.stage
     beside = tuple(map(dependent, effects)) if effects else ((),) * len(runs)
@@ -94,14 +94,14 @@ def regress(
         late = [speed] if baseline.skewed else []
         # With an instant off by d, a reading is y + d y' + d^2 y'' / 2: the first is noise, the second is not.
         blur = [np.gradient(speed[:, 0], run.record.time_s)[:, None]] if baseline.blurred else []
-        own.append(_without_decayed(np.concatenate([free[:n], *late, *blur], axis=1), run.fitted))
+        nuisance.append(_without_decayed(np.concatenate([free[:n], *late, *blur], axis=1), run.fitted))
         residuals.append(run.displacement_um - plain)
         if finer is None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
             for kind, part in zip(kinds, _along(fine, baseline, run, bases, around), strict=True):
                 kind.append(part)
     masks, structure = tuple(run.fitted for run in runs), tuple(map(tuple, kinds)) if finer is None else finer
-    data = tuple(rows), tuple(own), structure, tuple(residuals)
+    data = tuple(rows), tuple(nuisance), structure, tuple(residuals)
     return Regression(baseline, masks, *data, root_of(baseline.prior), levelling)
 
 
@@ -110,13 +110,13 @@ def root_of(prior: np.ndarray) -> np.ndarray:
     return cholesky(prior + 1e-12 * np.trace(prior) / len(prior) * np.eye(len(prior)))
 
 
-def _without_decayed(own: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+def _without_decayed(nuisance: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """A run's nuisance parameters without those whose signals have decayed before the samples that count.
 
     They would be fitted to noise there, and reach far beyond it where they begin.
     """
-    left = np.linalg.norm(own[fitted], axis=0) > _DEAD * np.linalg.norm(own, axis=0)
-    return np.where(left, own, 0.0)
+    left = np.linalg.norm(nuisance[fitted], axis=0) > _DEAD * np.linalg.norm(nuisance, axis=0)
+    return np.where(left, nuisance, 0.0)
 
 
 def _slope(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: Run) -> np.ndarray:

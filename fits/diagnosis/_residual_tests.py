@@ -29,12 +29,12 @@ _SENTENCES = {
     "gain": "the residual is in proportion to the displacement, by a factor that changes along the run",
 }
 # Lags of neighbours, stretches of a run, and samples that a stretch needs at least.
-_LAGS, _STRETCHES, _FEWEST = 20, 24, 20
+_LAGS, _STRETCHES, _FEWEST_IN_STRETCH = 20, 24, 20
 # Bursts: so much more spread of the stretches' sizes than chance, about their mean, and so heavy tails of what is new
 # in every sample (excess kurtosis).
 _SPREAD, _HEAVY = 0.4, 1.5
 # Evidence is counted up to so many standard deviations.
-_MOST = 37.0
+_LARGEST_Z = 37.0
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def irregular(projector: Projector, residual: np.ndarray) -> tuple[tuple[Test, .
     white, even, tails = np.zeros(runs), np.zeros(runs), np.zeros(runs)
     bursts = False
     for k, part in enumerate(projector.split(residual)):
-        if len(part) < _STRETCHES * _FEWEST:
+        if len(part) < _STRETCHES * _FEWEST_IN_STRETCH:
             continue
         part = part - part.mean()
         n, lags = len(part), np.arange(1, _LAGS + 1)
@@ -251,4 +251,4 @@ def _evidence(log_p: float, runs: int) -> tuple[float, float]:
     """Evidence in standard deviations, and probability, where the worst of some runs was taken."""
     log_p = min(log_p + float(np.log(runs)), 0.0)
     p = float(np.exp(log_p))
-    return float(np.clip(stats.norm.isf(p), 0.0, _MOST)) if p > 0 else _MOST, p
+    return float(np.clip(stats.norm.isf(p), 0.0, _LARGEST_Z)) if p > 0 else _LARGEST_Z, p

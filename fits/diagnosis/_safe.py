@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._baseline import Baseline, with_effects
-from fits.diagnosis._predict import Hypothesis, next_record
+from fits.diagnosis._predict import FARTHEST_DRAW, Hypothesis, next_record
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._programs import Limits, Path, Program, Samples, menu
 from fits.diagnosis._projector import Projector
@@ -18,13 +18,11 @@ from microid import Stage
 
 # Draws of the plain stage, and of the stage with each hypothesis.
 _DRAWS, _EACH = 4, 2
-# The farthest that a draw moves a coordinate, which are of the order of one.
-_FARTHEST = 1.0
 # Shares of the fastest slew that a program is tried with, until it is inside.
 _SLEWS = tuple(0.5**k for k in range(8))
 # Rounds in which the range of the voltage is narrowed, what each takes off beyond the excess, and the share of the
 # range below which nothing is worth playing.
-_ROUNDS, _MORE, _NARROW = 12, 1.1, 0.1
+_ROUNDS, _OVERSHOOT, _NARROWEST = 12, 1.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class Guard:
         limits = replace(limits, lower_V=max(limits.lower_V, lower), upper_V=min(limits.upper_V, upper))
         limits = replace(limits, fastest_V_per_s=min(limits.fastest_V_per_s, self.limits["slew"][1]))
         for _ in range(_ROUNDS):
-            if not limits.span_V > _NARROW * whole.span_V:
+            if not limits.span_V > _NARROWEST * whole.span_V:
                 return None
             slow = replace(limits, interval_s=max(limits.interval_s, limits.duration_s / 1000))
             (moved,) = (one for one in self.extremes(Path(slow).samples()) if one.name == "displacement")
@@ -85,8 +83,8 @@ class Guard:
             per_V = (moved.high - moved.low) / limits.span_V
             limits = replace(
                 limits,
-                lower_V=limits.lower_V + _MORE * max(moved.lowest - moved.low, 0.0) / per_V,
-                upper_V=limits.upper_V - _MORE * max(moved.high - moved.highest, 0.0) / per_V,
+                lower_V=limits.lower_V + _OVERSHOOT * max(moved.lowest - moved.low, 0.0) / per_V,
+                upper_V=limits.upper_V - _OVERSHOOT * max(moved.high - moved.highest, 0.0) / per_V,
             )
         return None
 
@@ -145,4 +143,4 @@ def _drawn(baseline: Baseline, projector: Projector, rng: np.random.Generator) -
     """A plain stage out of those that the records allow."""
     dz, dcolumns_um = projector.draw(rng)
     kept = np.maximum(baseline.columns_um + dcolumns_um, 0.0)
-    return baseline.moved(np.clip(dz, -_FARTHEST, _FARTHEST), kept - baseline.columns_um)
+    return baseline.moved(np.clip(dz, -FARTHEST_DRAW, FARTHEST_DRAW), kept - baseline.columns_um)

@@ -8,19 +8,19 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._effects import Bench, Law, _without_host, times
+from fits.diagnosis._effects import Bench, Law, times, without_host
 from fits.diagnosis._projector import Projector
 from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
 from microid import AbstractEffect, Coordinates, Scales, host
 
 # Strength at which an effect's derivative is taken, as a share of that of its probe.
-_SHARE = 1e-2
+_STRENGTH_SHARE = 1e-2
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
 # Samples that are taken to err alike.
-_BLOCK = 25
+BLOCK = 25
 # Rounds in which signatures whose multiples are not negative follow each other.
 _SWEEPS = 30
 # Multiple of a signature of finite size, as of a gap, beyond which it is none: what would have to be so much larger
@@ -102,7 +102,7 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
     for group in form.probes(scales, inner):
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
-            share = 1.0 if form.finite else _SHARE
+            share = 1.0 if form.finite else _STRENGTH_SHARE
             change = [c / share for c in bench.change([effect if form.finite else times(effect, share)])]
             if form.per_run and len(change) > 1:
                 for k in range(len(change)):
@@ -207,7 +207,7 @@ def _squares(columns: np.ndarray) -> np.ndarray:
 def _robust_z(along: np.ndarray, residual: np.ndarray) -> float:
     """Size of a fitted signal over the standard deviation that blocks of what is left of the residual give it."""
     products = along * (residual - along)
-    blocks = np.add.reduceat(products, np.arange(0, len(products), _BLOCK))
+    blocks = np.add.reduceat(products, np.arange(0, len(products), BLOCK))
     return float(along @ along / max(float(np.linalg.norm(blocks)), 1e-300)) if np.any(along) else 0.0
 
 
@@ -293,7 +293,7 @@ def law_of(scored: Scored, runs: int, more: float = 1.0) -> Law:
         first = scored.probe.effects[0]
         values = {}
         for name in form.strength:
-            spec = next(i.spec for i in Coordinates(_without_host(first)).table if i.path == name)
+            spec = next(i.spec for i in Coordinates(without_host(first)).table if i.path == name)
             total = np.zeros(np.shape(getattr(first, name)))
             for k, effect in enumerate(scored.probe.effects):
                 share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]

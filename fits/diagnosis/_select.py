@@ -24,9 +24,9 @@ from microid import EFFECTS
 from microid.effects import card_of
 
 # Causes that are sought, at most, and laws in all, as some causes come several times.
-_MOST, _LAWS = 4, 8
+_MOST_CAUSES, _MOST_LAWS = 4, 8
 # Part of what a cause explains by itself that must be left of it once all is fitted together.
-_REAL = 0.3
+_LEFT_JOINTLY = 0.3
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def select(
     refused: set[str] = set()
     refused_at_bound: set[str] = set()
     once = {form.name for form in EFFECTS if not form.repeats}
-    while len({cause.name for cause in causes}) < _MOST and len(causes) < _LAWS:
+    while len({cause.name for cause in causes}) < _MOST_CAUSES and len(causes) < _MOST_LAWS:
         taken = {cause.name for cause in causes}
         # Models of effects are not exact: what one leaves may look like another, above all like its confusions.
         whole = max(plain.cost - model.cost, 0.0)
@@ -118,7 +118,7 @@ def select(
         if guessed and causes and is_virgin(projector, top, model):
             return None
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
-        fitted = compare_rivals(bench, projector, model, open_, explained, _LAWS - len(causes))
+        fitted = compare_rivals(bench, projector, model, open_, explained, _MOST_LAWS - len(causes))
         if not fitted:
             refused |= {one.name for one in open_ if one.z > WORTH * top}
             continue
@@ -131,7 +131,7 @@ def select(
             rivals = (replace(first, apart=universal.apart), *(rival for rival in rivals if rival is not universal))
             first, beside = universal, fit_jointly(bench, projector, universal.refit)
         alone = beside[-1].is_noise(beside[1]) and not model.is_noise(projector)
-        if not beside[-1].determined(False, alone) or model.cost - beside[-1].cost < _REAL * drop:
+        if not beside[-1].determined(False, alone) or model.cost - beside[-1].cost < _LEFT_JOINTLY * drop:
             # Its strength is not determined, or what it explains is lost where all is fitted together.
             refused.add(first.name)
             refused_at_bound |= {first.name} if beside[-1].laws[-1].at_bound(beside[-1].x[-1]) else set()

@@ -27,7 +27,7 @@ _MAX_REVERSALS = 0.2  # share of the samples
 _WIGGLE_MIN, _WIGGLE_MAX = 1e-4, 0.05
 _GAP = 5.0  # in median time steps
 # So many equal readings, over so much of the voltage's range, are no peak: the sensor is at its end.
-_STANDS, _MOVES = 8, 0.03
+_EQUAL_READINGS, _MOVED_SHARE = 8, 0.03
 
 
 def read_csv(
@@ -225,13 +225,13 @@ class KnownColumns:
     def saturated(self) -> Iterator[str]:
         """Readings that stand at one end while the voltage moves on: the longest such stretch."""
         voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays["displacement_um"]
-        enough_V = _MOVES * float(np.ptp(voltage_V))
+        enough_V = _MOVED_SHARE * float(np.ptp(voltage_V))
         for end, words in ((displacement_um.max(), "largest"), (displacement_um.min(), "smallest")):
             stands = np.concatenate([[False], displacement_um == end, [False]])
             edges = np.flatnonzero(np.diff(stands.astype(int)))
             for first, stop in zip(edges[::2], edges[1::2], strict=True):
                 moved = float(np.ptp(voltage_V[first:stop]))
-                if stop - first >= _STANDS and moved > enough_V:
+                if stop - first >= _EQUAL_READINGS and moved > enough_V:
                     yield (
                         f"{self.place('displacement_um', int(first))}: {stop - first} readings in a row are the "
                         f"{words}, {end:.6g} um, while the voltage moves by {moved:.3g} V, so the sensor is at its "

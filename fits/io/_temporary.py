@@ -22,7 +22,7 @@ _LONGEST_ENDING = 12
 # A process that is listed, but has ended.
 _ENDED = ("Z", "X", "x")
 # Folders that were looked through: once in a process is enough.
-_SEEN: set[str] = set()
+_CLEANED: set[str] = set()
 
 
 def temporary_name(ending: str = "") -> str:
@@ -40,9 +40,9 @@ def is_temporary(name: str) -> bool:
 
 def remove_stale(folder: Path) -> None:
     """Remove this user's temporary files and folders of dead processes of this machine, once for each folder."""
-    if str(folder) in _SEEN or is_temporary(folder.name):
+    if str(folder) in _CLEANED or is_temporary(folder.name):
         return
-    _SEEN.add(str(folder))
+    _CLEANED.add(str(folder))
     # What cannot be seen or removed stays: it is in nobody's way.
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:

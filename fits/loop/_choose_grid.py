@@ -19,7 +19,7 @@ from fits.stats._noise import WHITE, correlation_samples, huber_weight
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
 # Refining goes on while it takes this fraction off the error of predicted blocks.
-_WORTH = 0.005
+_LEAST_GAIN = 0.005
 # From so many levels on more, by the square of their number.
 _COSTLY = 32
 # Errors up to so many times what a last digit rounds off are rounding.
@@ -28,9 +28,12 @@ _ROUNDED = 1.2
 _REWEIGHED = 8
 # Correlation of displacement with voltage below which there is no loop.
 _CORRELATED = 0.3
-# Coherence from which on it follows all the same, that of lines whose gain is believed, and segments whose spectra
-# are averaged: chance gives 1 / 16.
-_COHERENT, _CLEAR, _SEGMENTS = 0.2, 0.3, 16
+# Coherence from which on it follows all the same.
+_COHERENT = 0.2
+# Coherence of lines whose gain is trusted.
+_CLEAR = 0.3
+# Segments whose spectra are averaged: chance gives a coherence of 1 / 16.
+_SEGMENTS = 16
 # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
 _LEADING = 0.5
 
@@ -85,7 +88,7 @@ def _resolve(
             break
         trials.append(LevelTrial(n, finer.error_um))
         # A fit takes eight times as long for twice the levels, and must be worth it.
-        pays = finer.error_um < (1 - _WORTH * max(1.0, n / _COSTLY) ** 2) * best.error_um
+        pays = finer.error_um < (1 - _LEAST_GAIN * max(1.0, n / _COSTLY) ** 2) * best.error_um
         best = finer if finer.error_um <= best.error_um else best
         if not pays:
             break

@@ -16,7 +16,7 @@ _MIDDLE, _WIDTH = -4.6, 6.0
 
 
 class Posterior(eqx.Module):
-    """Gaussian belief about the columns, in strokes, before non-negativity.
+    """Gaussian posterior of the columns, in strokes, before non-negativity.
 
     `precision` is the inverse of the covariance, `root` its lower Cholesky factor.
     """
@@ -57,7 +57,7 @@ def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> Hyper
 
 
 @eqx.filter_jit
-def posterior(moments: Moments, rough: Roughness, hyper: Hyper) -> Posterior:
+def posterior_of(moments: Moments, rough: Roughness, hyper: Hyper) -> Posterior:
     """Condition the prior on the data."""
     prior = rough.precision(hyper)
     variance = jnp.exp(hyper.log_variance)
@@ -68,16 +68,16 @@ def posterior(moments: Moments, rough: Roughness, hyper: Hyper) -> Posterior:
 
 
 @eqx.filter_jit
-def effective(rough: Roughness, hyper: Hyper, belief: Posterior) -> Float[Array, ""]:
+def effective(rough: Roughness, hyper: Hyper, posterior: Posterior) -> Float[Array, ""]:
     """Count the columns that the data, not the prior, determine."""
     prior = jnp.linalg.cholesky(rough.precision(hyper))
-    held = jax.scipy.linalg.solve_triangular(belief.root, prior, lower=True)
+    held = jax.scipy.linalg.solve_triangular(posterior.root, prior, lower=True)
     return prior.shape[0] - jnp.sum(held**2)
 
 
 @eqx.filter_jit
-def renew_noise(moments: Moments, hyper: Hyper, belief: Posterior, determined: Float[Array, ""]) -> Hyper:
+def renew_noise(moments: Moments, hyper: Hyper, posterior: Posterior, determined: Float[Array, ""]) -> Hyper:
     """Re-estimate the noise from what is left at the full resolution (MacKay's fixed point)."""
-    left = moments.energy_um2 - 2 * belief.mean @ moments.cross_um + belief.mean @ moments.gram @ belief.mean
+    left = moments.energy_um2 - 2 * posterior.mean @ moments.cross_um + posterior.mean @ moments.gram @ posterior.mean
     variance = jnp.maximum(left, 0) / jnp.maximum(moments.count - determined, 1)
     return eqx.tree_at(lambda h: h.log_variance, hyper, jnp.log(jnp.maximum(variance, 1e-30)))

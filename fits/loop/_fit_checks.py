@@ -10,12 +10,14 @@ from fits.io._record import Record
 from fits.loop._run import Run
 from fits.stats._at_rest import quantum_um, stretches
 
-# A sensor sticks where so many readings in a row are the same to the last bit, while the stage, by its mean gain,
-# moves by such a part of its stroke, and by so many last digits.
-_STUCK, _MOVES, _DIGITS = 8, 0.05, 3.0
-# Readings count as impulses beyond so many deviations from their neighbours, where at most so many stand together and
-# nearly all others so near are much smaller.
-_IMPULSE, _TOGETHER, _AROUND, _ALONE = 8.0, 3, 16, 4.0
+# A sensor sticks where so many readings in a row are the same to the last bit.
+_STUCK_SAMPLES = 8
+# Meanwhile the stage, by its mean gain, moves by such a part of its stroke, and by so many last digits.
+_MOVED_SHARE, _DIGITS = 0.05, 3.0
+# Readings count as impulses beyond so many deviations from their neighbours, where at most so many stand together.
+_IMPULSE, _MOST_TOGETHER = 8.0, 3
+# They are so many times as large as the median of those within so many samples.
+_LEAST_RATIO, _COMPARED_SAMPLES = 4.0, 16
 # So many impulses are no chance; so many are listed.
 _FEW, _LISTED = 3, 6
 # Impulses count where they make such a part of the residual's squares.
@@ -57,7 +59,7 @@ def stuck(record: Record) -> list[str]:
     for first, stop in stretches((np.diff(reading) == 0) & inside):
         moved = float(np.ptp(voltage[first : stop + 1]))
         moved_um = moved * stroke / span
-        if stop + 1 - first >= _STUCK and moved_um > max(_MOVES * stroke, _DIGITS * digit):
+        if stop + 1 - first >= _STUCK_SAMPLES and moved_um > max(_MOVED_SHARE * stroke, _DIGITS * digit):
             found.append((stop + 1 - first, first, moved))
     if not found:
         return []
@@ -124,8 +126,8 @@ def impulsive(residual_um: np.ndarray, digit_um: float = 0.0) -> np.ndarray:
     far = off > _IMPULSE * 1.4826 * spread + 1e-300
     # What rings, or turns back, goes on as fast as it came: its neighbours move about as far from sample to sample.
     steps = np.abs(np.diff(residual_um, append=residual_um[-1]))
-    far &= off > _ALONE * median_filter(steps, 2 * _AROUND + 1, mode="nearest")
+    far &= off > _LEAST_RATIO * median_filter(steps, 2 * _COMPARED_SAMPLES + 1, mode="nearest")
     for first, stop in stretches(far):
-        if stop - first > _TOGETHER:
+        if stop - first > _MOST_TOGETHER:
             far[first:stop] = False
     return far

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from optimistix import RESULTS
 from scipy.optimize import nnls
 
-from fits.loop._evidence import Posterior, effective, maximise_evidence, posterior, renew_noise
+from fits.loop._evidence import Posterior, effective, maximise_evidence, posterior_of, renew_noise
 from fits.loop._moments import Data, Moments, blocks_of
 from fits.loop._prior import Hyper, interpolation, roughness
 from fits.loop._result import FitError, FitStatus
@@ -60,7 +60,7 @@ class GridSolution:
     """Non-negative weights and slopes of a grid, in strokes, and the Gaussian posterior they are the mode of."""
 
     columns: Float[Array, " D"]
-    belief: Posterior
+    posterior: Posterior
     hyper: Hyper
 
 
@@ -76,83 +76,83 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
         few, even = moments.project(basis), rough.project(basis)
         hyper = maximise_evidence(few, even, start)
-        belief = posterior(moments, rough, hyper)
+        posterior = posterior_of(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
-        determined = effective(even, hyper, posterior(few, even, hyper))
-        renewed = renew_noise(moments, hyper, belief, determined)
+        determined = effective(even, hyper, posterior_of(few, even, hyper))
+        renewed = renew_noise(moments, hyper, posterior, determined)
         if abs(float(renewed.log_variance - hyper.log_variance)) > _SAME_NOISE:
-            hyper, belief = renewed, posterior(moments, rough, renewed)
+            hyper, posterior = renewed, posterior_of(moments, rough, renewed)
     else:
         hyper = maximise_evidence(moments, rough, start)
-        belief = posterior(moments, rough, hyper)
-    if np.all(np.asarray(belief.mean) >= 0):
-        return GridSolution(belief.mean, belief, hyper)
-    columns, result = non_negative(belief)
+        posterior = posterior_of(moments, rough, hyper)
+    if np.all(np.asarray(posterior.mean) >= 0):
+        return GridSolution(posterior.mean, posterior, hyper)
+    columns, result = non_negative(posterior)
     if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
         raise FitError(FitStatus.MAX_STEPS)
     if result != RESULTS.successful:
         raise FitError(FitStatus.NONFINITE)
-    return GridSolution(columns, belief, hyper)
+    return GridSolution(columns, posterior, hyper)
 
 
-def non_negative(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
-    """Find the mode of the belief among non-negative columns.
+def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+    """Find the mode of the posterior among non-negative columns.
 
     Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
     those ends up below zero, more are bounded. The answer is that of all bounds together. Active-set solvers such as
     `scipy.optimize.nnls` take one column at a time, and minutes for the thousands of a fine grid.
     """
-    scale = np.sqrt(np.diagonal(belief.precision))
-    lowest = np.asarray(belief.mean) * scale
+    scale = np.sqrt(np.diagonal(posterior.precision))
+    lowest = np.asarray(posterior.mean) * scale
     size = len(lowest)
     bounded = _FIRST_BOUNDED
     while True:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
-        spread, precision, mean, unit = _marginal(belief, jnp.asarray(order))
+        spread, precision, mean, unit = _marginal(posterior, jnp.asarray(order))
         y, result = _pivot(precision, mean)
-        columns = _follow(belief, jnp.asarray(order), spread, precision, (y - mean, y), unit)
+        columns = _follow(posterior, jnp.asarray(order), spread, precision, (y - mean, y), unit)
         left = np.asarray(columns) * scale
         if result != RESULTS.successful:
-            return _one_by_one(belief)
+            return _one_by_one(posterior)
         if bounded == size or np.all(left >= -_ATOL):
             return jnp.maximum(columns, 0), result
         lowest = np.minimum(lowest, left)
         bounded *= 2
 
 
-def _one_by_one(belief: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+def _one_by_one(posterior: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
-    precision = np.asarray(belief.precision)
+    precision = np.asarray(posterior.precision)
     over: Any = RESULTS.nonlinear_max_steps_reached
     if len(precision) > _MOST_COLUMNS:
-        return jnp.maximum(belief.mean, 0), over
+        return jnp.maximum(posterior.mean, 0), over
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
     done: Any = RESULTS.successful
     try:
-        columns, _ = nnls(root, root @ (scale * np.asarray(belief.mean)), maxiter=_STEPS_PER_COLUMN * len(scale))
+        columns, _ = nnls(root, root @ (scale * np.asarray(posterior.mean)), maxiter=_STEPS_PER_COLUMN * len(scale))
     except RuntimeError:
-        return jnp.maximum(belief.mean, 0), over
+        return jnp.maximum(posterior.mean, 0), over
     return jnp.asarray(columns / scale), done
 
 
 @eqx.filter_jit
 def _marginal(
-    belief: Posterior, which: Int[Array, " k"]
+    posterior: Posterior, which: Int[Array, " k"]
 ) -> tuple[Float[Array, "D k"], Float[Array, "k k"], Float[Array, " k"], Float[Array, " k"]]:
-    """Covariance of all columns with the chosen ones, which ascend, and the belief about those alone, scaled."""
-    rows = jax.nn.one_hot(which, belief.mean.shape[0], dtype=belief.mean.dtype)
-    spread = jax.scipy.linalg.cho_solve((belief.root, True), rows.T)
+    """Covariance of all columns with the chosen ones, which ascend, and the posterior of those alone, scaled."""
+    rows = jax.nn.one_hot(which, posterior.mean.shape[0], dtype=posterior.mean.dtype)
+    spread = jax.scipy.linalg.cho_solve((posterior.root, True), rows.T)
     # With the chosen ones last, the end of the Cholesky factor is that of their marginal precision. The inverse of
     # their covariance would be the same, but for rounding, which may leave it indefinite.
     last = jnp.argsort(jnp.sum(rows, axis=0), stable=True)
-    root = jnp.linalg.cholesky(belief.precision[last][:, last])[-which.shape[0] :, -which.shape[0] :]
+    root = jnp.linalg.cholesky(posterior.precision[last][:, last])[-which.shape[0] :, -which.shape[0] :]
     precision = root @ root.T
     # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
     scale = jnp.sqrt(jnp.diagonal(precision))
-    return spread, precision / (scale[:, None] * scale[None, :]), belief.mean[which] * scale, scale
+    return spread, precision / (scale[:, None] * scale[None, :]), posterior.mean[which] * scale, scale
 
 
 @eqx.filter_jit
@@ -172,7 +172,7 @@ def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Fl
 
 @eqx.filter_jit
 def _follow(
-    belief: Posterior,
+    posterior: Posterior,
     which: Int[Array, " k"],
     spread: Float[Array, "D k"],
     precision: Float[Array, "k k"],
@@ -181,7 +181,7 @@ def _follow(
 ) -> Float[Array, " D"]:
     """Move all columns along with the chosen ones; where a bound holds it holds exactly."""
     by, to = moved
-    return (belief.mean + spread @ (scale * (precision @ by))).at[which].set(to / scale)
+    return (posterior.mean + spread @ (scale * (precision @ by))).at[which].set(to / scale)
 
 
 def _distance(y: Float[Array, " k"], args: tuple[Float[Array, "k k"], Float[Array, " k"]]) -> Float[Array, ""]:
@@ -195,15 +195,15 @@ def grid_estimate(
 ) -> Estimate:
     """Turn a solution in strokes into an estimate in um; the last two arguments are those of `Estimate`."""
     levels = min(data.grid.levels, BELIEF_LEVELS)
-    belief = solution.belief
+    posterior = solution.posterior
     if levels < data.grid.levels:
         basis = interpolation(levels, data.grid.levels)
         moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
-        belief = posterior(moments, roughness(data.grid.levels).project(basis), solution.hyper)
+        posterior = posterior_of(moments, roughness(data.grid.levels).project(basis), solution.hyper)
     return Estimate(
         model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
         levels=levels,
-        factor_um=belief.factor() * stroke_um,
+        factor_um=posterior.factor() * stroke_um,
         noise_um=float(jnp.exp(solution.hyper.log_variance / 2)) * stroke_um,
         correlation=correlation,
         discrepancy_um=discrepancy_um,
@@ -229,8 +229,8 @@ def cross_validate(
         if not block.count > 0:
             continue
         rest = Moments(*(a - b for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(block), strict=True)))
-        belief = posterior(rest.scaled(1 / correlation, stroke_um), rough, hyper)
-        columns = np.asarray(belief.mean if basis is None else basis @ belief.mean)
+        posterior = posterior_of(rest.scaled(1 / correlation, stroke_um), rough, hyper)
+        columns = np.asarray(posterior.mean if basis is None else basis @ posterior.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
         # A short run may have no sample in a block.
         off = []
@@ -240,13 +240,13 @@ def cross_validate(
                 off.append(run.weighed(left - run.mean(left, inside))[inside])
         squares += sum(float(np.sum(o**2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)
-        expected += float(_expected_square(belief, block)) * stroke_um**2
+        expected += float(_expected_square(posterior, block)) * stroke_um**2
         count += float(block.count)
     return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
 
 
 @eqx.filter_jit
-def _expected_square(belief: Posterior, block: Moments) -> Float[Array, ""]:
+def _expected_square(posterior: Posterior, block: Moments) -> Float[Array, ""]:
     """Sum over a block of the variances that the posterior gives its predictions."""
-    half = jax.scipy.linalg.solve_triangular(belief.root, block.gram, lower=True)
-    return jnp.trace(jax.scipy.linalg.solve_triangular(belief.root, half.T, lower=True))
+    half = jax.scipy.linalg.solve_triangular(posterior.root, block.gram, lower=True)
+    return jnp.trace(jax.scipy.linalg.solve_triangular(posterior.root, half.T, lower=True))

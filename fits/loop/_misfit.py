@@ -13,7 +13,7 @@ from fits.stats._whiten import rough_noise_um
 # So many samples of a command at rest say what the noise is.
 _IDLE = 150
 # A residual beyond so many times the noise, and such a part of the stroke in %, is far from it.
-_FAR, _FAR_PCT = 2.0, 0.1
+_FAR_TIMES_NOISE, _FAR_PCT = 2.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Misfit:
     @property
     def far(self) -> bool:
         """Whether more than noise is left, and more than a trifle of the stroke."""
-        return self.times_noise > _FAR and self.share_pct > _FAR_PCT
+        return self.times_noise > _FAR_TIMES_NOISE and self.share_pct > _FAR_PCT
 
 
 def misfits(runs: Sequence[Run], residuals: Sequence[np.ndarray]) -> list[Misfit]:

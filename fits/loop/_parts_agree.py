@@ -7,7 +7,7 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._evidence import posterior
+from fits.loop._evidence import posterior_of
 from fits.loop._fit_checks import remarks_on
 from fits.loop._grid import non_negative, solve_grid
 from fits.loop._misfit import Misfit, compare_gains, misfits, worst
@@ -24,13 +24,16 @@ _LEVELS = 16
 _TIMES = 2.0
 # Gains that differ by more than this are not those of one rig.
 _REFUSED = 0.1
-# Places, in parts of a run, at which it may have changed, samples that a part needs, and rounds of moving the place.
-_PLACES, _FEWEST, _ROUNDS = 5, 200, 4
+# A change is looked for at so many places of a run, and the best one is moved in so many rounds.
+_PLACES, _ROUNDS = 5, 4
+# Samples that each part of a run needs.
+_FEWEST_SAMPLES = 200
 # Shifts, in samples, at which a delay is looked for first, and how far.
 _FARTHEST = 64
-# Twice the logarithm of how much likelier a delay makes a run, and the part of the residual that it must take away
-# where more than so many times the noise stays.
-_WORTH, _MUCH, _NEAR = 30.0, 0.4, 2.0
+# A delay must raise twice the log likelihood of a run by this.
+_LEAST_GAIN = 30.0
+# It must leave no more than this part of the residual where that is more than so many times the noise.
+_LEFT_SHARE, _NEAR_NOISE = 0.4, 2.0
 # What is so near the noise, and as white, holds no delay.
 _QUIET = 1.3
 # A hysteresis takes part of a delay for width: it is known to half a sample at best.
@@ -83,7 +86,7 @@ class SeparateFits:
         """What a run leaves that is fitted alone as smoothly as all are, at its fitted samples, in um."""
         data = gather(grid_of([run], _LEVELS), [run])
         moments = data.total.scaled(1.0, self.stroke_um)
-        columns, _ = non_negative(posterior(moments, roughness(_LEVELS), self.hyper))
+        columns, _ = non_negative(posterior_of(moments, roughness(_LEVELS), self.hyper))
         return left_of(data.grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
 
 
@@ -139,11 +142,11 @@ def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
 
     for k in range(1, _PLACES):
         place = int(np.searchsorted(order, total * k / _PLACES))
-        if min(order[place], total - order[place]) < _FEWEST:
+        if min(order[place], total - order[place]) < _FEWEST_SAMPLES:
             continue
         for _ in range(_ROUNDS):
             first, second = parts(place)
-            if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST:
+            if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST_SAMPLES:
                 break
             models = separate.fit([first]), separate.fit([second])
             squares = [
@@ -193,9 +196,9 @@ def delays(
             continue
         samples, sd, before, after, gained = found
         if (
-            gained < _WORTH
+            gained < _LEAST_GAIN
             or abs(samples) < 5 * sd
-            or after > (_MUCH if after > _NEAR * miss.noise_um else 1.0) * before
+            or after > (_LEFT_SHARE if after > _NEAR_NOISE * miss.noise_um else 1.0) * before
         ):
             continue
         sd = max(sd, _ROUGHLY)

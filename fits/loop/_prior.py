@@ -12,7 +12,7 @@ _WIDE = 100.0
 _ROUNDING = 1e-14
 # Curvature counts by the square of the distance from the diagonal, in ranges, increased by this and over that: relays
 # that switch close together are many, and their density changes fast.
-_CLOSE, _FAR = 0.05, 0.35
+_CLOSE_TO_DIAGONAL, _FAR_FROM_DIAGONAL = 0.05, 0.35
 
 
 class Hyper(eqx.Module):
@@ -95,7 +95,7 @@ def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) 
     nodes = np.array([(i + di, j + dj) for di, dj in offsets])
     inside = np.all((nodes >= 0) & (nodes < n), axis=(0, 1)) & np.all(nodes[:, 0] >= nodes[:, 1], axis=0)
     columns = place[nodes[:, 0][:, inside], nodes[:, 1][:, inside]]
-    weight = (((i - j)[inside] / (n - 1) + _CLOSE) / _FAR) ** 2
+    weight = (((i - j)[inside] / (n - 1) + _CLOSE_TO_DIAGONAL) / _FAR_FROM_DIAGONAL) ** 2
     form = np.zeros((weights, weights))
     for one, left in zip(columns, factors, strict=True):
         for other, right in zip(columns, factors, strict=True):

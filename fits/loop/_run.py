@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._lagging import known_behind_lag
 from fits.loop._samples import Samples, refine, resized
 from microid import Hold, Preisach, Staircase, demagnetised, negative_saturation, positive_saturation, remember
 
@@ -21,7 +20,7 @@ _STAIRCASES = (64, 512, 4096)
 # A record has met an end of the range, or an extreme of its own, once it comes this close, as a fraction of the
 # range: the first of these that does not cost most of the samples, as peaks of a smooth command miss an end by a
 # little.
-_NEAR = (1e-3, 3e-3, 1e-2)
+_END_SHARES = (1e-3, 3e-3, 1e-2)
 # Samples that a run must leave to fit.
 _FEWEST = 50
 
@@ -132,8 +131,6 @@ def prepare_run(
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
     unknown = initial in ("unknown", VIRGIN)
-    if unknown and gain is not None and record.displacement_um is not None:
-        known = known_behind_lag(record.voltage_V, record.displacement_um, known)
     fitted = known.copy() if usable is None else known & usable
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False
@@ -182,7 +179,7 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
         return np.ones(len(voltage), dtype=bool)
     highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
     found: list[np.ndarray] = []
-    for share in _NEAR:
+    for share in _END_SHARES:
         near = share * (upper_V - lower_V)
         saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
         own = near if found else 0.0

@@ -16,7 +16,7 @@ from microid import AXES, MOTIONS, Axis
 # One compiled function serves all calls; the last piece is filled up.
 _CHUNK = 65536
 _QUANTILES_PCT = (0.135, 2.5, 50.0, 97.5, 99.865)
-_FEWEST, _MOST = 1000, 30_000_000
+_FEWEST_SAMPLES, _MOST_SAMPLES = 1000, 30_000_000
 # First order counts as right within this, and this many standard errors.
 _AGREE, _STANDARD_ERRORS = 0.02, 3.0
 
@@ -119,8 +119,8 @@ def monte_carlo(
         is not between 1000 and 30 million.
     """
     check(design, axes, distribution)
-    if not _FEWEST <= samples <= _MOST:
-        raise DataError(f"between {_FEWEST:,} and {_MOST:,} samples are needed, got {samples:,}")
+    if not _FEWEST_SAMPLES <= samples <= _MOST_SAMPLES:
+        raise DataError(f"between {_FEWEST_SAMPLES:,} and {_MOST_SAMPLES:,} samples are needed, got {samples:,}")
     different = tuple(dict.fromkeys(twin(axis) for axis in axes))
     gains = _gains_of_draws(design, different, samples, distribution, seed, voltage, progress)
     progress("summing up")

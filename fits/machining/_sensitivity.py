@@ -27,7 +27,7 @@ from fits.machining._tolerances import tolerances
 
 _TEN_UM_MM = 0.01
 # So short a stroke that all motions are in proportion to it, to the last digit.
-_SHORT_UM = 1e-6
+SHORT_um = 1e-6
 
 
 @dataclass(frozen=True)
@@ -175,11 +175,11 @@ def _differentiate(
 ) -> AxisDerivatives:
     piezo = (actuation.free_stroke_um, constants, actuation.piezo_N_per_um)
     full_um = m.loaded_um(axis, geometry, *piezo)
-    strokes_um = jnp.stack([jnp.full_like(full_um, _SHORT_UM), full_um])
+    strokes_um = jnp.stack([jnp.full_like(full_um, SHORT_um), full_um])
     found = jax.vmap(lambda stroke_um: m.sensitivity(axis, geometry, stroke_um, constants))(strokes_um)
     return AxisDerivatives(
         gain=found.piezo[0],
-        slopes={name: slope[0] / _SHORT_UM for name, slope in found.dimensions.items()},
+        slopes={name: slope[0] / SHORT_um for name, slope in found.dimensions.items()},
         loaded_stroke_um=full_um,
         stroke=found.output[1],
         slopes_at_full_stroke={name: slope[1] for name, slope in found.dimensions.items()},

@@ -13,7 +13,7 @@ from fits.machining._gains import gain_model, gains_of_many, inputs_of, once_per
 from fits.machining._tolerances import Distribution, check, check_independent, from_normal, tolerances
 from microid import AXES, Axis
 
-_FEWEST, _MOST = 256, 2**20
+_FEWEST_SAMPLES, _MOST_SAMPLES = 256, 2**20
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,10 @@ def sobol(
     """
     check(design, axes, distribution)
     check_independent(design, "the variance has no unique parts for correlated dimensions: use monte_carlo")
-    if samples.bit_count() != 1 or not _FEWEST <= samples <= _MOST:
-        raise DataError(f"the number of samples is a power of two from {_FEWEST} to {_MOST}, got {samples}")
+    if samples.bit_count() != 1 or not _FEWEST_SAMPLES <= samples <= _MOST_SAMPLES:
+        raise DataError(
+            f"the number of samples is a power of two from {_FEWEST_SAMPLES} to {_MOST_SAMPLES}, got {samples}"
+        )
     if not 0 < confidence < 1 or resamples < 100:
         raise DataError("intervals need a confidence between 0 and 1 and at least 100 resamples")
 

@@ -34,11 +34,10 @@ from fits.plots._sensitivity import plot_sensitivity
 from fits.stats._metrics import errors, loop_width_pct
 from microid.control import step_metrics, tracking_errors
 
-Tell = Callable[[str], None]
 _IDLE_SAMPLES, _IDLE_RATE_Hz = 20_000, 1000.0
 
 
-def paper_result(seeds: int, seed: int, folder: Path, tell: Tell) -> PaperResult:
+def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], None]) -> PaperResult:
     """Run everything, and write the page, the JSON file and the pictures into an existing folder."""
     result = PaperResult(seed, seeds, assumed=_assumed())
     piezo = data_synth.PaperPiezo()
@@ -46,18 +45,18 @@ def paper_result(seeds: int, seed: int, folder: Path, tell: Tell) -> PaperResult
     loops, *others = np.random.default_rng(seed).spawn(2 + 2 * len(data_synth.PAPER_AXES))
     idle = others.pop()
     with tempfile.TemporaryDirectory() as records:
-        tell(f"identifying the hysteresis from {seeds} noisy CSVs")
+        progress(f"identifying the hysteresis from {seeds} noisy CSVs")
         identified = identify(piezo, loops.spawn(seeds), Path(records))
         stands, noises = {}, {}
         for (name, axis), modes_rng, runs_rng in zip(
             data_synth.PAPER_AXES.items(), others[::2], others[1::2], strict=True
         ):
-            tell(f"identifying the response of axis {name}")
+            progress(f"identifying the response of axis {name}")
             modes = identify_modes(axis, piezo, seeds, modes_rng, Path(records))
             stands[name], noises[name] = PaperStand(axis, piezo, identified, modes), runs_rng
     steps: dict[str, PaperRun] = {}
     for scheme in PAPER["table2"]:
-        tell(f"step, {scheme}")
+        progress(f"step, {scheme}")
         steps[scheme] = stands["x"].step(scheme, None)
         noisy = stands["x"].step(scheme, noises["x"].spawn(1)[0])
         result.table2[scheme] = _steps(steps[scheme], noisy, PAPER["table2"][scheme])
@@ -66,14 +65,14 @@ def paper_result(seeds: int, seed: int, folder: Path, tell: Tell) -> PaperResult
         said = PAPER["table3"] if name == "x" else PAPER["table4"][name]
         tracks[name] = {}
         for scheme in said:
-            tell(f"tracking along {name}, {scheme}")
+            progress(f"tracking along {name}, {scheme}")
             tracks[name][scheme] = stand.track(scheme, noises[name].spawn(1)[0])
         found = {scheme: _tracking(run, said[scheme]) for scheme, run in tracks[name].items()}
         if name == "x":
             result.table3 = found
         else:
             result.table4[name] = found
-    tell("drawing")
+    progress("drawing")
     result.figures = {"fig6": _loop_figures(identified), "fig9": _inverse_figures(identified, piezo)}
     pictures = [
         ("Fig. 6: the hysteresis and its model", _draw_loop(identified[0], folder)),

@@ -22,7 +22,6 @@ from fits.stage._frequency import estimate_response, read_multisine
 from fits.stage._modal_fit import fit_response
 from microid import Preisach, positive_saturation
 
-FEEDBACK = ("HC+PID", "HC+BP-PID", "HC+CMAC-PID")
 LEVELS = 23
 # Loops are closed this long before a run begins, so that the noise they carry has found its level.
 LEAD_s = 1.0

@@ -8,7 +8,8 @@ import numpy as np
 from fits.control._compensate import Compensation
 from fits.control._compensate_stage import simulate_model
 from fits.io._record import Record, Reference
-from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, TWO_SIDED_95, WIDE_in, curve, figure, label, legend, save
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save
+from fits.stats._metrics import TWO_SIDED_95
 from microid import Preisach, Stage
 
 

@@ -12,11 +12,11 @@ from microid.effects import View
 
 _BINS = 36
 # Fewer samples than this make no mean.
-_FEWEST = 4
+_FEWEST_IN_MEAN = 4
 # Samples whose mean is where a change begins: more would hide what happens meanwhile.
 _FIRST = 3
 # A change of the voltage below this part of its range is none.
-_STILL = 1e-6
+_SMALLEST_MOVE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, 
     """Means over even stretches of `x`, or over equally many samples."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
-    if x.size < _FEWEST * 3 or np.ptp(x) == 0:
+    if x.size < _FEWEST_IN_MEAN * 3 or np.ptp(x) == 0:
         raise ValueError("too few samples")
     edges = np.linspace(x.min(), x.max(), _BINS + 1) if even else np.unique(np.quantile(x, np.linspace(0, 1, 37)))
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     rows = []
     for k in range(len(edges) - 1):
         inside = place == k
-        if np.count_nonzero(inside) >= _FEWEST:
+        if np.count_nonzero(inside) >= _FEWEST_IN_MEAN:
             low, high = np.quantile(y[inside], [0.1, 0.9])
             rows.append((np.mean(x[inside]), np.mean(y[inside]), low, high))
     if len(rows) < 3:
@@ -99,7 +99,7 @@ def _over_voltage(runs: Sequence[RunView], factor: float) -> list[Curve]:
 def _last_move(run: RunView) -> tuple[np.ndarray, np.ndarray]:
     """Direction of the last move of the voltage, and the sample at which it last started, stopped or turned."""
     step = np.diff(run.voltage_V, prepend=run.voltage_V[:1])
-    sign = np.sign(np.where(np.abs(step) > _STILL * (np.ptp(run.voltage_V) or 1.0), step, 0.0))
+    sign = np.sign(np.where(np.abs(step) > _SMALLEST_MOVE * (np.ptp(run.voltage_V) or 1.0), step, 0.0))
     index = np.arange(sign.size)
     moved = np.maximum.accumulate(np.where(sign != 0, index, 0))
     changed = np.concatenate([[0.0], np.diff(sign)]) != 0

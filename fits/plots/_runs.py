@@ -15,7 +15,6 @@ from fits.plots._style import (
     LIGHT,
     MEASURED,
     MODEL,
-    TWO_SIDED_95,
     NARROW_in,
     WIDE_in,
     curve,
@@ -25,6 +24,7 @@ from fits.plots._style import (
     thinned,
     verbatim,
 )
+from fits.stats._metrics import TWO_SIDED_95
 
 # Runs side by side in one picture.
 _MOST_RUNS = 3

@@ -24,7 +24,7 @@ from microid import AbstractLinear, Preisach, Stage
 # Frequencies at which the model's response is drawn, and how far beyond the measured ones.
 _FREQUENCIES, _BEYOND = 600, 1.3
 # Coherence from which a line counts as measured, and the lightest grey of those that do not.
-_SURE, _FAINTEST = 0.8, 0.85
+_COHERENT, _FAINTEST = 0.8, 0.85
 
 
 def plot_stage(
@@ -109,7 +109,7 @@ def _measured(
 
 def _highest_Hz(measured: MeasuredResponse) -> float:
     """The highest frequency that a run surely shows; that of its last line if it shows none surely."""
-    sure = measured.frequency_Hz[measured.coherence > _SURE]
+    sure = measured.frequency_Hz[measured.coherence > _COHERENT]
     return float((sure if len(sure) else measured.frequency_Hz).max())
 
 
@@ -150,7 +150,7 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
     picture = figure(WIDE_in, 3.9)
     size, turn = picture.subplots(2, 1, sharex=True, height_ratios=(1.4, 1))
     grey = {
-        "c": _FAINTEST * np.minimum(1.0, (1 - measured.coherence) / (1 - _SURE) / 2),
+        "c": _FAINTEST * np.minimum(1.0, (1 - measured.coherence) / (1 - _COHERENT) / 2),
         "cmap": "gray",
         "vmin": 0.0,
         "vmax": 1.0,

@@ -19,8 +19,6 @@ NARROW_in, WIDE_in = 3.54, 7.09
 DARK, LIGHT = "0.1", "0.75"
 MEASURED: dict[str, Any] = {"color": "0.65", "linewidth": 1.5}
 MODEL: dict[str, Any] = {"color": "0.0", "linewidth": 0.5}
-# Half-width of a 95 % interval in standard deviations.
-TWO_SIDED_95 = 1.959964
 _FONT_pt = 8
 _DPI = 200
 # More points than this do not show at this size.

@@ -10,10 +10,9 @@ from fits.loop._result import FitError, FitResult
 from fits.stage._solve import Solved, solve_chain
 from fits.stage._steps import Plan
 from fits.stage._uncertainty import Precision
+from fits.stats._metrics import TWO_SIDED_95
 from microid import Stage
 
-# Half the width of a 95 % interval, in standard deviations.
-_NORMAL = 1.959964
 # What pulls a fit ruins it where it moves a parameter by more than this part of it.
 _RUINED = 0.5
 
@@ -31,7 +30,7 @@ class Alternative:
         """Read it off a solution."""
         z, values = precision.solved.z, precision.chain.coordinates.values
         sd = precision.sd()
-        ends = (np.asarray(values(jnp.asarray(z + k * _NORMAL * sd))) for k in (0, -1, 1))
+        ends = (np.asarray(values(jnp.asarray(z + k * TWO_SIDED_95 * sd))) for k in (0, -1, 1))
         return cls(*ends)
 
     @classmethod

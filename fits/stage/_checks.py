@@ -16,15 +16,15 @@ from microid import Driver, Mechanics, Stage
 # Gains that differ by more than this are not those of one rig, and by more than that are worth a remark.
 _REFUSED, _REMARKED = 0.1, 0.05
 # A resonance above this fraction of the sampling rate is hardly told from its mirror image.
-_HIGHEST = 0.45
+_HIGHEST_RESONANCE = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
 UNSEEN, _LOST = 0.5, 5.0
 # Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
 WORTH = 40.0
 # A run that leaves so many times what the quietest leaves moves in ways that its samples do not show.
-_LOUD = 3.0
+_LARGEST_NOISE_RATIO = 3.0
 # Ranges of voltage that differ by less than this, as a fraction, are alike.
-_ALIKE = 0.05
+_SAME_RANGE = 0.05
 # And speeds that differ by less than this factor.
 _SAME_SPEED = 1.5
 # Rates beyond so many times the resonance show it well.
@@ -32,7 +32,7 @@ _FINELY = 5.0
 # Share of a command's speed in the upper half of the band from which on it is not sampled finely.
 _UPPER = 0.1
 # Poles that piezo stages have, from slow macro stages and weak amplifiers to small ones with strong ones.
-_USUAL = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
+_USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
 _POLES = ("time_constant_s", "natural_frequency_Hz")
 
 
@@ -44,7 +44,9 @@ def refuse_slopes(records: Sequence[Record]) -> None:
         if record.displacement_um is not None
     ]
     widest = max(span for span, _, _, _ in spans)
-    full = [(moved / span, speed, source) for span, moved, speed, source in spans if span > (1 - _ALIKE) * widest]
+    full = [
+        (moved / span, speed, source) for span, moved, speed, source in spans if span > (1 - _SAME_RANGE) * widest
+    ]
     for high, fast, one in full:
         for low, slow, other in full:
             # What is faster may move less far because of the dynamics, which are not known yet.
@@ -99,7 +101,7 @@ def refuse_unidentifiable(
         for name, part in zip(stage.names, stage.parts, strict=True)
         if isinstance(part, Mechanics)
     ]
-    beyond = [(name, value) for name, value in mechanics if value > _HIGHEST * fastest.rate_Hz]
+    beyond = [(name, value) for name, value in mechanics if value > _HIGHEST_RESONANCE * fastest.rate_Hz]
     seen = likelihood_ratio(solved, drives) >= WORTH
     some = bool(unidentified) and (len(unidentified) == len(poles) or not fast)
     driven = any(isinstance(part, Driver) for part in stage.parts)
@@ -113,7 +115,7 @@ def refuse_unidentifiable(
     if len(unidentified) == len(poles) or not seen:
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
-        if noise[loudest] > _LOUD * min(noise):
+        if noise[loudest] > _LARGEST_NOISE_RATIO * min(noise):
             check_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
             what = (
@@ -153,7 +155,7 @@ def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit
             continue
         resonance = float(part.natural_frequency_Hz)
         for run, one in zip(runs, left, strict=True):
-            blind = _HIGHEST * finest < resonance
+            blind = _HIGHEST_RESONANCE * finest < resonance
             where = "far beyond" if resonance > 2 * run.rate_Hz else f"near {resonance:.3g} Hz"
             if one.far and (blind or (run.rate_Hz < _FINELY * resonance and not _resolved(run))):
                 raise DataError(
@@ -180,7 +182,7 @@ def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence
     """
     for name, value in zip(names, values, strict=True):
         field = name.rpartition(".")[2]
-        low, high = _USUAL.get(field, (-np.inf, np.inf))
+        low, high = _USUAL_RANGES.get(field, (-np.inf, np.inf))
         if low <= value <= high:
             continue
         hertz = field.endswith("_Hz")

@@ -17,26 +17,27 @@ from fits.stage._run import nuisance_columns, project_out, simulate_stage
 from fits.stage._solve import Problem, Solved, solve_chain
 from fits.stage._start import best_shifts, measure_response, start_stages
 from fits.stage._steps import Plan, hysteresis_alone
-from fits.stage._uncertainty import Precision, sandwich
+from fits.stage._uncertainty import NO_PRECISION, Precision, sandwich
 from microid import Preisach, Stage
 
-# A delay counts from so many standard deviations on, if it is as many samples long, and moves a parameter by so many
-# of its own; from there on it is followed until it changes by less than a part of its standard deviation.
-_SURE, _LEAST, _MOVED = 5.0, 0.02, 0.5
+# A delay counts from so many standard deviations, and so many samples, on.
+_SURE_Z, _LEAST_SAMPLES = 5.0, 0.02
+# It must move a parameter by so many of that one's standard deviations, too.
+_MOVED_SD = 0.5
+# It is followed for so many rounds at most, until it changes by less than this part of its standard deviation.
 _ROUNDS, _SETTLED = 10, 0.3
 # A step is halved so often where it leaves more of its run.
 _HALVED, _NO_WORSE = 4, 1.01
 # Part of a sample by which a command is shifted to see what a delay does.
 _STEP = 0.25
-# Runs that leave so many times the noise are searched for delays up to so many samples either way, and so many of
-# these are tried.
-_LOUD, _FARTHEST, _TRIED = 1.5, 64, 3
+# Runs that leave so many times the noise are searched for delays.
+_SEARCHED_NOISE = 1.5
+# The search goes so many samples either way, and so many of the delays are tried.
+_FARTHEST_SAMPLES, _MOST_TRIED = 64, 3
 # What is as much likelier as leaving this part of a run's residual is a better answer.
 _BETTER = 0.7
 # Where more than so many times the noise is left, a delay counts if it takes all but this part away.
-_NEAR, _MUCH = 2.0, 0.4
-# Precision, in scaled coordinates, that stands in for none.
-_WEAK = 1e-8
+_NEAR_NOISE, _LEFT_SHARE = 2.0, 0.4
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
 _REMEDY = (
@@ -60,7 +61,7 @@ class Delay:
     @property
     def seen(self) -> bool:
         """Whether it is no chance."""
-        return abs(self.delay_s) > _SURE * self.sd_s and abs(self.samples) > _LEAST
+        return abs(self.delay_s) > _SURE_Z * self.sd_s and abs(self.samples) > _LEAST_SAMPLES
 
     def words(self) -> str:
         """Say what the columns look like."""
@@ -108,7 +109,7 @@ def fit_without_delays(
         gross = max(one.share_pct for one in left) > GROSS_PCT
         return fit_without_delays(plan, start.full, None, left) if gross and start.full is not None else None
     shifts = np.zeros(len(plan.records))
-    far = [k for k, one in enumerate(left) if one.times_noise > _LOUD]
+    far = [k for k, one in enumerate(left) if one.times_noise > _SEARCHED_NOISE]
     searched = _search(plan, solved, far)
     if searched is not None:
         shifts, start = searched
@@ -150,11 +151,11 @@ def fit_without_delays(
             known, shifts, left, solved.weighing.noise_um, found.weighing.noise_um, strict=True
         )
         # Where much is left with it as without it, it is something else.
-        if one.seen and shift and after < (_MUCH if after > miss.noise_um * _NEAR else 1.0) * before
+        if one.seen and shift and after < (_LEFT_SHARE if after > miss.noise_um * _NEAR_NOISE else 1.0) * before
     )
     if not seen:
         return None
-    if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd()) < _MOVED:
+    if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd()) < _MOVED_SD:
         return None
     return WithoutDelays(seen, found, sure)
 
@@ -191,15 +192,15 @@ def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray
     here, stage = (jnp.asarray(solved.z), jnp.asarray(solved.columns_um)), solved.stage
     whole = precision.gram + precision.prior
     # What nothing is known of must not spoil the rest.
-    whole = whole + _WEAK * np.eye(len(whole))
+    whole = whole + NO_PRECISION * np.eye(len(whole))
     out = []
     for k, (run, one) in enumerate(zip(solved.runs, solved.sums, strict=True)):
         n, step, weight = len(run.record), _STEP / run.rate_Hz, run.fit_weight
         late, early = (simulate_stage(stage, plan.run(k, run.stride, shifts[k] + sign * step)) for sign in (1, -1))
         full = np.zeros(run.samples.weight.shape[0])
         full[:n] = (late - early) / (2 * step)
-        own = jnp.asarray(nuisance_columns(stage, run.samples))
-        late_um_per_s = np.asarray(project_out(own, run.samples.weight, jnp.asarray(full)))[:n]
+        nuisance = jnp.asarray(nuisance_columns(stage, run.samples))
+        late_um_per_s = np.asarray(project_out(nuisance, run.samples.weight, jnp.asarray(full)))[:n]
         worth = solved.weighing.shares[k] / precision.variance
         weighed = worth * weight * late_um_per_s
         _, slope, _ = linearise(chain, *here, run)
@@ -233,7 +234,9 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
         if not len(response.frequency_Hz):
             continue
         step = min(1.0 / run.rate_Hz, 0.1 / response.frequency_Hz.max())
-        tried = best_shifts(stage, response, step * np.arange(-_FARTHEST, _FARTHEST + 1))[:_TRIED]
+        tried = best_shifts(stage, response, step * np.arange(-_FARTHEST_SAMPLES, _FARTHEST_SAMPLES + 1))[
+            :_MOST_TRIED
+        ]
         for shift in (shift for shift in tried if shift):
             there = shifts.copy()
             there[k] = shift

@@ -145,24 +145,24 @@ def run_sums(
     The columns are part of it only if they are `free`.
     """
     samples, size = run.samples, chain.size if free else 0
-    out, slope, own = linearise(chain, z, columns_um, run)
+    out, slope, nuisance = linearise(chain, z, columns_um, run)
     weight = np.asarray(samples.weight)
     residual = np.asarray(samples.displacement_um) - out
     root = np.sqrt(weight)
     known = size + slope.shape[1]
-    rows = np.empty((min(len(weight), _PIECE), known + own.shape[1]))
+    rows = np.empty((min(len(weight), _PIECE), known + nuisance.shape[1]))
     sums = Moments(np.zeros((rows.shape[1],) * 2), np.zeros(rows.shape[1]), np.zeros(()), np.zeros(()))
     for first, columns in pieces(chain, z, run, free):
         piece = slice(first, first + columns.shape[0])
         used = rows[: columns.shape[0]]
-        used[:, :size], used[:, size:known], used[:, known:] = columns, slope[piece], own[piece]
+        used[:, :size], used[:, size:known], used[:, known:] = columns, slope[piece], nuisance[piece]
         target = root[piece] * (residual[piece] + columns @ np.asarray(columns_um)[:size])
         used *= root[piece, None]
         sums = sums + Moments(
             used.T @ used, used.T @ target, np.asarray(target @ target), np.asarray(weight[piece].sum())
         )
     reduced, _, _ = split_moments(sums, known, 0.0)
-    off = np.asarray(_project_out(jnp.asarray(own), samples.weight, jnp.asarray(residual)))
+    off = np.asarray(_project_out(jnp.asarray(nuisance), samples.weight, jnp.asarray(residual)))
     return RunSums(reduced, np.asarray(sums.gram)[:known, known] / weight.sum(), off[: len(run.record)])
 
 
@@ -170,8 +170,8 @@ def linearise(
     chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, run: Run
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Response of a padded run, its slopes along the coordinates, and its nuisance columns."""
-    out, slope, own = _linearised(chain, z, columns_um, run.samples)
-    return np.asarray(out), np.asarray(slope), np.asarray(own)
+    out, slope, nuisance = _linearised(chain, z, columns_um, run.samples)
+    return np.asarray(out), np.asarray(slope), np.asarray(nuisance)
 
 
 def along(
@@ -233,9 +233,9 @@ def split_moments(total: Moments, size: int, damping: float) -> tuple[Moments, n
     diagonal that is added to the eliminated ones' own block.
     """
     gram, cross = np.asarray(total.gram), np.asarray(total.cross_um)
-    own = gram[size:, size:]
-    own = own + damping * np.diag(np.diagonal(own)) + 1e-14 * np.trace(own) * np.eye(len(own))
-    answer, follow = np.linalg.solve(own, cross[size:]), np.linalg.solve(own, gram[size:, :size])
+    block = gram[size:, size:]
+    block = block + damping * np.diag(np.diagonal(block)) + 1e-14 * np.trace(block) * np.eye(len(block))
+    answer, follow = np.linalg.solve(block, cross[size:]), np.linalg.solve(block, gram[size:, :size])
     reduced = Moments(
         gram[:size, :size] - gram[:size, size:] @ follow,
         cross[:size] - gram[:size, size:] @ answer,

@@ -17,7 +17,7 @@ from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, St
 # Steps in a period of the resonance: a sampled sine misses less than 2 % of its peak.
 _PER_PERIOD = 16
 # Samples of a run in all steps, at most: what rings between samples that are this far apart has died away.
-_MOST = 1 << 18
+_MOST_SAMPLES = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def fine_steps(stage: Stage, interval_s: float, count: int) -> int:
     resonances = [float(p.natural_frequency_Hz) for p in map(innermost, stage.parts) if isinstance(p, Mechanics)]
     wanted = max((interval_s * _PER_PERIOD * f for f in resonances), default=1.0)
     # In powers of two, so that few programs are compiled.
-    return int(2 ** math.ceil(math.log2(min(max(wanted, 1.0), max(_MOST / count, 1.0)))))
+    return int(2 ** math.ceil(math.log2(min(max(wanted, 1.0), max(_MOST_SAMPLES / count, 1.0)))))
 
 
 def motion(

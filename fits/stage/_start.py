@@ -25,7 +25,7 @@ _SHARPEST = 30.0
 _DAMPING_RATIOS = (0.005, 0.03, 0.15, 0.7)
 _FREQUENCIES, _TIMES, _PEAKS = 24, 8, 3
 # Lines of a response that are kept, spread evenly over the logarithm of the frequency and around the largest.
-_MOST = 240
+_MOST_LINES = 240
 # Candidates, in logarithms of the poles, that are too alike to refine both, or to keep both.
 _COARSE, _SAME = 0.5, 0.05
 _LEADING, _REFINED, _KEPT = 200, 4, 3
@@ -71,10 +71,10 @@ def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
 
 def _thinned(frequency: np.ndarray, size: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Keep some lines of many: spread over the logarithm of the frequency, and the largest, where poles show."""
-    if len(seen) <= _MOST:
+    if len(seen) <= _MOST_LINES:
         return seen
-    spread = np.searchsorted(frequency[seen], np.geomspace(frequency[seen[0]], frequency[seen[-1]], _MOST // 2))
-    largest = np.argsort(-size[seen])[: _MOST // 2]
+    spread = np.searchsorted(frequency[seen], np.geomspace(frequency[seen[0]], frequency[seen[-1]], _MOST_LINES // 2))
+    largest = np.argsort(-size[seen])[: _MOST_LINES // 2]
     return seen[np.unique(np.concatenate([np.minimum(spread, len(seen) - 1), largest]))]
 
 

@@ -14,13 +14,12 @@ from fits.stage._checks import check_gains
 from fits.stage._run import residual_of, simulate_stage
 from fits.stage._uncertainty import Precision
 from fits.stats._identifiability import unseen_directions
+from fits.stats._metrics import TWO_SIDED_95
 from fits.stats._noise import WHITE
 from microid import Stage
 
-# Half the width of a 95 % interval, in standard deviations.
-_NORMAL = 1.959964
 # A coordinate, of the order of 1, that is known no better than this is hardly seen.
-_UNSEEN = 0.5
+_UNSEEN_SD = 0.5
 
 
 def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
@@ -33,9 +32,9 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     covariance = precision.covariance(precision.influence())
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     names, value, slope = solved.parameters()
-    ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * _NORMAL * sd))) for sign in (-1, 1)]
+    ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * TWO_SIDED_95 * sd))) for sign in (-1, 1)]
     # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
-    width = np.where(sd > _UNSEEN, np.abs(ends[1] - ends[0]) / (2 * _NORMAL), np.abs(slope) * sd)
+    width = np.where(sd > _UNSEEN_SD, np.abs(ends[1] - ends[0]) / (2 * TWO_SIDED_95), np.abs(slope) * sd)
     parameters = tuple(
         ParameterEstimate(name, unit, *map(float, figures))
         for (name, unit), *figures in zip(names, value, width, *ends, strict=True)

@@ -24,7 +24,7 @@ _LEVELS = 16
 # Autocovariances are trusted up to so many correlation times.
 _LAGS = 6.0
 # Precision, in scaled coordinates, that stands in for none.
-_WEAK = 1e-8
+NO_PRECISION = 1e-8
 
 
 class StageUncertainty(AbstractUncertainty):
@@ -98,7 +98,7 @@ class Precision:
         size, count = self.chain.size, len(self.solved.z)
         whole = self.gram + self.prior
         # Coordinates that nothing is known of must not spoil those that something is known of.
-        whole[np.arange(size, size + count), np.arange(size, size + count)] += _WEAK
+        whole[np.arange(size, size + count), np.arange(size, size + count)] += NO_PRECISION
         return np.linalg.solve(whole, np.eye(size + count)[:, size:])
 
     def influence(self) -> list[np.ndarray]:
@@ -123,7 +123,10 @@ class Precision:
         """
         size, answer = self.chain.size, self.answer()
         # What nothing is known of stays unknown, whatever the residual.
-        held = answer[:size].T @ self.prior[:size, :size] @ answer[:size] + _WEAK * answer[size:].T @ answer[size:]
+        held = (
+            answer[:size].T @ self.prior[:size, :size] @ answer[:size]
+            + NO_PRECISION * answer[size:].T @ answer[size:]
+        )
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
             held = held + sandwich(own, np.sqrt(run.fit_weight) * one.residual_um, run.fitted)
         return held
@@ -141,7 +144,7 @@ class Precision:
             basis = interpolation(_LEVELS, self.chain.levels)
         whole = np.zeros((size + count, basis.shape[1] + count))
         whole[:size, : basis.shape[1]], whole[size:, basis.shape[1] :] = basis, np.eye(count)
-        precision = whole.T @ (self.gram + self.prior) @ whole + _WEAK * np.eye(whole.shape[1])
+        precision = whole.T @ (self.gram + self.prior) @ whole + NO_PRECISION * np.eye(whole.shape[1])
         root = np.linalg.cholesky(precision)
         factor = np.linalg.solve(root, np.eye(len(root)))
         shared = float(np.mean([shared_square(one.residual_um[run.fitted]) for one, run in self._pairs()]))

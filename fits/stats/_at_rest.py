@@ -3,7 +3,7 @@
 import numpy as np
 
 # A command that rests for this many samples is idle from a third of the rest on.
-_REST = 24
+_FEWEST_AT_REST = 24
 
 
 def stretches(flags: np.ndarray) -> list[tuple[int, int]]:
@@ -17,7 +17,7 @@ def idle_stretches(voltage_V: np.ndarray, settling: int) -> list[slice]:
     found = []
     for first, stop in stretches(np.diff(voltage_V) == 0):
         begin = max(first + (stop - first) // 3, first + settling)
-        if stop - begin >= 2 * _REST // 3:
+        if stop - begin >= 2 * _FEWEST_AT_REST // 3:
             found.append(slice(begin, stop))
     return found
 

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 # A branch that goes less far than this, in steps of the grid, stands still.
-_STILL = 1e-12
+_SMALLEST_MOVE = 1e-12
 _SLOTS = 4
 _NEGLIGIBLE = 1e-14
 
@@ -67,7 +67,7 @@ def compress(
 
     # Visits of many samples: moments of the fraction of the way, then the square root of their Gram matrix.
     start, span = voltage_V[first], voltage_V[last] - voltage_V[first]
-    safe = np.where(np.abs(span) <= _STILL * step, 1.0, span)
+    safe = np.where(np.abs(span) <= _SMALLEST_MOVE * step, 1.0, span)
     way = (voltage_V - start[group]) / safe[group]
     powers = np.vander(way, 2 * _SLOTS - 1, increasing=True)
     powers *= share[:, None]

@@ -5,6 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 
+# Half the width of a 95 % interval, in standard deviations.
+TWO_SIDED_95 = 1.959964
 # A loop must span this fraction of the largest excursion to be measured.
 _SPAN = 0.95
 

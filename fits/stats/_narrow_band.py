@@ -9,10 +9,16 @@ from scipy.ndimage import median_filter, uniform_filter1d
 MAINS_Hz, DRIFT = (50.0, 60.0), 0.002
 # A narrow band lies within this part of its frequency on either side.
 _WIDE = 0.2
-# Bins that a band may have, the room that it needs in bins of its width, how many times more evidence a broad one
-# must have, and the share of the mean power that nearly every eighth of a record has. No line has so many bins.
+# Bins that a band may have.
+_WIDTHS = (1, 4, 16, 64)
+# No line has so many bins.
 _BROAD = 16
-_WIDTHS, _ROOM, _MORE, _WEAKEST = (1, 4, 16, 64), 12, 3.0, 0.25
+# The room that a band needs, in bins of its width.
+_ROOM = 12
+# A broad band must have so many times the evidence of a narrow one.
+_LEAST_GAIN = 3.0
+# Nearly every eighth of a record has at least this share of the mean power.
+_WEAKEST = 0.25
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ def _strongest(power: np.ndarray, inside: np.ndarray) -> tuple[int, int, float, 
         above = high if wide == 1 else wide / 2 * (high - 1 - np.log(high))
         found.append((best, wide, float(np.log(inside.sum() / wide)) - above, around))
     narrow, broad = found[0], min(found, key=lambda one: one[2])
-    return broad if broad[2] < _MORE * min(narrow[2], -1.0) else narrow
+    return broad if broad[2] < _LEAST_GAIN * min(narrow[2], -1.0) else narrow
 
 
 def _steady(values: np.ndarray, middle: float, width: float) -> bool:

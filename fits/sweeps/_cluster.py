@@ -17,7 +17,7 @@ from fits.sweeps._spec import Sweep, parse_sweep
 from fits.sweeps._types import Rows
 
 # Chunks that wait per thread of the workers, so that none is idle; and how often a chunk may lose its worker.
-_AHEAD, _LOSSES = 2, 5
+_WAITING_PER_THREAD, _MOST_LOSSES = 2, 5
 _CONNECT_s = 20
 _MOST_LOCAL = 1024
 # How long a scheduler without workers is waited for, without a word and at all; how often workers are looked for.
@@ -160,7 +160,7 @@ def _all(
     results, workers = distributed.as_completed(loop=client.loop), _Workers(client, progress)
     while waiting or futures:
         usable = workers.usable()
-        while waiting and len(futures) < _AHEAD * sum(usable.values()):
+        while waiting and len(futures) < _WAITING_PER_THREAD * sum(usable.values()):
             chunk = waiting.pop()
             # Should all of them die, others may have it: those that are refused give it back.
             chosen = {"workers": [*usable], "allow_other_workers": True} if workers.banned else {}
@@ -176,7 +176,7 @@ def _all(
                 answer: _Answer = future.result()
             except (distributed.KilledWorker, ImportError) as error:
                 losses[chunk] = losses.get(chunk, 0) + 1
-                if losses[chunk] > _LOSSES:
+                if losses[chunk] > _MOST_LOSSES:
                     raise DataError(_often(chunk, error)) from None
                 waiting.append(chunk)
                 continue
@@ -193,7 +193,7 @@ def _often(chunk: int, error: Exception) -> str:
     if isinstance(error, ImportError):
         return f"--cluster: workers cannot import what they need ({error}); install the same microid on all of them."
     return (
-        f"--cluster: chunk {chunk} lost its worker {_LOSSES} times, as if it took too much memory; lower "
+        f"--cluster: chunk {chunk} lost its worker {_MOST_LOSSES} times, as if it took too much memory; lower "
         "run.memory_MB, then go on with --resume."
     )
 

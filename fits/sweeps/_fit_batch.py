@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, design
-from fits.loop._evidence import effective, posterior, renew_noise
+from fits.loop._evidence import effective, posterior_of, renew_noise
 from fits.loop._moments import Moments
 from fits.loop._prior import Hyper, Roughness
 from fits.stats._nonnegative import BlockPivoting
@@ -84,19 +84,19 @@ def _one(
     hyper = Hyper(weight_of, weight_of, weight_of, jnp.log(jnp.asarray(_NOISE)))
 
     def renew(_: int, hyper: Hyper) -> Hyper:
-        belief = posterior(moments, rough, hyper)
-        return renew_noise(moments, hyper, belief, effective(rough, hyper, belief))
+        posterior = posterior_of(moments, rough, hyper)
+        return renew_noise(moments, hyper, posterior, effective(rough, hyper, posterior))
 
     hyper = lax.fori_loop(0, _ROUNDS, renew, hyper)
-    belief = posterior(moments, rough, hyper)
-    scale = jnp.sqrt(jnp.diagonal(belief.precision))
+    posterior = posterior_of(moments, rough, hyper)
+    scale = jnp.sqrt(jnp.diagonal(posterior.precision))
     solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
-    precision = belief.precision / (scale[:, None] * scale[None, :])
+    precision = posterior.precision / (scale[:, None] * scale[None, :])
     solution: Any = optx.minimise(
         _distance,
         solver,
-        jnp.maximum(belief.mean * scale, 0),
-        args=(precision, belief.mean * scale),
+        jnp.maximum(posterior.mean * scale, 0),
+        args=(precision, posterior.mean * scale),
         options={"hessian": precision},
         max_steps=_STEPS,
         throw=False,

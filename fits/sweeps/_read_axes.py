@@ -19,7 +19,7 @@ from fits.sweeps._types import Parameter, check_plain, code_of
 
 _PREFIXES = {"k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
 _BASES = ("s", "V", "m", "Hz", "Pa", "rad")
-_MOST = 2**62
+_MOST_ROWS = 2**62
 # Values of a grid are held at once.
 _LONGEST = 1_000_000
 # Keys beside those that every axis may have, by the one that says where its values come from.
@@ -48,7 +48,7 @@ class _Design(msgspec.Struct):
     method: Annotated[
         Literal["random", "latin_hypercube", "sobol"], Meta(description=f"one of {', '.join(SAMPLERS)}")
     ]
-    rows: Annotated[int, Meta(ge=1, le=_MOST, description="a number from 1 to 2^62")]
+    rows: Annotated[int, Meta(ge=1, le=_MOST_ROWS, description="a number from 1 to 2^62")]
 
 
 def read_plan(
@@ -96,7 +96,7 @@ def read_plan(
     if not groups and repeats == 1:
         raise DataError("axis: expected at least one axis, found none; add [[axis]].")
     plan = Plan(tuple(groups), repeats)
-    if math.prod(len(group) for group in groups) * repeats > _MOST:
+    if math.prod(len(group) for group in groups) * repeats > _MOST_ROWS:
         raise DataError("axis: these are more rows than can be counted; leave out some.")
     return plan
 

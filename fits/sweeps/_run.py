@@ -38,8 +38,8 @@ class Outcome:
 class _Progress:
     """Tells how far a sweep is, its rate, and the time that is left."""
 
-    def __init__(self, tell: Callable[[str], None], rows: int, done: int):
-        self._tell, self._rows, self._done, self._new = tell, rows, done, 0
+    def __init__(self, progress: Callable[[str], None], rows: int, done: int):
+        self._progress, self._rows, self._done, self._new = progress, rows, done, 0
         self._began = self._told = time.monotonic()
 
     def __call__(self, rows: int) -> None:
@@ -52,7 +52,7 @@ class _Progress:
             full = _BAR * self._done // self._rows
             left = _duration((self._rows - self._done) / rate)
             bar = "#" * full + "." * (_BAR - full)
-            self._tell(f"[{bar}] {self._done:,} of {self._rows:,} rows, {rate:.3g} rows/s, {left} left")
+            self._progress(f"[{bar}] {self._done:,} of {self._rows:,} rows, {rate:.3g} rows/s, {left} left")
 
 
 def run_sweep(

@@ -35,7 +35,7 @@ NOMINAL = "nominal"
 INITIAL = ("negative", "positive", "demagnetised")
 _LEVELS, _RANGE_V, _LOOPS_um, _SLOPE_um_per_V = 16, (0.0, 120.0), 5.0, 0.1
 # Share of the range over which the density of relays falls by e away from the diagonal.
-_NEAR = 0.2
+_DENSITY_WIDTH = 0.2
 _EXTREMES = 16
 
 
@@ -43,7 +43,7 @@ def nominal_stage() -> Stage:
     """A stage of common size: 0 to 120 V, 17 um, loops of some 15 %, 1 ms, 200 Hz and a damping ratio of 0.03."""
     lower, upper = (jnp.asarray(value) for value in _RANGE_V)
     i, j = np.tril_indices(_LEVELS)
-    density = np.exp(-(i - j) / (_LEVELS - 1) / _NEAR) * node_areas(_LEVELS)[i, j]
+    density = np.exp(-(i - j) / (_LEVELS - 1) / _DENSITY_WIDTH) * node_areas(_LEVELS)[i, j]
     grid = GridDensity(jnp.asarray(_LOOPS_um * density / density.sum()), lower, upper)
     slope = Reversible(jnp.full(_LEVELS, _SLOPE_um_per_V), lower, upper)
     return Stage.of(

@@ -34,7 +34,7 @@ ABOUT, RESULTS, LEDGER, TEXT, TABLE = "about.json", "results.zarr", "ledger", "s
 _STATUS = Output("status", "1", "of the row: 0 pending, 1 done, 2 failed", dtype="i1")
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 # A disk that is nearly full is full for others.
-_SHARE = 0.9
+_USABLE_SHARE = 0.9
 # What zarr calls a file before it is whole.
 _PARTIAL = "**/*.partial"
 
@@ -255,7 +255,7 @@ def _check_size(sweep: Sweep, out: str, anchor: Path) -> None:
     # The table holds all but the traces once more.
     needed = len(sweep.plan) * 2 * bytes_per_row(sweep)
     free = shutil.disk_usage(anchor).free
-    if needed > _SHARE * free:
+    if needed > _USABLE_SHARE * free:
         raise DataError(
             f"{out}: {len(sweep.plan):,} rows would take about {needed / 1e9:.3g} GB, and the disk has "
             f"{free / 1e9:.3g} GB; keep fewer rows or no traces, or choose another disk."

@@ -18,6 +18,8 @@ Place = Literal["driver", "hysteresis", "mechanics", "environment", "sensor", "t
 PLACES: tuple[Place, ...] = ("driver", "hysteresis", "mechanics", "environment", "sensor", "time", "noise")
 # What a residual is drawn against: the last is the time since the voltage last started, stopped or turned.
 View = Literal["voltage", "position", "velocity", "frequency", "time", "since_move"]
+# What would tell faults of the clocks apart, in the words of a report.
+_TIME_STAMPS = "raw time stamps of both clocks, which show a lost sample or a wrong rate at once."
 # What is measured of single samples and of the noise.
 Statistic = Literal["", "spikes", "rounding", "jitter", "band"]
 
@@ -110,8 +112,8 @@ class AbstractEffect(AbstractPart):
     view
         What the residual is drawn against in a report, so that the effect shows best.
     column
-        A further column that would tell it from others: `temperature_degC`, `monitor_V` (the voltage at the piezo),
-        `other_um` (the second axis), `time_stamps` of both clocks, or a sentence that names another. Empty for none.
+        A further column that would tell it from others: one of those in `fits/io/columns/`, such as
+        `temperature_degC`, or a sentence that names another. Empty for none.
     statistic
         For a fault of single samples or of the noise, which no model holds: what is measured of it. Empty for an
         effect that changes the mean.

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from microid._linear import Times
-from microid._modes import _plays
 from microid._param import param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, register
+from microid.hysteresis._play import _plays
 
 
 @register

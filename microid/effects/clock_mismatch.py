@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
+from microid.effects._base import _TIME_STAMPS, AbstractEffect, Place, Scales, View, _times_of, register
 from microid.effects._resample import _read_at
 
 
@@ -32,7 +32,7 @@ class ClockMismatch(AbstractEffect):
     experiment: ClassVar[str] = "A long record of a fast ramp that is repeated, with the time stamps of both clocks."
     source: ClassVar[str] = "quartz clocks differ by 10 to 200 ppm (estimate)"
     view: ClassVar[View] = "velocity"
-    column: ClassVar[str] = "time_stamps"
+    column: ClassVar[str] = _TIME_STAMPS
     rate_ppm: Float[Array, ""] = param(unit="ppm", scale=100.0)
 
     @classmethod

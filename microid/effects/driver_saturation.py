@@ -39,7 +39,7 @@ class DriverSaturation(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = ("sensor_nonlinearity", "slew_limit", "backlash")
     experiment: ClassVar[str] = "Two peaks of different height beyond the level, each held."
     source: ClassVar[str] = "rails at 95 to 103 % of the nominal range under load (estimate)"
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     rail_V: Float[Array, ""] = param(unit="V", scale=10.0)
 
     @classmethod
@@ -75,7 +75,7 @@ class LowerDriverSaturation(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = DriverSaturation.confusions
     experiment: ClassVar[str] = DriverSaturation.experiment
     source: ClassVar[str] = DriverSaturation.source
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     rail_V: Float[Array, ""] = param(unit="V", scale=10.0)
 
     @classmethod

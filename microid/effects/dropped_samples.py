@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
+from microid.effects._base import _TIME_STAMPS, AbstractEffect, Place, Scales, View, _times_of, register
 from microid.effects._resample import _read_at
 
 _INSTANTS = 12
@@ -44,7 +44,7 @@ class DroppedSamples(AbstractEffect):
     experiment: ClassVar[str] = "Raw time stamps or a counter of samples, and a fast ramp throughout."
     source: ClassVar[str] = "losses of up to 0.1 % of the samples under load (estimate)"
     view: ClassVar[View] = "velocity"
-    column: ClassVar[str] = "time_stamps"
+    column: ClassVar[str] = _TIME_STAMPS
     dropped_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
     after_s: Float[Array, ""] = param(unit="s", scale=1.0, lower=0.0)
 

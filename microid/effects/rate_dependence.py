@@ -58,7 +58,7 @@ class RateDependence(AbstractEffect):
         "Robert, Damjanovic & Setter, J. Appl. Phys. 90 (2001) 2459; Wolf, Sutor, Rupitsch & Lerch, Sens. Actuators "
         "A 172 (2011) 245; 2 to 10 % of the width per decade (estimate)"
     )
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     inner: AbstractPart
     gain_per_decade: Float[Array, ""] = param(unit="1", scale=0.05, lower=0.0)
     onset_V_per_s: Float[Array, ""] = param(unit="V/s", scale=100.0, lower=1e-3, upper=1e7)
@@ -106,7 +106,7 @@ class RelaxingHysteresis(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = RateDependence.confusions
     experiment: ClassVar[str] = RateDependence.experiment
     source: ClassVar[str] = RateDependence.source
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     inner: AbstractPart
     share: Float[Array, ""] = param(unit="1", scale=0.1, lower=0.0)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=0.01, lower=1e-6, upper=1e3)
@@ -158,7 +158,7 @@ class ActivatedSwitching(AbstractEffect):
     confusions: ClassVar[tuple[str, ...]] = RateDependence.confusions
     experiment: ClassVar[str] = RateDependence.experiment
     source: ClassVar[str] = "thermally activated domain walls, a law of Eyring's kind; onsets are estimates"
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     inner: AbstractPart
     lag_V: Float[Array, ""] = param(unit="V", scale=0.1, lower=0.0)
     onset_V_per_s: Float[Array, ""] = param(unit="V/s", scale=10.0, lower=1e-3, upper=1e7)

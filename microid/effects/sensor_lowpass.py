@@ -42,7 +42,7 @@ class SensorLowpass(AbstractEffect):
     experiment: ClassVar[str] = "A broadband signal beyond the corner, and a monitor of the piezo's voltage."
     source: ClassVar[str] = "first-order lag; corners of 10 Hz to 10 kHz in capacitive controllers (estimate)"
     view: ClassVar[View] = "velocity"
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     time_constant_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
 
     @classmethod

@@ -46,7 +46,7 @@ class SlewLimit(AbstractEffect):
     experiment: ClassVar[str] = "Steps of three heights, and a small chirp up to the same frequencies."
     source: ClassVar[str] = "Thorlabs piezo driver bandwidth tutorial: slew rate I_max / C, 5 to 150 V/ms"
     view: ClassVar[View] = "velocity"
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     limit_V_per_s: Float[Array, ""] = param(unit="V/s", scale=1e4, lower=0.0)
 
     @classmethod
@@ -98,7 +98,7 @@ class CurrentLimit(AbstractEffect):
     experiment: ClassVar[str] = SlewLimit.experiment
     source: ClassVar[str] = SlewLimit.source
     view: ClassVar[View] = "velocity"
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     inner: AbstractPart
     limit_V_per_s: Float[Array, ""] = param(unit="V/s", scale=1e4, lower=0.0)
 

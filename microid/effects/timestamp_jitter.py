@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, Statistic, View, _rate_of, register
+from microid.effects._base import _TIME_STAMPS, AbstractEffect, Place, Scales, Statistic, View, _rate_of, register
 
 
 @register
@@ -32,7 +32,7 @@ class TimestampJitter(AbstractEffect):
     experiment: ClassVar[str] = "Raw time stamps, and ramps at three rates."
     source: ClassVar[str] = "1 us with hardware timing to 1 ms with software timing (estimate)"
     view: ClassVar[View] = "velocity"
-    column: ClassVar[str] = "time_stamps"
+    column: ClassVar[str] = _TIME_STAMPS
     statistic: ClassVar[Statistic] = "jitter"
     jitter_s: Float[Array, ""] = param(unit="s", scale=1e-4, lower=0.0)
 

@@ -35,7 +35,7 @@ class TransportDelay(AbstractEffect):
     experiment: ClassVar[str] = "A small broadband signal up to several times the first resonance."
     source: ClassVar[str] = "dead time exp(-s d); 0.05 to 5 ms in controllers, 1 to 20 ms in polled loops (estimate)"
     view: ClassVar[View] = "velocity"
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     delay: ClassVar[str] = "delay_s"
     delay_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
 

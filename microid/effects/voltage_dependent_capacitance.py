@@ -43,7 +43,7 @@ class VoltageDependentCapacitance(AbstractEffect):
     experiment: ClassVar[str] = "Small chirps at four biases, and a monitor of the piezo's voltage."
     source: ClassVar[str] = "Noliac tutorial on heat dissipation; 20 to 50 % over the unipolar range (estimate)"
     view: ClassVar[View] = "velocity"
-    column: ClassVar[str] = "monitor_V"
+    column: ClassVar[str] = "drive_monitor_V"
     inner: AbstractPart
     slope: Float[Array, ""] = param(unit="1", scale=0.1, lower=-0.9, upper=0.9)
     middle_V: Float[Array, ""] = array()

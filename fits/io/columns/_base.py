@@ -34,6 +34,8 @@ class Column:
         Whether effects that use it do without where it is missing.
     title
         As in "the residual goes with the temperature"; a diagnosis does not look whether it does if empty.
+    use
+        Why the next experiment should record it: what follows its name in that advice.
     """
 
     quantity: Quantity
@@ -43,6 +45,7 @@ class Column:
     shown_if_constant: bool = False
     optional: bool = False
     title: str = ""
+    use: str = ""
 
     @property
     def key(self) -> str:

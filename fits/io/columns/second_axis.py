@@ -7,7 +7,7 @@ from fits.io._record import Record
 from fits.io.columns._base import Column, register
 
 # Correlation beyond which a column is another reading of the same.
-_ALIKE = 0.99
+_SAME_READING = 0.99
 
 
 def _recognised(name: str, values: FloatArray, record: Record) -> bool:
@@ -15,7 +15,17 @@ def _recognised(name: str, values: FloatArray, record: Record) -> bool:
     if not name.lower().endswith(("_um", "_nm", "_mm", "_m")) or name.lower().startswith("temp"):
         return False
     own = [record.time_s, record.voltage_V, record.displacement_um]
-    return not any(abs(np.corrcoef(values, one)[0, 1]) > _ALIKE for one in own if one is not None and np.ptp(one) > 0)
+    return not any(
+        abs(np.corrcoef(values, one)[0, 1]) > _SAME_READING for one in own if one is not None and np.ptp(one) > 0
+    )
 
 
-register(Column(Quantity("y_displacement", "um", LENGTH), "other_um", _recognised, title="second axis"))
+register(
+    Column(
+        Quantity("y_displacement", "um", LENGTH),
+        "other_um",
+        _recognised,
+        title="second axis",
+        use="the position of the second axis, without which its share of this one looks like a drift.",
+    )
+)

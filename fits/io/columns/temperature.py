@@ -26,11 +26,13 @@ def _first_smoothed(values: FloatArray, record: Record) -> FloatArray:
     return np.concatenate([[line(record.time_s[0])], values[1:]])
 
 
-register(
+TEMPERATURE = register(
     Column(
         Quantity("temperature", "degC", {"degC": 0, "C": 0, "K": 0}),
         recognised=_recognised,
         cleaned=_first_smoothed,
         title="temperature",
+        use="the temperature of the stage's body, which what the room does follows and what the command does "
+        "ignores.",
     )
-)
+).key

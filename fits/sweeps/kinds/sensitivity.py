@@ -16,6 +16,7 @@ from fits.io._errors import DataError, shown
 from fits.io._typed import typed
 from fits.machining._design import Design, paper_design
 from fits.machining._design_file import read_design
+from fits.machining._sensitivity import SHORT_um
 from fits.sweeps._devices import by_rows, place
 from fits.sweeps._toml import in_a_file
 from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows
@@ -23,8 +24,6 @@ from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Req
 _Tree = TypeVar("_Tree", m.Geometry, m.Actuation)
 KEYS = ("stage", "sensitivity")
 _BLOCK = 256
-# So short a stroke that all motions are in proportion to it, to the last digit.
-_SHORT_UM = 1e-6
 # Beyond it a bridge has no inclination left.
 _LARGEST_ANGLE_RAD = 1.5
 
@@ -138,9 +137,9 @@ def _evaluate(
         )
         constants = m.constants_of(changed, level, 1e3 * modulus, guides)
         stage = m.stage_constants(axis, changed, constants, piezos)
-        slopes = m.sensitivity(axis, changed, jnp.asarray(_SHORT_UM), constants).dimensions
+        slopes = m.sensitivity(axis, changed, jnp.asarray(SHORT_um), constants).dimensions
         dimensions = m.MOTIONS[axis].dimensions
-        changes = jnp.stack([slopes[name] for name in dimensions]) / _SHORT_UM * tolerance / stage.gain
+        changes = jnp.stack([slopes[name] for name in dimensions]) / SHORT_um * tolerance / stage.gain
         spread = 100 * jnp.sqrt(jnp.maximum(changes @ together @ changes, 0))
         return stage.gain, stage.stroke, stage.resonance_Hz, spread
 
