@@ -1,5 +1,6 @@
 """How often records that are not what they seem are told, on rigs that nobody has seen; clean ones beside them."""
 
+import os
 import re
 
 import numpy as np
@@ -9,7 +10,7 @@ from _wrong_records import TRUTH, bench, delayed, in_ms, joined, read, stuck, th
 
 import fits
 
-RIGS = 10
+RIGS = int(os.environ.get("MICROID_RIGS", 10))
 NOISE_UM = 0.05
 ALARMS = r"BEFORE|AFTER|stuck|outliers|another unit|in ms|no resonance|too slow|one hysteresis|something changed"
 
@@ -32,7 +33,11 @@ def cases(rig, rng):
     yield "20 samples late", lambda: stage(slow, delayed(fast, 20)), r"fast\.csv: .* AFTER"
     yield "1 sample late", lambda: stage(slow, delayed(fast, 1)), r"fast\.csv: .* AFTER"
     yield "3 samples early", lambda: stage(slow, delayed(fast, -3)), r"fast\.csv: .* BEFORE"
-    yield "thinned", lambda: stage(slow, thinned(fast, 37)), r"fast\.csv: sampled at 135\.1 Hz, .*too slow"
+    yield (
+        "thinned",
+        lambda: stage(slow, thinned(fast, 37)),
+        r"fast\.csv: sampled at 135\.1 Hz, .*(too slow|beyond half)",
+    )
     yield "ms called s", lambda: stage(in_ms(slow), in_ms(fast)), "in ms instead of s"
     # By chance two rigs may be twins: what is no more than 8 times the noise apart is not asked for.
     if np.std(slow.displacement_um - other.displacement_um) > 8 * NOISE_UM:
