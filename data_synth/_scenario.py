@@ -25,6 +25,8 @@ from data_synth._types import FloatArray, Initial
 
 # Of a run, and of all runs together: a CSV of 1 GB.
 _MOST_SAMPLES = 10_000_000
+# Samples times plays: as long as so many samples of the usual 400 plays take.
+_MOST_WORK = 400 * _MOST_SAMPLES
 # No record of a stage is sampled more slowly or faster.
 _RATES_Hz = (1e-3, 1e8)
 
@@ -86,7 +88,7 @@ class RigSettings:
             share = getattr(self, name)
             _require(share is None or 0 < share < 1, f"{name} must be between 0 and 1, got {share}")
         _require(2 <= self.relays <= 10_000, f"relays must be 2 to 10000, got {self.relays}")
-        _require(20 <= self.plays <= 100_000, f"plays must be 20 to 100000, got {self.plays}")
+        _require(20 <= self.plays <= 10_000, f"plays must be 20 to 10000, got {self.plays}")
         _require(0 <= self.roughness <= 1, f"roughness must be 0 to 1, got {self.roughness}")
 
     def draw(self, rng: np.random.Generator) -> Rig:
@@ -306,6 +308,11 @@ class Scenario:
                 raise ValueError(f"runs[{k}]: {error}") from error
             samples += len(played_V)
             _require(samples <= _MOST_SAMPLES, f"runs[{k}]: all runs take more than {_MOST_SAMPLES:,} samples")
+            _require(
+                self.rig.kind == "relays" or samples * self.rig.plays <= _MOST_WORK,
+                f"runs[{k}]: all runs take more than {_MOST_WORK // self.rig.plays:,} samples, the most with "
+                f"{self.rig.plays:,} plays: shorten them, or take fewer plays",
+            )
 
 
 def parse_scenario(text: str, file: str = "scenario") -> Scenario:

@@ -173,3 +173,14 @@ def test_the_quickstart_is_the_stage_of_the_paper():
     assert (bench.rig.lower_V, bench.rig.upper_V, bench.rig.stroke_um) == (0.0, 120.0, 40.0)
     assert bench.rig.loop_width == 0.13
     assert (scenario.sensor.noise_um, scenario.sensor.quantum_um) == (0.03, 0.001)
+
+
+def test_what_takes_hours_is_refused():
+    """Many samples of many plays; either alone is fine."""
+    many, long = GOOD.replace("relays = 60", 'kind = "plays"\nplays = 10_000'), ("10.0", "100_000.0")
+    ds.parse_scenario(many)
+    ds.parse_scenario(GOOD.replace(*long, 1))
+    with pytest.raises(
+        ds.ScenarioError, match=r"runs\[0\]: all runs take more than 400,000 samples, .* 10,000 plays"
+    ):
+        ds.parse_scenario(many.replace(*long, 1))

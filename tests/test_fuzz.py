@@ -222,13 +222,13 @@ def test_the_command_refuses_them_with_status_2_or_writes_finite_files(good, tmp
 
 
 def work(name, path):
-    """How much a file that was taken asks for: fine steps of a scenario, substeps of a stage."""
+    """How much a file that was taken asks for: fine steps of a scenario and its plays, substeps of a stage."""
     if name == "scenario.toml":
         scenario = data_synth.load_scenario(str(path))
         rng, rig = np.random.default_rng(0), scenario.rig
         plant = Plant() if scenario.plant is None else scenario.plant.draw(rng)
         counts = [len(each.voltage_V(rig.lower_V, rig.lower_V, rig.upper_V, rng)) for each in scenario.runs]
-        return sum(
+        return rig.plays * sum(
             n * refinement(plant, each.sample_rate_Hz, n) for n, each in zip(counts, scenario.runs, strict=True)
         )
     return fits.load_model(path).model.substeps if name == "stage.json" else 1
@@ -251,6 +251,8 @@ def test_study_in_this_process(good, tmp_path, seed):
                 usual[name, found] = max(usual[name, found], time.monotonic() - began)
     figures, faults, slow = collections.Counter(), [], []
     for k, name, path, rng in inputs(good, seed, STUDY, tmp_path):
+        if k % 5000 == 4999:
+            jax.clear_caches()  # what is compiled maps memory, of which a process may have only so many pieces
         began, again = time.monotonic(), copy.deepcopy(rng)
         try:
             found = tried(good, name, path, empty(out), rng)
