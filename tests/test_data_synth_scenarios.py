@@ -180,7 +180,5 @@ def test_what_takes_hours_is_refused():
     many, long = GOOD.replace("relays = 60", 'kind = "plays"\nplays = 10_000'), ("10.0", "100_000.0")
     ds.parse_scenario(many)
     ds.parse_scenario(GOOD.replace(*long, 1))
-    with pytest.raises(
-        ds.ScenarioError, match=r"runs\[0\]: all runs take more than 400,000 samples, .* 10,000 plays"
-    ):
+    with pytest.raises(ds.ScenarioError, match=r"runs\[0\]: all runs take more than 400,000 samples"):
         ds.parse_scenario(many.replace(*long, 1))
