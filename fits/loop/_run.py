@@ -125,13 +125,13 @@ def prepare_run(
     """Make a record ready whose command stays in a range; a `DataError` if nothing of it is left to fit.
 
     The memory before the first sample is `initial`, one of `INITIAL_STATES`, or `VIRGIN`; a fraction at the end is
-    held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Of the samples only those
-    that are `usable` may be fitted, shape `(n,)`. For the others see `Run`.
+    held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Samples that are not
+    `usable` are not known ones, shape `(n,)`. For the others see `Run`.
     """
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
-    unknown = initial in ("unknown", VIRGIN)
-    fitted = known.copy() if usable is None else known & usable
+    known = known if usable is None else known & usable
+    unknown, fitted = initial in ("unknown", VIRGIN), known.copy()
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False
     if holdout < 1 and fitted.sum() < _FEWEST:

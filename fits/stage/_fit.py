@@ -18,7 +18,7 @@ from fits.stage._alternative import Alternative, fit_without_outliers
 from fits.stage._checks import implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, fit_without_delays, refuse_delays, widen_for_delays
 from fits.stage._run import gain_ahead, place_of_hysteresis
-from fits.stage._solve import Solved
+from fits.stage._solve import Problem, Solved
 from fits.stage._steps import Plan, refine_problem, start_problem
 from fits.stage._summary import summarise
 from fits.stage._uncertainty import Precision
@@ -186,11 +186,19 @@ def solve_stage(
     plan = Plan(
         tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, accept_best
     )
-    problem = start_problem(plan, stage, levels, finest)
+    found = _refined(plan, start_problem(plan, stage, levels, finest))
+    settled = plan.behind(found.solved)
+    if settled is None:
+        return found
+    progress("again without what an unknown past reaches behind the lag")
+    return _refined(settled, found.solved.onward)
+
+
+def _refined(plan: Plan, problem: Problem) -> Solution:
     try:
         return Solution(*refine_problem(plan, problem), plan)
     except FitError as failure:
-        if accept_best:
+        if plan.accept_best:
             raise
         # What the best place leaves may show why.
         return Solution(*refine_problem(replace(plan, accept_best=True), problem), plan, failure)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
-from fits.loop._run import Run, command_range_V, prepare_run
+from fits.loop._run import VIRGIN, Run, command_range_V, known_samples, prepare_run
 from fits.loop._samples import Samples
 from fits.loop._uncertainty import refuse_outside
 from microid import (
@@ -31,6 +31,8 @@ from microid import (
 
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
+# Where a lag has come this close, as a fraction of the range, it no longer knows from where.
+_FORGOTTEN = 1e-3
 
 
 def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
@@ -116,12 +118,31 @@ def joined(parts: Sequence[Any]) -> LinearSystem | None:
     return total
 
 
-def ahead(stage: Stage, place: int, samples: Samples) -> Float[Array, " m"]:
-    """Voltage that a part sees, at the refined times, in V, shape `(m,)`."""
-    signal = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
+def ahead(stage: Stage, place: int, samples: Samples, rest_V: float | None = None) -> Float[Array, " m"]:
+    """Voltage at a part after a rest at the first command, or at another, at the refined times, in V, `(m,)`."""
+    rest = samples.voltage_V[0] if rest_V is None else jnp.asarray(rest_V)
+    signal = Signal(samples.voltage_V, rest, stage.hold)
     for part in stage.parts[:place]:
         signal = part.run(samples.time_s, signal)
     return signal.values
+
+
+def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
+    """Mark what no longer depends on a past that is `initial` once the lag ahead of the hysteresis is known.
+
+    All of them, where less than half of those that are fitted would be left.
+    """
+    place, n = place_of_hysteresis(stage), len(run.record)
+    everything = np.ones(n, dtype=bool)
+    if not place or initial not in ("unknown", VIRGIN):
+        return everything
+    # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.
+    rests_V = run.lower_V / run.gain, run.upper_V / run.gain
+    low_V, high_V = (np.asarray(ahead(stage, place, run.samples, rest))[:: run.stride][:n] for rest in rests_V)
+    begun = int(np.argmax(np.abs(high_V - low_V) < _FORGOTTEN * (run.upper_V - run.lower_V)))
+    settled = np.arange(n) >= begun
+    settled[begun:] = known_samples(low_V[begun:], run.lower_V, run.upper_V, initial)
+    return settled if 2 * (settled & run.fitted).sum() > run.fitted.sum() else everything
 
 
 def range_of(stage: Stage) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from fits.stage._checks import (
     speed_Hz,
 )
 from fits.stage._moments import offsets_out
-from fits.stage._run import place_of_hysteresis, simulate_stage
+from fits.stage._run import place_of_hysteresis, settled_samples, simulate_stage
 from fits.stage._solve import Problem, Solved, solve_chain
 from fits.stage._start import measure_response, start_stages
 from fits.stage._uncertainty import Precision
@@ -45,7 +45,11 @@ _VANISHED, _RESTARTED = 1e-2, 0.3
 
 @dataclass(frozen=True)
 class Plan:
-    """What was asked for."""
+    """What was asked for.
+
+    The command of each run is so many s later as `shifts_s` say, and of each those samples are fitted that have
+    `settled`, shape `(n,)`; none and all by default.
+    """
 
     records: tuple[Record, ...]
     states: tuple[str, ...]
@@ -57,6 +61,7 @@ class Plan:
     hold: Hold
     accept_best: bool
     shifts_s: tuple[float, ...] = ()
+    settled: tuple[np.ndarray, ...] = ()
 
     def runs(self, stride: int) -> list[Run]:
         """The records, each interval divided into so many steps."""
@@ -65,11 +70,12 @@ class Plan:
 
     def run(self, k: int, stride: int, shift_s: float = 0.0) -> Run:
         """One of them, its command that much later."""
-        record, usable = self.records[k], None
+        record, usable = self.records[k], self.settled[k] if self.settled else None
         if shift_s:
             time = record.time_s - shift_s
             # Beyond the record's ends nobody knows the command.
-            usable = (time >= record.time_s[0]) & (time <= record.time_s[-1])
+            there = (time >= record.time_s[0]) & (time <= record.time_s[-1])
+            usable = there if usable is None else there & usable
             later = np.interp(time, record.time_s, record.voltage_V)
             record = replace(record, voltage_V=later, extra=dict(record.extra))
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
@@ -78,6 +84,17 @@ class Plan:
     def smoothed(self) -> "Plan":
         """The same without readings that jump out and back, of which a start must not be read off."""
         return replace(self, records=tuple(map(without_impulses, self.records)))
+
+    def behind(self, solved: Solved) -> "Plan | None":
+        """The same without what an unknown past reaches behind the lag that was found; None where that is nothing.
+
+        The hysteresis is driven by what lags the command: it turns later, and short of the command's ends.
+        """
+        settled = [settled_samples(solved.stage, *each) for each in zip(solved.runs, self.states, strict=True)]
+        lost = [run.fitted & ~own for run, own in zip(solved.runs, settled, strict=True)]
+        if not any(one.any() for one in lost):
+            return None
+        return replace(self, settled=tuple(settled))
 
     def shifted(self, shifts_s: np.ndarray) -> "Plan":
         """The same with the command of each run that much later, in s, shape `(runs,)`."""
