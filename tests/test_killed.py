@@ -112,6 +112,31 @@ def test_files_that_belong_together_are_whole_at_any_moment(tmp_path, rng, sent,
     assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 4 + 7 * 3
 
 
+# A class that is told its name wraps what is raised meanwhile in another exception.
+IMPORTED = """
+import os, time
+
+class Slow:
+    def __set_name__(self, owner, name):
+        os.kill(os.getpid(), int(os.environ["SENT"]))
+        time.sleep(30)
+
+class Named:
+    slow = Slow()
+"""
+
+
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_request_to_end_during_an_import_ends_in_a_sentence(tmp_path, sent):
+    (tmp_path / "imported.py").write_text(IMPORTED)
+    program = "from fits.cli._common import heed_signals; heed_signals(); import imported"
+    process = begin("-c", program, cwd=tmp_path, env={"SENT": str(int(sent))})
+    _, stderr = process.communicate()
+    assert process.returncode == 128 + sent
+    said = "Terminated" if sent == signal.SIGTERM else "Interrupted"
+    assert stderr == f"{said}: no unfinished file was left.\n"
+
+
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     """A folder with records, a model, a sweep and a cache of compiled functions, and what the commands say of it."""

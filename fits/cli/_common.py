@@ -3,6 +3,7 @@
 Of other packages only click is imported before a command runs, so that help does not wait for JAX.
 """
 
+import contextlib
 import errno
 import functools
 import os
@@ -10,7 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from types import SimpleNamespace
+from types import FrameType, SimpleNamespace
 from typing import Any, NoReturn
 
 import click
@@ -20,7 +21,8 @@ from fits.io._file_set import discard_all
 from fits.io._printable import printable
 
 # Signals that ask the command to end.
-_SIGNALS = ("SIGTERM", "SIGHUP")
+_SIGNALS = ("SIGTERM", "SIGHUP", "SIGINT")
+NOTHING_LEFT = "no unfinished file was left"
 _AGAIN_s = 0.05
 
 
@@ -41,14 +43,36 @@ class Terminated(KeyboardInterrupt):
 def heed_signals() -> None:
     """Let a request to end clean up as Ctrl-C does; one that is ignored, as under `nohup`, stays ignored."""
 
-    def stop(number: int, _: object) -> None:
-        raise Terminated(number)
+    def stop(number: int, frame: FrameType | None) -> None:
+        request = KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)
+        if not _is_importing(frame):
+            raise request
+        # What is being imported may wrap an exception in another, or end in C++ with a crash.
+        try:
+            stopped(request, NOTHING_LEFT)
+        except Stopped as end:
+            leave(end)
 
     for name in _SIGNALS:
         number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+        if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, stop)
     sys.unraisablehook = _again
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Whether a module is being imported in a frame, or in one that called it."""
+    while frame is not None and frame.f_globals.get("__name__") != "importlib._bootstrap":
+        frame = frame.f_back
+    return frame is not None
+
+
+def leave(stop: "Stopped") -> NoReturn:
+    """End at once: all that is kept is written, and threads that still compile crash an interpreter taken down."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, AttributeError):
+            stream.flush()
+    os._exit(int(str(stop.code)))
 
 
 def _again(lost: Any) -> None:
@@ -100,7 +124,7 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
         try:
             command(Given(**options))
         except KeyboardInterrupt as stop:
-            stopped(stop, "no unfinished file was left")
+            stopped(stop, NOTHING_LEFT)
         except DataError as error:
             sentence = printable(" ".join(str(error).split()))
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)

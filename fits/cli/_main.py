@@ -3,10 +3,8 @@
 Only the standard library and click are imported before a command runs.
 """
 
-import contextlib
 import importlib
 import io
-import os
 import pkgutil
 import sys
 from typing import Any
@@ -14,7 +12,7 @@ from typing import Any
 import click
 
 import fits.cli
-from fits.cli._common import Stopped, heed_signals, stopped, system_refuses
+from fits.cli._common import NOTHING_LEFT, Stopped, heed_signals, leave, stopped, system_refuses
 from fits.io._errors import without_middle
 
 
@@ -67,15 +65,11 @@ def main() -> None:
         try:
             cli(prog_name="microid")
         except KeyboardInterrupt as stop:
-            stopped(stop, "no unfinished file was left")
+            stopped(stop, NOTHING_LEFT)
         except OSError as error:
             system_refuses(error)
     except Stopped as stop:
-        # All that is kept is written. Threads that still compile crash an interpreter that is taken down.
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, AttributeError):
-                stream.flush()
-        os._exit(int(str(stop.code)))
+        leave(stop)
 
 
 def _bear_any_text() -> None:
