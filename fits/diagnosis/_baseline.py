@@ -147,7 +147,7 @@ def fit_baseline(
     stride = solved.runs[0].stride
 
     def prepared(many: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
-        held = _prepared(aside, range_V, initial, 0.0, many, hold)
+        held = _prepared(aside, range_V, initial, 0.0, many, hold, estimated=False)
         return _prepared(records, range_V, initial, holdout, many, hold), held
 
     # What a step starts is over soon, and slow runs sample it sparsely.
@@ -183,9 +183,10 @@ def _prepared(
     holdout: float,
     stride: int,
     hold: Hold = "first",
+    estimated: bool = True,
 ) -> tuple[Run, ...]:
     settings = range_V, initial, holdout, stride
-    return tuple(prepare_run(record, *settings, hold=hold) for record in records)
+    return tuple(prepare_run(record, *settings, hold=hold, estimated=estimated) for record in records)
 
 
 def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:
@@ -214,6 +215,9 @@ def _static(
     stage = Stage.of(hysteresis=grid.model(columns, np.zeros(())))
     chain = Chain(Fixed(stage), 0, grid)  # type: ignore[arg-type]
     prior = np.asarray(roughness(grid.levels).precision(tried.solution.hyper)) / stroke**2
-    ready, held = _prepared(records, range_V, initial, holdout, 1), _prepared(aside, range_V, initial, 0.0, 1)
+    ready, held = (
+        _prepared(records, range_V, initial, holdout, 1),
+        _prepared(aside, range_V, initial, 0.0, 1, estimated=False),
+    )
     same = (ready, held) * 4
     return Baseline(chain, np.zeros(0), columns, prior, stroke, range_V, *same, dynamic=False, remarks=remarks)

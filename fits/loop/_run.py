@@ -51,7 +51,8 @@ class Run:
     unknown past, but for a constant, and `fitted` those of them that are not held out, shape `(n,)`; `weight` is that
     of each in the sum of squares, None where all count alike. For a stage the intervals are divided into `stride`
     steps, between samples the command runs as `hold` says (see `Stage`), and the stage may have been `moving` when
-    the record began.
+    the record began. Where an unknown past is estimated, all samples are known ones; it no longer matters from the
+    first of the `ends_V` on.
     """
 
     record: Record
@@ -65,6 +66,7 @@ class Run:
     stride: int = 1
     hold: Hold = "first"
     moving: bool = False
+    ends_V: tuple[float, float] | None = None
 
     @property
     def displacement_um(self) -> np.ndarray:
@@ -101,7 +103,7 @@ class Run:
     @cached_property
     def samples(self) -> Samples:
         """The run padded and refined in time, as the fit of a stage needs it."""
-        return refine(self.record, self.fit_weight, self.start, self.stride, self.moving, self.hold)
+        return refine(self.record, self.fit_weight, self.start, self.stride, self.moving, self.hold, self.ends_V)
 
     def weighed(self, residual_um: np.ndarray) -> np.ndarray:
         """Make a residual as large as it counts, shape `(n,)`."""
@@ -121,15 +123,21 @@ def prepare_run(
     gain: float | None = 1.0,
     hold: Hold = "first",
     usable: np.ndarray | None = None,
+    estimated: bool = False,
 ) -> Run:
     """Make a record ready whose command stays in a range; a `DataError` if nothing of it is left to fit.
 
     The memory before the first sample is `initial`, one of `INITIAL_STATES`, or `VIRGIN`; a fraction at the end is
     held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Samples that are not
-    `usable` are not known ones, shape `(n,)`. For the others see `Run`.
+    `usable` are not known ones, shape `(n,)`; nor are those with an unknown past, unless that is `estimated`.
+    For the others see `Run`.
     """
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
+    ends_V = None
+    if estimated and not known.all():
+        near = _END_SHARES[-1] * (upper - lower) if initial == "unknown" else -np.inf
+        ends_V, known = (lower + near, upper - near), np.ones(n, dtype=bool)
     known = known if usable is None else known & usable
     unknown, fitted = initial in ("unknown", VIRGIN), known.copy()
     if holdout > 0:
@@ -143,7 +151,9 @@ def prepare_run(
     ahead = 1.0 if gain is None else gain
     lower, upper = ahead * lower, ahead * upper
     start = initial_state(initial, lower, upper)
-    return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown)
+    if ends_V is not None:
+        ends_V = ahead * ends_V[0], ahead * ends_V[1]
+    return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown, ends_V)
 
 
 def command_range_V(records: Sequence[Record]) -> tuple[float, float]:

@@ -26,7 +26,8 @@ class Samples(eqx.Module):
     """A run of `n` samples, padded, with `m = (n - 1) stride + 1` steps.
 
     `time_s` is the one interval between steps where they are even. `weight` is that of each sample in the sum of
-    squares, 0 where it is not fitted. `moving` says whether the stage may have been moving when the record began.
+    squares, 0 where it is not fitted. `moving` says whether the stage may have been moving when the record began, and
+    `ends_V` at which voltages an unknown past of its hysteresis no longer matters; None where it is not estimated.
     `beside` holds further columns under the names of `columns_beside`.
     """
 
@@ -38,9 +39,18 @@ class Samples(eqx.Module):
     stride: int = eqx.field(static=True)
     moving: bool = eqx.field(static=True)
     beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
+    ends_V: Float[Array, " 2"] | None = None
 
 
-def refine(record: Record, weight: np.ndarray, start: Staircase, stride: int, moving: bool, hold: Hold) -> Samples:
+def refine(
+    record: Record,
+    weight: np.ndarray,
+    start: Staircase,
+    stride: int,
+    moving: bool,
+    hold: Hold,
+    ends_V: tuple[float, float] | None = None,
+) -> Samples:
     """Fill up a record, divide its intervals into steps, and take a displacement that it lacks for zero."""
     refuse_many_steps(record, stride)
     n, time_s = len(record), record.time_s
@@ -63,6 +73,7 @@ def refine(record: Record, weight: np.ndarray, start: Staircase, stride: int, mo
         stride=stride,
         moving=moving,
         beside={name: jnp.asarray(np.interp(share, np.arange(n), v)) for name, v in columns_beside(record).items()},
+        ends_V=None if ends_V is None else jnp.asarray(ends_V),
     )
 
 

@@ -17,6 +17,7 @@ from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import VIRGIN, Run, command_range_V, known_samples, prepare_run
 from fits.loop._samples import Samples
 from fits.loop._uncertainty import refuse_outside
+from fits.stage._past import past_columns
 from microid import (
     AbstractEffect,
     AbstractHysteresis,
@@ -42,13 +43,16 @@ def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
 
 
 def nuisance_columns(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
-    """What a run's nuisance parameters add, shape `(n, k)`: an offset in um, and how the stage moved before.
+    """What a run's nuisance parameters add, `(n, k)`: an offset in um, its past, and how the stage moved before.
 
     The latter are the free motions of what follows the hysteresis, or of the whole chain without one. A voltage at
     the piezo that still settles when the record begins is not among them.
     """
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
+    if samples.ends_V is not None and place is not None:
+        past = past_columns(ahead(stage, place, samples)[:: samples.stride], samples.ends_V)
+        offset = jnp.concatenate([offset, past], axis=1)
     system = joined(stage.parts[0 if place is None else place + 1 :])
     if not samples.moving or system is None or system.order == 0:
         return offset

@@ -1,0 +1,71 @@
+"""The unknown past of a run against relays in random states."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fits.stage._past import past_columns
+
+LEVELS = 120
+
+
+def relays(voltage, state, weight, on_V, off_V):
+    """The sum of relays, one loop in Python over the samples."""
+    out = np.empty(len(voltage))
+    for k, value in enumerate(voltage):
+        state = np.where(value >= on_V, 1.0, np.where(value <= off_V, -1.0, state))
+        out[k] = weight @ state
+    return out
+
+
+def half_plane(rng):
+    """Relays over 0 to 1 V, and a smooth density that decays with their width and varies with their bias."""
+    level = (np.arange(LEVELS) + 0.5) / LEVELS
+    on_V, off_V = (one.ravel() for one in np.meshgrid(level, level, indexing="ij"))
+    inside = on_V > off_V
+    on_V, off_V = on_V[inside], off_V[inside]
+    weight = np.exp(-(on_V - off_V) / 0.3) * (1 + 0.5 * np.sin(4 * (on_V + off_V) + rng.uniform(0, 6)))
+    return on_V, off_V, weight / weight.sum()
+
+
+def grown(n, start):
+    """A sine whose amplitude grows, so that it goes a little farther each time."""
+    phase = np.linspace(0, 24 * np.pi, n)
+    return (
+        0.5 + (start - 0.5) * np.cos(phase) + (0.5 - abs(start - 0.5)) * np.linspace(0, 1, n) ** 0.7 * np.sin(phase)
+    )
+
+
+WAYS = {
+    "up first": lambda n: np.interp(np.linspace(0, 4, n), [0, 1, 2, 3, 4], [0.3, 0.9, 0.1, 0.9, 0.3]),
+    "down first": lambda n: np.interp(np.linspace(0, 4, n), [0, 1, 2, 3, 4], [0.6, 0.2, 0.8, 0.4, 0.8]),
+    "ever farther": lambda n: grown(n, 0.5),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_relays_not_yet_swept_add_what_the_columns_span(rng, way):
+    on_V, off_V, weight = half_plane(rng)
+    # Not on a level, so that no relay switches on the spot.
+    voltage = WAYS[way](4000) + 1e-6
+    swept = np.where(voltage[0] >= on_V, 1.0, -1.0)
+    known = (on_V <= voltage[0]) | (off_V >= voltage[0])
+    # Whatever turns it went through before: states that vary smoothly over the half-plane.
+    before = np.clip(3 * np.sin(5 * on_V - 3 * off_V + rng.uniform(0, 6)), -1, 1)
+    past = relays(voltage, np.where(known, swept, before), weight, on_V, off_V)
+    plain = relays(voltage, np.where(known, swept, -1.0), weight, on_V, off_V)
+    columns = np.asarray(past_columns(jnp.asarray(voltage), jnp.asarray([-np.inf, np.inf])))
+    basis = np.concatenate([columns, np.ones((len(voltage), 1))], axis=1)
+    difference = past - plain
+    left = difference - basis @ np.linalg.lstsq(basis, difference, rcond=None)[0]
+    assert np.std(difference) > 0.01
+    # What is left is the relays' own coarseness, and what a sum of two functions misses.
+    assert np.std(left) < 0.05 * np.std(difference)
+
+
+def test_the_past_ends_at_an_end_of_the_range(rng):
+    voltage = WAYS["up first"](400)
+    columns = np.asarray(past_columns(jnp.asarray(voltage), jnp.asarray([0.0, 0.85])))
+    reached = int(np.argmax(voltage >= 0.85))
+    assert np.all(columns[reached:] == 0)
+    assert np.linalg.matrix_rank(columns[:reached]) > 3
