@@ -15,7 +15,6 @@ from fits.diagnosis._effects import Law
 from fits.diagnosis._extension import Compared, gain_of, predicts_worse, shared_effects
 from fits.diagnosis._prepare import HOLDS, _covered
 from fits.diagnosis._protocol import _regressed, _stretches_at_rest
-from fits.loop._run import VIRGIN
 from microid.effects import EFFECTS
 
 
@@ -155,11 +154,8 @@ def asked(monkeypatch):
 
         return Prepared(reading, baseline, projector=projector, doubted=answer.get("doubted", False), **parts)
 
-    def select(bench, projector, probes, false_alarm, rng, progress, guessed):
+    def select(bench, projector, probes, false_alarm, rng, progress):
         answer = log.answers[len(log.readings) - 1]
-        if answer.get("virgin"):
-            assert guessed
-            return None
         model = SimpleNamespace(is_noise=lambda _: answer.get("noise", False), change_um=())
         causes = [SimpleNamespace(z=z) for z in answer.get("z", ())]
         return SimpleNamespace(causes=causes, model=model, projector=None, left_um=answer.get("left", 1.0), of=answer)
@@ -182,15 +178,8 @@ def test_a_plain_answer_is_taken(asked):
     answer = {"z": (9.0,)}
     ready, kept, (reading,) = asked(answer)
     assert kept is answer
-    assert (reading.fraction, reading.initial, reading.guessed, reading.holds) == (0.2, "unknown", True, HOLDS)
+    assert (reading.fraction, reading.initial, reading.holds) == (0.2, "unknown", HOLDS)
     assert ready.baseline.remarks == ("said",)
-
-
-def test_an_initial_curve_is_left_out(asked):
-    last = {"z": (9.0,)}
-    _, kept, (first, second) = asked({"virgin": True}, last)
-    assert kept is last
-    assert (first.initial, second.initial, second.guessed) == ("unknown", VIRGIN, False)
 
 
 @pytest.mark.parametrize("better", [True, False])
@@ -199,16 +188,15 @@ def test_steps_and_curves_are_doubted_where_they_leave_more(asked, better):
     _, kept, (_, reading) = asked(first, lines)
     assert reading.holds == HOLDS[:1]
     assert kept is (lines if better else first)
-    # Noise leaves no doubt, nor is any left where lines begin on an initial curve.
+    # Noise leaves no doubt.
     assert asked(first | {"noise": True})[1]["doubted"]
-    assert asked(first, {"virgin": True})[1] is first
 
 
 @pytest.mark.parametrize("z", [20.0, 5.0])
 def test_what_was_held_out_is_used_where_only_it_shows_a_cause(asked, z):
     first, whole = {"error": 3.0}, {"z": (z,)}
     ready, kept, (_, reading) = asked(first, whole)
-    assert (reading.fraction, reading.guessed) == (0.0, False)
+    assert reading.fraction == 0.0
     assert kept is (whole if z > 8 else first)
     assert any("not measured on new data" in words for words in ready.baseline.remarks) == (z > 8)
     # It is not where noise explains it, a cause was found, or whole runs are held out.

@@ -54,18 +54,10 @@ def test_relays_not_yet_swept_add_what_the_columns_span(rng, way):
     before = np.clip(3 * np.sin(5 * on_V - 3 * off_V + rng.uniform(0, 6)), -1, 1)
     past = relays(voltage, np.where(known, swept, before), weight, on_V, off_V)
     plain = relays(voltage, np.where(known, swept, -1.0), weight, on_V, off_V)
-    columns = np.asarray(past_columns(jnp.asarray(voltage), jnp.asarray([-np.inf, np.inf])))
+    columns = np.asarray(past_columns(jnp.asarray(voltage)))
     basis = np.concatenate([columns, np.ones((len(voltage), 1))], axis=1)
     difference = past - plain
     left = difference - basis @ np.linalg.lstsq(basis, difference, rcond=None)[0]
     assert np.std(difference) > 0.01
     # What is left is the relays' own coarseness, and what a sum of two functions misses.
     assert np.std(left) < 0.05 * np.std(difference)
-
-
-def test_the_past_ends_at_an_end_of_the_range(rng):
-    voltage = WAYS["up first"](400)
-    columns = np.asarray(past_columns(jnp.asarray(voltage), jnp.asarray([0.0, 0.85])))
-    reached = int(np.argmax(voltage >= 0.85))
-    assert np.all(columns[reached:] == 0)
-    assert np.linalg.matrix_rank(columns[:reached]) > 3

@@ -33,6 +33,7 @@ from fits.diagnosis._result import Diagnosis, Gain, RunView, Step, Test
 from fits.diagnosis._select import Selection
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
+from fits.loop._run import known_samples
 from microid.effects import card_of
 
 # Causes that explain less than this part of what is reproducible are not named: the true ones are not in the library.
@@ -270,12 +271,10 @@ def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
     said = [warning for record in records for warning in record.warnings]
     said += [*baseline.remarks, *ready.faults.remarks]
     for run in baseline.runs:
-        lost = int(np.sum(~run.known))
-        if lost:
+        if run.has_past and not known_samples(run.record.voltage_V, *baseline.range_V).all():
             said.append(
-                f"{run.record.source}: the first {lost} samples depend on what the rig went through before and were "
-                "not used, so that an unknown initial state is not taken for an effect; state it with --initial to "
-                "have it tested"
+                f"{run.record.source}: what the rig went through before is unknown and estimated beside the rest, so "
+                "that it is not taken for an effect; state it with --initial to have it tested"
             )
     if ONE_WAY not in said and not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
         said.append("nothing was held out, so the gain is not measured: hold out a part, or a run with --holdout")

@@ -16,7 +16,6 @@ from fits.diagnosis._select import Selection, select
 from fits.io._errors import DataError
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import Record, refuse_repeats
-from fits.loop._run import VIRGIN
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
@@ -32,10 +31,10 @@ _ALL = (
 
 @dataclass(frozen=True)
 class _Answer:
-    """What a selection found in one reading of the records; None where runs begin on an initial curve."""
+    """What a selection found in one reading of the records."""
 
     ready: Prepared
-    found: Selection | None
+    found: Selection
 
 
 @dataclass(frozen=True)
@@ -50,35 +49,27 @@ class _Question:
 
 
 def _not_in_lines(answer: _Answer) -> bool:
-    found = answer.found
-    return found is not None and answer.ready.doubted and not found.model.is_noise(found.projector)
+    return answer.ready.doubted and not answer.found.model.is_noise(answer.found.projector)
 
 
 def _leaves_less(other: _Answer, answer: _Answer) -> bool:
-    return other.found is not None and answer.found is not None and other.found.left_um < answer.found.left_um
+    return other.found.left_um < answer.found.left_um
 
 
 def _held_out_is_unlike(answer: _Answer) -> bool:
     found, ready = answer.found, answer.ready
-    if found is None or found.causes or ready.reading.aside:
+    if found.causes or ready.reading.aside:
         return False
     return ready.projector.held_out_error(found.model.change_um) > _UNLIKE
 
 
 def _finds_a_cause(other: _Answer, _: _Answer) -> bool:
-    causes = other.found.causes if other.found is not None else ()
-    return max((cause.z for cause in causes), default=0.0) > _STRONG
+    return max((cause.z for cause in other.found.causes), default=0.0) > _STRONG
 
 
 def _questions() -> tuple[_Question, ...]:
     """What is asked of each answer, in this order."""
     return (
-        _Question(
-            "asking again without the initial curve of each run",
-            lambda answer: answer.found is None,
-            {"initial": VIRGIN, "guessed": False},
-            lambda *_: True,
-        ),
         _Question(
             "asking again with the command in lines between samples",
             _not_in_lines,
@@ -88,7 +79,7 @@ def _questions() -> tuple[_Question, ...]:
         _Question(
             "asking again with what was held out, which noise does not explain",
             _held_out_is_unlike,
-            {"aside": (), "fraction": 0.0, "guessed": False, "holds": HOLDS},
+            {"aside": (), "fraction": 0.0, "holds": HOLDS},
             _finds_a_cause,
             _ALL,
         ),
@@ -170,9 +161,9 @@ def diagnose(
         ready = prepare_diagnosis(reading, progress)
         progress(Step.SELECTION)
         stage = ready.bench, ready.projector, ready.probes
-        return _Answer(ready, select(*stage, false_alarm, rng, progress, reading.guessed))
+        return _Answer(ready, select(*stage, false_alarm, rng, progress))
 
-    best = answer(Reading(records, aside, fraction, initial, guessed=initial == "unknown"))
+    best = answer(Reading(records, aside, fraction, initial))
     for question in _questions():
         if not question.arises(best):
             continue
@@ -182,6 +173,5 @@ def diagnose(
             baseline = other.ready.baseline
             said = (*baseline.remarks, question.remark) if question.remark else baseline.remarks
             best = replace(other, ready=replace(other.ready, baseline=replace(baseline, remarks=said)))
-    assert best.found is not None
     request = Request(duration_s, limits, margin)
     return conclude(best.ready, best.found, [*records, *aside], false_alarm, progress, request)

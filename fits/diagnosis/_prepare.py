@@ -9,13 +9,12 @@ import numpy as np
 from fits.diagnosis._baseline import Baseline, along_curves, fit_baseline, simulate
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
-from fits.diagnosis._projector import Projector, learn_roughness, orthonormal
-from fits.diagnosis._protocol import held_gain, is_virgin, virgin_columns
+from fits.diagnosis._projector import Projector, learn_roughness
+from fits.diagnosis._protocol import held_gain
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
-from fits.diagnosis._score import Probe, applicable, probes_of, rescore, scales_of, score
+from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
 from fits.io._record import Record
-from fits.loop._run import VIRGIN
 from microid import EFFECTS, Hold, Scales, Stage
 
 # Curves, steps or a delay that lower the sum of squares by less than this, in noise variances, are not looked into.
@@ -47,10 +46,6 @@ _CLOSED = (
     "a controller held the displacement, and what bends a loop cannot be told from a density there, which is asked "
     "only along the way that it took"
 )
-_FIRST = (
-    "the voltage's first way through its range differs from later ones, as an initial magnetisation curve does after "
-    "a rest or a demagnetisation, and was not used"
-)
 # Part of its range through which the voltage goes up, and down, in what is fitted.
 _HALF = 0.5
 ONE_WAY = (
@@ -65,15 +60,13 @@ class Reading:
     """How the records are read.
 
     The last `fraction` of each of the `records` is held out, and all of `aside`. `initial` is the memory before each
-    run, which is `guessed` until something says otherwise. `holds` are the ways in which the command may run between
-    samples, of which lines are the first.
+    run. `holds` are the ways in which the command may run between samples, of which lines are the first.
     """
 
     records: Sequence[Record]
     aside: Sequence[Record]
     fraction: float
     initial: str
-    guessed: bool
     holds: Sequence[Hold] = HOLDS
 
 
@@ -118,22 +111,17 @@ class _Fit:
     def probed(self) -> tuple[list[Probe], list[tuple[str, str]]]:
         return _probed(self.bench, self.scales)
 
-    @cached_property
-    def beside(self) -> np.ndarray:
-        """Orthonormal columns along which initial curves may differ from loops."""
-        return orthonormal(self.projector.off(virgin_columns(self.projector)))
-
     def remaining(self) -> float:
-        """Sum of squares that is left, whatever the initial curves are."""
+        """Sum of squares that is left."""
         left = self.projector.off(self.projector.residual)
-        return float(left @ left) - float(np.sum((self.beside.T @ left) ** 2))
+        return float(left @ left)
 
     def late(self) -> tuple[float, float]:
         """Decrease of that by a delay, and the delay in s."""
         left = self.projector.off(self.projector.residual)
         form = next(form for form in EFFECTS if form.delay)
         probes = list(probes_of(self.bench, form, self.scales))
-        scores = rescore(score(self.projector, probes, left), self.beside, left)
+        scores = score(self.projector, probes, left)
         if not scores:
             return 0.0, 0.0
         best = max(scores, key=lambda one: one.drop)
@@ -153,7 +141,6 @@ class _Fit:
         pairs = zip(curved, baseline.finest, strict=True)
         change = [simulate(smooth, curve) - simulate(stage, line) for curve, line in pairs]
         column, left = (self.projector.off(one) for one in (self.projector.join(change), self.projector.residual))
-        column, left = (one - self.beside @ (self.beside.T @ one) for one in (column, left))
         size = float(column @ column)
         along = float(column @ left)
         return along**2 / size if size > 0 and _NOTICEABLE * size < along else 0.0
@@ -167,11 +154,11 @@ class _Fit:
 def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prepared:
     """Fit the plain stage, learn the noise, and simulate every probe of every effect."""
     records, initial, fraction = reading.records, reading.initial, reading.fraction
-    said: tuple[str, ...] = (_FIRST,) if initial == VIRGIN else ()
+    said: tuple[str, ...] = ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, ONE_WAY)
 
-    def fitted(hold: Hold, initial: str) -> _Fit:
+    def fitted(hold: Hold) -> _Fit:
         regression = regress(fit_baseline(records, reading.aside, fraction, initial, progress, hold))
         faults = find_faults(regression)
         if not faults.repaired:
@@ -183,7 +170,7 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
         return _Fit(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
 
     progress(Step.BASELINE)
-    here = fitted("first", initial)
+    here = fitted("first")
     drop_programs(records)
     progress(Step.PROBES)
     doubted = False
@@ -196,16 +183,12 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
             drop_programs(records)
-            other = fitted(hold, initial)
+            other = fitted(hold)
             drop_programs(records)
             if not (_runs_along_curves(here, other) if hold == "smooth" else _is_held_in_steps(here, other, drop)):
                 continue
             doubted = doubted or drop < here.largest_z() ** 2
             here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
-        if initial == "unknown" and is_virgin(here.projector, here.largest_z()):
-            progress("fitting the plain stage again, without the initial curve of each run")
-            initial = VIRGIN
-            here, said = fitted(hold, initial), (*said, _FIRST)
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
         if drop > max(_LATE, (_ABOUT * here.largest_z()) ** 2) and late_s < _SKEW * here.scales.interval_s:

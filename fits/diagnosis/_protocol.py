@@ -1,4 +1,4 @@
-"""How runs were taken: from an initial magnetisation curve on, or under a controller that held the displacement."""
+"""Runs that were taken under a controller that held the displacement."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,23 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import EffectParameter, FoundCause
-from fits.diagnosis._score import evidence
 from fits.io._record import Record
-from fits.loop._run import VIRGIN, known_samples
 from fits.stats._metrics import TWO_SIDED_95
 from microid.effects import card_of
 
-# An initial curve is described by so many waves along the voltage.
-_WAVES = 12
-# It counts from this evidence on, in standard deviations.
-_EVIDENT = 5.5
-# It must have at least this share of the evidence of the best effect, too.
-_NEARLY = 0.8
-# The voltage must go up, and down, through so much of its range beside it.
-_WHOLE_RANGE = 1.0
 # A hold lasts so long and has so many samples.
 _LONG_s, _SAMPLES = 1.0, 200
 # Meanwhile the displacement keeps within this part of its range.
@@ -35,51 +23,6 @@ _AFTER = 8
 _BLOCKS, _DECADES = 24, 2.0
 # Part of the scatter about its mean that a line over the logarithm of time must explain.
 _STRAIGHT = 0.97
-
-
-def is_virgin(projector: Projector, highest: float, model: Refit | None = None) -> bool:
-    """Whether an initial magnetisation curve at the start of the runs explains about as much as anything else.
-
-    A stage that was at rest since it was made, or demagnetised, begins on a curve of its own. What it lacks of a loop
-    depends on nothing but how far the voltage has come. The `projector` is of a baseline fitted to runs whose state
-    before is unknown, and taken for saturated where they begin at an end of the range; `highest` is the evidence for
-    the best of all effects in standard deviations, and `model` holds the causes that are known already.
-    """
-    columns = virgin_columns(projector)
-    if columns.shape[1] == 0:
-        return False
-    columns = projector.off(columns)
-    if model is None:
-        residual = projector.off(projector.residual)
-    else:
-        residual, basis = model.residual, model.basis()
-        columns = columns - basis @ (basis.T @ columns)
-    z, _, _ = evidence(columns, residual, False)
-    return z > max(_EVIDENT, _NEARLY * highest)
-
-
-def virgin_columns(projector: Projector) -> np.ndarray:
-    """Signals along which initial curves may differ from loops, joined; none where too little is beside them."""
-    runs, range_V = projector.regression.baseline.runs, projector.regression.baseline.range_V
-    columns: list[np.ndarray] = []
-    none = [np.zeros(len(run.record)) for run in runs]
-    up_V = down_V = 0.0
-    for k, run in enumerate(runs):
-        voltage = run.record.voltage_V
-        strict = known_samples(voltage, *range_V, VIRGIN)
-        moves_V = np.diff(voltage)[(run.fitted & strict)[1:]]
-        up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
-        first = run.fitted & ~strict
-        if first.any():
-            gone = np.maximum.accumulate(np.abs(voltage - voltage[0]))
-            share = gone / max(float(gone[first].max()), 1e-300)
-            columns += [
-                projector.join([*none[:k], first * np.cos(np.pi * wave * share), *none[k + 1 :]])
-                for wave in range(_WAVES)
-            ]
-    if not columns or min(up_V, down_V) < _WHOLE_RANGE * (range_V[1] - range_V[0]):
-        return np.zeros((len(projector.residual), 0))
-    return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from fits.diagnosis._comparison import (
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import fit_jointly, is_smoothness_confirmed, refine, relearn_noise
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._protocol import is_virgin
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._score import Family, Probe, Scored, best_of, rescore, score
 from microid import EFFECTS
@@ -82,13 +81,11 @@ def select(
     false_alarm: float,
     rng: np.random.Generator,
     progress: Callable[[str], None],
-    guessed: bool = False,
     again: int = 2,
-) -> Selection | None:
+) -> Selection:
     """Add effects one at a time until chance explains the rest, take out what became unnecessary, and refine.
 
-    Where a cause passed for noise before, selection begins again beside less noise, so often at most. None where the
-    state before the runs was `guessed`, and runs that begin on an initial magnetisation curve explain what is left.
+    Where a cause passed for noise before, selection begins again beside less noise, so often at most.
     """
     plain = model = nothing(bench, projector)
     first_bench, first_projector = bench, projector
@@ -115,8 +112,6 @@ def select(
         sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
         if family.p(top / sigma) >= false_alarm:
             break
-        if guessed and causes and is_virgin(projector, top, model):
-            return None
         progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
         fitted = compare_rivals(bench, projector, model, open_, explained, _MOST_LAWS - len(causes))
         if not fitted:
@@ -147,8 +142,8 @@ def select(
         afresh = relearn_noise(first_projector, projector, model) if again else None
         if afresh is not None:
             # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
-            found = select(first_bench, afresh, probes, false_alarm, rng, progress, guessed, again - 1)
-            if found is None or (found.causes and is_smoothness_confirmed(found.projector, found.model)):
+            found = select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)
+            if found.causes and is_smoothness_confirmed(found.projector, found.model):
                 return found
             again = 0
         new = len(model.laws) - len(causes)

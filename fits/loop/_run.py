@@ -25,8 +25,6 @@ _END_SHARES = (1e-3, 3e-3, 1e-2)
 _FEWEST = 50
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
-VIRGIN = "virgin"
-"""As `unknown`, where relays that the range does not reach back may have any state, too."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,7 @@ class Run:
     unknown past, but for a constant, and `fitted` those of them that are not held out, shape `(n,)`; `weight` is that
     of each in the sum of squares, None where all count alike. For a stage the intervals are divided into `stride`
     steps, between samples the command runs as `hold` says (see `Stage`), and the stage may have been `moving` when
-    the record began. Where an unknown past is estimated, all samples are known ones; it no longer matters from the
-    first of the `ends_V` on.
+    the record began. It `has_past` where its unknown memory is estimated, so that all samples are known ones.
     """
 
     record: Record
@@ -66,7 +63,7 @@ class Run:
     stride: int = 1
     hold: Hold = "first"
     moving: bool = False
-    ends_V: tuple[float, float] | None = None
+    has_past: bool = False
 
     @property
     def displacement_um(self) -> np.ndarray:
@@ -103,7 +100,7 @@ class Run:
     @cached_property
     def samples(self) -> Samples:
         """The run padded and refined in time, as the fit of a stage needs it."""
-        return refine(self.record, self.fit_weight, self.start, self.stride, self.moving, self.hold, self.ends_V)
+        return refine(self.record, self.fit_weight, self.start, self.stride, self.moving, self.hold, self.has_past)
 
     def weighed(self, residual_um: np.ndarray) -> np.ndarray:
         """Make a residual as large as it counts, shape `(n,)`."""
@@ -127,19 +124,19 @@ def prepare_run(
 ) -> Run:
     """Make a record ready whose command stays in a range; a `DataError` if nothing of it is left to fit.
 
-    The memory before the first sample is `initial`, one of `INITIAL_STATES`, or `VIRGIN`; a fraction at the end is
-    held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Samples that are not
+    The memory before the first sample is `initial`, one of `INITIAL_STATES`; a fraction at the end is held out.
+    `gain` is None for a stage without a hysteresis, which no past is unknown of. Samples that are not
     `usable` are not known ones, shape `(n,)`; nor are those with an unknown past, unless that is `estimated`.
     For the others see `Run`.
     """
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
-    ends_V = None
-    if estimated and not known.all():
-        near = _END_SHARES[-1] * (upper - lower) if initial == "unknown" else -np.inf
-        ends_V, known = (lower + near, upper - near), np.ones(n, dtype=bool)
+    unknown = initial == "unknown"
+    has_past = estimated and unknown and gain is not None
+    if has_past:
+        known = np.ones(n, dtype=bool)
     known = known if usable is None else known & usable
-    unknown, fitted = initial in ("unknown", VIRGIN), known.copy()
+    fitted = known.copy()
     if holdout > 0:
         fitted[n - round(holdout * n) :] = False
     if holdout < 1 and fitted.sum() < _FEWEST:
@@ -151,9 +148,7 @@ def prepare_run(
     ahead = 1.0 if gain is None else gain
     lower, upper = ahead * lower, ahead * upper
     start = initial_state(initial, lower, upper)
-    if ends_V is not None:
-        ends_V = ahead * ends_V[0], ahead * ends_V[1]
-    return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown, ends_V)
+    return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown, has_past)
 
 
 def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
@@ -168,7 +163,7 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
     An unknown state is stood in for by negative saturation; the samples that would show the difference are not
     known ones.
     """
-    if name in ("negative", "unknown", VIRGIN):
+    if name in ("negative", "unknown"):
         return negative_saturation(lower_V)
     if name == "positive":
         return positive_saturation(lower_V, upper_V)
@@ -178,14 +173,14 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
 
 
 def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:
-    """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES` or `VIRGIN`.
+    """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES`.
 
     At an end of the range every relay is in a known state, if none lies beyond: one that a voltage within the range
     switches on and none switches off is on after the first loop, and may have been off before. Short of that, relays
     outside the extremes that this run itself reaches either never switch or switch on the way to them; once both
     have been visited they are a constant, which the run's own offset takes up.
     """
-    if initial not in ("unknown", VIRGIN):
+    if initial != "unknown":
         return np.ones(len(voltage), dtype=bool)
     highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
     found: list[np.ndarray] = []
@@ -194,7 +189,7 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
         saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
         own = near if found else 0.0
         both = (highest >= voltage.max() - own) & (lowest <= voltage.min() + own)
-        found.append(both if initial == VIRGIN else saturated | both)
+        found.append(saturated | both)
     return next(known for known in found if 2 * known.sum() >= found[-1].sum())
 
 

@@ -27,7 +27,7 @@ class Samples(eqx.Module):
 
     `time_s` is the one interval between steps where they are even. `weight` is that of each sample in the sum of
     squares, 0 where it is not fitted. `moving` says whether the stage may have been moving when the record began, and
-    `ends_V` at which voltages an unknown past of its hysteresis no longer matters; None where it is not estimated.
+    `has_past` whether the unknown memory of its hysteresis is estimated.
     `beside` holds further columns under the names of `columns_beside`.
     """
 
@@ -39,7 +39,7 @@ class Samples(eqx.Module):
     stride: int = eqx.field(static=True)
     moving: bool = eqx.field(static=True)
     beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
-    ends_V: Float[Array, " 2"] | None = None
+    has_past: bool = eqx.field(static=True, default=False)
 
 
 def refine(
@@ -49,7 +49,7 @@ def refine(
     stride: int,
     moving: bool,
     hold: Hold,
-    ends_V: tuple[float, float] | None = None,
+    has_past: bool = False,
 ) -> Samples:
     """Fill up a record, divide its intervals into steps, and take a displacement that it lacks for zero."""
     refuse_many_steps(record, stride)
@@ -73,7 +73,7 @@ def refine(
         stride=stride,
         moving=moving,
         beside={name: jnp.asarray(np.interp(share, np.arange(n), v)) for name, v in columns_beside(record).items()},
-        ends_V=None if ends_V is None else jnp.asarray(ends_V),
+        has_past=has_past,
     )
 
 

@@ -14,15 +14,9 @@ from jaxtyping import Array, Float
 _PIECES = 5
 
 
-def past_columns(voltage_V: Float[Array, " n"], ends_V: Float[Array, " 2"]) -> Float[Array, "n k"]:
-    """Signals of the unknown past of a hysteresis under a voltage, shape `(n, k)`.
-
-    At one of the `ends_V` of the range every relay is in a known state, and no past matters any more.
-    """
-    known = lax.cummax(((voltage_V <= ends_V[0]) | (voltage_V >= ends_V[1])).astype(voltage_V.dtype))
-    highest, lowest = lax.cummax(voltage_V), lax.cummin(voltage_V)
-    columns = [jnp.ones_like(voltage_V)[:, None], *map(_spline, (highest, lowest))]
-    return (1 - known)[:, None] * jnp.concatenate(columns, axis=1)
+def past_columns(voltage_V: Float[Array, " n"]) -> Float[Array, "n k"]:
+    """Signals of the unknown past of a hysteresis under a voltage, shape `(n, k)`."""
+    return jnp.concatenate([_spline(lax.cummax(voltage_V)), _spline(lax.cummin(voltage_V))], axis=1)
 
 
 def _spline(reached_V: Float[Array, " n"]) -> Float[Array, "n k"]:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
-from fits.loop._run import VIRGIN, Run, command_range_V, known_samples, prepare_run
+from fits.loop._run import Run, command_range_V, known_samples, prepare_run
 from fits.loop._samples import Samples
 from fits.loop._uncertainty import refuse_outside
 from fits.stage._past import past_columns
@@ -50,8 +50,8 @@ def nuisance_columns(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
     """
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
-    if samples.ends_V is not None and place is not None:
-        past = past_columns(ahead(stage, place, samples)[:: samples.stride], samples.ends_V)
+    if samples.has_past and place is not None:
+        past = past_columns(ahead(stage, place, samples)[:: samples.stride])
         offset = jnp.concatenate([offset, past], axis=1)
     system = joined(stage.parts[0 if place is None else place + 1 :])
     if not samples.moving or system is None or system.order == 0:
@@ -138,7 +138,7 @@ def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
     """
     place, n = place_of_hysteresis(stage), len(run.record)
     everything = np.ones(n, dtype=bool)
-    if not place or initial not in ("unknown", VIRGIN):
+    if not place or initial != "unknown":
         return everything
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.
     rests_V = run.lower_V / run.gain, run.upper_V / run.gain
