@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from optimistix import RESULTS
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
 
@@ -185,10 +184,10 @@ class Projector:
         precision = gram[:columns, :columns] - gram[:columns, columns:] @ follow
         precision = (precision + precision.T) / 2 + 1e-12 * np.diag(np.diagonal(precision))
         mean = baseline.columns_um + np.linalg.solve(precision, cross[:columns] - follow.T @ cross[columns:])
-        kept, result = non_negative(
+        kept, found = non_negative(
             Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
         )
-        if result != RESULTS.successful:
+        if not found:
             raise FitError(FitStatus.MAX_STEPS)
         others = alone - follow @ (np.asarray(kept) - baseline.columns_um)
         return others[coordinate], np.asarray(kept)

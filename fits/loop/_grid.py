@@ -2,15 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float, Int
-from optimistix import RESULTS
+from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import nnls
 
 from fits.loop._evidence import Posterior, effective, maximise_evidence, posterior_of, renew_noise
@@ -19,7 +16,7 @@ from fits.loop._prior import Hyper, interpolation, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
 from fits.stats._noise import shared_square
-from fits.stats._nonnegative import BlockPivoting
+from fits.stats._nonnegative import minimise_nonnegative
 from microid import Preisach
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
@@ -87,16 +84,14 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
         posterior = posterior_of(moments, rough, hyper)
     if np.all(np.asarray(posterior.mean) >= 0):
         return GridSolution(posterior.mean, posterior, hyper)
-    columns, result = non_negative(posterior)
-    if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
+    columns, found = non_negative(posterior)
+    if not found:
         raise FitError(FitStatus.MAX_STEPS)
-    if result != RESULTS.successful:
-        raise FitError(FitStatus.NONFINITE)
     return GridSolution(columns, posterior, hyper)
 
 
-def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
-    """Find the mode of the posterior among non-negative columns.
+def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
+    """Find the mode of the posterior among non-negative columns; and whether it was found.
 
     Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
     those ends up below zero, more are bounded. The answer is that of all bounds together. Active-set solvers such as
@@ -110,32 +105,30 @@ def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
         spread, precision, mean, unit = _marginal(posterior, jnp.asarray(order))
-        y, result = _pivot(precision, mean)
+        y, found = _pivot(precision, mean)
         columns = _follow(posterior, jnp.asarray(order), spread, precision, (y - mean, y), unit)
         left = np.asarray(columns) * scale
-        if result != RESULTS.successful:
+        if not found:
             return _one_by_one(posterior)
         if bounded == size or np.all(left >= -_ATOL):
-            return jnp.maximum(columns, 0), result
+            return jnp.maximum(columns, 0), True
         lowest = np.minimum(lowest, left)
         bounded *= 2
 
 
-def _one_by_one(posterior: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+def _one_by_one(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
     precision = np.asarray(posterior.precision)
-    over: Any = RESULTS.nonlinear_max_steps_reached
     if len(precision) > _MOST_COLUMNS:
-        return jnp.maximum(posterior.mean, 0), over
+        return jnp.maximum(posterior.mean, 0), False
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
-    done: Any = RESULTS.successful
     try:
         columns, _ = nnls(root, root @ (scale * np.asarray(posterior.mean)), maxiter=_STEPS_PER_COLUMN * len(scale))
     except RuntimeError:
-        return jnp.maximum(posterior.mean, 0), over
-    return jnp.asarray(columns / scale), done
+        return jnp.maximum(posterior.mean, 0), False
+    return jnp.asarray(columns / scale), True
 
 
 @eqx.filter_jit
@@ -156,18 +149,8 @@ def _marginal(
 
 
 @eqx.filter_jit
-def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Float[Array, " k"], RESULTS]:
-    solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
-    solution: Any = optx.minimise(
-        _distance,
-        solver,
-        jnp.maximum(mean, 0),
-        args=(precision, mean),
-        options={"hessian": precision},
-        max_steps=_STEPS,
-        throw=False,
-    )
-    return solution.value, solution.result
+def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Float[Array, " k"], Bool[Array, ""]]:
+    return minimise_nonnegative(precision, -(precision @ mean), jnp.maximum(mean, 0), _ATOL, _STEPS)
 
 
 @eqx.filter_jit
@@ -182,12 +165,6 @@ def _follow(
     """Move all columns along with the chosen ones; where a bound holds it holds exactly."""
     by, to = moved
     return (posterior.mean + spread @ (scale * (precision @ by))).at[which].set(to / scale)
-
-
-def _distance(y: Float[Array, " k"], args: tuple[Float[Array, "k k"], Float[Array, " k"]]) -> Float[Array, ""]:
-    precision, mean = args
-    off = y - mean
-    return off @ (precision @ off) / 2
 
 
 def grid_estimate(
