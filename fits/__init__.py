@@ -49,16 +49,12 @@ if TYPE_CHECKING:
     from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
     from fits.report._fit import describe, fit_report
     from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
-    from fits.stage._draw_plants import draw_plants
     from fits.stage._fit import default_stage, fit_stage
-    from fits.stage._frequency import Multisine, ResponseData, estimate_response, read_multisine
+    from fits.stage._frequency import Multisine, ResponseData, estimate_response, read_multisine, read_response
     from fits.stage._modal_fit import ModalFit, fit_hysteresis, fit_response, relative_error
     from fits.stage._model_file import ModelFile, load_model, save_model
-    from fits.stage._posterior import Draws, sample_posterior
-    from fits.stage._predict import predict
-    from fits.stage._profile import Profile, profile_stage
-    from fits.stage._read_response import read_response
-    from fits.stage._uncertainty import StageUncertainty
+    from fits.stage._posterior import Draws, Profile, profile_stage, sample_posterior
+    from fits.stage._uncertainty import StageUncertainty, draw_plants, predict
     from fits.stats._metrics import Errors, errors, loop_width_pct
     from fits.stats._noise_spectrum import NoiseBand, NoiseLine
     from fits.sweeps._run import Outcome, run_sweep

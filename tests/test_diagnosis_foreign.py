@@ -13,9 +13,9 @@ from fits.diagnosis._noise import Floor, pooled
 from fits.diagnosis._protocol import held_gain
 from fits.diagnosis._regression import _without_decayed
 from fits.loop import _grid as grid
-from fits.loop._evidence import Posterior
+from fits.loop._prior import Posterior
 from fits.loop._run import known_samples
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 
 RATE_Hz, FINE = 1000.0, 16
 

@@ -9,9 +9,8 @@ from scipy.stats import multivariate_normal
 
 import fits
 from fits.loop._design import Grid, columns_of
-from fits.loop._evidence import _negative_log, maximise_evidence, posterior_of
 from fits.loop._moments import gather
-from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._prior import Hyper, _negative_log, interpolation, maximise_evidence, posterior_of, roughness
 from fits.loop._run import prepare_run, simulate_run
 from fits.stats._noise import correlation_samples, shared_square
 from fits.stats._nonnegative import minimise_nonnegative

@@ -19,7 +19,7 @@ from fits.stage._fit import default_stage, solve_stage
 from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
 from fits.stage._solve import prior_precision
-from fits.stats._whiten import rough_noise_um
+from fits.stats._noise import rough_noise_um
 from microid import AbstractEffect, Hold, Mechanics, Stage, extend, host
 
 # What a finer grid would follow has a prior of its own in the projection.

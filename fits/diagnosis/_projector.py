@@ -10,13 +10,12 @@ from scipy.optimize import minimize
 
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._regression import Regression, root_of
-from fits.loop._evidence import Posterior, maximise_evidence
 from fits.loop._grid import EVIDENCE_LEVELS, non_negative
 from fits.loop._moments import Moments
-from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._prior import Hyper, Posterior, interpolation, maximise_evidence, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.stage._solve import prior_precision
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
 _ROUGHEST = 0.5

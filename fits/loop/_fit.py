@@ -7,13 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record, refuse_repeats
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits.loop._design import Grid, columns_of
 from fits.loop._grid import Estimate, grid_estimate
-from fits.loop._history import estimate_start
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._prior import interpolation
@@ -22,7 +23,7 @@ from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
 from fits.loop._shapes import solve_shape
 from fits.loop._uncertainty import Uncertainty, perturbations
 from fits.stats._noise import LOSSES, WHITE
-from microid import FAMILIES, Preisach
+from microid import FAMILIES, Preisach, Staircase
 
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
@@ -215,3 +216,60 @@ def _remarks(runs: list[Run]) -> list[str]:
             "beyond them the model is extrapolated"
         )
     return remarks
+
+
+# Pairs of extremes that stand for the unknown history, and samples that are compared.
+_PAIRS = 6
+_SAMPLES = 1024
+_SIZE = 64
+
+
+def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Array, ""]) -> Staircase:
+    """Extremes that close in on the first sample, by the shares of the way that the coordinates stand for."""
+    below, above = jax.nn.softmax(z[0]), jax.nn.softmax(z[1])
+    low, high = model.density.lower_V, model.density.upper_V
+    minima = low + (first_V - low) * jnp.cumsum(below)[:-1]
+    maxima = high - (high - first_V) * jnp.cumsum(above)[:-1]
+    inner = jnp.stack([maxima, minima], axis=1).ravel()
+    extremes = jnp.concatenate([low[None], inner, first_V[None]])
+    count = extremes.shape[0]
+    padded = jnp.concatenate([extremes, jnp.broadcast_to(first_V, (_SIZE - count,))])
+    return Staircase(padded, jnp.asarray(count, dtype=jnp.int32))
+
+
+def _residual(
+    z: Float[Array, "2 pairs_1"], args: tuple[Preisach, Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
+) -> Float[Array, " m"]:
+    model, voltage_V, displacement_um, weight = args
+    start = _staircase(z, model, voltage_V[0])
+    # A faint pull towards an even decay decides what the samples leave open.
+    return jnp.concatenate([weight * (model(voltage_V, start) - displacement_um), 1e-2 * z.ravel()])
+
+
+@eqx.filter_jit
+def _solve(args: tuple[Preisach, Array, Array, Array]) -> Staircase:
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+    start = jnp.zeros((2, _PAIRS + 1))
+    solution: Any = optx.least_squares(_residual, solver, start, args=args, max_steps=100, throw=False)
+    return _staircase(solution.value, args[0], args[1][0])
+
+
+def estimate_start(model: Preisach, run: Run, noise_um: float) -> Staircase:
+    """Fit the memory before the first sample to the samples that depend on it; the model has this run's offset.
+
+    The output is differentiable in the remembered extremes as it is in any voltage, so the extremes themselves are
+    the unknowns (Levenberg-Marquardt on `2 x 7` shares of the way from the ends of the range to the first sample).
+    """
+    keep = np.arange(np.flatnonzero(~run.known)[-1] + 1)
+    # Thinned out evenly; the extremes of the path must stay, as they make the memory.
+    if len(keep) > _SAMPLES:
+        voltage = run.voltage_V[keep]
+        turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(voltage))) != 0)
+        even = np.linspace(0, len(keep) - 1, max(2, _SAMPLES - len(turns))).astype(np.int64)
+        keep = np.unique(np.concatenate([even, turns]))[: 2 * _SAMPLES]
+    size = 2 * _SAMPLES
+    pad = (0, size - len(keep))
+    voltage = np.pad(run.voltage_V[keep], pad, mode="edge")
+    displacement = np.pad(run.displacement_um[keep], pad)
+    weight = np.pad(np.full(len(keep), 1 / noise_um), pad)
+    return _solve((model, jnp.asarray(voltage), jnp.asarray(displacement), jnp.asarray(weight)))

@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 
 from fits.io._record import Record
 from fits.loop._run import Run
-from fits.stats._at_rest import quantum_um, stretches
+from fits.stats._noise import quantum_um, stretches
 
 # A sensor sticks where so many readings in a row are the same to the last bit.
 _STUCK_SAMPLES = 8

@@ -10,9 +10,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import nnls
 
-from fits.loop._evidence import Posterior, effective, maximise_evidence, posterior_of, renew_noise
 from fits.loop._moments import Data, Moments, blocks_of
-from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._prior import (
+    Hyper,
+    Posterior,
+    effective,
+    interpolation,
+    maximise_evidence,
+    posterior_of,
+    renew_noise,
+    roughness,
+)
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
 from fits.stats._noise import shared_square

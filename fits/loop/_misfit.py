@@ -7,8 +7,7 @@ import numpy as np
 
 from fits.io._record import Record
 from fits.loop._run import Run
-from fits.stats._at_rest import idle_stretches, quantum_um
-from fits.stats._whiten import rough_noise_um
+from fits.stats._noise import idle_stretches, quantum_um, rough_noise_um
 
 # So many samples of a command at rest say what the noise is.
 _IDLE = 150

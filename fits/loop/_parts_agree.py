@@ -7,12 +7,11 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._evidence import posterior_of
 from fits.loop._fit_checks import remarks_on
 from fits.loop._grid import non_negative, solve_grid
 from fits.loop._misfit import Misfit, compare_gains, misfits, worst
 from fits.loop._moments import gather, grid_of
-from fits.loop._prior import Hyper, roughness
+from fits.loop._prior import Hyper, posterior_of, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, simulate_run
 from fits.stats._noise import WHITE, correlation_samples

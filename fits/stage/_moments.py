@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
-from fits.loop._run import Run
-from fits.loop._samples import Samples
+from fits.loop._run import Run, Samples
 from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
 from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
 

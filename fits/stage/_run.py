@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
-from fits.loop._run import VIRGIN, Run, command_range_V, known_samples, prepare_run
-from fits.loop._samples import Samples
+from fits.loop._run import VIRGIN, Run, Samples, command_range_V, known_samples, prepare_run
 from fits.loop._uncertainty import refuse_outside
 from microid import (
     AbstractEffect,

@@ -10,9 +10,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, design
-from fits.loop._evidence import effective, posterior_of, renew_noise
 from fits.loop._moments import Moments
-from fits.loop._prior import Hyper, Roughness
+from fits.loop._prior import Hyper, Roughness, effective, posterior_of, renew_noise
 from fits.stats._nonnegative import minimise_nonnegative
 from fits.sweeps._devices import by_rows
 from microid import Staircase
