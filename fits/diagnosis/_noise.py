@@ -212,7 +212,7 @@ class Faults:
         out = []
         for record, height in zip(records, self.heights_um, strict=True):
             assert record.displacement_um is not None
-            out.append(replace(record, displacement_um=record.displacement_um - height, extra=dict(record.extra)))
+            out.append(replace(record, displacement_um=record.displacement_um - height))
         return out
 
 

@@ -29,15 +29,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield files.file(path)
 
 
-def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write bytes to `path`, whole or not at all; errors are those of `atomic_path`."""
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
-
-
 def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write text to `path` as UTF-8 with its line ends kept, whole or not at all; errors as `atomic_path`."""
-    atomic_write_bytes(path, text.encode())
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(text.encode())
 
 
 def refuse_nonfinite(name: str, values: NDArray[Any]) -> None:

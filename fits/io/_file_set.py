@@ -24,8 +24,9 @@ def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path
         target = Path(os.path.realpath(path))
         anchor = next(place for place in (target, *target.parents) if os.path.lexists(place))
         # Also whether its name, and those on the way to it, can be.
-        if target != anchor:
-            _length_checked(target, anchor)
+        for name in target.relative_to(anchor).parts:
+            with suppress(FileNotFoundError, NotADirectoryError):
+                os.lstat(anchor / name)
         good = anchor.is_dir() and os.access(anchor, os.W_OK | os.X_OK)
     except (OSError, ValueError) as error:
         raise DataError(
@@ -35,12 +36,6 @@ def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path
         raise DataError(f"{shown}: expected a folder that can be written to; choose another for {option}.")
     remove_stale(anchor)
     return target, anchor
-
-
-def _length_checked(target: Path, anchor: Path) -> None:
-    for name in target.relative_to(anchor).parts:
-        with suppress(FileNotFoundError, NotADirectoryError):
-            os.lstat(anchor / name)
 
 
 def check_file(path: str | os.PathLike[str], shown: str | None = None) -> Path:

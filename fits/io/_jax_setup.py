@@ -16,13 +16,7 @@ _KEPT_S = 0.3
 
 
 def start_jax() -> None:
-    """Configure JAX; call it before any computation.
-
-    Raises
-    ------
-    DataError
-        If MICROID_CACHE names a folder that other users can write to.
-    """
+    """Configure JAX before any computation; a `DataError` if others can write to the folder MICROID_CACHE names."""
     jax.config.update("jax_enable_x64", True)
     folder = _cache_folder()
     if folder is not None:

@@ -1,11 +1,9 @@
 """Which numbers can be measurements: what lies beyond is a slip of a unit or of an export, and overflows later."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fits.io._quantity import FloatArray
 from fits.io._table import Table, data_error
-
-FloatArray = NDArray[np.float64]
 
 # Largest size of a value, and of those in other units. Slips of a unit by 1e6 stay within, so that they are warned
 # of in words.

@@ -5,15 +5,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fits.io._errors import DataError
 from fits.io._plausible import LARGEST_EXTRA, check_size, check_steps
+from fits.io._quantity import FloatArray
 from fits.io._record import Record, Reference
 from fits.io._table import Problem, Table, data_error, open_table
 from fits.io._units import Source, find_sources, known_quantity
-
-FloatArray = NDArray[np.float64]
 
 # Piezo stages move 0.01 um/V (stack on a 1000 V amplifier) to 15 um/V (voltage logged before an amplifier of
 # ten-fold gain). Of a typical 0.1 to 1 um/V, slips of 1e3 and 1e6 lie outside these limits.

@@ -43,7 +43,7 @@ def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
     except (FileNotFoundError, NotADirectoryError):
         raise DataError(f"{name}: no such file; check the name and the folder.") from None
     except (OSError, ValueError) as error:
-        reason = error.strerror or error if isinstance(error, OSError) else error
+        reason = getattr(error, "strerror", None) or error
         raise DataError(f"{name}: cannot be read ({reason}); check the name and the permissions.") from None
 
 

@@ -6,12 +6,11 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fits.io._errors import DataError
 from fits.io._printable import printable
-
-FloatArray = NDArray[np.float64]
+from fits.io._quantity import FloatArray
 
 
 def _read_only(values: ArrayLike) -> FloatArray:
@@ -85,14 +84,8 @@ class Record:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A MappingProxyType cannot be pickled, and records travel to worker processes.
-        return Record, (
-            self.time_s,
-            self.voltage_V,
-            self.displacement_um,
-            dict(self.extra),
-            self.source,
-            self.warnings,
-        )
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return Record, tuple((values | {"extra": dict(self.extra)}).values())
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fits.io._errors import DataError
+from fits.io._quantity import FloatArray
 from fits.io._read_file import MOST_CSV_BYTES, read_bytes, unpack
-
-FloatArray = NDArray[np.float64]
 
 _COMMENT = re.compile(r"^ *[#%].*\n?", re.MULTILINE)
 _EXCEL_SEPARATOR = re.compile(r'"?sep=(.)"?', re.IGNORECASE)

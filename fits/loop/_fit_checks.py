@@ -116,7 +116,7 @@ def without_impulses(record: Record) -> Record:
     if bad.sum() < _FEW:
         return record
     mended = np.where(bad, median_filter(reading, 7, mode="nearest"), reading)
-    return replace(record, displacement_um=mended, extra=dict(record.extra))
+    return replace(record, displacement_um=mended)
 
 
 def impulsive(residual_um: np.ndarray, digit_um: float = 0.0) -> np.ndarray:

@@ -185,7 +185,7 @@ def delays(
         def residual(samples: float, run: Run = run, interval: float = interval) -> np.ndarray:
             record = run.record
             voltage = np.interp(record.time_s - samples * interval, record.time_s, record.voltage_V)
-            return separate.left(prepare(replace(record, voltage_V=voltage, extra=dict(record.extra))))
+            return separate.left(prepare(replace(record, voltage_V=voltage)))
 
         try:
             found = _profile(residual)

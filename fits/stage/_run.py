@@ -174,7 +174,7 @@ def prepare_program(stage: Stage, record: Record, initial: str) -> tuple[Stage, 
     refuse_outside(record, *range_V)
     needed = {name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs}
     needed -= {name for name, column in COLUMNS.items() if column.optional}
-    program = replace(record, displacement_um=None, extra=dict(record.extra))
+    program = replace(record, displacement_um=None)
     missing = sorted(needed - set(columns_beside(program)))
     if missing:
         raise DataError(

@@ -77,7 +77,7 @@ class Plan:
             there = (time >= record.time_s[0]) & (time <= record.time_s[-1])
             usable = there if usable is None else there & usable
             later = np.interp(time, record.time_s, record.voltage_V)
-            record = replace(record, voltage_V=later, extra=dict(record.extra))
+            record = replace(record, voltage_V=later)
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
         return prepare_run(record, *settings, usable)
 

@@ -20,9 +20,9 @@ _NEGLIGIBLE = 1e-14
 class Compressed:
     """Groups of four voltages, in the order of the path.
 
-    A group stands for samples by `mix @ response(voltage_V) ~ target_um`, whose sums of squares and products equal
-    those of the samples; the squares that no response could explain are in `residue_um2`. `block` is -1, and `mix`
-    zero, where samples are not used; `count` is their number, each as often as it counts.
+    Sums of squares and products of `mix @ response(voltage_V) ~ target_um` equal those of the samples; the squares
+    that no response could explain are in `residue_um2`. `block` is -1, and `mix` zero, where samples are not used;
+    `count` is their number, each as often as it counts.
     """
 
     voltage_V: np.ndarray

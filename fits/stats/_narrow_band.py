@@ -50,8 +50,7 @@ class Band:
 def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -> Band:
     """Find a narrow band between 2 and 200 Hz that goes on throughout and that the command does not play.
 
-    Bins of the spectrum are compared with the median of those around; a band of noise has the chance of so many
-    exponential variables.
+    Bins of the spectrum are compared with the median around: those of noise are exponential variables.
     """
     none = Band(0.0, 0.0, 0.0, 0.0, 0.0)
     n = len(residual_um)

@@ -1,4 +1,4 @@
-"""How many samples of a residual are worth one independent one."""
+"""Noise of a sensor and of residuals: how large, how correlated, and where a record shows it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,17 +15,16 @@ WHITE = 1.2
 LOSSES = ("squares", "huber")
 # Sokal's window: sum the correlations up to this many correlation times.
 _WINDOW = 5.0
-
-
 # Neighbours this close share an error of the model, but not white noise.
 _NEIGHBOURS = 10
+# A command that rests for this many samples is idle from a third of the rest on.
+_FEWEST_AT_REST = 24
 
 
 def shared_square(residual: np.ndarray) -> float:
-    """Mean square of the part of a residual that neighbouring samples share, in its unit squared.
+    """Mean of the autocovariances at lags 1 to 10, in the residual's unit squared.
 
-    That is the mean of the autocovariances at lags 1 to 10: white noise has none, model discrepancy has. As an
-    estimate it can come out negative.
+    White noise has none, model discrepancy has. As an estimate it can come out negative.
     """
     centred = residual - residual.mean()
     furthest = min(_NEIGHBOURS, len(residual) - 1)
@@ -36,11 +35,10 @@ def shared_square(residual: np.ndarray) -> float:
 def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     """Estimate the integrated correlation time of the residuals of some runs, in samples; 1 for white noise.
 
-    Least squares rests on `n / correlation_samples` samples' worth of evidence. See A. Sokal, "Monte Carlo Methods in
+    Least squares rests on `n / correlation_samples` independent samples. See A. Sokal, "Monte Carlo Methods in
     Statistical Mechanics" (1997), section 3.
     """
-    longest = max(len(r) for r in residuals)
-    total = np.zeros(longest)
+    total = np.zeros(max(len(r) for r in residuals))
     for residual in residuals:
         n = len(residual)
         spectrum = np.abs(fft.rfft(residual - residual.mean(), fft.next_fast_len(2 * n))) ** 2
@@ -48,8 +46,7 @@ def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     if total[0] <= 0:
         return 1.0
     time = 1 + 2 * np.cumsum(total[1:] / total[0])
-    lag = np.arange(1, longest)
-    inside = np.flatnonzero(lag >= _WINDOW * time)
+    inside = np.flatnonzero(np.arange(1, len(total)) >= _WINDOW * time)
     return float(max(1.0, time[inside[0]] if len(inside) else time.max(initial=1.0)))
 
 
@@ -121,10 +118,6 @@ def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Nois
         if score < best - 6:
             best, past, variance = score, coefficients, error
     return Noise(float(np.sqrt(variance)) * inflate, past)
-
-
-# A command that rests for this many samples is idle from a third of the rest on.
-_FEWEST_AT_REST = 24
 
 
 def stretches(flags: np.ndarray) -> list[tuple[int, int]]:
