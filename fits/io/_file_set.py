@@ -14,6 +14,10 @@ from typing import overload
 from fits.io._errors import DataError
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
+_DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+# Of file systems that have no such thing as flushing.
+_NO_FLUSH = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
+
 
 def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path]:
     """Refuse a folder that cannot be written to, or made; itself and the nearest one that exists come back."""
@@ -67,11 +71,6 @@ def check_file(path: str | os.PathLike[str], shown: str | None = None) -> Path:
 def reason_of(error: Exception) -> str:
     """Say why, as the system does."""
     return str(getattr(error, "strerror", None) or error)
-
-
-_DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
-# Of file systems that have no such thing as flushing.
-_NO_FLUSH = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""From records to a fitted Preisach operator."""
+"""From records to a fitted Preisach operator, and to what a rig must have been through before its record."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -30,6 +30,10 @@ _SHAPE_LEVELS = 34
 # Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
 _EDGE = 0.02
 _MINOR = 0.01
+# Pairs of extremes that stand for the unknown history, and samples that are compared.
+_PAIRS = 6
+_SAMPLES = 1024
+_SIZE = 64
 
 
 def fit(
@@ -95,8 +99,7 @@ def fit(
     if loss == "huber":
         runs = weigh_robustly(runs, progress)
     stroke, tried, trials = choose_grid(runs, levels, progress)
-    remarks = _remarks(runs)
-    remarks += [warning for record in aside for warning in record.warnings]
+    remarks = [*_remarks(runs), *(warning for record in aside for warning in record.warnings)]
     if family == "grid":
         found = grid_estimate(tried.data, tried.solution, stroke, tried.correlation, tried.discrepancy_um)
         if levels is None and tried.data.grid.levels == LADDER[-1]:
@@ -111,24 +114,19 @@ def fit(
                 f"the best two of {starts} starts ended at different fits; there may be a better one: raise --starts"
             )
     if found.correlation > WHITE:
-        remarks.append(
-            f"neighbouring residuals agree over {found.correlation:.0f} samples: something other than sensor noise "
-            "(creep, rate, drift or a density this family cannot follow) is left that this model does not describe"
-        )
+        remarks.append(correlated(found.correlation, "creep, rate, drift or a density this family cannot follow"))
     model = found.model
     progress("checking the records")
     miss, told = check_loops(runs, prepare, model, stroke, tried.solution.hyper, loss == "huber")
-    offsets = _offsets(model, tried.data)
-
+    columns = np.asarray(columns_of(model))
+    offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]
     progress("comparing with the measurement")
     figures = {"noise_um": found.noise_um, "correlation_samples": found.correlation, "substeps": 1}
-    reports = [
-        _report(_with_offset(model, offset), run, found, **figures) for offset, run in zip(offsets, runs, strict=True)
-    ]
+    reports = [_report(model, offset, run, found, **figures) for offset, run in zip(offsets, runs, strict=True)]
     for record in aside:
         run = prepare_run(record, range_V, initial, holdout=1.0)
         off = float(np.mean((run.displacement_um - simulate_run(model, run))[run.known]))
-        reports.append(_report(_with_offset(model, off), run, found))
+        reports.append(_report(model, off, run, found))
     return FitResult(
         model=_with_offset(model, offsets[0]),
         uncertainty=_uncertainty(tried.data, found),
@@ -138,6 +136,14 @@ def fit(
         misfit=miss,
         smoothness=float(np.exp(tried.solution.hyper.log_density)),
         trials=tuple(trials),
+    )
+
+
+def correlated(samples: float, what: str) -> str:
+    """The remark on residuals whose neighbours agree over some samples, and what may be left."""
+    return (
+        f"neighbouring residuals agree over {samples:.0f} samples: something other than sensor noise ({what}) is "
+        "left that this model does not describe"
     )
 
 
@@ -175,18 +181,14 @@ def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
     )
 
 
-def _offsets(model: Preisach, data: Data) -> list[float]:
-    columns = np.asarray(columns_of(model))
-    return [mean.displacement_um - float(mean.response @ columns) for mean in data.means]
-
-
 def _with_offset(model: Preisach, offset_um: float) -> Preisach:
     return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offset_um))
 
 
-def _report(model: Preisach, run: Run, found: Estimate, **figures: Any) -> RunReport:
+def _report(model: Preisach, offset_um: float, run: Run, found: Estimate, **figures: Any) -> RunReport:
+    model = _with_offset(model, offset_um)
     start = run.start if run.known.all() else estimate_start(model, run, found.noise_um)
-    return RunReport.of(run, simulate_run(model, run), float(model.offset_um), start, **figures)
+    return RunReport.of(run, simulate_run(model, run), offset_um, start, **figures)
 
 
 def _remarks(runs: list[Run]) -> list[str]:
@@ -216,12 +218,6 @@ def _remarks(runs: list[Run]) -> list[str]:
             "beyond them the model is extrapolated"
         )
     return remarks
-
-
-# Pairs of extremes that stand for the unknown history, and samples that are compared.
-_PAIRS = 6
-_SAMPLES = 1024
-_SIZE = 64
 
 
 def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Array, ""]) -> Staircase:
@@ -267,9 +263,7 @@ def estimate_start(model: Preisach, run: Run, noise_um: float) -> Staircase:
         turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(voltage))) != 0)
         even = np.linspace(0, len(keep) - 1, max(2, _SAMPLES - len(turns))).astype(np.int64)
         keep = np.unique(np.concatenate([even, turns]))[: 2 * _SAMPLES]
-    size = 2 * _SAMPLES
-    pad = (0, size - len(keep))
+    pad = (0, 2 * _SAMPLES - len(keep))
     voltage = np.pad(run.voltage_V[keep], pad, mode="edge")
-    displacement = np.pad(run.displacement_um[keep], pad)
-    weight = np.pad(np.full(len(keep), 1 / noise_um), pad)
+    displacement, weight = (np.pad(x, pad) for x in (run.displacement_um[keep], np.full(len(keep), 1 / noise_um)))
     return _solve((model, jnp.asarray(voltage), jnp.asarray(displacement), jnp.asarray(weight)))

@@ -1,4 +1,4 @@
-"""What is believed of a density before any data: that it is smooth, how much so being left to the data."""
+"""How smooth and how noisy a density is believed to be: found by maximising the evidence, not set by hand."""
 
 from functools import lru_cache
 from typing import Any
@@ -18,6 +18,8 @@ _ROUNDING = 1e-14
 # Curvature counts by the square of the distance from the diagonal, in ranges, increased by this and over that: relays
 # that switch close together are many, and their density changes fast.
 _CLOSE_TO_DIAGONAL, _FAR_FROM_DIAGONAL = 0.05, 0.35
+# Where the evidence is flat the smoothness stays within a few times this factor, in e-folds, of a middling one.
+_MIDDLE, _WIDTH = -4.6, 6.0
 
 
 class Hyper(eqx.Module):
@@ -128,10 +130,6 @@ def interpolation(coarse: int, fine: int) -> np.ndarray:
     out[: nodes.shape[0], :m] = nodes
     out[nodes.shape[0] :, m:] = line
     return out
-
-
-# Where the evidence is flat the smoothness stays within a few times this factor, in e-folds, of a middling one.
-_MIDDLE, _WIDTH = -4.6, 6.0
 
 
 class Posterior(eqx.Module):

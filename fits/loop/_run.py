@@ -1,4 +1,4 @@
-"""A record made ready for fitting: which samples count, what it began from, and what a model needs of it."""
+"""A record made ready for fitting: which samples count, what it began from, and the arrays that models take."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,6 +33,18 @@ _EVEN = 1e-6
 _EXTREMES = 512
 # A hundred arrays of so many values are 8 GB.
 _MOST_STEPS = 10_000_000
+# All records pass through the same compiled functions in pieces of this many samples.
+_PIECE = 8192
+_STAIRCASES = (64, 512, 4096)
+# A record has met an end of the range, or an extreme of its own, once it comes this close, as a fraction of the
+# range: the first of these that does not cost most of the samples, as peaks of a smooth command miss an end by a
+# little.
+_END_SHARES = (1e-3, 3e-3, 1e-2)
+# Samples that a run must leave to fit.
+_FEWEST = 50
+INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
+VIRGIN = "virgin"
+"""As `unknown`, where relays that the range does not reach back may have any state, too."""
 
 
 class Samples(eqx.Module):
@@ -92,21 +104,6 @@ def refuse_many_steps(record: Record, stride: int) -> None:
             f"{record.source}: expected at most {_MOST_STEPS:,} steps, found {len(record):,} samples of {stride} "
             "substeps each; split the record, or use a model of fewer substeps"
         )
-
-
-# All records pass through the same compiled functions in pieces of this many samples.
-_PIECE = 8192
-_STAIRCASES = (64, 512, 4096)
-# A record has met an end of the range, or an extreme of its own, once it comes this close, as a fraction of the
-# range: the first of these that does not cost most of the samples, as peaks of a smooth command miss an end by a
-# little.
-_END_SHARES = (1e-3, 3e-3, 1e-2)
-# Samples that a run must leave to fit.
-_FEWEST = 50
-
-INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
-VIRGIN = "virgin"
-"""As `unknown`, where relays that the range does not reach back may have any state, too."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Readings that come late, or before their command: seen in what a fitted stage leaves of each run."""
+"""What pulls a fit: readings that come late, or before their command, and outliers; intervals reach beyond it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +23,29 @@ from microid import Preisach, Stage
 
 # What pulls a fit ruins it where it moves a parameter by more than this part of it.
 _RUINED = 0.5
+# A delay counts from so many standard deviations, and so many samples, on.
+_SURE_Z, _LEAST_SAMPLES = 5.0, 0.02
+# It must move a parameter by so many of that one's standard deviations, too.
+_MOVED_SD = 0.5
+# It is followed for so many rounds at most, until it changes by less than this part of its standard deviation.
+_ROUNDS, _SETTLED = 10, 0.3
+# A step is halved so often where it leaves more of its run.
+_HALVED, _NO_WORSE = 4, 1.01
+# Part of a sample by which a command is shifted to see what a delay does.
+_STEP = 0.25
+# Runs that leave so many times the noise are searched for delays.
+_SEARCHED_NOISE = 1.5
+# The search goes so many samples either way, and so many of the delays are tried.
+_FARTHEST_SAMPLES, _MOST_TRIED = 64, 3
+# What is as much likelier as leaving this part of a run's residual is a better answer.
+_BETTER = 0.7
+# Where more than so many times the noise is left, a delay counts if it takes all but this part away.
+_NEAR_NOISE, _LEFT_SHARE = 2.0, 0.4
+# What a stage leaves, in % of the stroke, that is more than creep and its like would be.
+GROSS_PCT = 2.0
+_REMEDY = (
+    "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
+)
 
 
 @dataclass(frozen=True)
@@ -86,31 +109,6 @@ def fit_without_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Alterna
     except (FitError, np.linalg.LinAlgError):
         return None
     return sources, Alternative.of(Precision(found))
-
-
-# A delay counts from so many standard deviations, and so many samples, on.
-_SURE_Z, _LEAST_SAMPLES = 5.0, 0.02
-# It must move a parameter by so many of that one's standard deviations, too.
-_MOVED_SD = 0.5
-# It is followed for so many rounds at most, until it changes by less than this part of its standard deviation.
-_ROUNDS, _SETTLED = 10, 0.3
-# A step is halved so often where it leaves more of its run.
-_HALVED, _NO_WORSE = 4, 1.01
-# Part of a sample by which a command is shifted to see what a delay does.
-_STEP = 0.25
-# Runs that leave so many times the noise are searched for delays.
-_SEARCHED_NOISE = 1.5
-# The search goes so many samples either way, and so many of the delays are tried.
-_FARTHEST_SAMPLES, _MOST_TRIED = 64, 3
-# What is as much likelier as leaving this part of a run's residual is a better answer.
-_BETTER = 0.7
-# Where more than so many times the noise is left, a delay counts if it takes all but this part away.
-_NEAR_NOISE, _LEFT_SHARE = 2.0, 0.4
-# What a stage leaves, in % of the stroke, that is more than creep and its like would be.
-GROSS_PCT = 2.0
-_REMEDY = (
-    "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
-)
 
 
 @dataclass(frozen=True)

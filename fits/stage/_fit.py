@@ -1,4 +1,4 @@
-"""From slow and fast records to a whole fitted stage."""
+"""From slow and fast records to a whole fitted stage, in the terms of its user."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ import numpy as np
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._choose_grid import LADDER
-from fits.loop._fit import check_fit
+from fits.loop._fit import check_fit, correlated
 from fits.loop._fit_checks import remarks_on
 from fits.loop._misfit import misfits, worst
 from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate, RunReport
@@ -33,6 +33,9 @@ from fits.stats._identifiability import unseen_directions
 from fits.stats._metrics import TWO_SIDED_95
 from fits.stats._noise import WHITE
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
+
+# A coordinate, of the order of 1, that is known no better than this is hardly seen.
+_UNSEEN_SD = 0.5
 
 
 def default_stage(hold: Hold = "first") -> Stage:
@@ -214,10 +217,6 @@ def _refined(plan: Plan, problem: Problem) -> Solution:
         return Solution(*refine_problem(replace(plan, accept_best=True), problem), plan, failure)
 
 
-# A coordinate, of the order of 1, that is known no better than this is hardly seen.
-_UNSEEN_SD = 0.5
-
-
 def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     """Put the fit of a stage, and runs that were held out, into words and figures.
 
@@ -242,10 +241,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
         figures = {"noise_um": noise_um, "correlation_samples": correlation, "substeps": run.stride}
         reports.append(_report(stage, run, **figures))
         if correlation > WHITE:
-            remarks.append(
-                f"{run.record.source}: neighbouring residuals agree over {correlation:.0f} samples: something other "
-                "than sensor noise (creep, rate, a second mode, drift) is left that this model does not describe"
-            )
+            remarks.append(f"{run.record.source}: {correlated(correlation, 'creep, rate, a second mode, drift')}")
     reports += [_report(stage, run) for run in held]
     return FitResult(
         model=_with_offset(stage, reports[0].offset_um).with_substeps(max(run.stride for run in solved.runs)),

@@ -1,4 +1,4 @@
-"""Measured frequency responses: from periodic multisines to the best linear approximation and its variance."""
+"""Measured frequency responses: from periodic multisines, or read as an analyser writes them."""
 
 import os
 from dataclasses import dataclass
@@ -15,6 +15,19 @@ from fits.io._table import Table, data_error, open_table
 _EXCITED = 0.01
 # Variances are averaged over this many neighbouring lines: few realizations alone make poor weights.
 _SMOOTH = 9
+_REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
+_MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"
+# What a unit is checked by, of each column.
+_UNITS = {
+    "frequency_Hz": "Hz",
+    _REAL: "um/V",
+    _IMAGINARY: "um/V",
+    _VARIANCE: "um^2/V^2",
+    _MAGNITUDE: "um/V",
+    _DECIBEL: "dB",
+    _DEGREES: "deg",
+    _RADIANS: "rad",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,21 +215,6 @@ def smooth(variance: NDArray[Any]) -> NDArray[Any]:
     half = min(_SMOOTH, len(variance) - 1 | 1) // 2
     padded = np.pad(variance, ((half, half), (0, 0)), mode="reflect")
     return np.mean(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0), axis=-1)
-
-
-_REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
-_MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"
-# What a unit is checked by, of each column.
-_UNITS = {
-    "frequency_Hz": "Hz",
-    _REAL: "um/V",
-    _IMAGINARY: "um/V",
-    _VARIANCE: "um^2/V^2",
-    _MAGNITUDE: "um/V",
-    _DECIBEL: "dB",
-    _DEGREES: "deg",
-    _RADIANS: "rad",
-}
 
 
 def read_response(path: str | os.PathLike[str]) -> ResponseData:

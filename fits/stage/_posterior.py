@@ -1,4 +1,4 @@
-"""The whole posterior of a stage's parameters, by NUTS: for those who do not trust a standard deviation."""
+"""For those who do not trust a standard deviation: draws from a posterior by NUTS, and the profile likelihood."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +20,9 @@ from fits.stage._moments import offsets_out
 from fits.stage._run import nuisance_columns, place_of_hysteresis, prepare_again, project_out, residual_of, respond
 from fits.stage._solve import Problem, Solved, Weighing, prior_precision, solve_chain
 from microid import Coordinates, GridDensity, Preisach, Stage, parameter_table
+
+# Half of the width that is looked at, in standard deviations of the quadratic approximation.
+_WIDTH = 3.5
 
 
 @dataclass(frozen=True)
@@ -111,10 +114,6 @@ def sample_posterior(
         lost = int(np.sum(np.asarray(sampler.get_extra_fields()["diverging"])))
     values = np.asarray(jax.vmap(coordinates.values)(z))
     return Draws(tuple(parameter.name for parameter in result.parameters), values, lost)
-
-
-# Half of the width that is looked at, in standard deviations of the quadratic approximation.
-_WIDTH = 3.5
 
 
 @dataclass(frozen=True)

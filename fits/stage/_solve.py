@@ -18,6 +18,14 @@ from fits.stage._run import residual_of
 from fits.stats._noise import correlation_samples, huber_weight
 from microid import Stage
 
+_ROUNDS, _ROUGH = 40, 12
+# Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
+_DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
+# A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
+_STATIONARY = 0.02
+# Variance of the noise below which, in squares of the stroke, all is rounding.
+_ROUNDING = 1e-20
+
 
 @dataclass(frozen=True)
 class Weighing:
@@ -68,15 +76,6 @@ class Weighing:
         """Sum of squares that goes with `total`."""
         each = zip(runs, residuals, self.shares, strict=True)
         return sum(share * float(np.sum(run.fit_weight * left**2)) for run, left, share in each)
-
-
-_ROUNDS, _ROUGH = 40, 12
-# Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
-_DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
-# A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
-_STATIONARY = 0.02
-# Variance of the noise below which, in squares of the stroke, all is rounding.
-_ROUNDING = 1e-20
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How sure the fit of a stage is: of its parameters, however the noise is coloured, and of its predictions."""
+"""How sure the fit of a stage is: of its parameters, however coloured the noise, of predictions and of plants."""
 
 from collections.abc import Sequence
 
