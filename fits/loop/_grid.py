@@ -1,7 +1,9 @@
 """Fitting the weights of a grid: a smooth, non-negative regression, convex and therefore without a start."""
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import equinox as eqx
 import jax
@@ -102,8 +104,7 @@ def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
     """Find the mode of the posterior among non-negative columns; and whether it was found.
 
     Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
-    those ends up below zero, more are bounded. The answer is that of all bounds together. Active-set solvers such as
-    `scipy.optimize.nnls` take one column at a time, and minutes for the thousands of a fine grid.
+    those ends up below zero, more are bounded. The answer is that of all bounds together.
     """
     scale = np.sqrt(np.diagonal(posterior.precision))
     lowest = np.asarray(posterior.mean) * scale
@@ -114,7 +115,7 @@ def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
         spread, precision, mean, unit = _marginal(posterior, jnp.asarray(order))
         y, found = _pivot(precision, mean)
-        columns = _follow(posterior, jnp.asarray(order), spread, precision, (y - mean, y), unit)
+        columns = _follow(posterior, jnp.asarray(order), spread, precision, mean, y, unit)
         left = np.asarray(columns) * scale
         if not found:
             return _one_by_one(posterior)
@@ -167,12 +168,12 @@ def _follow(
     which: Int[Array, " k"],
     spread: Float[Array, "D k"],
     precision: Float[Array, "k k"],
-    moved: tuple[Float[Array, " k"], Float[Array, " k"]],
+    mean: Float[Array, " k"],
+    y: Float[Array, " k"],
     scale: Float[Array, " k"],
 ) -> Float[Array, " D"]:
-    """Move all columns along with the chosen ones; where a bound holds it holds exactly."""
-    by, to = moved
-    return (posterior.mean + spread @ (scale * (precision @ by))).at[which].set(to / scale)
+    """Move all columns along with the chosen ones, from their mean to `y`; where a bound holds it holds exactly."""
+    return (posterior.mean + spread @ (scale * (precision @ (y - mean)))).at[which].set(y / scale)
 
 
 def grid_estimate(
@@ -207,14 +208,13 @@ def cross_validate(
     if levels < data.grid.levels:
         basis = interpolation(levels, data.grid.levels)
         rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
-    whole = sum(blocks[1:], start=blocks[0])
+    whole = reduce(operator.add, blocks)
     labels = [blocks_of(run) for run in runs]
     squares = shared = expected = count = 0.0
     for number, block in enumerate(blocks):
         if not block.count > 0:
             continue
-        rest = Moments(*(a - b for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(block), strict=True)))
-        posterior = posterior_of(rest.scaled(1 / correlation, stroke_um), rough, hyper)
+        posterior = posterior_of((whole - block).scaled(1 / correlation, stroke_um), rough, hyper)
         columns = np.asarray(posterior.mean if basis is None else basis @ posterior.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
         # A short run may have no sample in a block.

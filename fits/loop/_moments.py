@@ -1,10 +1,13 @@
 """All that least squares needs to know of records: sums of products, per block."""
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,7 +25,7 @@ BLOCKS = 5
 
 
 def _zero_dimensional(value: Any) -> Any:
-    # NumPy's arithmetic turns arrays without axes into scalars.
+    """Turn what NumPy's arithmetic makes of arrays without axes back into such."""
     return np.asarray(value) if isinstance(value, float | np.generic) else value
 
 
@@ -37,13 +40,16 @@ class Moments(eqx.Module):
     energy_um2: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
     count: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
 
+    @classmethod
+    def empty(cls, size: int) -> "Moments":
+        """Of no sample."""
+        return cls(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(()))
+
     def __add__(self, other: "Moments") -> "Moments":
-        return Moments(
-            self.gram + other.gram,
-            self.cross_um + other.cross_um,
-            self.energy_um2 + other.energy_um2,
-            self.count + other.count,
-        )
+        return Moments(*map(operator.add, jax.tree.leaves(self), jax.tree.leaves(other)))
+
+    def __sub__(self, other: "Moments") -> "Moments":
+        return Moments(*map(operator.sub, jax.tree.leaves(self), jax.tree.leaves(other)))
 
     def scaled(self, count: Float[Array, ""] | float, unit_um: float) -> "Moments":
         """Measure displacement in `unit_um`, and count each sample as `count` independent ones."""
@@ -94,31 +100,24 @@ def grid_of(runs: Sequence[Run], levels: int) -> Grid:
 
 def gather(grid: Grid, runs: Sequence[Run]) -> Data:
     """Pass runs with displacement through the regression once."""
-    totals, means = [], []
-    blocks: list[list[Moments]] = [[] for _ in range(BLOCKS)]
+    centred: list[list[Moments]] = []
+    means = []
     levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
     for run in runs:
         path = run.path
         branches = run.voltage_V, run.displacement_um, path.anchor_V, path.rising
-        squeezed = compress(*branches, blocks_of(run), levels_V, run.weight)
-        sums = _sums(grid, squeezed, path.starts[0])
-        for block, part in enumerate(sums):
-            blocks[block].append(_centre(part)[0])
-        total, mean = _centre(sum(sums[1:], start=sums[0]))
-        totals.append(total)
+        sums = _sums(grid, compress(*branches, blocks_of(run), levels_V, run.weight), path.starts[0])
+        total, mean = _centre(reduce(operator.add, sums))
+        centred.append([total, *(_centre(part)[0] for part in sums)])
         means.append(mean)
-    return Data(
-        grid,
-        sum(totals[1:], start=totals[0]),
-        tuple(sum(parts[1:], start=parts[0]) for parts in blocks),
-        tuple(means),
-    )
+    whole, *blocks = (reduce(operator.add, parts) for parts in zip(*centred, strict=True))
+    return Data(grid, whole, tuple(blocks), tuple(means))
 
 
 def _sums(grid: Grid, groups: Compressed, start: Staircase) -> list[Moments]:
     """Moments per block, with a column of ones at the end and no mean taken off."""
     size = grid.columns + 1
-    sums = [Moments(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(())) for _ in range(BLOCKS)]
+    sums = [Moments.empty(size) for _ in range(BLOCKS)]
     table = jnp.asarray(branch_table(grid.levels))
     length = _MANY if grid.levels > _MANY_LEVELS else _FEW
     for begin in range(0, len(groups.block), length):

@@ -150,7 +150,7 @@ def run_sums(
     root = np.sqrt(weight)
     known = size + slope.shape[1]
     rows = np.empty((min(len(weight), _PIECE), known + nuisance.shape[1]))
-    sums = Moments(np.zeros((rows.shape[1],) * 2), np.zeros(rows.shape[1]), np.zeros(()), np.zeros(()))
+    sums = Moments.empty(rows.shape[1])
     for first, columns in pieces(chain, z, run, free):
         piece = slice(first, first + columns.shape[0])
         used = rows[: columns.shape[0]]

@@ -1,7 +1,9 @@
 """Fitting a whole stage: damped Gauss-Newton steps, the columns of the hysteresis solved for exactly in each."""
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -69,8 +71,7 @@ class Weighing:
 
     def total(self, sums: Sequence[RunSums]) -> Moments:
         """Moments of all runs."""
-        first, *more = (one.moments.scaled(share, 1.0) for one, share in zip(sums, self.shares, strict=True))
-        return sum(more, start=first)
+        return reduce(operator.add, (one.moments.scaled(k, 1.0) for one, k in zip(sums, self.shares, strict=True)))
 
     def cost_um2(self, runs: Sequence[Run], residuals: Sequence[np.ndarray]) -> float:
         """Sum of squares that goes with `total`."""
