@@ -17,9 +17,9 @@ from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
 from fits.loop._run import Run, Samples
 from fits.stage._moments import offsets_out
-from fits.stage._run import nuisance_columns, place_of_hysteresis, prepare_again, project_out, residual_of, respond
+from fits.stage._run import free_grid, nuisance_columns, prepare_again, project_out, residual_of, respond
 from fits.stage._solve import Problem, Solved, Weighing, prior_precision, solve_chain
-from microid import Coordinates, GridDensity, Preisach, Stage, parameter_table
+from microid import Coordinates, Stage, parameter_table
 
 # Half of the width that is looked at, in standard deviations of the quadratic approximation.
 _WIDTH = 3.5
@@ -27,16 +27,9 @@ _WIDTH = 3.5
 
 @dataclass(frozen=True)
 class Draws:
-    """Draws from a posterior.
+    """Draws from a posterior: names of the parameters, and values in their units, shape `(draws, p)`.
 
-    Attributes
-    ----------
-    names
-        Of the parameters.
-    values
-        In their units, shape `(draws, p)`.
-    divergences
-        Number of trajectories that went astray; more than a few mean that the draws are not to be trusted.
+    `divergences` are trajectories that went astray; more than a few mean that the draws are not to be trusted.
     """
 
     names: tuple[str, ...]
@@ -122,12 +115,9 @@ class Profile:
 
     Attributes
     ----------
-    name, unit
-        The parameter.
-    values
-        Where it was held, shape `(k,)`.
-    deviance
-        Twice the loss of log likelihood, shape `(k,)`; a parabola where the standard deviation says all.
+    values, deviance
+        Where it was held, and twice the loss of log likelihood there, shape `(k,)`; a parabola where the standard
+        deviation says all.
     lower, upper
         Ends of the 95 % interval; the last value looked at where the deviance stays below its bound.
     """
@@ -204,14 +194,13 @@ def profile_stage(
 
 def _solved(stage: Stage, runs: Sequence[Run], hyper: Hyper | None, stroke_um: float) -> Solved:
     """Fit what is free of a stage; a `ValueError` where nothing is."""
-    place = place_of_hysteresis(stage)
-    law = None if place is None else stage.parts[place]
-    frozen = stage.names[place or 0] in stage.frozen
-    if isinstance(law, Preisach) and isinstance(law.density, GridDensity) and not frozen:
+    fitted = free_grid(stage)
+    if fitted is None:
+        problem = Problem.of(stage, None, np.zeros(0), None, stroke_um)
+    else:
+        law = fitted[1]
         grid = Grid(law.density.lower_V, law.density.upper_V, law.density.levels)
         problem = Problem.of(stage, grid, np.asarray(columns_of(law)), hyper, stroke_um)
-    else:
-        problem = Problem.of(stage, None, np.zeros(0), None, stroke_um)
     return solve_chain(problem, runs, "squares", lambda _: None)
 
 

@@ -20,6 +20,7 @@ from microid import (
     AbstractEffect,
     AbstractHysteresis,
     AbstractLinear,
+    GridDensity,
     LinearSystem,
     Preisach,
     Signal,
@@ -93,6 +94,24 @@ def place_of_hysteresis(stage: Stage) -> int | None:
     return places[0] if places else None
 
 
+def as_stage(model: Preisach | Stage) -> Stage:
+    """A model as a stage: a hysteresis alone is one of a single part."""
+    return model if isinstance(model, Stage) else Stage.of(hysteresis=model)
+
+
+def hysteresis_of(stage: Stage) -> Any:
+    """The part of a stage that holds its hysteresis, with what is around it; None where there is none."""
+    place = place_of_hysteresis(stage)
+    return None if place is None else stage.parts[place]
+
+
+def free_grid(stage: Stage) -> tuple[str, Preisach] | None:
+    """Name and Preisach operator of a stage that is fitted on a grid; None where it is frozen, or of another kind."""
+    law, name = hysteresis_of(stage), stage.names[place_of_hysteresis(stage) or 0]
+    on_grid = isinstance(law, Preisach) and isinstance(law.density, GridDensity)
+    return (name, law) if on_grid and name not in stage.frozen else None
+
+
 def gain_ahead(stage: Stage) -> float | None:
     """Voltage at the hysteresis per command, at rest; None without one, a `DataError` where it is not positive."""
     place = place_of_hysteresis(stage)
@@ -146,13 +165,11 @@ def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
 
 def range_of(stage: Stage) -> tuple[float, float]:
     """Commands that a stage was fitted on, in V; unlimited without a Preisach operator."""
-    place = place_of_hysteresis(stage)
-    law = None if place is None else innermost(stage.parts[place])
-    if isinstance(law, Preisach):
-        gain = gain_ahead(stage)
-        assert gain is not None
-        return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
-    return -np.inf, np.inf
+    law, gain = hysteresis_of(stage), gain_ahead(stage)
+    law = None if law is None else innermost(law)
+    if gain is None or not isinstance(law, Preisach):
+        return -np.inf, np.inf
+    return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
 
 
 def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout: float) -> list[Run]:

@@ -14,7 +14,7 @@ from fits.loop._prior import interpolation
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Prediction, Uncertainty
 from fits.stage._moments import Chain, RunSums, along, offsets_out
-from fits.stage._run import place_of_hysteresis, prepare_program, simulate_stage
+from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._noise import WHITE, correlation_samples, shared_square
 from microid import Preisach, Stage
@@ -31,20 +31,9 @@ class StageUncertainty(AbstractUncertainty):
     """Independent perturbations of a stage, each one standard deviation long.
 
     The variance of a prediction is the sum of the squared changes under all of them, to first order; sensor noise is
-    not in it.
-
-    Attributes
-    ----------
-    coordinates
-        Perturbations of the stage's coordinates, shape `(k, p)`.
-    columns_um
-        And of the columns of its grid, shape `(k, D)`; `D = 0` without one.
-    mean_um
-        What each does to the mean of the first run, which its offset makes up for, shape `(k,)`.
-    discrepancy_um
-        Standard deviation of the model's own error, as neighbouring residuals show it.
-    grid
-        The columns; None without a grid.
+    not in it. Each perturbation moves the stage's `coordinates`, shape `(k, p)`, the columns of its grid, shape
+    `(k, D)`, where `D = 0` without one, and the mean of the first run by `mean_um`, which the offset makes up for.
+    `discrepancy_um` is the standard deviation of the model's own error, as neighbouring residuals show it.
     """
 
     coordinates: Float[Array, "k p"]
@@ -201,7 +190,7 @@ def predict(
     """
     if uncertainty is not None:
         return uncertainty.predict(model, record, initial)
-    stage, run = prepare_program(model if isinstance(model, Stage) else Stage.of(hysteresis=model), record, initial)
+    stage, run = prepare_program(as_stage(model), record, initial)
     return Prediction(simulate_stage(stage, run), np.full(len(record), np.nan))
 
 
@@ -214,10 +203,8 @@ def draw_plants(
     ----------
     model, uncertainty
         From a fit or a model file.
-    count
-        How many stages in all, 1 or more; the first is the fitted one.
-    seed
-        Of the draws.
+    count, seed
+        How many stages in all, 1 or more, of which the first is the fitted one; and the seed of the draws.
 
     Returns
     -------
@@ -232,7 +219,7 @@ def draw_plants(
     """
     if count < 1:
         raise ValueError(f"count must be 1 or more, got {count}")
-    stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
+    stage = as_stage(model)
     if count == 1:
         return (stage,)
     if isinstance(model, Stage) and isinstance(uncertainty, StageUncertainty):
@@ -257,10 +244,10 @@ def _moved(stage: Stage, grid: Grid | None, along: np.ndarray, columns_um: np.nd
     place = place_of_hysteresis(stage)
     if grid is None or place is None:
         return stage
-    law = stage.parts[place]
+    name, law = stage.names[place], stage.parts[place]
     if not isinstance(law, Preisach):
-        raise DataError(f"{stage.names[place]!r} is a {type(law).__name__}: take off what is around the hysteresis")
+        raise DataError(f"{name!r} is a {type(law).__name__}: take off what is around the hysteresis")
     levels = law.density.levels
     columns = np.asarray(columns_of(law)) + interpolation(grid.levels, levels) @ columns_um
     fine = Grid(law.density.lower_V, law.density.upper_V, levels)
-    return stage.swap(stage.names[place], fine.model(np.maximum(columns, 0.0), law.offset_um - float(mean_um)))
+    return stage.swap(name, fine.model(np.maximum(columns, 0.0), law.offset_um - float(mean_um)))
