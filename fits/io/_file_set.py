@@ -116,10 +116,7 @@ class FileSet:
         self._scraps: list[Path] = []
 
     def file(self, path: str | os.PathLike[str]) -> Path:
-        """Give a temporary name for a file to write; it does not exist yet, and ends as `path` does.
-
-        A `DataError` says that `path` cannot be written to.
-        """
+        """Give a temporary name, of the ending of `path`, for a file to write; a `DataError` if `path` cannot be."""
         target = check_file(path)
         if any(is_temporary(part) for part in target.parts):
             # Of another set, which puts it in its place or deletes it.
@@ -141,7 +138,7 @@ class FileSet:
     def folder(self, path: str | os.PathLike[str] | None, option: str = "--plots") -> Path | None:
         """Make a temporary folder, whose files go to the folder `path` that an option named; for None there is none.
 
-        `path` is made if need be; a `DataError` says that it cannot be written to, or is no folder.
+        A `DataError` says that `path`, which is made if need be, cannot be written to, or is no folder.
         """
         if path is None:
             return None
@@ -266,10 +263,7 @@ def file_set() -> Iterator[FileSet]:
 
 
 def discard_all() -> None:
-    """Delete what is under temporary names, for a process that ends.
-
-    A signal may come at any moment, such as between the end of a block and what cleans up after it.
-    """
+    """Delete what is under temporary names, for a process that ends: a signal may come at any moment."""
     for files in _OPEN:
         files.discard()
 

@@ -75,11 +75,7 @@ class Extreme:
 
 
 def parse_limits(texts: Iterable[str]) -> Ranges:
-    """Read the texts of the option `--limit`, such as `displacement=0:40um` or, of a size, `slew=2kV/s`.
-
-    A `DataError` refuses a name that is not in `UNITS`, a unit of another quantity, and anything but a range of two
-    rising numbers.
-    """
+    """Read texts such as `displacement=0:40um` or, of a size, `slew=2kV/s`; a `DataError` refuses any others."""
     found: Ranges = {}
     for text in texts:
         name, _, words = text[:200].partition("=")

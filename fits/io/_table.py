@@ -57,8 +57,8 @@ class Table:
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
         """Parse all columns: the numeric ones, each of shape (n,), and the first problem of each other.
 
-        A `DataError` refuses a row with too many or too few cells, a cell of a `strict` column that is not a finite
-        number, and a file without rows.
+        A `DataError` refuses a file without rows, a row of another length, and what is not finite in a `strict`
+        column.
         """
         if next(self._lines(), None) is None:
             what = "expected rows of numbers below the header, found none; export again"
@@ -209,11 +209,7 @@ class Table:
 
 
 def open_table(path: str | os.PathLike[str]) -> Table:
-    """Read a file and its header.
-
-    A `DataError` says that it is missing, a folder, unreadable, empty, binary or corrupted, or that the header is
-    missing or has duplicates.
-    """
+    """Read a file and its header; a `DataError` says that this is no readable text with a header of its own."""
     shown = os.fspath(path)
     data = read_bytes(shown, "a CSV file", MOST_CSV_BYTES)
     if data.startswith(b"\x1f\x8b") or shown.lower().endswith(".gz"):

@@ -53,8 +53,8 @@ def choose_grid(
 ) -> tuple[float, GridTrial, list[LevelTrial]]:
     """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
 
-    Returns the stroke in um, which is the unit of the columns, the grid that is kept, and all that were tried. A
-    `DataError` where there is no loop to fit, a `FitError` where a solver fails.
+    Returns the stroke in um, the unit of the columns, the grid that is kept, and all trials. A `DataError` where
+    there is no loop to fit, a `FitError` where a solver fails.
     """
     stroke = max(_stroke(run) for run in runs)
 

@@ -150,10 +150,7 @@ def correlated(samples: float, what: str) -> str:
 def check_fit(
     records: Sequence[Record], holdout: float | Sequence[Record], loss: str
 ) -> tuple[float, tuple[Record, ...], tuple[float, float]]:
-    """Check what a fit is given: the fraction and the records that are held out, and the range of all voltages.
-
-    A `DataError` if it cannot be fitted, a `RuntimeError` if JAX computes in single precision.
-    """
+    """Check what a fit is given; the fraction and the records held out, and the range of all voltages."""
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
     if loss not in LOSSES:

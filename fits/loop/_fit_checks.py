@@ -29,10 +29,7 @@ _SPARSE_s = 1.0
 
 
 def remarks_on(runs: Sequence[Run], residuals: Sequence[np.ndarray], robust: bool) -> list[str]:
-    """Name what is wrong with runs that were fitted, by what the fit leaves of each in um, shape `(n,)`.
-
-    `robust` says whether outliers count less in the fit already.
-    """
+    """Name what is wrong with fitted runs, by their residuals in um, `(n,)`; `robust` if outliers count less."""
     out = []
     for run, residual in zip(runs, residuals, strict=True):
         record = run.record

@@ -72,10 +72,9 @@ class GridSolution:
 
 
 def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -> GridSolution:
-    """Find the most probable non-negative columns, smoothness and noise, all in strokes.
+    """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on.
 
-    So many samples as `correlation` are worth one independent one; the search begins at `start`. A `FitError` if the
-    regression does not converge.
+    So many samples as `correlation` are worth one independent one. A `FitError` if the regression does not converge.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)

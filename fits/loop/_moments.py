@@ -76,10 +76,7 @@ class RunMean:
 
 @dataclass(frozen=True)
 class Data:
-    """Moments of all runs on one grid: over all fitted samples, and over consecutive fifths of every run's.
-
-    Each run, and each fifth, is counted from its own mean.
-    """
+    """Moments of all runs, over all fitted samples and over fifths of every run's, each from its own mean."""
 
     grid: Grid
     total: Moments

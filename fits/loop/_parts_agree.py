@@ -47,10 +47,9 @@ def check_loops(
     hyper: Hyper,
     robust: bool,
 ) -> tuple[Misfit, list[str]]:
-    """Say how far from noise a fitted hysteresis is, and what is wrong with the runs that it was fitted to.
+    """Say how far from noise a fitted hysteresis is, and what is wrong with its runs; errors of `disagreements`.
 
-    `prepare` makes a record ready again; `robust` says whether outliers counted less. A `DataError` as of
-    `disagreements`.
+    `prepare` makes a record ready again; `robust` says whether outliers counted less.
     """
     residuals = [left_of(model, run) for run in runs]
     left, remarks = misfits(runs, residuals), remarks_on(runs, residuals, robust)

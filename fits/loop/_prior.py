@@ -91,10 +91,7 @@ def _matrices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) -> np.ndarray:
-    """Sum the squares of a stencil over all places where it fits into the half-plane, as a quadratic form.
-
-    Each counts by the distance of its place from the diagonal.
-    """
+    """Sum of the squares of a stencil over its places in the half-plane, weighed by distance from the diagonal."""
     weights = n * (n + 1) // 2
     place = -np.ones((n, n), dtype=np.int64)
     place[np.tril_indices(n)] = np.arange(weights)
@@ -133,10 +130,7 @@ def interpolation(coarse: int, fine: int) -> np.ndarray:
 
 
 class Posterior(eqx.Module):
-    """Gaussian posterior of the columns, in strokes, before non-negativity.
-
-    `precision` is the inverse of the covariance, `root` its lower Cholesky factor.
-    """
+    """Gaussian posterior of the columns, in strokes, without bounds; `root` is the precision's Cholesky factor."""
 
     mean: Float[Array, " D"]
     precision: Float[Array, "D D"]

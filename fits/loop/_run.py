@@ -232,8 +232,7 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
 def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
     """Make the memory before a record from its name, one of `INITIAL_STATES`; a `DataError` for another name.
 
-    An unknown state is stood in for by negative saturation; the samples that would show the difference are not
-    known ones.
+    Negative saturation stands in for an unknown state, as the samples that would show the difference are not used.
     """
     if name in ("negative", "unknown", VIRGIN):
         return negative_saturation(lower_V)
@@ -247,10 +246,9 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
 def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:
     """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES` or `VIRGIN`.
 
-    At an end of the range every relay is in a known state, if none lies beyond: one that a voltage within the range
-    switches on and none switches off is on after the first loop, and may have been off before. Short of that, relays
-    outside the extremes that this run itself reaches either never switch or switch on the way to them; once both
-    have been visited they are a constant, which the run's own offset takes up.
+    At an end of the range every relay is in a known state, unless it cannot be switched back within the range. Short
+    of that, relays outside the extremes that this run itself reaches either never switch or switch on the way to
+    them; once both have been visited they are a constant, which the run's own offset takes up.
     """
     if initial not in ("unknown", VIRGIN):
         return np.ones(len(voltage), dtype=bool)

@@ -102,8 +102,7 @@ def perturbations(
 ) -> Uncertainty:
     """Turn a factor of the covariance of the columns, `factor @ factor.T`, into perturbations of a model.
 
-    The offset is fixed by the mean displacement of a run: it makes up for what a perturbation does to the run's mean
-    response, and has the standard deviation of that mean.
+    The offset, fixed by the mean displacement of a run, makes up for what each does to that, and has its deviation.
     """
     columns = jnp.concatenate([factor_um.T, jnp.zeros((1, grid.columns))])
     offsets = jnp.append(-(mean_response @ factor_um), offset_sd_um)

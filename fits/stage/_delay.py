@@ -94,10 +94,7 @@ class Alternative:
 
 
 def fit_without_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Alternative] | None:
-    """Fit again without readings that jump out; the files that have such, and where the parameters come out.
-
-    None where there are none, or where a robust loss weighs them less already, or where that fit fails.
-    """
+    """Fit again without outliers: the files that have some, and the parameters; None where that has no use."""
     bad = [outlying(one.residual_um, run.fitted) for one, run in zip(solved.sums, solved.runs, strict=True)]
     sources = [run.record.source for one, run in zip(bad, solved.runs, strict=True) if one.any()]
     if plan.loss != "squares" or not sources:
@@ -161,9 +158,8 @@ def fit_without_delays(
 ) -> WithoutDelays | None:
     """Look for delays in what a fit leaves of each run, and fit again without them; None where that does not help.
 
-    A small one shows as the derivative of the residual with respect to a delay, whatever the parameters may do
-    beside it (the score test of Rao 1948). In runs that are far from noise the measured frequency response is
-    searched for larger ones; without a precision, only these are looked for.
+    A small one shows as the derivative of the residual with respect to a delay (the score test of Rao 1948); of runs
+    far from noise the frequency response is searched for larger ones, without a precision for these alone.
     """
     # Between two samples a command in steps has no place where it could be shifted to, and without a resonance to
     # measure it by a delay is part of the lag.
@@ -242,10 +238,7 @@ def refuse_delays(undelayed: WithoutDelays | None) -> None:
 
 
 def widen_for_delays(fit: FitResult[Stage], undelayed: WithoutDelays) -> FitResult[Stage]:
-    """Name the delays of a fit, and widen the intervals by what they did to its parameters.
-
-    A `DataError` if a parameter moves so much that the fit says nothing.
-    """
+    """Name delays, and widen intervals by what they did; a `DataError` if a fit says nothing because of them."""
     other, said = Alternative.of(undelayed.precision), undelayed.words()
     if moved := other.contradicted(fit):
         raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")

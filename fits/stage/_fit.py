@@ -157,10 +157,7 @@ def fit_stage(
 
 @dataclass(frozen=True)
 class Solution:
-    """What the fit of a stage found before it is compared with anything, and what was asked for.
-
-    `failure` says why this is only the best place that was found; None where the fit converged.
-    """
+    """What the fit of a stage found, for what plan; or the best place, and the `failure` that it ended with."""
 
     solved: Solved
     precision: Precision
@@ -179,7 +176,7 @@ def solve_stage(
     finest: int = LADDER[-1],
     accept_best: bool = False,
 ) -> Solution:
-    """Fit a stage, on a grid of at most the finest levels; other arguments and errors are those of `fit_stage`.
+    """Fit a stage, on a grid of at most the finest levels; see `fit_stage`.
 
     `accept_best` takes the best place for an answer where the fit does not become stationary.
     """
@@ -218,10 +215,7 @@ def _refined(plan: Plan, problem: Problem) -> Solution:
 
 
 def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
-    """Put the fit of a stage, and runs that were held out, into words and figures.
-
-    A `DataError` if the runs turn out not to be of one rig.
-    """
+    """Put the fit of a stage, and held-out runs, into figures; a `DataError` if the runs are not of one rig."""
     coordinates, solved, stage = precision.chain.coordinates, precision.solved, precision.solved.stage
     remarks = check_gains(stage, solved.runs, refuse=True)
     covariance = precision.covariance(precision.influence())

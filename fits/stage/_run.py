@@ -44,8 +44,8 @@ def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
 def nuisance_columns(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, shape `(n, k)`: an offset in um, and how the stage moved before.
 
-    The latter are the free motions of what follows the hysteresis, or of the whole chain without one. A voltage at
-    the piezo that still settles when the record begins is not among them.
+    The latter are free motions of what follows the hysteresis, or of the whole chain without one. What still settles
+    ahead of the hysteresis when the record begins is not among them.
     """
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
@@ -146,7 +146,7 @@ def ahead(stage: Stage, place: int, samples: Samples, rest_V: float | None = Non
 
 
 def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
-    """Mark what no longer depends on a past that is `initial` once the lag ahead of the hysteresis is known.
+    """Mark what no longer depends on a past that is `initial`, behind the lag ahead of the hysteresis.
 
     All of them, where less than half of those that are fitted would be left.
     """
@@ -184,8 +184,7 @@ def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout
 def prepare_program(stage: Stage, record: Record, initial: str) -> tuple[Stage, Run]:
     """Make a voltage program ready for a stage, and the stage for intervals that are divided already.
 
-    A `DataError` if the voltage leaves the range that the stage was fitted on, or the stage has an effect of another
-    column that the program lacks.
+    A `DataError` if it leaves the range that the stage was fitted on, or lacks a column that the stage depends on.
     """
     range_V = range_of(stage)
     refuse_outside(record, *range_V)

@@ -83,10 +83,10 @@ class Weighing:
 class Problem:
     """A stage to be fitted, where its fit begins, and what the user should know.
 
-    The unit of the columns is `stroke_um`; `hyper` is their smoothness and noise to start from, None to leave them as
-    they are. No run counts as quieter than the part `least_noise_share` of the loudest: where more than noise is
-    left, one run would otherwise be fitted ever better, and so count for ever more, at the cost of the others. Where
-    a part was left out, `full` is the stage with it, roughly fitted.
+    The columns' unit is `stroke_um`; `hyper` is the smoothness and noise to start from, None to leave columns as they
+    are. Where more than noise is left, one run would be fitted ever better, and count ever more, at the cost of
+    others: none counts as quieter than the part `least_noise_share` of the loudest. `full` is the stage before a part
+    was left out.
     """
 
     stage: Stage
@@ -110,10 +110,9 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solved:
-    """Where a fit ended: coordinates, shape `(p,)`, and columns of the grid, shape `(D,)`.
+    """Where a fit ended: coordinates `(p,)`, columns of the grid `(D,)`, smoothness and noise if there is one.
 
-    `hyper` is the smoothness and noise of the grid, None without one. The runs have the weights of their samples, and
-    the sums are the regression at the end.
+    The runs have the weights of their samples, and the sums are the regression at the end.
     """
 
     problem: Problem

@@ -45,11 +45,7 @@ _VANISHED, _RESTARTED = 1e-2, 0.3
 
 @dataclass(frozen=True)
 class Plan:
-    """What was asked for.
-
-    The command of each run is so many s later as `shifts_s` say, and of each those samples are fitted that have
-    `settled`, shape `(n,)`; none and all by default.
-    """
+    """What was asked for; commands come `shifts_s` later, and samples that have `settled`, `(n,)`, are fitted."""
 
     records: tuple[Record, ...]
     states: tuple[str, ...]

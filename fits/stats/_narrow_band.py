@@ -95,7 +95,7 @@ def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -
 def _strongest(power: np.ndarray, inside: np.ndarray) -> tuple[int, int, float, np.ndarray]:
     """Bin of the strongest band, its width in bins, log-probability of as much by chance, and what is around.
 
-    One bin, or the mean of some where that is more by far: one of noise may be low in the very middle of a band.
+    A band wider than a bin counts where its mean is stronger by far: noise may be low in the very middle of a band.
     """
     found = []
     for wide in _WIDTHS:

@@ -22,10 +22,7 @@ _FEWEST_AT_REST = 24
 
 
 def shared_square(residual: np.ndarray) -> float:
-    """Mean of the autocovariances at lags 1 to 10, in the residual's unit squared.
-
-    White noise has none, model discrepancy has. As an estimate it can come out negative.
-    """
+    """Mean autocovariance at lags 1 to 10: about zero for white noise, which may make it negative."""
     centred = residual - residual.mean()
     furthest = min(_NEIGHBOURS, len(residual) - 1)
     products = [float(np.mean(centred[lag:] * centred[:-lag])) for lag in range(1, furthest + 1)]
@@ -102,10 +99,7 @@ def rough_noise_um(residual_um: np.ndarray) -> float:
 
 
 def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Noise:
-    """Learn the noise of a run from what nothing explains, `freedom` unknowns having been fitted to it.
-
-    The Bayesian information criterion chooses the order of the autoregression (Yule-Walker).
-    """
+    """Learn the noise of a residual by Yule-Walker, its order by BIC; `freedom` unknowns were fitted to it."""
     n = len(residual_um)
     inflate = (n / max(n - freedom, n / 2)) ** 0.5
     lags = np.array([residual_um[: n - k] @ residual_um[k:] / n for k in range(order + 1)])
