@@ -62,12 +62,16 @@ class Table:
         """
         if next(self._lines(), None) is None:
             what = "expected rows of numbers below the header, found none; export again"
-            raise data_error(self.path, what, self.header_line)
+            raise self.error(what)
         columns = self._read_fast()
         if columns is None or not all(name in columns for name in strict):
             return self._read_slowly(strict)
         problems = {name: self._first_problem(i) for i, name in enumerate(self.names) if name not in columns}
         return columns, problems
+
+    def error(self, what: str, row: int | None = None, column: str | None = None) -> DataError:
+        """The one sentence on a row of the parsed columns, or on the header."""
+        return data_error(self.path, what, self.header_line if row is None else self.line(row), column)
 
     def line(self, row: int) -> int:
         """Physical line, from 1, of a row of the parsed columns, from 0."""
@@ -169,11 +173,9 @@ class Table:
         return columns, problems
 
     def _first_problem(self, i: int) -> Problem:
-        for line, cells in self._rows():
-            number = self._number(cells[i])
-            if isinstance(number, str):
-                return line, number
-        return self.header_line + 1, "a number that pandas does not read"
+        found = ((line, self._number(cells[i])) for line, cells in self._rows())
+        other = self.header_line + 1, "a number that pandas does not read"
+        return next(((line, text) for line, text in found if isinstance(text, str)), other)
 
     def _number(self, cell: str) -> float | str:
         """Value of a cell, or what was found instead of a finite number."""

@@ -265,27 +265,19 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
 
 def _walk(voltage: np.ndarray, start: Staircase) -> Path:
     for size in _STAIRCASES:
-        path = _followed(voltage, resized(start, size))
-        if path is not None:
-            return path
+        memory, found = resized(start, size), []
+        for piece in _split(voltage):
+            anchor, rising, after = _remember(jnp.asarray(piece), memory)
+            found.append((memory, anchor, rising))
+            memory = after
+        # Without room for all extremes the memory is NaN, and stays so.
+        if not np.isnan(memory.extremes_V[0]):
+            starts, anchors, risings = zip(*found, strict=True)
+            return Path(starts, np.concatenate(anchors)[: len(voltage)], np.concatenate(risings)[: len(voltage)])
     raise DataError(
         f"the voltage nests more than {_STAIRCASES[-1]} loops into each other: that is noise, not a drive; "
         "use the commanded voltage"
     )
-
-
-def _followed(voltage: np.ndarray, start: Staircase) -> Path | None:
-    """Follow a voltage; None where the memory has no room for its extremes."""
-    starts, anchors, risings = [], [], []
-    for piece in _split(voltage):
-        starts.append(start)
-        anchor, rising, start = _remember(jnp.asarray(piece), start)
-        anchors.append(anchor)
-        risings.append(rising)
-        if np.isnan(start.extremes_V[0]):
-            return None
-    n = len(voltage)
-    return Path(tuple(starts), np.concatenate(anchors)[:n], np.concatenate(risings)[:n])
 
 
 def _split(values: np.ndarray) -> list[np.ndarray]:

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
 
 from fits.io._errors import DataError
 from fits.io._plausible import SHORTEST_STEP_s, check_size
-from fits.io._table import Table, data_error, open_table
+from fits.io._table import Table, open_table
 
 # A line is excited if the input reaches this share of its largest.
 _EXCITED = 0.01
@@ -135,9 +136,7 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
     needed = ("time_s", "realization", "period", *(inputs or ["u1_V"]), *(outputs or ["y1_um"]))
     for name in needed:
         if name not in table.names:
-            raise data_error(
-                table.path, f"expected a column '{name}', found none; rename or add it", table.header_line
-            )
+            raise table.error(f"expected a column '{name}', found none; rename or add it")
     values, _ = table.read(needed)
     for name in needed:
         check_size(table, name, values[name], {"V": "V", "um": "um", "s": "s"}.get(name.rpartition("_")[2], "1"))
@@ -150,20 +149,16 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
         or np.any(order != np.arange(len(starts)))
         or len(starts) != periods * len(np.unique(group[0]))
     ):
-        raise data_error(
-            table.path,
+        raise table.error(
             "expected every realization with the same periods of the same length, in order; cut or sort the rows",
-            table.header_line,
-            "period",
+            column="period",
         )
     if periods * lengths[0] < 2:
-        raise data_error(table.path, "expected two samples or more per realization, found one", table.header_line)
+        raise table.error("expected two samples or more per realization, found one")
     steps = np.diff(values["time_s"].reshape(-1, periods * lengths[0]), axis=1)
     interval_s = float(np.mean(steps))
     if not interval_s >= SHORTEST_STEP_s or np.max(np.abs(steps - interval_s)) > 0.01 * interval_s:
-        raise data_error(
-            table.path, "expected even time steps of 1e-12 s or more; sample evenly", table.header_line, "time_s"
-        )
+        raise table.error("expected even time steps of 1e-12 s or more; sample evenly", column="time_s")
     shape = (-1, periods, lengths[0])
     u, y = (np.stack([values[name].reshape(shape) for name in names], axis=-1) for names in (inputs, outputs))
     return Multisine(interval_s, u, y, os.path.basename(table.path))
@@ -212,9 +207,9 @@ def approximate(record: Multisine, u: NDArray[Any], y: NDArray[Any]) -> tuple[ND
 
 
 def smooth(variance: NDArray[Any]) -> NDArray[Any]:
-    half = min(_SMOOTH, len(variance) - 1 | 1) // 2
-    padded = np.pad(variance, ((half, half), (0, 0)), mode="reflect")
-    return np.mean(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0), axis=-1)
+    """Mean over neighbouring lines, shape `(f, p)`."""
+    width = 2 * (min(_SMOOTH, len(variance) - 1 | 1) // 2) + 1
+    return convolve1d(variance, np.full(width, 1 / width), axis=0, mode="mirror")
 
 
 def read_response(path: str | os.PathLike[str]) -> ResponseData:
@@ -239,11 +234,9 @@ def read_response(path: str | os.PathLike[str]) -> ResponseData:
     phase = _one_of(table, _DEGREES, _RADIANS)
     cartesian = _REAL in table.names and _IMAGINARY in table.names
     if "frequency_Hz" not in table.names or cartesian == bool(magnitude and phase):
-        raise data_error(
-            table.path,
+        raise table.error(
             f"expected the columns frequency_Hz and either {_REAL} and {_IMAGINARY} or {_MAGNITUDE} (or {_DECIBEL}) "
-            f"and {_DEGREES} (or {_RADIANS}), found {', '.join(table.names)}; rename or drop columns",
-            table.header_line,
+            f"and {_DEGREES} (or {_RADIANS}), found {', '.join(table.names)}; rename or drop columns"
         )
     shown = (_REAL, _IMAGINARY) if cartesian else (magnitude, phase)
     known = (_VARIANCE,) if _VARIANCE in table.names else ()
@@ -260,7 +253,7 @@ def read_response(path: str | os.PathLike[str]) -> ResponseData:
     ):
         if np.any(wrong):
             row = int(np.argmax(wrong))
-            raise data_error(table.path, f"expected {expected}; correct or sort the rows", table.line(row), name)
+            raise table.error(f"expected {expected}; correct or sort the rows", row, name)
     if cartesian:
         response = first + 1j * second
     else:
@@ -274,7 +267,5 @@ def read_response(path: str | os.PathLike[str]) -> ResponseData:
 def _one_of(table: Table, *names: str) -> str:
     found = [name for name in names if name in table.names]
     if len(found) > 1:
-        raise data_error(
-            table.path, f"expected one of {' and '.join(names)}, found both; drop one", table.header_line
-        )
+        raise table.error(f"expected one of {' and '.join(names)}, found both; drop one")
     return found[0] if found else ""
