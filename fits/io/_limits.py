@@ -89,13 +89,10 @@ def parse_limits(texts: Iterable[str]) -> Ranges:
         if match is None:
             raise DataError(f"--limit {name}: expected a range such as {example}, found {words!r}; write it so.")
         factor = _factor(name, (match[3] or "").strip())
+        if match[1] is None and name in _TWO_SIDED:
+            raise DataError(f"--limit {name}: expected two numbers such as {example}, found {words!r}.")
         high = float(match[2]) * factor
-        if match[1] is None:
-            if name in _TWO_SIDED:
-                raise DataError(f"--limit {name}: expected two numbers such as {example}, found {words!r}.")
-            low = -high
-        else:
-            low = float(match[1]) * factor
+        low = -high if match[1] is None else float(match[1]) * factor
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise DataError(f"--limit {name}: expected the lower of two numbers first, found {words!r}; swap them.")
         found[name] = low, high

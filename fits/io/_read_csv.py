@@ -42,7 +42,7 @@ def read_csv(
     Parameters
     ----------
     path
-        File to read; it may be compressed by gzip.
+        File to read.
     columns
         Canonical column to source column, for example ``{"voltage_V": "u1_V", "displacement_um": "-height[m]"}``:
         the unit is the suffix of the source or stands in brackets, and a minus flips the sign.

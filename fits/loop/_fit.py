@@ -57,10 +57,8 @@ def fit(
     ----------
     records
         Runs of one rig. Each has its own sensor offset.
-    family
-        Name in `microid.FAMILIES`.
-    levels
-        Number of switching voltages; chosen from the data by default.
+    family, levels
+        Name in `microid.FAMILIES`, and number of switching voltages, chosen from the data by default.
     holdout
         Fraction at the end of every run that is only predicted, or records that are.
     initial
@@ -81,10 +79,8 @@ def fit(
     ------
     DataError
         If the records cannot be fitted, or are not of one rig.
-    FitError
-        If a solver fails.
-    RuntimeError
-        If JAX computes in single precision.
+    FitError, RuntimeError
+        If a solver fails, or JAX computes in single precision.
     """
     fraction, aside, range_V = check_fit(records, holdout, loss)
     if family not in FAMILIES:

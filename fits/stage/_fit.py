@@ -41,13 +41,8 @@ _UNSEEN_SD = 0.5
 def default_stage(hold: Hold = "first") -> Stage:
     """The stage of Section 3.1: driver, Preisach operator and mechanics, with all gain in the operator.
 
-    A gain anywhere else would only be seen together with it.
-
-    Parameters
-    ----------
-    hold
-        How the command runs between samples: `first` for lines, `smooth` for curves, `zero` for steps that each begin
-        at a sample and are not seen by it yet.
+    A gain anywhere else would only be seen together with it. `hold` says how the command runs between samples:
+    `first` for lines, `smooth` for curves, `zero` for steps that each begin at a sample and are not seen by it yet.
     """
     flat = Preisach(
         GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
@@ -89,29 +84,18 @@ def fit_stage(
         present values. By default the stage of `default_stage`.
     levels
         Number of switching voltages; chosen from the slow runs by default.
-    holdout
-        Fraction at the end of every run that is only predicted, or records that are.
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. One for all holds for records
         that are held out, too; theirs is unknown where each fitted run has its own.
-    loss
-        `squares`, or `huber`, to which outliers count less.
-    progress
-        Told what is being done, a sentence at a time.
-
-    Returns
-    -------
-    FitResult
-        Never the start: a fit that fails raises.
+    holdout, loss, progress
+        See `fit`, as for what is returned.
 
     Raises
     ------
     DataError
         If the records cannot be fitted, do not show the dynamics, or are not of one rig.
-    FitError
-        If a solver fails.
-    RuntimeError
-        If JAX computes in single precision.
+    FitError, RuntimeError
+        If a solver fails, or JAX computes in single precision.
     """
     found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
     solved, runs = found.solved, found.solved.runs

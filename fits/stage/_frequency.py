@@ -35,14 +35,7 @@ _UNITS = {
 class Multisine:
     """Steady-state response to periodic inputs: `r` realizations of `q` periods, `n` samples each.
 
-    Attributes
-    ----------
-    interval_s
-        Between samples.
-    voltage_V, displacement_um
-        Shapes `(r, q, n, m)` and `(r, q, n, p)`.
-    source
-        Name of the file.
+    Voltages and displacements have shapes `(r, q, n, m)` and `(r, q, n, p)`.
     """
 
     interval_s: float
@@ -82,19 +75,10 @@ class Multisine:
 
 @dataclass(frozen=True, eq=False)
 class ResponseData:
-    """A measured frequency response.
+    """A measured frequency response: increasing frequencies, shape `(f,)`, and complex responses, `(f, p, m)`.
 
-    Attributes
-    ----------
-    frequency_Hz
-        Shape `(f,)`, increasing.
-    response_um_per_V
-        Shape `(f, p, m)`, complex.
-    variance_um2_per_V2
-        Of the complex response, from noise and distortion together, shape `(f, p, m)`; None where it is not known,
-        and then all lines weigh the same.
-    noise_variance_um2_per_V2
-        The part of it that differs between periods; None for a single period.
+    The variance of the latter, `(f, p, m)`, holds noise and distortion; where it is None, all lines weigh the same.
+    The noise variance is the part of it that differs between periods; None for a single period.
     """
 
     frequency_Hz: NDArray[np.float64]
@@ -123,12 +107,8 @@ class ResponseData:
 def read_multisine(path: str | os.PathLike[str]) -> Multisine:
     """Read `time_s, realization, period, u1_V, u2_V, ..., y1_um, y2_um, ...` from a CSV file.
 
-    Rows are ordered by realization, then period, then time. Time may start anew with each realization.
-
-    Raises
-    ------
-    DataError
-        One sentence with file and column, what was expected and what to do.
+    Rows are ordered by realization, then period, then time, which may start anew with each realization. A `DataError`
+    says in one sentence with file and column what was expected and what to do.
     """
     table = open_table(path)
     inputs = [f"u{i}_V" for i in range(1, len(table.names) + 1) if f"u{i}_V" in table.names]
@@ -169,12 +149,8 @@ def estimate_response(record: Multisine) -> ResponseData:
 
     Least squares over the realizations of what periods have averaged; see Pintelon and Schoukens, *System
     Identification: A Frequency Domain Approach* (2012), chapter 4. What differs between periods is noise; what
-    differs between realizations is noise and nonlinear distortion together. Voltages count as exact.
-
-    Raises
-    ------
-    DataError
-        If there are no more realizations than inputs, or the inputs are not independent.
+    differs between realizations is noise and nonlinear distortion together. Voltages count as exact. A `DataError` if
+    there are no more realizations than inputs, or the inputs are not independent.
     """
     frequency_Hz, u, y = record.spectra()
     gain, total = approximate(record, u, y)
@@ -217,17 +193,8 @@ def read_response(path: str | os.PathLike[str]) -> ResponseData:
 
     The columns are `frequency_Hz`, then `real_um_per_V` and `imag_um_per_V`, or a magnitude (`magnitude_um_per_V`, or
     `magnitude_dB` for 20 log10 of um/V) and a phase (`phase_deg` or `phase_rad`). A column `variance_um2_per_V2`, of
-    the complex response, may stand beside them.
-
-    Returns
-    -------
-    ResponseData
-        Of shape `(f, 1, 1)`, for `fit_response`.
-
-    Raises
-    ------
-    DataError
-        One sentence with file and column, what was expected and what to do.
+    the complex response, may stand beside them. The data are of shape `(f, 1, 1)`, for `fit_response`. A `DataError`
+    says in one sentence with file and column what was expected and what to do.
     """
     table = open_table(path)
     magnitude = _one_of(table, _MAGNITUDE, _DECIBEL)

@@ -65,12 +65,11 @@ def fit_response(data: ResponseData, modes: int = 2, band_Hz: _Band = None, coup
     ----------
     data
         One input and output or several.
-    modes
-        Number of modes. One more than the band shows stands for the next one above it.
+    modes, coupled
+        Number of modes, of which one more than the band shows stands for the next one above it; and whether damping
+        may couple them, by `quadrature_um_per_V`, zero otherwise.
     band_Hz
         Lowest and highest frequency to fit; all by default.
-    coupled
-        Whether damping may couple the modes: fits `quadrature_um_per_V`, zero otherwise.
 
     Raises
     ------
@@ -86,7 +85,7 @@ def fit_response(data: ResponseData, modes: int = 2, band_Hz: _Band = None, coup
     # Without plays every pair of input and output is a response of its own to the same poles.
     wanted, variance = (values.reshape(len(gain), 1, -1) for values in (gain, variance))
     drive = np.ones((len(gain), 1, 1), dtype=complex)
-    spectra = _Spectra(*map(jnp.asarray, (frequency, drive, wanted, variance)), coupled=coupled)
+    spectra = _spectra(frequency, drive, wanted, variance, coupled)
     found = _fit(_start(spectra, gain, modes), spectra, known is not None)
     model, sd = (_reshaped(modes, gain.shape[1:]) for modes in (found.model, found.sd))
     return ModalFit(model, sd, found.covariance, found.misfit, found.band_Hz)
@@ -110,17 +109,11 @@ def fit_hysteresis(
     ----------
     record
         More realizations than inputs: they tell how much of the spectra is distortion, which the weights are made of.
-    start
-        Modes to start from, usually of `fit_response`.
-    threshold_V
-        Thresholds of the plays, shape `(K,)`, not zero, where a play is the voltage itself.
+    start, threshold_V
+        Modes to start from, usually of `fit_response`, and thresholds of the plays, shape `(K,)`, not zero, where a
+        play is the voltage itself.
     band_Hz, coupled
-        See `fit_response`.
-
-    Raises
-    ------
-    DataError, FitError
-        See `fit_response`.
+        See `fit_response`, as for what is raised.
     """
     frequency, u, y = record.spectra()
     modes = start if isinstance(start, Modes) else start.model
@@ -132,7 +125,7 @@ def fit_hysteresis(
     lines = np.rint(frequency[band] * samples * record.interval_s).astype(int)
     drive = np.moveaxis(np.fft.rfft(drive, axis=1)[:, lines] / samples, 1, 0)
     wanted = np.mean(y, axis=2)[band]
-    spectra = _Spectra(*map(jnp.asarray, (frequency[band], drive, wanted, variance)), coupled=coupled)
+    spectra = _spectra(frequency[band], drive, wanted, variance, coupled)
     # Solved for first of all, so what they start from does not matter.
     zero = jnp.zeros((len(modes.damping_ratio), y.shape[3], drive.shape[2]))
     modes = Modes(modes.natural_frequency_Hz, modes.damping_ratio, zero, zero, zero[0], modes.delay_s)
@@ -193,6 +186,12 @@ class _Spectra(eqx.Module):
     def _white(self, values: Complex[Array, "f e p"]) -> Float[Array, "p n"]:
         scaled = jnp.moveaxis(jnp.stack([values.real, values.imag]) * (2 / self.variance[None]) ** 0.5, -1, 0)
         return scaled.reshape(scaled.shape[0], -1)
+
+
+def _spectra(frequency_Hz: Any, drive: Any, wanted: Any, variance: Any, coupled: bool) -> _Spectra:
+    return _Spectra(
+        jnp.asarray(frequency_Hz), jnp.asarray(drive), jnp.asarray(wanted), jnp.asarray(variance), coupled=coupled
+    )
 
 
 def _modes(model: Modes | HystereticModes) -> Modes:

@@ -44,9 +44,8 @@ def _potential(
     coordinates, runs, precision = data
     stage, total = coordinates(z), jnp.zeros(())
     for samples, share in zip(runs, precision, strict=True):
-        off = project_out(
-            nuisance_columns(stage, samples), samples.weight, samples.displacement_um - respond(stage, samples)
-        )
+        left = samples.displacement_um - respond(stage, samples)
+        off = project_out(nuisance_columns(stage, samples), samples.weight, left)
         total = total + share * jnp.sum(samples.weight * off**2) / 2
     return total
 
@@ -67,14 +66,10 @@ def sample_posterior(
 
     Parameters
     ----------
-    result
-        From `fit_stage` of the same records; where the sampler starts.
-    records, holdout, initial
-        As they were given there.
-    draws, warmup
-        Number of draws, and of steps to adapt before.
-    seed
-        Of the sampler.
+    result, records, holdout, initial
+        From `fit_stage`, where the sampler starts, and what was given there.
+    draws, warmup, seed
+        Number of draws, of steps to adapt before, and the seed of the sampler.
 
     Raises
     ------
@@ -144,14 +139,11 @@ def profile_stage(
 
     Parameters
     ----------
-    result
-        From `fit_stage` of the same records, with the squares as loss.
-    records, holdout, initial
-        As they were given there.
-    name
-        Of the parameter, such as `mechanics.damping_ratio`.
-    points
-        Number of values, evenly spread over seven standard deviations, less where a bound comes before.
+    result, records, holdout, initial
+        From `fit_stage`, with the squares as loss, and what was given there.
+    name, points
+        Of the parameter, such as `mechanics.damping_ratio`, and number of values: evenly spread over seven standard
+        deviations, less where a bound comes before.
     progress
         Told what is being done.
 

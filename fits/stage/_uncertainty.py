@@ -177,10 +177,9 @@ def predict(
     ----------
     model, uncertainty
         From a fit or a model file; without an uncertainty the standard deviations are NaN.
-    record
-        The program; its displacement, if any, is not looked at.
-    initial
-        Memory before the first sample: `negative`, `positive` or `demagnetised`.
+    record, initial
+        The program, whose displacement, if any, is not looked at; and the memory before its first sample: `negative`,
+        `positive` or `demagnetised`.
 
     Raises
     ------
