@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.io._atomic import atomic_path, atomic_write_bytes, atomic_write_text, write_csv
+from fits.io._atomic import atomic_path, atomic_write_text, write_csv
 from fits.io._errors import DataError
 from fits.io._record import Record
 
 
 def test_text_and_bytes_are_written_as_they_are(tmp_path):
     atomic_write_text(tmp_path / "a.txt", "5 µm\r\nend\n")
-    atomic_write_bytes(tmp_path / "b.bin", b"\x00\xff")
+    with atomic_path(tmp_path / "b.bin") as temporary:
+        temporary.write_bytes(b"\x00\xff")
     assert (tmp_path / "a.txt").read_bytes() == b"5 \xc2\xb5m\r\nend\n"
     assert (tmp_path / "b.bin").read_bytes() == b"\x00\xff"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "b.bin"]

@@ -23,7 +23,7 @@ from fits.loop._run import prepare_run
 from fits.stage._fit import default_stage
 from fits.stage._moments import Chain, offsets_out
 from fits.stage._run import place_of_hysteresis
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 from microid import EFFECTS, Sensor
 from microid.effects.aging import Aging
 from microid.effects.voltage_dependent_capacitance import VoltageDependentCapacitance

@@ -15,7 +15,7 @@ from fits.diagnosis._joint_fit import leave_bounds
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 from microid import EFFECTS, Driver
 
 STEP_S, COUNT = 0.01, 3300

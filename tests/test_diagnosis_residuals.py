@@ -24,7 +24,7 @@ from fits.diagnosis._residual_tests import (
     run_regressors,
 )
 from fits.stats._narrow_band import Band
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 
 
 def plain_projector(lengths=(600, 800)):

@@ -15,7 +15,7 @@ from fits.diagnosis._regression import regress
 from fits.loop._choose_grid import _resolve
 from fits.loop._result import FitStatus
 from fits.loop._run import known_samples
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 from microid.effects.backlash import Backlash
 
 NOISE_um = 0.02

@@ -21,7 +21,7 @@ from fits.diagnosis._result import FoundCause
 from fits.diagnosis._score import law_of, probes_of, scales_of, score
 from fits.diagnosis._select import Cause, select
 from fits.loop._run import prepare_run
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 from microid import EFFECTS
 
 MOST = 3000

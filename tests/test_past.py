@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits.stage._past import past_columns
+from fits.loop._past import past_columns
 
 LEVELS = 120
 

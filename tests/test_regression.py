@@ -2,7 +2,6 @@
 
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 from scipy.integrate import quad
 from scipy.optimize import nnls
@@ -10,12 +9,11 @@ from scipy.stats import multivariate_normal
 
 import fits
 from fits.loop._design import Grid, columns_of
-from fits.loop._evidence import _negative_log, maximise_evidence, posterior_of
 from fits.loop._moments import gather
-from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._prior import Hyper, _negative_log, interpolation, maximise_evidence, posterior_of, roughness
 from fits.loop._run import prepare_run, simulate_run
 from fits.stats._noise import correlation_samples, shared_square
-from fits.stats._nonnegative import BlockPivoting
+from fits.stats._nonnegative import minimise_nonnegative
 
 LEVELS = 6
 
@@ -146,11 +144,11 @@ def test_block_pivoting_finds_the_minimum_that_nnls_finds(rng, condition):
     def cost(y, _):
         return y @ (hessian @ y) / 2 - linear @ y
 
-    solver = BlockPivoting(rtol=0.0, atol=1e-8, norm=optx.max_norm)
-    found = optx.minimise(cost, solver, jnp.asarray(rng.normal(size=size)), max_steps=400, throw=False)
-    assert found.result == optx.RESULTS.successful
+    start = jnp.asarray(rng.normal(size=size))
+    found, success = minimise_nonnegative(jnp.asarray(hessian), -jnp.asarray(linear), start, 1e-8, 400)
+    assert success
     exact, _ = nnls(root, target, maxiter=10000)
-    y = np.asarray(found.value)
+    y = np.asarray(found)
     assert np.all(y >= 0)
     assert np.any(y == 0)
     np.testing.assert_allclose(cost(y, None), cost(exact, None), rtol=1e-7)
@@ -161,12 +159,9 @@ def test_block_pivoting_finds_the_minimum_that_nnls_finds(rng, condition):
 
 def test_block_pivoting_says_when_it_ran_out_of_steps(rng):
     root = rng.normal(size=(30, 30))
-    hessian, linear = root.T @ root, root.T @ rng.normal(size=30)
-    solver = BlockPivoting(rtol=0.0, atol=1e-10, norm=optx.max_norm)
-    short = optx.minimise(
-        lambda y, _: y @ (hessian @ y) / 2 - linear @ y, solver, jnp.zeros(30), max_steps=1, throw=False
-    )
-    assert short.result == optx.RESULTS.nonlinear_max_steps_reached
+    hessian, linear = jnp.asarray(root.T @ root), -jnp.asarray(root.T @ rng.normal(size=30))
+    assert not minimise_nonnegative(hessian, linear, jnp.zeros(30), 1e-10, 1)[1]
+    assert minimise_nonnegative(hessian, linear, jnp.zeros(30), 1e-10, 400)[1]
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.6, 0.9])

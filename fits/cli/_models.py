@@ -8,7 +8,7 @@ from fits.io._limits import Ranges, allowed, parse_limits
 from fits.io._record import Record
 from fits.loop._uncertainty import Prediction
 from fits.stage._model_file import ModelFile
-from fits.stage._predict import predict
+from fits.stage._uncertainty import predict
 from microid import Preisach, Stage
 
 

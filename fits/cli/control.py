@@ -121,9 +121,9 @@ def control(given: Given) -> None:
     from fits.io._units import parse_columns
     from fits.loop._result import FitError
     from fits.report._control import control_json, describe_control
-    from fits.stage._draw_plants import draw_plants
     from fits.stage._model_file import load_model
     from fits.stage._motion import predicted_ranges
+    from fits.stage._uncertainty import draw_plants
     from microid import CONTROLLERS, Stage
 
     for name, least in _LEAST.items():

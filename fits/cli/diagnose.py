@@ -46,9 +46,9 @@ def diagnose(given: Given) -> None:
     Name the runs in the order in which they were taken. A column that begins with temp, and one of a second axis in
     um, nm, mm or m, are used. The end of every run is kept aside to check what is found.
     """
+    from fits.io._file_set import usable_folder
     from fits.io._jax_setup import start_jax
     from fits.io._limits import parse_limits
-    from fits.io._places import usable_folder
     from fits.io._read_csv import read_csv, read_runs
     from fits.io._units import parse_columns
     from fits.loop._result import FitError

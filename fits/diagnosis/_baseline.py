@@ -19,7 +19,7 @@ from fits.stage._fit import default_stage, solve_stage
 from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
 from fits.stage._solve import prior_precision
-from fits.stats._whiten import rough_noise_um
+from fits.stats._noise import rough_noise_um
 from microid import AbstractEffect, Hold, Mechanics, Stage, extend, host
 
 # What a finer grid would follow has a prior of its own in the projection.
@@ -208,7 +208,7 @@ def _static(
     remarks: tuple[str, ...],
     progress: Callable[[str], None],
 ) -> Baseline:
-    loops = [prepare_run(record, range_V, initial, holdout) for record in records]
+    loops = list(_prepared(records, range_V, initial, holdout, 1))
     stroke, tried, _ = choose_grid(loops, None, progress, _FINEST)
     grid = tried.data.grid
     columns = np.asarray(tried.solution.columns) * stroke

@@ -10,9 +10,8 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 from fits.io._record import Record
 from fits.loop._run import Run
-from fits.stats._at_rest import idle_stretches, quantum_um
 from fits.stats._narrow_band import DRIFT, Band, MAINS_Hz, band_of
-from fits.stats._whiten import Noise, learn_noise, rough_noise_um
+from fits.stats._noise import Noise, idle_stretches, learn_noise, quantum_um, rough_noise_um
 from microid.effects import Statistic
 
 # So many samples at rest are enough to read the noise from.
@@ -213,7 +212,7 @@ class Faults:
         out = []
         for record, height in zip(records, self.heights_um, strict=True):
             assert record.displacement_um is not None
-            out.append(replace(record, displacement_um=record.displacement_um - height, extra=dict(record.extra)))
+            out.append(replace(record, displacement_um=record.displacement_um - height))
         return out
 
 

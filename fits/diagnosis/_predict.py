@@ -12,7 +12,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Kinds, Regression, regress, saturating
 from fits.io._record import Record
 from fits.loop._run import prepare_run
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 from microid import AbstractEffect
 
 _STEP = 1e-3

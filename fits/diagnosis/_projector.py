@@ -5,19 +5,17 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from optimistix import RESULTS
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
 
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._regression import Regression, root_of
-from fits.loop._evidence import Posterior, maximise_evidence
 from fits.loop._grid import EVIDENCE_LEVELS, non_negative
 from fits.loop._moments import Moments
-from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._prior import Hyper, Posterior, interpolation, maximise_evidence, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.stage._solve import prior_precision
-from fits.stats._whiten import Noise
+from fits.stats._noise import Noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
 _ROUGHEST = 0.5
@@ -185,10 +183,10 @@ class Projector:
         precision = gram[:columns, :columns] - gram[:columns, columns:] @ follow
         precision = (precision + precision.T) / 2 + 1e-12 * np.diag(np.diagonal(precision))
         mean = baseline.columns_um + np.linalg.solve(precision, cross[:columns] - follow.T @ cross[columns:])
-        kept, result = non_negative(
+        kept, found = non_negative(
             Posterior(jnp.asarray(mean), jnp.asarray(precision), jnp.linalg.cholesky(jnp.asarray(precision)))
         )
-        if result != RESULTS.successful:
+        if not found:
             raise FitError(FitStatus.MAX_STEPS)
         others = alone - follow @ (np.asarray(kept) - baseline.columns_um)
         return others[coordinate], np.asarray(kept)

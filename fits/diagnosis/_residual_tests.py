@@ -11,7 +11,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._result import Test
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import Run
-from fits.stats._whiten import learn_noise
+from fits.stats._noise import learn_noise
 
 _WAVES, _POWERS = 12, 4
 _PERIODS = 1920

@@ -20,24 +20,17 @@ from fits.io._file_set import file_set
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path; on success it becomes `path`, on any exception it is deleted.
 
-    The temporary path does not exist yet, lies in the same folder and ends as `path` does, so that Matplotlib
-    infers the format. A file that was at `path` before is replaced in one step or left as it was. What is written is
-    on the disk before it is at `path`; a symbolic link is followed. For several files that belong together, and for
-    what is refused in a `DataError`, see `file_set`.
+    It does not exist yet, lies in the same folder and ends as `path` does, so that Matplotlib infers the format. What
+    is written is on the disk before it is at `path`; a symbolic link is followed. For the rest see `file_set`.
     """
     with file_set() as files:
         yield files.file(path)
 
 
-def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write bytes to `path`, whole or not at all; errors are those of `atomic_path`."""
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
-
-
 def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write text to `path` as UTF-8 with its line ends kept, whole or not at all; errors as `atomic_path`."""
-    atomic_write_bytes(path, text.encode())
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(text.encode())
 
 
 def refuse_nonfinite(name: str, values: NDArray[Any]) -> None:
@@ -64,10 +57,9 @@ def finite_json(content: Any) -> str:
 def write_csv(
     path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]], comments: Sequence[str] = ()
 ) -> None:
-    """Write columns, each of shape `(n,)`, as CSV, with as many digits as reading them back exactly takes.
+    """Write columns, shape `(n,)` each, as CSV that is read back exactly, with comments before the header.
 
-    A name that ends in `.gz` is compressed. Comments come before the header, each behind `#`, which the reader passes
-    over. A `DataError` refuses values that are not finite, a ValueError columns that differ in length.
+    A name that ends in `.gz` is compressed. A `DataError` refuses values that are not finite.
     """
     for name, values in columns.items():
         refuse_nonfinite(name, np.asarray(values))

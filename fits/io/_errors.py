@@ -13,14 +13,8 @@ class DataError(ValueError):
     """Bad input, in one sentence: the file, the place in it, what was expected and what to do.
 
     The `microid` command prints the sentence on stderr and exits with status 2. Of more than 1,000 characters the
-    middle is left out: what was expected stands at the beginning, and what to do at the end.
-
-    Parameters
-    ----------
-    sentence
-        What is wrong.
-    of_model
-        Whether a model cannot do what is asked; the command names its file before the sentence.
+    middle is left out: what was expected stands at the beginning, and what to do at the end. `of_model` says whether
+    a model cannot do what is asked; the command names its file before the sentence.
     """
 
     def __init__(self, sentence: object = "", *, of_model: bool = False) -> None:

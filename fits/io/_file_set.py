@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -11,12 +12,65 @@ from pathlib import Path
 from typing import overload
 
 from fits.io._errors import DataError
-from fits.io._places import check_file, reason_of, usable_folder
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
 _DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 # Of file systems that have no such thing as flushing.
 _NO_FLUSH = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
+
+
+def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path]:
+    """Refuse a folder that cannot be written to, or made; itself and the nearest one that exists come back."""
+    shown = os.fspath(path)
+    if not shown:
+        raise DataError(f"{option}: expected the name of a folder, found none; write . for the current one.")
+    try:
+        target = Path(os.path.realpath(path))
+        anchor = next(place for place in (target, *target.parents) if os.path.lexists(place))
+        # Also whether its name, and those on the way to it, can be.
+        for name in target.relative_to(anchor).parts:
+            with suppress(FileNotFoundError, NotADirectoryError):
+                os.lstat(anchor / name)
+        good = anchor.is_dir() and os.access(anchor, os.W_OK | os.X_OK)
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"{shown}: cannot be the name of a folder ({reason_of(error)}); choose another for {option}."
+        ) from None
+    if not good:
+        raise DataError(f"{shown}: expected a folder that can be written to; choose another for {option}.")
+    remove_stale(anchor)
+    return target, anchor
+
+
+def check_file(path: str | os.PathLike[str], shown: str | None = None) -> Path:
+    """Refuse what cannot become, or be replaced by, a regular file; its real path comes back."""
+    shown = os.fspath(path) if shown is None else shown
+    if not shown:
+        raise DataError("expected the name of a file to write, found an empty one; give one.")
+    try:
+        target = Path(os.path.realpath(path))
+        mode = target.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        mode = None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{shown}: cannot be the name of a file ({reason_of(error)}); choose another.") from None
+    if mode is not None and stat.S_ISDIR(mode):
+        raise DataError(f"{shown}: expected the name of a file to write, found a folder; add a file name.")
+    if mode is not None and not stat.S_ISREG(mode):
+        # A rename would put a file in the place of what all other programs use.
+        raise DataError(f"{shown}: expected a regular file or a new name, found a device or a pipe; choose another.")
+    if not target.parent.is_dir():
+        raise DataError(f"{shown}: the folder {target.parent} does not exist; create it or choose another.")
+    if not os.access(target.parent, os.W_OK | os.X_OK):
+        raise DataError(f"{shown}: the folder {target.parent} cannot be written to; choose another.")
+    if mode is not None and not os.access(target, os.W_OK):
+        raise DataError(f"{shown}: the file is write-protected; choose another name or allow writing.")
+    return target
+
+
+def reason_of(error: Exception) -> str:
+    """Say why, as the system does."""
+    return str(getattr(error, "strerror", None) or error)
 
 
 @dataclass(frozen=True)
@@ -62,10 +116,7 @@ class FileSet:
         self._scraps: list[Path] = []
 
     def file(self, path: str | os.PathLike[str]) -> Path:
-        """Give a temporary name for a file to write; it does not exist yet, and ends as `path` does.
-
-        A `DataError` says that `path` cannot be written to.
-        """
+        """Give a temporary name, of the ending of `path`, for a file to write; a `DataError` if `path` cannot be."""
         target = check_file(path)
         if any(is_temporary(part) for part in target.parts):
             # Of another set, which puts it in its place or deletes it.
@@ -87,7 +138,7 @@ class FileSet:
     def folder(self, path: str | os.PathLike[str] | None, option: str = "--plots") -> Path | None:
         """Make a temporary folder, whose files go to the folder `path` that an option named; for None there is none.
 
-        `path` is made if need be; a `DataError` says that it cannot be written to, or is no folder.
+        A `DataError` says that `path`, which is made if need be, cannot be written to, or is no folder.
         """
         if path is None:
             return None
@@ -212,10 +263,7 @@ def file_set() -> Iterator[FileSet]:
 
 
 def discard_all() -> None:
-    """Delete what is under temporary names, for a process that ends.
-
-    A signal may come at any moment, such as between the end of a block and what cleans up after it.
-    """
+    """Delete what is under temporary names, for a process that ends: a signal may come at any moment."""
     for files in _OPEN:
         files.discard()
 

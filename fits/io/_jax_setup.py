@@ -16,13 +16,7 @@ _KEPT_S = 0.3
 
 
 def start_jax() -> None:
-    """Configure JAX; call it before any computation.
-
-    Raises
-    ------
-    DataError
-        If MICROID_CACHE names a folder that other users can write to.
-    """
+    """Configure JAX before any computation; a `DataError` if others can write to the folder MICROID_CACHE names."""
     jax.config.update("jax_enable_x64", True)
     folder = _cache_folder()
     if folder is not None:
@@ -34,8 +28,8 @@ def start_jax() -> None:
 def _cache_folder() -> Path | None:
     """Make the folder for compiled functions; None where there is none or it cannot be written to.
 
-    What is in it runs as the user's own code. One that others can write to is refused where it was asked for; without
-    a wish nothing is kept then, and a note says so.
+    What is in it runs as the user's own code. One that others can write to is refused if it was asked for, else not
+    used.
     """
     stated = os.environ.get("MICROID_CACHE")
     if stated in ("", "0", "off"):

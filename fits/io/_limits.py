@@ -75,11 +75,7 @@ class Extreme:
 
 
 def parse_limits(texts: Iterable[str]) -> Ranges:
-    """Read the texts of the option `--limit`, such as `displacement=0:40um` or, of a size, `slew=2kV/s`.
-
-    A `DataError` refuses a name that is not in `UNITS`, a unit of another quantity, and anything but a range of two
-    rising numbers.
-    """
+    """Read texts such as `displacement=0:40um` or, of a size, `slew=2kV/s`; a `DataError` refuses any others."""
     found: Ranges = {}
     for text in texts:
         name, _, words = text[:200].partition("=")
@@ -93,13 +89,10 @@ def parse_limits(texts: Iterable[str]) -> Ranges:
         if match is None:
             raise DataError(f"--limit {name}: expected a range such as {example}, found {words!r}; write it so.")
         factor = _factor(name, (match[3] or "").strip())
+        if match[1] is None and name in _TWO_SIDED:
+            raise DataError(f"--limit {name}: expected two numbers such as {example}, found {words!r}.")
         high = float(match[2]) * factor
-        if match[1] is None:
-            if name in _TWO_SIDED:
-                raise DataError(f"--limit {name}: expected two numbers such as {example}, found {words!r}.")
-            low = -high
-        else:
-            low = float(match[1]) * factor
+        low = -high if match[1] is None else float(match[1]) * factor
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise DataError(f"--limit {name}: expected the lower of two numbers first, found {words!r}; swap them.")
         found[name] = low, high

@@ -1,11 +1,9 @@
 """Which numbers can be measurements: what lies beyond is a slip of a unit or of an export, and overflows later."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fits.io._table import Table, data_error
-
-FloatArray = NDArray[np.float64]
+from fits.io._quantity import FloatArray
+from fits.io._table import Table
 
 # Largest size of a value, and of those in other units. Slips of a unit by 1e6 stay within, so that they are warned
 # of in words.
@@ -30,11 +28,11 @@ def check_size(table: Table, column: str, values: FloatArray, unit: str, given: 
     if wrong.any():
         row = int(np.argmax(wrong))
         what = f"expected numbers from {-most:g} to {most:g} {unit}, found {values[row]:.6g}; {remedy}"
-        raise data_error(table.path, what, table.line(row), column)
+        raise table.error(what, row, column)
     change = float(np.ptp(values))
     if unit in ("V", "um") and 0 < change < LEAST_CHANGE:
         what = f"expected changes of at least {LEAST_CHANGE:g} {unit}, found {change:.3g} in all; {remedy}"
-        raise data_error(table.path, what, table.line(0), column)
+        raise table.error(what, 0, column)
 
 
 def check_steps(table: Table, column: str, time_s: FloatArray) -> None:
@@ -49,4 +47,4 @@ def check_steps(table: Table, column: str, time_s: FloatArray) -> None:
             f"expected time steps of at least {least_s:.3g} s, which is what double precision resolves here, found "
             f"{steps_s[row]:.3g} s; begin at 0 s, or check the unit"
         )
-        raise data_error(table.path, what, table.line(row + 1), column)
+        raise table.error(what, row + 1, column)

@@ -2,11 +2,7 @@
 
 
 def printable(text: str) -> str:
-    r"""Write characters that cannot be shown by their codes, as in `\x1b`.
-
-    These are control characters, such as line ends and what colours a terminal; what XML and HTML cannot hold; and
-    halves of characters, which stand for the bytes of a file name that is not UTF-8.
-    """
+    r"""Write control characters, and what XML, HTML and UTF-8 cannot hold, by their codes, as in `\x1b`."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -19,10 +19,7 @@ _KELVIN_AT_0_DEGC = 273.15
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measured quantity: its name such as ``voltage``, and its canonical unit such as ``V``.
-
-    `powers` are those of ten that take each known unit to the canonical one.
-    """
+    """A measured quantity: name, such as ``voltage``, canonical unit, and power of ten of each known unit."""
 
     stem: str
     unit: str

@@ -5,15 +5,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fits.io._errors import DataError
 from fits.io._plausible import LARGEST_EXTRA, check_size, check_steps
+from fits.io._quantity import FloatArray
 from fits.io._record import Record, Reference
-from fits.io._table import Problem, Table, data_error, open_table
+from fits.io._table import Problem, Table, open_table
 from fits.io._units import Source, find_sources, known_quantity
-
-FloatArray = NDArray[np.float64]
 
 # Piezo stages move 0.01 um/V (stack on a 1000 V amplifier) to 15 um/V (voltage logged before an amplifier of
 # ten-fold gain). Of a typical 0.1 to 1 um/V, slips of 1e3 and 1e6 lie outside these limits.
@@ -44,7 +42,7 @@ def read_csv(
     Parameters
     ----------
     path
-        File to read; it may be compressed by gzip.
+        File to read.
     columns
         Canonical column to source column, for example ``{"voltage_V": "u1_V", "displacement_um": "-height[m]"}``:
         the unit is the suffix of the source or stands in brackets, and a minus flips the sign.
@@ -70,7 +68,7 @@ def read_csv(
     if "displacement_um" in required:
         if time_s.size < MIN_SAMPLES:
             what = f"expected at least {MIN_SAMPLES} samples, found {time_s.size}; record longer or sample faster"
-            raise data_error(table.path, what, table.line(time_s.size - 1))
+            raise table.error(what, time_s.size - 1)
         for name in ("voltage_V", "displacement_um"):
             array = read.found[sources[name].column]
             if array.min() == array.max():
@@ -78,7 +76,7 @@ def read_csv(
                     f"expected values that change, found {array[0]:.9g} in every line from here to line "
                     f"{table.line(array.size - 1)}; choose another column with --columns, or check the wiring"
                 )
-                raise data_error(table.path, what, table.line(0), sources[name].column)
+                raise table.error(what, 0, sources[name].column)
 
     used = {*sources, *(source.column for source in sources.values())}
     extra = {name: array for name, array in read.found.items() if name not in used} | arrays
@@ -276,7 +274,7 @@ def _check_time(table: Table, column: str, time_s: FloatArray) -> None:
         found = f"a restart at {now:.9g} s after {before:.9g} s; split the file here into one file per run"
     else:
         found = f"{now:.9g} s after {before:.9g} s; put the lines in order, or split the file into one file per run"
-    raise data_error(table.path, f"expected strictly increasing times, found {found}", table.line(row), column)
+    raise table.error(f"expected strictly increasing times, found {found}", row, column)
 
 
 def _reversals(values: FloatArray) -> FloatArray:

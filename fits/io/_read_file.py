@@ -23,11 +23,7 @@ _LARGEST_INTEGER = 2**63 - 1
 
 
 def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
-    """Read `what` is expected at a path, such as `a CSV file`, of at most so many bytes.
-
-    A `DataError` says that there is no such file, that it is a folder, a device or a pipe, has more bytes, or cannot
-    be read.
-    """
+    """Read `what` is expected at a path, such as `a CSV file`; a `DataError` if it cannot be, or is too large."""
     name = os.fspath(path)
     try:
         mode = os.stat(path).st_mode
@@ -43,7 +39,7 @@ def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
     except (FileNotFoundError, NotADirectoryError):
         raise DataError(f"{name}: no such file; check the name and the folder.") from None
     except (OSError, ValueError) as error:
-        reason = error.strerror or error if isinstance(error, OSError) else error
+        reason = getattr(error, "strerror", None) or error
         raise DataError(f"{name}: cannot be read ({reason}); check the name and the permissions.") from None
 
 
@@ -70,10 +66,9 @@ def unpack(data: bytes, name: str, most: int) -> bytes:
 
 
 def parse_json(text: str, place: str, what: str) -> Any:
-    """Read JSON text, which is to be such as `a model file`.
+    """Read JSON text, which is to be such as `a model file`; a `DataError` begins with the place.
 
-    A `DataError`, which begins with the place, says that it is not JSON, that a key stands twice, that it nests more
-    than 32 deep, or holds a number or a character that cannot be kept.
+    It says that this is not JSON, that a key stands twice, or what later steps could not work with.
     """
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -96,10 +91,7 @@ def parse_json(text: str, place: str, what: str) -> Any:
 
 
 def parse_toml(text: str, place: str) -> dict[str, Any]:
-    """Read TOML text; a `DataError` begins with the place.
-
-    It says that this is not TOML, nests more than 32 deep, or holds an integer beyond 64 bits.
-    """
+    """Read TOML text; a `DataError`, which begins with the place, says why that cannot be."""
     try:
         found = tomllib.loads(text)
     except (ValueError, RecursionError) as error:

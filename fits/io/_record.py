@@ -6,12 +6,11 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fits.io._errors import DataError
 from fits.io._printable import printable
-
-FloatArray = NDArray[np.float64]
+from fits.io._quantity import FloatArray
 
 
 def _read_only(values: ArrayLike) -> FloatArray:
@@ -36,10 +35,9 @@ class Record:
         Measured displacement in um, shape (n,), or None for a voltage programme.
     extra
         All other numeric columns by name, each of shape (n,), such as ``temperature_degC``.
-    source
-        Name of the file, without its folder; what cannot be printed of it is kept as codes.
-    warnings
-        What looked odd when the file was read, one sentence each.
+    source, warnings
+        Name of the file, without its folder, and what looked odd when it was read, one sentence each; what cannot be
+        printed of them is kept as codes.
 
     Raises
     ------
@@ -85,35 +83,16 @@ class Record:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A MappingProxyType cannot be pickled, and records travel to worker processes.
-        return Record, (
-            self.time_s,
-            self.voltage_V,
-            self.displacement_um,
-            dict(self.extra),
-            self.source,
-            self.warnings,
-        )
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return Record, tuple((values | {"extra": dict(self.extra)}).values())
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
     """A displacement wanted over time, `n` samples long.
 
-    Parameters
-    ----------
-    time_s
-        Sample times in s, shape (n,), strictly increasing.
-    displacement_um
-        Displacement in um as the sensor would read it, shape (n,).
-    source
-        Name of the file, without its folder; what cannot be printed of it is kept as codes.
-    warnings
-        What looked odd when the file was read, one sentence each.
-
-    Raises
-    ------
-    ValueError
-        The arrays are not one-dimensional or differ in length.
+    Times in s increase strictly; displacements are in um as the sensor would read them, shape (n,). For the others,
+    and the ValueError, see `Record`.
     """
 
     time_s: FloatArray
@@ -144,9 +123,6 @@ def refuse_repeats(records: Sequence[Record]) -> None:
     """Refuse, in a `DataError`, records that are given twice: they would count twice, or be held out in vain."""
     for k, one in enumerate(records):
         for other in records[:k]:
-            if _same(one.voltage_V, other.voltage_V) and _same(one.displacement_um, other.displacement_um):
+            pairs = ((getattr(each, name) for each in (one, other)) for name in ("voltage_V", "displacement_um"))
+            if one.displacement_um is not None and all(np.array_equal(*pair) for pair in pairs):
                 raise DataError(f"{other.source} and {one.source} hold the same samples: give each run once")
-
-
-def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
-    return one is not None and other is not None and np.array_equal(one, other)

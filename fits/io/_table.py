@@ -13,12 +13,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fits.io._errors import DataError
+from fits.io._quantity import FloatArray
 from fits.io._read_file import MOST_CSV_BYTES, read_bytes, unpack
-
-FloatArray = NDArray[np.float64]
 
 _COMMENT = re.compile(r"^ *[#%].*\n?", re.MULTILINE)
 _EXCEL_SEPARATOR = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
@@ -59,17 +57,21 @@ class Table:
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
         """Parse all columns: the numeric ones, each of shape (n,), and the first problem of each other.
 
-        A `DataError` refuses a row with too many or too few cells, a cell of a `strict` column that is not a finite
-        number, and a file without rows.
+        A `DataError` refuses a file without rows, a row of another length, and what is not finite in a `strict`
+        column.
         """
         if next(self._lines(), None) is None:
             what = "expected rows of numbers below the header, found none; export again"
-            raise data_error(self.path, what, self.header_line)
+            raise self.error(what)
         columns = self._read_fast()
         if columns is None or not all(name in columns for name in strict):
             return self._read_slowly(strict)
         problems = {name: self._first_problem(i) for i, name in enumerate(self.names) if name not in columns}
         return columns, problems
+
+    def error(self, what: str, row: int | None = None, column: str | None = None) -> DataError:
+        """The one sentence on a row of the parsed columns, or on the header."""
+        return data_error(self.path, what, self.header_line if row is None else self.line(row), column)
 
     def line(self, row: int) -> int:
         """Physical line, from 1, of a row of the parsed columns, from 0."""
@@ -171,11 +173,9 @@ class Table:
         return columns, problems
 
     def _first_problem(self, i: int) -> Problem:
-        for line, cells in self._rows():
-            number = self._number(cells[i])
-            if isinstance(number, str):
-                return line, number
-        return self.header_line + 1, "a number that pandas does not read"
+        found = ((line, self._number(cells[i])) for line, cells in self._rows())
+        other = self.header_line + 1, "a number that pandas does not read"
+        return next(((line, text) for line, text in found if isinstance(text, str)), other)
 
     def _number(self, cell: str) -> float | str:
         """Value of a cell, or what was found instead of a finite number."""
@@ -211,11 +211,7 @@ class Table:
 
 
 def open_table(path: str | os.PathLike[str]) -> Table:
-    """Read a file and its header.
-
-    A `DataError` says that it is missing, a folder, unreadable, empty, binary or corrupted, or that the header is
-    missing or has duplicates.
-    """
+    """Read a file and its header; a `DataError` says that this is no readable text with a header of its own."""
     shown = os.fspath(path)
     data = read_bytes(shown, "a CSV file", MOST_CSV_BYTES)
     if data.startswith(b"\x1f\x8b") or shown.lower().endswith(".gz"):

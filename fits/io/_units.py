@@ -43,10 +43,9 @@ def recognise(name: str) -> tuple[Quantity, str] | None:
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Read the option ``--columns``: pairs such as ``voltage_V=u1_V,displacement_um=-height[m]``.
+    """Read pairs such as ``voltage_V=u1_V,displacement_um=-height[m]`` of ``--columns``, as `read_csv` takes them.
 
-    Canonical column to source comes back, as `read_csv` takes it. A `DataError` refuses a pair without ``=``, and an
-    unknown or a repeated column.
+    A `DataError` refuses a pair without ``=``, and an unknown or a repeated column.
     """
     columns: dict[str, str] = {}
     for pair in filter(str.strip, text.split(",")):
@@ -74,10 +73,10 @@ def known_quantity(column: str) -> Quantity:
 def find_sources(
     names: Sequence[str], columns: Mapping[str, str], required: Collection[str], place: str
 ) -> dict[str, Source]:
-    """Choose the source column of every canonical column that the headers, or the user's mapping, give.
+    """Choose the source column of every canonical column that the user's mapping or, failing that, the headers give.
 
-    The mapping wins over the headers. `place`, file and line of the header, begins the sentence of a `DataError`: a
-    required column that is missing, a duplicate, a unit that is missing or unknown.
+    A `DataError`, which begins with the place, refuses a required column that is missing, duplicates, and wrong
+    units.
     """
     sources = {column: _mapped(column, text, names, place) for column, text in columns.items()}
     taken = {source.column for source in sources.values()}

@@ -13,8 +13,7 @@ from fits.loop._moments import Data, gather, grid_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, LevelTrial
 from fits.loop._run import Run, simulate_run
-from fits.stats._at_rest import quantum_um
-from fits.stats._noise import WHITE, correlation_samples, huber_weight
+from fits.stats._noise import WHITE, correlation_samples, huber_weight, quantum_um
 
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
@@ -54,8 +53,8 @@ def choose_grid(
 ) -> tuple[float, GridTrial, list[LevelTrial]]:
     """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
 
-    Returns the stroke in um, which is the unit of the columns, the grid that is kept, and all that were tried. A
-    `DataError` where there is no loop to fit, a `FitError` where a solver fails.
+    Returns the stroke in um, the unit of the columns, the grid that is kept, and all trials. A `DataError` where
+    there is no loop to fit, a `FitError` where a solver fails.
     """
     stroke = max(_stroke(run) for run in runs)
 
@@ -101,7 +100,8 @@ def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compa
     solution = solve_grid(data, stroke, correlation, hyper)
     model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
-    left = [run.weighed(run.displacement_um - simulate_run(model, run))[run.fitted] for run in runs]
+    off = [run.without_nuisance(run.displacement_um - simulate_run(model, run), run.fitted) for run in runs]
+    left = [run.weighed(one)[run.fitted] for run, one in zip(runs, off, strict=True)]
     found = correlation_samples(left)
     if found > WHITE:
         correlation = found

@@ -100,8 +100,7 @@ def _reach(x: Float[Array, " m"], n: int) -> Float[Array, "m N"]:
 def _rectangles(high: Float[Array, "m N"], low: Float[Array, "m N"]) -> Float[Array, "m p"]:
     """Products of the two along all pairs `(i, j <= i)`, packed row by row.
 
-    The nodes under the diagonal triangles are not free: they continue the three corners linearly, so what they
-    would add goes to those.
+    The nodes under the diagonal triangles continue the three corners linearly: what they would add goes to those.
     """
     n = high.shape[1]
     i, j = np.tril_indices(n)

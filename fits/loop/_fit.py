@@ -1,4 +1,4 @@
-"""From records to a fitted Preisach operator."""
+"""From records to a fitted Preisach operator, and to what a rig must have been through before its record."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,13 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record, refuse_repeats
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits.loop._design import Grid, columns_of
 from fits.loop._grid import Estimate, grid_estimate
-from fits.loop._history import estimate_start
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._prior import interpolation
@@ -22,13 +23,17 @@ from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
 from fits.loop._shapes import solve_shape
 from fits.loop._uncertainty import Uncertainty, perturbations
 from fits.stats._noise import LOSSES, WHITE
-from microid import FAMILIES, Preisach
+from microid import FAMILIES, Preisach, Staircase
 
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
 # Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
 _EDGE = 0.02
 _MINOR = 0.01
+# Pairs of extremes that stand for the unknown history, and samples that are compared.
+_PAIRS = 6
+_SAMPLES = 1024
+_SIZE = 64
 
 
 def fit(
@@ -52,10 +57,8 @@ def fit(
     ----------
     records
         Runs of one rig. Each has its own sensor offset.
-    family
-        Name in `microid.FAMILIES`.
-    levels
-        Number of switching voltages; chosen from the data by default.
+    family, levels
+        Name in `microid.FAMILIES`, and number of switching voltages, chosen from the data by default.
     holdout
         Fraction at the end of every run that is only predicted, or records that are.
     initial
@@ -76,10 +79,8 @@ def fit(
     ------
     DataError
         If the records cannot be fitted, or are not of one rig.
-    FitError
-        If a solver fails.
-    RuntimeError
-        If JAX computes in single precision.
+    FitError, RuntimeError
+        If a solver fails, or JAX computes in single precision.
     """
     fraction, aside, range_V = check_fit(records, holdout, loss)
     if family not in FAMILIES:
@@ -94,8 +95,7 @@ def fit(
     if loss == "huber":
         runs = weigh_robustly(runs, progress)
     stroke, tried, trials = choose_grid(runs, levels, progress)
-    remarks = _remarks(runs)
-    remarks += [warning for record in aside for warning in record.warnings]
+    remarks = [*_remarks(runs), *(warning for record in aside for warning in record.warnings)]
     if family == "grid":
         found = grid_estimate(tried.data, tried.solution, stroke, tried.correlation, tried.discrepancy_um)
         if levels is None and tried.data.grid.levels == LADDER[-1]:
@@ -110,24 +110,19 @@ def fit(
                 f"the best two of {starts} starts ended at different fits; there may be a better one: raise --starts"
             )
     if found.correlation > WHITE:
-        remarks.append(
-            f"neighbouring residuals agree over {found.correlation:.0f} samples: something other than sensor noise "
-            "(creep, rate, drift or a density this family cannot follow) is left that this model does not describe"
-        )
+        remarks.append(correlated(found.correlation, "creep, rate, drift or a density this family cannot follow"))
     model = found.model
     progress("checking the records")
     miss, told = check_loops(runs, prepare, model, stroke, tried.solution.hyper, loss == "huber")
-    offsets = _offsets(model, tried.data)
-
+    columns = np.asarray(columns_of(model))
+    offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]
     progress("comparing with the measurement")
     figures = {"noise_um": found.noise_um, "correlation_samples": found.correlation, "substeps": 1}
-    reports = [
-        _report(_with_offset(model, offset), run, found, **figures) for offset, run in zip(offsets, runs, strict=True)
-    ]
+    reports = [_report(model, offset, run, found, **figures) for offset, run in zip(offsets, runs, strict=True)]
     for record in aside:
         run = prepare_run(record, range_V, initial, holdout=1.0)
         off = float(np.mean((run.displacement_um - simulate_run(model, run))[run.known]))
-        reports.append(_report(_with_offset(model, off), run, found))
+        reports.append(_report(model, off, run, found))
     return FitResult(
         model=_with_offset(model, offsets[0]),
         uncertainty=_uncertainty(tried.data, found),
@@ -140,13 +135,18 @@ def fit(
     )
 
 
+def correlated(samples: float, what: str) -> str:
+    """The remark on residuals whose neighbours agree over some samples, and what may be left."""
+    return (
+        f"neighbouring residuals agree over {samples:.0f} samples: something other than sensor noise ({what}) is "
+        "left that this model does not describe"
+    )
+
+
 def check_fit(
     records: Sequence[Record], holdout: float | Sequence[Record], loss: str
 ) -> tuple[float, tuple[Record, ...], tuple[float, float]]:
-    """Check what a fit is given: the fraction and the records that are held out, and the range of all voltages.
-
-    A `DataError` if it cannot be fitted, a `RuntimeError` if JAX computes in single precision.
-    """
+    """Check what a fit is given; the fraction and the records held out, and the range of all voltages."""
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
     if loss not in LOSSES:
@@ -174,18 +174,14 @@ def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
     )
 
 
-def _offsets(model: Preisach, data: Data) -> list[float]:
-    columns = np.asarray(columns_of(model))
-    return [mean.displacement_um - float(mean.response @ columns) for mean in data.means]
-
-
 def _with_offset(model: Preisach, offset_um: float) -> Preisach:
     return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offset_um))
 
 
-def _report(model: Preisach, run: Run, found: Estimate, **figures: Any) -> RunReport:
+def _report(model: Preisach, offset_um: float, run: Run, found: Estimate, **figures: Any) -> RunReport:
+    model = _with_offset(model, offset_um)
     start = run.start if run.known.all() else estimate_start(model, run, found.noise_um)
-    return RunReport.of(run, simulate_run(model, run), float(model.offset_um), start, **figures)
+    return RunReport.of(run, simulate_run(model, run), offset_um, start, **figures)
 
 
 def _remarks(runs: list[Run]) -> list[str]:
@@ -215,3 +211,52 @@ def _remarks(runs: list[Run]) -> list[str]:
             "beyond them the model is extrapolated"
         )
     return remarks
+
+
+def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Array, ""]) -> Staircase:
+    """Extremes that close in on the first sample, by the shares of the way that the coordinates stand for."""
+    below, above = jax.nn.softmax(z[0]), jax.nn.softmax(z[1])
+    low, high = model.density.lower_V, model.density.upper_V
+    minima = low + (first_V - low) * jnp.cumsum(below)[:-1]
+    maxima = high - (high - first_V) * jnp.cumsum(above)[:-1]
+    inner = jnp.stack([maxima, minima], axis=1).ravel()
+    extremes = jnp.concatenate([low[None], inner, first_V[None]])
+    count = extremes.shape[0]
+    padded = jnp.concatenate([extremes, jnp.broadcast_to(first_V, (_SIZE - count,))])
+    return Staircase(padded, jnp.asarray(count, dtype=jnp.int32))
+
+
+def _residual(
+    z: Float[Array, "2 pairs_1"], args: tuple[Preisach, Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
+) -> Float[Array, " m"]:
+    model, voltage_V, displacement_um, weight = args
+    start = _staircase(z, model, voltage_V[0])
+    # A faint pull towards an even decay decides what the samples leave open.
+    return jnp.concatenate([weight * (model(voltage_V, start) - displacement_um), 1e-2 * z.ravel()])
+
+
+@eqx.filter_jit
+def _solve(args: tuple[Preisach, Array, Array, Array]) -> Staircase:
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+    start = jnp.zeros((2, _PAIRS + 1))
+    solution: Any = optx.least_squares(_residual, solver, start, args=args, max_steps=100, throw=False)
+    return _staircase(solution.value, args[0], args[1][0])
+
+
+def estimate_start(model: Preisach, run: Run, noise_um: float) -> Staircase:
+    """Fit the memory before the first sample to the samples that depend on it; the model has this run's offset.
+
+    The output is differentiable in the remembered extremes as it is in any voltage, so the extremes themselves are
+    the unknowns (Levenberg-Marquardt on `2 x 7` shares of the way from the ends of the range to the first sample).
+    """
+    keep = np.arange(np.flatnonzero(~run.known)[-1] + 1)
+    # Thinned out evenly; the extremes of the path must stay, as they make the memory.
+    if len(keep) > _SAMPLES:
+        voltage = run.voltage_V[keep]
+        turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(voltage))) != 0)
+        even = np.linspace(0, len(keep) - 1, max(2, _SAMPLES - len(turns))).astype(np.int64)
+        keep = np.unique(np.concatenate([even, turns]))[: 2 * _SAMPLES]
+    pad = (0, 2 * _SAMPLES - len(keep))
+    voltage = np.pad(run.voltage_V[keep], pad, mode="edge")
+    displacement, weight = (np.pad(x, pad) for x in (run.displacement_um[keep], np.full(len(keep), 1 / noise_um)))
+    return _solve((model, jnp.asarray(voltage), jnp.asarray(displacement), jnp.asarray(weight)))

@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 
 from fits.io._record import Record
 from fits.loop._run import Run
-from fits.stats._at_rest import quantum_um, stretches
+from fits.stats._noise import quantum_um, stretches
 
 # A sensor sticks where so many readings in a row are the same to the last bit.
 _STUCK_SAMPLES = 8
@@ -29,10 +29,7 @@ _SPARSE_s = 1.0
 
 
 def remarks_on(runs: Sequence[Run], residuals: Sequence[np.ndarray], robust: bool) -> list[str]:
-    """Name what is wrong with runs that were fitted, by what the fit leaves of each in um, shape `(n,)`.
-
-    `robust` says whether outliers count less in the fit already.
-    """
+    """Name what is wrong with fitted runs, by their residuals in um, `(n,)`; `robust` if outliers count less."""
     out = []
     for run, residual in zip(runs, residuals, strict=True):
         record = run.record
@@ -116,7 +113,7 @@ def without_impulses(record: Record) -> Record:
     if bad.sum() < _FEW:
         return record
     mended = np.where(bad, median_filter(reading, 7, mode="nearest"), reading)
-    return replace(record, displacement_um=mended, extra=dict(record.extra))
+    return replace(record, displacement_um=mended)
 
 
 def impulsive(residual_um: np.ndarray, digit_um: float = 0.0) -> np.ndarray:

@@ -1,25 +1,32 @@
 """Fitting the weights of a grid: a smooth, non-negative regression, convex and therefore without a start."""
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import reduce
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float, Int
-from optimistix import RESULTS
+from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import nnls
 
-from fits.loop._evidence import Posterior, effective, maximise_evidence, posterior_of, renew_noise
 from fits.loop._moments import Data, Moments, blocks_of
-from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._prior import (
+    Hyper,
+    Posterior,
+    effective,
+    interpolation,
+    maximise_evidence,
+    posterior_of,
+    renew_noise,
+    roughness,
+)
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
 from fits.stats._noise import shared_square
-from fits.stats._nonnegative import BlockPivoting
+from fits.stats._nonnegative import minimise_nonnegative
 from microid import Preisach
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
@@ -65,10 +72,9 @@ class GridSolution:
 
 
 def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -> GridSolution:
-    """Find the most probable non-negative columns, smoothness and noise, all in strokes.
+    """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on.
 
-    So many samples as `correlation` are worth one independent one; the search begins at `start`. A `FitError` if the
-    regression does not converge.
+    So many samples as `correlation` are worth one independent one. A `FitError` if the regression does not converge.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
@@ -87,20 +93,17 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
         posterior = posterior_of(moments, rough, hyper)
     if np.all(np.asarray(posterior.mean) >= 0):
         return GridSolution(posterior.mean, posterior, hyper)
-    columns, result = non_negative(posterior)
-    if result == RESULTS.nonlinear_max_steps_reached or result == RESULTS.max_steps_reached:
+    columns, found = non_negative(posterior)
+    if not found:
         raise FitError(FitStatus.MAX_STEPS)
-    if result != RESULTS.successful:
-        raise FitError(FitStatus.NONFINITE)
     return GridSolution(columns, posterior, hyper)
 
 
-def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
-    """Find the mode of the posterior among non-negative columns.
+def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
+    """Find the mode of the posterior among non-negative columns; and whether it was found.
 
     Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
-    those ends up below zero, more are bounded. The answer is that of all bounds together. Active-set solvers such as
-    `scipy.optimize.nnls` take one column at a time, and minutes for the thousands of a fine grid.
+    those ends up below zero, more are bounded. The answer is that of all bounds together.
     """
     scale = np.sqrt(np.diagonal(posterior.precision))
     lowest = np.asarray(posterior.mean) * scale
@@ -110,32 +113,30 @@ def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
         spread, precision, mean, unit = _marginal(posterior, jnp.asarray(order))
-        y, result = _pivot(precision, mean)
-        columns = _follow(posterior, jnp.asarray(order), spread, precision, (y - mean, y), unit)
+        y, found = _pivot(precision, mean)
+        columns = _follow(posterior, jnp.asarray(order), spread, precision, mean, y, unit)
         left = np.asarray(columns) * scale
-        if result != RESULTS.successful:
+        if not found:
             return _one_by_one(posterior)
         if bounded == size or np.all(left >= -_ATOL):
-            return jnp.maximum(columns, 0), result
+            return jnp.maximum(columns, 0), True
         lowest = np.minimum(lowest, left)
         bounded *= 2
 
 
-def _one_by_one(posterior: Posterior) -> tuple[Float[Array, " D"], RESULTS]:
+def _one_by_one(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
     precision = np.asarray(posterior.precision)
-    over: Any = RESULTS.nonlinear_max_steps_reached
     if len(precision) > _MOST_COLUMNS:
-        return jnp.maximum(posterior.mean, 0), over
+        return jnp.maximum(posterior.mean, 0), False
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
-    done: Any = RESULTS.successful
     try:
         columns, _ = nnls(root, root @ (scale * np.asarray(posterior.mean)), maxiter=_STEPS_PER_COLUMN * len(scale))
     except RuntimeError:
-        return jnp.maximum(posterior.mean, 0), over
-    return jnp.asarray(columns / scale), done
+        return jnp.maximum(posterior.mean, 0), False
+    return jnp.asarray(columns / scale), True
 
 
 @eqx.filter_jit
@@ -156,18 +157,8 @@ def _marginal(
 
 
 @eqx.filter_jit
-def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Float[Array, " k"], RESULTS]:
-    solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
-    solution: Any = optx.minimise(
-        _distance,
-        solver,
-        jnp.maximum(mean, 0),
-        args=(precision, mean),
-        options={"hessian": precision},
-        max_steps=_STEPS,
-        throw=False,
-    )
-    return solution.value, solution.result
+def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Float[Array, " k"], Bool[Array, ""]]:
+    return minimise_nonnegative(precision, -(precision @ mean), jnp.maximum(mean, 0), _ATOL, _STEPS)
 
 
 @eqx.filter_jit
@@ -176,18 +167,12 @@ def _follow(
     which: Int[Array, " k"],
     spread: Float[Array, "D k"],
     precision: Float[Array, "k k"],
-    moved: tuple[Float[Array, " k"], Float[Array, " k"]],
+    mean: Float[Array, " k"],
+    y: Float[Array, " k"],
     scale: Float[Array, " k"],
 ) -> Float[Array, " D"]:
-    """Move all columns along with the chosen ones; where a bound holds it holds exactly."""
-    by, to = moved
-    return (posterior.mean + spread @ (scale * (precision @ by))).at[which].set(to / scale)
-
-
-def _distance(y: Float[Array, " k"], args: tuple[Float[Array, "k k"], Float[Array, " k"]]) -> Float[Array, ""]:
-    precision, mean = args
-    off = y - mean
-    return off @ (precision @ off) / 2
+    """Move all columns along with the chosen ones, from their mean to `y`; where a bound holds it holds exactly."""
+    return (posterior.mean + spread @ (scale * (precision @ (y - mean)))).at[which].set(y / scale)
 
 
 def grid_estimate(
@@ -222,22 +207,21 @@ def cross_validate(
     if levels < data.grid.levels:
         basis = interpolation(levels, data.grid.levels)
         rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
-    whole = sum(blocks[1:], start=blocks[0])
+    whole = reduce(operator.add, blocks)
     labels = [blocks_of(run) for run in runs]
     squares = shared = expected = count = 0.0
     for number, block in enumerate(blocks):
         if not block.count > 0:
             continue
-        rest = Moments(*(a - b for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(block), strict=True)))
-        posterior = posterior_of(rest.scaled(1 / correlation, stroke_um), rough, hyper)
+        posterior = posterior_of((whole - block).scaled(1 / correlation, stroke_um), rough, hyper)
         columns = np.asarray(posterior.mean if basis is None else basis @ posterior.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
         # A short run may have no sample in a block.
         off = []
         for run, label in zip(runs, labels, strict=True):
             if (inside := label == number).any():
-                left = run.displacement_um - simulate_run(model, run)
-                off.append(run.weighed(left - run.mean(left, inside))[inside])
+                left = run.without_nuisance(run.displacement_um - simulate_run(model, run), inside)
+                off.append(run.weighed(left)[inside])
         squares += sum(float(np.sum(o**2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)
         expected += float(_expected_square(posterior, block)) * stroke_um**2

@@ -7,8 +7,7 @@ import numpy as np
 
 from fits.io._record import Record
 from fits.loop._run import Run
-from fits.stats._at_rest import idle_stretches, quantum_um
-from fits.stats._whiten import rough_noise_um
+from fits.stats._noise import idle_stretches, quantum_um, rough_noise_um
 
 # So many samples of a command at rest say what the noise is.
 _IDLE = 150
@@ -62,10 +61,7 @@ def worst(found: Sequence[Misfit]) -> Misfit:
 
 
 def compare_gains(moved_um: Sequence[np.ndarray], left_um: Sequence[np.ndarray]) -> tuple[int, int, float]:
-    """The runs that move furthest and least far for what a model says of them, and the ratio of the two.
-
-    Of each run the displacement that the model says, and what it leaves, in um.
-    """
+    """The runs that move most and least for what a model says they move, by what it leaves, and their ratio."""
     gains = []
     for moved, left in zip(moved_um, left_um, strict=True):
         moved = moved - moved.mean()

@@ -1,15 +1,19 @@
 """All that least squares needs to know of records: sums of products, per block."""
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, branch_table, design
+from fits.loop._past import past_columns
 from fits.loop._run import Run
 from fits.stats._compress import Compressed, compress
 from microid import Staircase
@@ -19,10 +23,12 @@ from microid import Staircase
 _FEW, _MANY = 256, 512
 _MANY_LEVELS = 32
 BLOCKS = 5
+# Squares below which a column is nothing, and parts of the largest below which a combination of columns is.
+_TINY, _SHOWN = 1e-300, 1e-11
 
 
 def _zero_dimensional(value: Any) -> Any:
-    # NumPy's arithmetic turns arrays without axes into scalars.
+    """Turn what NumPy's arithmetic makes of arrays without axes back into such."""
     return np.asarray(value) if isinstance(value, float | np.generic) else value
 
 
@@ -37,13 +43,16 @@ class Moments(eqx.Module):
     energy_um2: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
     count: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
 
+    @classmethod
+    def empty(cls, size: int) -> "Moments":
+        """Of no sample."""
+        return cls(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(()))
+
     def __add__(self, other: "Moments") -> "Moments":
-        return Moments(
-            self.gram + other.gram,
-            self.cross_um + other.cross_um,
-            self.energy_um2 + other.energy_um2,
-            self.count + other.count,
-        )
+        return Moments(*map(operator.add, jax.tree.leaves(self), jax.tree.leaves(other)))
+
+    def __sub__(self, other: "Moments") -> "Moments":
+        return Moments(*map(operator.sub, jax.tree.leaves(self), jax.tree.leaves(other)))
 
     def scaled(self, count: Float[Array, ""] | float, unit_um: float) -> "Moments":
         """Measure displacement in `unit_um`, and count each sample as `count` independent ones."""
@@ -70,10 +79,7 @@ class RunMean:
 
 @dataclass(frozen=True)
 class Data:
-    """Moments of all runs on one grid: over all fitted samples, and over consecutive fifths of every run's.
-
-    Each run, and each fifth, is counted from its own mean.
-    """
+    """Moments of all runs, over all fitted samples and over fifths of every run's, each from its own mean."""
 
     grid: Grid
     total: Moments
@@ -94,31 +100,30 @@ def grid_of(runs: Sequence[Run], levels: int) -> Grid:
 
 def gather(grid: Grid, runs: Sequence[Run]) -> Data:
     """Pass runs with displacement through the regression once."""
-    totals, means = [], []
-    blocks: list[list[Moments]] = [[] for _ in range(BLOCKS)]
+    centred: list[list[Moments]] = []
+    means = []
     levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
     for run in runs:
         path = run.path
         branches = run.voltage_V, run.displacement_um, path.anchor_V, path.rising
-        squeezed = compress(*branches, blocks_of(run), levels_V, run.weight)
-        sums = _sums(grid, squeezed, path.starts[0])
-        for block, part in enumerate(sums):
-            blocks[block].append(_centre(part)[0])
-        total, mean = _centre(sum(sums[1:], start=sums[0]))
-        totals.append(total)
+        groups = compress(*branches, blocks_of(run), levels_V, run.weight)
+        past = (
+            past_columns(jnp.asarray(groups.voltage_V.ravel()))
+            if run.has_past
+            else np.zeros((groups.block.size * 4, 0))
+        )
+        sums = _sums(grid, groups, path.starts[0], np.asarray(past).reshape(len(groups.block), 4, -1))
+        total, mean = _without_nuisance(reduce(operator.add, sums), grid.columns)
+        centred.append([total, *(_without_nuisance(part, grid.columns)[0] for part in sums)])
         means.append(mean)
-    return Data(
-        grid,
-        sum(totals[1:], start=totals[0]),
-        tuple(sum(parts[1:], start=parts[0]) for parts in blocks),
-        tuple(means),
-    )
+    whole, *blocks = (reduce(operator.add, parts) for parts in zip(*centred, strict=True))
+    return Data(grid, whole, tuple(blocks), tuple(means))
 
 
-def _sums(grid: Grid, groups: Compressed, start: Staircase) -> list[Moments]:
-    """Moments per block, with a column of ones at the end and no mean taken off."""
-    size = grid.columns + 1
-    sums = [Moments(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(())) for _ in range(BLOCKS)]
+def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) -> list[Moments]:
+    """Moments per block, with the nuisance parameters at the end: columns of a past, `(groups, 4, k)`, and ones."""
+    size = grid.columns + past.shape[2] + 1
+    sums = [Moments.empty(size) for _ in range(BLOCKS)]
     table = jnp.asarray(branch_table(grid.levels))
     length = _MANY if grid.levels > _MANY_LEVELS else _FEW
     for begin in range(0, len(groups.block), length):
@@ -127,7 +132,9 @@ def _sums(grid: Grid, groups: Compressed, start: Staircase) -> list[Moments]:
         voltage = np.pad(groups.voltage_V[piece].ravel(), (0, 4 * pad[1]), mode="edge")
         mix = np.pad(groups.mix[piece], (pad, (0, 0), (0, 0)))
         mixed, start = _regress(grid, table, jnp.asarray(voltage), start, jnp.asarray(mix))
-        rows = np.asarray(mixed)
+        more = np.einsum("gij,gjk->gik", mix[: len(past[piece])], past[piece]).reshape(-1, past.shape[2])
+        rows = np.asarray(mixed)[: len(more)]
+        rows = np.concatenate([rows[:, :-1], more, rows[:, -1:]], axis=1)
         for block in np.unique(groups.block[piece]):
             if block < 0:
                 continue
@@ -155,14 +162,18 @@ def _regress(
     return mixed.reshape(response.shape), end
 
 
-def _centre(sums: Moments) -> tuple[Moments, RunMean]:
-    """Take the mean off, and with it the last column."""
-    count = np.maximum(sums.count, 1.0)
-    response, displacement = sums.gram[-1, :-1] / count, sums.cross_um[-1] / count
-    centred = Moments(
-        sums.gram[:-1, :-1] - count * response[:, None] * response[None, :],
-        sums.cross_um[:-1] - count * response * displacement,
-        sums.energy_um2 - count * displacement**2,
+def _without_nuisance(sums: Moments, size: int) -> tuple[Moments, RunMean]:
+    """Eliminate a run's nuisance parameters, all unknowns but the first `size`; the last of them is its offset."""
+    gram, cross = np.asarray(sums.gram), np.asarray(sums.cross_um)
+    scale = np.sqrt(np.maximum(np.diagonal(gram)[size:], _TINY))
+    block = gram[size:, size:] / scale / scale[:, None]
+    # A past that has ended before a block is not seen in it.
+    inverse = np.linalg.pinv(block, rcond=_SHOWN, hermitian=True) / scale / scale[:, None]
+    follow, answer = inverse @ gram[size:, :size], inverse @ cross[size:]
+    reduced = Moments(
+        gram[:size, :size] - gram[:size, size:] @ follow,
+        cross[:size] - gram[:size, size:] @ answer,
+        sums.energy_um2 - cross[size:] @ answer,
         sums.count,
     )
-    return centred, RunMean(np.asarray(response), float(displacement), float(sums.count))
+    return reduced, RunMean(follow[-1], float(answer[-1]), float(sums.count))

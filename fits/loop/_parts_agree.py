@@ -1,18 +1,17 @@
 """Whether the parts of what was fitted as one hysteresis belong to one, and whether readings come late in it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._evidence import posterior_of
 from fits.loop._fit_checks import remarks_on
 from fits.loop._grid import non_negative, solve_grid
 from fits.loop._misfit import Misfit, compare_gains, misfits, worst
 from fits.loop._moments import gather, grid_of
-from fits.loop._prior import Hyper, roughness
+from fits.loop._prior import Hyper, posterior_of, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, simulate_run
 from fits.stats._noise import WHITE, correlation_samples
@@ -48,16 +47,15 @@ def check_loops(
     hyper: Hyper,
     robust: bool,
 ) -> tuple[Misfit, list[str]]:
-    """Say how far from noise a fitted hysteresis is, and what is wrong with the runs that it was fitted to.
+    """Say how far from noise a fitted hysteresis is, and what is wrong with its runs; errors of `disagreements`.
 
-    `prepare` makes a record ready again; `robust` says whether outliers counted less. A `DataError` as of
-    `disagreements`.
+    `prepare` makes a record ready again; `robust` says whether outliers counted less.
     """
     residuals = [left_of(model, run) for run in runs]
     left, remarks = misfits(runs, residuals), remarks_on(runs, residuals, robust)
     separate = SeparateFits(stroke_um, hyper)
     try:
-        told = disagreements(runs, model, separate, left)
+        told = disagreements(runs, residuals, separate, left)
     except FitError:
         # Fits of parts are only asked for an opinion.
         told = []
@@ -70,11 +68,12 @@ def check_loops(
     return worst(left), [*told, *remarks]
 
 
+@dataclass(frozen=True)
 class SeparateFits:
     """Fits of single runs, or parts of them, on a coarse grid, in strokes, with the smoothness and noise given."""
 
-    def __init__(self, stroke_um: float, hyper: Hyper):
-        self.stroke_um, self.hyper = stroke_um, hyper
+    stroke_um: float
+    hyper: Hyper
 
     def fit(self, runs: Sequence[Run]) -> Preisach:
         """Fit a hysteresis to some runs; a `FitError` where that fails."""
@@ -92,35 +91,36 @@ class SeparateFits:
 
 def left_of(model: Preisach, run: Run) -> np.ndarray:
     """Measurement less prediction, the offset taken off over the fitted samples, in um, shape `(n,)`."""
-    left = run.displacement_um - simulate_run(model, run)
-    return np.asarray(left - run.mean(left, run.fitted))
+    return run.without_nuisance(run.displacement_um - simulate_run(model, run), run.fitted)
 
 
-def disagreements(runs: Sequence[Run], model: Preisach, separate: SeparateFits, left: Sequence[Misfit]) -> list[str]:
-    """Look for runs, and parts of runs, that a hysteresis explains one by one but not together.
+def disagreements(
+    runs: Sequence[Run], residuals: Sequence[np.ndarray], separate: SeparateFits, left: Sequence[Misfit]
+) -> list[str]:
+    """Look for runs, and parts of runs, that a hysteresis explains one by one but not together: a sentence for each.
 
-    Returns a sentence for each. A `DataError` if the gains of two runs differ by so much that they are not of one rig
-    in one setting.
+    The residuals are those of all runs together. A `DataError` if the gains of two runs differ by so much that they
+    are not of one rig in one setting.
     """
     if not any(one.far for one in left):
         return []
     remarks = []
-    models = [separate.fit([run]) for run in runs]
-    own = [_rms(left_of(one, run)[run.fitted]) for one, run in zip(models, runs, strict=True)]
-    together = [_rms(left_of(model, run)[run.fitted]) for run in runs]
+    left_um = [residual[run.fitted] for residual, run in zip(residuals, runs, strict=True)]
+    own = [_rms(left_of(separate.fit([run]), run)[run.fitted]) for run in runs]
+    together = [_rms(one) for one in left_um]
     if len(runs) > 1 and _pooled(together, runs) > _TIMES * _pooled(own, runs):
-        left_um = [left_of(model, run) for run in runs]
-        said = [(run.displacement_um - one)[run.fitted] for run, one in zip(runs, left_um, strict=True)]
-        high, low, ratio = compare_gains(said, [one[run.fitted] for run, one in zip(runs, left_um, strict=True)])
-        names = ", ".join(run.record.source for run in runs)
-        strokes = [float(np.ptp(run.displacement_um[run.fitted])) for run in runs]
-        apart = ", ".join(f"{100 * rms / stroke:.2g}" for rms, stroke in zip(own, strokes, strict=True))
-        joint = ", ".join(f"{100 * rms / stroke:.2g}" for rms, stroke in zip(together, strokes, strict=True))
+        measured_um = [run.displacement_um[run.fitted] for run in runs]
+        said = [measured - one for measured, one in zip(measured_um, left_um, strict=True)]
+        high, low, ratio = compare_gains(said, left_um)
+        joint, apart = (
+            ", ".join(f"{100 * rms / np.ptp(measured):.2g}" for rms, measured in zip(each, measured_um, strict=True))
+            for each in (together, own)
+        )
         sentence = (
-            f"{names}: these runs do not show one hysteresis: fitted together they leave {joint} % of their strokes, "
-            f"each alone {apart} %; under the same voltage {runs[high].record.source} moves {ratio:.3g} "
-            f"times as far as {runs[low].record.source}: they are of different rigs or settings, or differ in rate, "
-            "drift, load or temperature; fit them apart"
+            f"{', '.join(run.record.source for run in runs)}: these runs do not show one hysteresis: fitted together "
+            f"they leave {joint} % of their strokes, each alone {apart} %; under the same voltage "
+            f"{runs[high].record.source} moves {ratio:.3g} times as far as {runs[low].record.source}: they are of "
+            "different rigs or settings, or differ in rate, drift, load or temperature; fit them apart"
         )
         if ratio > 1 + _REFUSED:
             raise DataError(sentence)
@@ -165,14 +165,13 @@ def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
     gains = [simulate_run(model, run)[run.fitted] for model in (one, other)]
     ratio = float(np.std(gains[1]) / max(np.std(gains[0]), 1e-300))
     stroke = float(np.ptp(run.displacement_um[run.fitted]))
-    sentence = (
+    return [
         f"{run.record.source}: something changed near sample {place + 1} ({run.record.time_s[place]:.6g} s): fitted "
         f"as one hysteresis the run leaves {100 * rms_um / stroke:.2g} % of its stroke, its parts before and after "
         f"{100 * split / stroke:.2g} %; after it the stage moves {ratio:.3g} times as far as before: two rigs or "
         "settings, a sensor that jumped or stuck, creep over a hold, or a part that came loose; split the file "
         "there, and fit the parts apart"
-    )
-    return [sentence]
+    ]
 
 
 def delays(
@@ -186,7 +185,7 @@ def delays(
         def residual(samples: float, run: Run = run, interval: float = interval) -> np.ndarray:
             record = run.record
             voltage = np.interp(record.time_s - samples * interval, record.time_s, record.voltage_V)
-            return separate.left(prepare(replace(record, voltage_V=voltage, extra=dict(record.extra))))
+            return separate.left(prepare(replace(record, voltage_V=voltage)))
 
         try:
             found = _profile(residual)

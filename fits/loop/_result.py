@@ -1,6 +1,7 @@
 """What a fit gives back, of a hysteresis alone or of a whole stage."""
 
 import enum
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -30,13 +31,7 @@ class FitStatus(enum.Enum):
 
 
 class FitError(RuntimeError):
-    """A fit, or a tuning, failed; it has no answer to give.
-
-    Attributes
-    ----------
-    status
-        Why, and what to do.
-    """
+    """A fit, or a tuning, failed; it has no answer to give. The `status` says why, and what to do."""
 
     def __init__(self, status: FitStatus, detail: str = "", what: str = "fit"):
         super().__init__(f"the {what} failed: {status.value}{f' ({detail})' if detail else ''}")
@@ -45,15 +40,10 @@ class FitError(RuntimeError):
 
 @dataclass(frozen=True)
 class LevelTrial:
-    """One resolution that was tried.
+    """One resolution that was tried: a number of levels `N`.
 
-    Attributes
-    ----------
-    levels
-        Number of levels `N`.
-    error_um
-        Root mean square error on blocks of the fitted samples, each predicted from the others; on at most 24 levels
-        where the resolution was given and there was nothing to compare.
+    The root mean square error is that on blocks of the fitted samples, each predicted from the others; on at most 24
+    levels where the resolution was given and there was nothing to compare.
     """
 
     levels: int
@@ -62,20 +52,10 @@ class LevelTrial:
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """One parameter of a stage.
+    """One parameter of a stage, by part and field, such as `mechanics.natural_frequency_Hz`.
 
-    Attributes
-    ----------
-    name
-        Part and field, such as `mechanics.natural_frequency_Hz`.
-    unit
-        Its unit.
-    value
-        The estimate.
-    sd
-        Its standard deviation, the noise as coloured as the residual is.
-    lower, upper
-        Ends of its 95 % interval, within its bounds.
+    The noise counts as coloured as the residual is in the standard deviation and the ends of the 95 % interval, which
+    lies within the bounds.
     """
 
     name: str
@@ -92,10 +72,8 @@ class RunReport:
 
     Attributes
     ----------
-    source
-        Name of the file.
-    offset_um
-        Sensor offset of the run.
+    source, offset_um
+        Name of the file, and the sensor offset of the run.
     in_sample, held_out
         Errors on the samples that were fitted, and on those that were only predicted; None where there are none.
     unknown
@@ -105,14 +83,10 @@ class RunReport:
     loop_measured_pct, loop_model_pct
         Width of the widest loop (Eq. 34); None where the record holds none.
     reached
-        Ranges of voltage, slew and displacement in the record, see `fits.io._limits.measured_ranges`.
-    noise_um
-        Standard deviation of the residual, in the fit of a hysteresis that of all runs; None of a run that was only
-        predicted, as are the next two.
-    correlation_samples
-        Number of residual samples that are worth one independent one; 1 for white noise.
-    substeps
-        Steps into which each interval was divided.
+        Ranges of voltage, slew and displacement in the record.
+    noise_um, correlation_samples, substeps
+        Standard deviation of the residual (of all runs, for a hysteresis alone), number of its samples that are worth
+        one independent one, and steps into which each interval was divided; None of a run that was only predicted.
     """
 
     source: str
@@ -161,27 +135,21 @@ class FitResult(Generic[_M]):
 
     Attributes
     ----------
-    model
-        The Preisach operator, or the stage, with the offset of the first run.
-    uncertainty
-        Of its predictions.
-    status
-        How the fit ended.
-    remarks
-        What the user should know, one sentence each.
+    model, uncertainty
+        The Preisach operator, or the stage, with the offset of the first run; and how sure its predictions are.
+    status, remarks
+        How the fit ended, and what the user should know, one sentence each.
     runs
         One report per fitted run, then one per held-out record.
     misfit
         How far the residual of the run that is described worst is from noise.
     smoothness
-        Weight on the squared curvature of the density that the data chose, in 1/strokes^2; None where no grid of
-        weights was fitted.
+        Weight on the squared curvature of the density that the data chose, in 1/strokes^2; None without a grid.
     trials
         The resolutions that the fit of a hysteresis tried, in order.
-    parameters
-        Those of a stage outside of the hysteresis' grid, in the order of the solver's coordinates.
-    correlation
-        Between them, shape `(p, p)`.
+    parameters, correlation
+        Those of a stage outside of the hysteresis' grid, in the order of the solver's coordinates, and the
+        correlation between them, shape `(p, p)`.
     unseen
         Combinations of them that the data leave open, one sentence each.
     """
@@ -247,7 +215,7 @@ class FitResult(Generic[_M]):
     @property
     def in_sample(self) -> Errors:
         """Errors on all fitted samples together."""
-        pooled = _pool([run.in_sample for run in self.runs])
+        pooled = _pool(run.in_sample for run in self.runs)
         if pooled is None:
             raise ValueError("no run was fitted")
         return pooled
@@ -255,14 +223,14 @@ class FitResult(Generic[_M]):
     @property
     def held_out(self) -> Errors | None:
         """Errors on all held-out samples together; None where nothing was held out."""
-        return _pool([run.held_out for run in self.runs])
+        return _pool(run.held_out for run in self.runs)
 
     def predict(self, record: Record, initial: str = "negative") -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
         return self.uncertainty.predict(self.model, record, initial)
 
 
-def _pool(parts: list[Errors | None]) -> Errors | None:
+def _pool(parts: Iterable[Errors | None]) -> Errors | None:
     """Combine the errors of several runs; percentages refer to the largest range."""
     given = [part for part in parts if part is not None]
     if not given:

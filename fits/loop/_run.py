@@ -1,8 +1,9 @@
-"""A record made ready for fitting: which samples count, what it began from, and what a model needs of it."""
+"""A record made ready for fitting: which samples count, what it began from, and the arrays that models take."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,9 +12,28 @@ from jaxtyping import Array, Bool, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._samples import Samples, refine, resized
-from microid import Hold, Preisach, Staircase, demagnetised, negative_saturation, positive_saturation, remember
+from fits.io.columns import columns_beside
+from fits.loop._past import past_columns
+from microid import (
+    Hold,
+    Preisach,
+    Staircase,
+    Start,
+    demagnetised,
+    negative_saturation,
+    positive_saturation,
+    refined,
+    remember,
+)
 
+# Records are filled up to a power of two, so that those of like length share what was compiled.
+_SHORTEST = 1024
+# Intervals that differ by less than this from their mean, as a fraction of it, count as even.
+_EVEN = 1e-6
+# Extremes that a memory may hold: filtered multisines nest deeply.
+_EXTREMES = 512
+# A hundred arrays of so many values are 8 GB.
+_MOST_STEPS = 10_000_000
 # All records pass through the same compiled functions in pieces of this many samples.
 _PIECE = 8192
 _STAIRCASES = (64, 512, 4096)
@@ -23,8 +43,71 @@ _STAIRCASES = (64, 512, 4096)
 _END_SHARES = (1e-3, 3e-3, 1e-2)
 # Samples that a run must leave to fit.
 _FEWEST = 50
-
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
+
+
+class Samples(eqx.Module):
+    """A run of `n` samples, padded, with `m = (n - 1) stride + 1` steps.
+
+    `time_s` is the one interval between steps where they are even. `weight` is that of each sample in the sum of
+    squares, 0 where it is not fitted. `moving` says whether the stage may have been moving when the record began, and
+    `has_past` whether the unknown memory of its hysteresis is estimated. `beside` holds further columns under the
+    names of `columns_beside`.
+    """
+
+    time_s: Float[Array, " m"] | Float[Array, ""]
+    voltage_V: Float[Array, " m"]
+    displacement_um: Float[Array, " n"]
+    weight: Float[Array, " n"]
+    start: Start
+    stride: int = eqx.field(static=True)
+    moving: bool = eqx.field(static=True)
+    has_past: bool = eqx.field(static=True)
+    beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
+
+
+def refine(
+    record: Record, weight: np.ndarray, start: Staircase, stride: int, moving: bool, has_past: bool, hold: Hold
+) -> Samples:
+    """Fill up a record, divide its intervals into steps, and take a displacement that it lacks for zero."""
+    refuse_many_steps(record, stride)
+    n, time_s = len(record), record.time_s
+    pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
+    step = (time_s[-1] - time_s[0]) / (n - 1)
+    share = np.arange((n + pad[1] - 1) * stride + 1) / stride
+    _, voltage_V = refined(jnp.ones(()), jnp.asarray(np.pad(record.voltage_V, pad, mode="edge")), stride, hold)
+    if np.max(np.abs(np.diff(time_s) - step)) <= _EVEN * step:
+        time: Any = np.asarray(step / stride)
+    else:
+        longer = np.concatenate([time_s, time_s[-1] + step * np.arange(1, pad[1] + 1)])
+        time = np.interp(share, np.arange(n + pad[1]), longer)
+    measured = np.zeros(n) if record.displacement_um is None else record.displacement_um
+    return Samples(
+        time_s=jnp.asarray(time),
+        voltage_V=voltage_V,
+        displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
+        weight=jnp.asarray(np.pad(weight, pad)),
+        start=Start(memory=resized(start, _EXTREMES)),
+        stride=stride,
+        moving=moving,
+        has_past=has_past,
+        beside={name: jnp.asarray(np.interp(share, np.arange(n), v)) for name, v in columns_beside(record).items()},
+    )
+
+
+def resized(start: Staircase, size: int) -> Staircase:
+    """Give a memory room for so many extremes at least."""
+    pad = jnp.full(max(0, size - start.extremes_V.shape[0]), start.extremes_V[0])
+    return Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
+
+
+def refuse_many_steps(record: Record, stride: int) -> None:
+    """Refuse, in a `DataError`, what would not fit into the memory."""
+    if stride * len(record) > _MOST_STEPS:
+        raise DataError(
+            f"{record.source}: expected at most {_MOST_STEPS:,} steps, found {len(record):,} samples of {stride} "
+            "substeps each; split the record, or use a model of fewer substeps"
+        )
 
 
 @dataclass(frozen=True)
@@ -100,15 +183,21 @@ class Run:
     @cached_property
     def samples(self) -> Samples:
         """The run padded and refined in time, as the fit of a stage needs it."""
-        return refine(self.record, self.fit_weight, self.start, self.stride, self.moving, self.hold, self.has_past)
+        return refine(self.record, self.fit_weight, self.start, self.stride, self.moving, self.has_past, self.hold)
 
     def weighed(self, residual_um: np.ndarray) -> np.ndarray:
         """Make a residual as large as it counts, shape `(n,)`."""
         return residual_um if self.weight is None else np.sqrt(self.weight) * residual_um
 
-    def mean(self, values: np.ndarray, among: np.ndarray) -> float:
-        """Weighted mean of some of the samples."""
-        return float(np.average(values[among], weights=None if self.weight is None else self.weight[among]))
+    def without_nuisance(self, values: np.ndarray, among: np.ndarray) -> np.ndarray:
+        """Take off the run's offset, and what its unknown past adds, fitted to some of the samples, shape `(n,)`."""
+        weight = np.ones(len(values)) if self.weight is None else self.weight
+        if not self.has_past:
+            return values - float(np.average(values[among], weights=weight[among]))
+        columns = np.asarray(past_columns(jnp.asarray(self.voltage_V)))
+        columns = np.concatenate([np.ones((len(values), 1)), columns], axis=1)
+        root = np.sqrt(weight[among])
+        return values - columns @ np.linalg.lstsq(root[:, None] * columns[among], root * values[among], rcond=None)[0]
 
 
 def prepare_run(
@@ -160,8 +249,7 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
 def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
     """Make the memory before a record from its name, one of `INITIAL_STATES`; a `DataError` for another name.
 
-    An unknown state is stood in for by negative saturation; the samples that would show the difference are not
-    known ones.
+    Negative saturation stands in for an unknown state, as the samples that would show the difference are not used.
     """
     if name in ("negative", "unknown"):
         return negative_saturation(lower_V)
@@ -175,10 +263,9 @@ def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
 def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:
     """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES`.
 
-    At an end of the range every relay is in a known state, if none lies beyond: one that a voltage within the range
-    switches on and none switches off is on after the first loop, and may have been off before. Short of that, relays
-    outside the extremes that this run itself reaches either never switch or switch on the way to them; once both
-    have been visited they are a constant, which the run's own offset takes up.
+    At an end of the range every relay is in a known state, unless it cannot be switched back within the range. Short
+    of that, relays outside the extremes that this run itself reaches either never switch or switch on the way to
+    them; once both have been visited they are a constant, which the run's own offset takes up.
     """
     if initial != "unknown":
         return np.ones(len(voltage), dtype=bool)
@@ -195,27 +282,19 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
 
 def _walk(voltage: np.ndarray, start: Staircase) -> Path:
     for size in _STAIRCASES:
-        path = _followed(voltage, resized(start, size))
-        if path is not None:
-            return path
+        memory, found = resized(start, size), []
+        for piece in _split(voltage):
+            anchor, rising, after = _remember(jnp.asarray(piece), memory)
+            found.append((memory, anchor, rising))
+            memory = after
+        # Without room for all extremes the memory is NaN, and stays so.
+        if not np.isnan(memory.extremes_V[0]):
+            starts, anchors, risings = zip(*found, strict=True)
+            return Path(starts, np.concatenate(anchors)[: len(voltage)], np.concatenate(risings)[: len(voltage)])
     raise DataError(
         f"the voltage nests more than {_STAIRCASES[-1]} loops into each other: that is noise, not a drive; "
         "use the commanded voltage"
     )
-
-
-def _followed(voltage: np.ndarray, start: Staircase) -> Path | None:
-    """Follow a voltage; None where the memory has no room for its extremes."""
-    starts, anchors, risings = [], [], []
-    for piece in _split(voltage):
-        starts.append(start)
-        anchor, rising, start = _remember(jnp.asarray(piece), start)
-        anchors.append(anchor)
-        risings.append(rising)
-        if np.isnan(start.extremes_V[0]):
-            return None
-    n = len(voltage)
-    return Path(tuple(starts), np.concatenate(anchors)[:n], np.concatenate(risings)[:n])
 
 
 def _split(values: np.ndarray) -> list[np.ndarray]:

@@ -99,14 +99,12 @@ def solve_shape(
     key: PRNGKeyArray,
     progress: Callable[[str], None],
 ) -> tuple[Estimate, bool]:
-    """Fit a family of `microid.FAMILIES` that is not linear in its parameters.
+    """Fit a family of `microid.FAMILIES` that is not linear in its parameters, on the moments of the record alone.
 
-    The record enters through its moments only, so that a start costs milliseconds whatever the record's length.
-    The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise
-    is what this family leaves, which may be more than the grid's, in `hyper`.
-
-    Returns the best of all starts, and whether the two best ended at the same cost. A `FitError` if no start gives a
-    finite cost, or the best one does not become stationary.
+    The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise is
+    what this family leaves, which may be more than the grid's, in `hyper`. Returns the best of all starts, and
+    whether the two best ended at the same cost. A `FitError` if no start ends finite, or the best one is not
+    stationary.
     """
     grid = data.grid
     moments = data.total.scaled(1.0, stroke_um)

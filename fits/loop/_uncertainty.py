@@ -20,15 +20,9 @@ _BATCH = 32
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted displacement of a voltage program.
+    """Predicted displacement of a voltage program, and its standard deviation, shape `(n,)` each.
 
-    Attributes
-    ----------
-    displacement_um
-        Shape `(n,)`.
-    displacement_sd_um
-        Its standard deviation from noise and smoothing, sensor noise not included, shape `(n,)`; NaN where it is not
-        known.
+    The latter comes from noise and smoothing, sensor noise not included; NaN where it is not known.
     """
 
     displacement_um: np.ndarray
@@ -38,10 +32,8 @@ class Prediction:
 class AbstractUncertainty(eqx.Module):
     """How sure the predictions of a fitted model are.
 
-    Attributes
-    ----------
-    discrepancy_um
-        Standard deviation of the model's own error, as predicting parts of the record from others shows it.
+    `discrepancy_um` is the standard deviation of the model's own error, as predicting parts of the record from others
+    shows it.
     """
 
     discrepancy_um: eqx.AbstractVar[Float[Array, ""]]
@@ -60,18 +52,8 @@ class Uncertainty(AbstractUncertainty):
 
     The variance of a prediction is the sum of the squared responses to all of them: the covariance of the weights,
     carried through the linear operator. To that comes what the model is seen to leave out. It is the uncertainty of
-    the noise-free displacement: sensor noise is not in it.
-
-    Attributes
-    ----------
-    columns_um
-        Perturbations of the columns of the grid, shape `(k, D)`.
-    offset_um
-        And of the sensor offset, shape `(k,)`.
-    discrepancy_um
-        See `AbstractUncertainty`.
-    grid
-        The columns.
+    the noise-free displacement: sensor noise is not in it. Perturbations of the columns of the grid and of the sensor
+    offset go together; `discrepancy_um` is as in `AbstractUncertainty`.
     """
 
     columns_um: Float[Array, "k D"]
@@ -120,8 +102,7 @@ def perturbations(
 ) -> Uncertainty:
     """Turn a factor of the covariance of the columns, `factor @ factor.T`, into perturbations of a model.
 
-    The offset is fixed by the mean displacement of a run: it makes up for what a perturbation does to the run's mean
-    response, and has the standard deviation of that mean.
+    The offset, fixed by the mean displacement of a run, makes up for what each does to that, and has its deviation.
     """
     columns = jnp.concatenate([factor_um.T, jnp.zeros((1, grid.columns))])
     offsets = jnp.append(-(mean_response @ factor_um), offset_sd_um)

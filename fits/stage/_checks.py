@@ -176,10 +176,7 @@ def _resolved(run: Run) -> bool:
 
 
 def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> tuple[str, float] | None:
-    """Find poles that no piezo stage has: the time is probably in another unit than its column says.
-
-    Returns a sentence, and what a time in the unit it suspects has to be multiplied by to be in s; None without such.
-    """
+    """Find poles that no piezo stage has: a sentence, and the factor that takes times in the suspected unit to s."""
     for name, value in zip(names, values, strict=True):
         field = name.rpartition(".")[2]
         low, high = _USUAL_RANGES.get(field, (-np.inf, np.inf))
@@ -200,8 +197,7 @@ def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence
 def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
     """Twice the logarithm of how much likelier poles make the run that shows them best.
 
-    Slow runs may become less likely: the hysteresis read off them has taken in the driver's lag, which now counts
-    twice.
+    Slow runs may become less likely: the hysteresis read off them holds the driver's lag, which now counts twice.
     """
     ratios = []
     for run, drive, noise in zip(solved.runs, drives, solved.weighing.noise_um, strict=True):
@@ -212,10 +208,7 @@ def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
 
 
 def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
-    """Find runs that move further, or less far, than the others under the same voltage: a remark, if any.
-
-    With `refuse`, too large a difference is a `DataError`, as such runs cannot be of one rig.
-    """
+    """Find runs that move further, or less far, than others: a remark, or a `DataError` where to `refuse` it."""
     predicted = [simulate_stage(stage, run)[run.fitted] for run in runs]
     high, low, ratio = compare_gains(predicted, [residual_of(stage, run)[run.fitted] for run in runs])
     one, other = runs[high].record.source, runs[low].record.source

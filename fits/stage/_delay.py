@@ -1,4 +1,4 @@
-"""Readings that come late, or before their command: seen in what a fitted stage leaves of each run."""
+"""What pulls a fit: readings that come late, or before their command, and outliers; intervals reach beyond it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,18 +8,21 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.loop._design import columns_of
+from fits.loop._fit_checks import outlying
 from fits.loop._misfit import Misfit, misfits
 from fits.loop._result import FitError, FitResult
 from fits.loop._run import Run
-from fits.stage._alternative import Alternative
 from fits.stage._moments import along, linearise, pieces
 from fits.stage._run import nuisance_columns, project_out, simulate_stage
 from fits.stage._solve import Problem, Solved, solve_chain
 from fits.stage._start import best_shifts, measure_response, start_stages
 from fits.stage._steps import Plan, hysteresis_alone
 from fits.stage._uncertainty import NO_PRECISION, Precision, sandwich
+from fits.stats._metrics import TWO_SIDED_95
 from microid import Preisach, Stage
 
+# What pulls a fit ruins it where it moves a parameter by more than this part of it.
+_RUINED = 0.5
 # A delay counts from so many standard deviations, and so many samples, on.
 _SURE_Z, _LEAST_SAMPLES = 5.0, 0.02
 # It must move a parameter by so many of that one's standard deviations, too.
@@ -43,6 +46,66 @@ GROSS_PCT = 2.0
 _REMEDY = (
     "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
 )
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Where the parameters of a stage come out without something, and the ends of their 95 % intervals, `(p,)`."""
+
+    values: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, precision: Precision) -> "Alternative":
+        """Read it off a solution."""
+        z, values = precision.solved.z, precision.chain.coordinates.values
+        sd = precision.sd()
+        ends = (np.asarray(values(jnp.asarray(z + k * TWO_SIDED_95 * sd))) for k in (0, -1, 1))
+        return cls(*ends)
+
+    @classmethod
+    def in_unit(cls, fit: FitResult[Stage], factor: float) -> "Alternative":
+        """Where a fit comes out if a unit of its times is so many s."""
+        powers = np.asarray([{"s": 1.0, "Hz": -1.0}.get(p.unit, 0.0) for p in fit.parameters])
+        figures = [[getattr(p, name) for p in fit.parameters] for name in ("value", "lower", "upper")]
+        return cls(*(factor**powers * np.asarray(each) for each in figures))
+
+    def contradicted(self, fit: FitResult[Stage]) -> list[str]:
+        """Say which parameters of a fit are far from these, one sentence each."""
+        return [
+            f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
+            for p, v in zip(fit.parameters, self.values, strict=True)
+            if abs(v - p.value) > _RUINED * min(abs(v), abs(p.value))
+        ]
+
+    def widen(self, fit: FitResult[Stage], said: str, remedy: str = "") -> FitResult[Stage]:
+        """Let a fit's intervals reach these, and say first what pulls it and what to do about that."""
+        parameters = tuple(
+            replace(
+                p, sd=float(np.hypot(p.sd, v - p.value)), lower=min(p.lower, float(a)), upper=max(p.upper, float(b))
+            )
+            for p, v, a, b in zip(fit.parameters, self.values, self.low, self.high, strict=True)
+        )
+        listed = ", ".join(f"{p.name} {v:.5g} {p.unit}" for p, v in zip(fit.parameters, self.values, strict=True))
+        remark = f"{said}; without that the parameters would be {listed}, and the intervals reach there"
+        remark += f": {remedy}" if remedy else ""
+        return replace(fit, parameters=parameters, remarks=(remark, *fit.remarks))
+
+
+def fit_without_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Alternative] | None:
+    """Fit again without outliers: the files that have some, and the parameters; None where that has no use."""
+    bad = [outlying(one.residual_um, run.fitted) for one, run in zip(solved.sums, solved.runs, strict=True)]
+    sources = [run.record.source for one, run in zip(bad, solved.runs, strict=True) if one.any()]
+    if plan.loss != "squares" or not sources:
+        return None
+    runs = [replace(run, fitted=run.fitted & ~one) for run, one in zip(solved.runs, bad, strict=True)]
+    plan.progress(f"fitting without the outliers of {', '.join(sources)}")
+    try:
+        found = solve_chain(solved.onward, runs, plan.loss, plan.progress, accept_best=True)
+    except (FitError, np.linalg.LinAlgError):
+        return None
+    return sources, Alternative.of(Precision(found))
 
 
 @dataclass(frozen=True)
@@ -95,9 +158,8 @@ def fit_without_delays(
 ) -> WithoutDelays | None:
     """Look for delays in what a fit leaves of each run, and fit again without them; None where that does not help.
 
-    A small one shows as the derivative of the residual with respect to a delay, whatever the parameters may do
-    beside it (the score test of Rao 1948). In runs that are far from noise the measured frequency response is
-    searched for larger ones; without a precision, only these are looked for.
+    A small one shows as the derivative of the residual with respect to a delay (the score test of Rao 1948); of runs
+    far from noise the frequency response is searched for larger ones, without a precision for these alone.
     """
     # Between two samples a command in steps has no place where it could be shifted to, and without a resonance to
     # measure it by a delay is part of the lag.
@@ -176,10 +238,7 @@ def refuse_delays(undelayed: WithoutDelays | None) -> None:
 
 
 def widen_for_delays(fit: FitResult[Stage], undelayed: WithoutDelays) -> FitResult[Stage]:
-    """Name the delays of a fit, and widen the intervals by what they did to its parameters.
-
-    A `DataError` if a parameter moves so much that the fit says nothing.
-    """
+    """Name delays, and widen intervals by what they did; a `DataError` if a fit says nothing because of them."""
     other, said = Alternative.of(undelayed.precision), undelayed.words()
     if moved := other.contradicted(fit):
         raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")

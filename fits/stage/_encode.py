@@ -29,10 +29,7 @@ _DTYPES = ("float32", "float64", "int32", "int64", "bool")
 
 
 def encode(value: Any, unit: str = "1", packed: Collection[str] = ()) -> Any:
-    """Turn a module, or what one of its fields may hold, into JSON values; arrays in `packed` fields into base64.
-
-    A `DataError` says what in it cannot be written.
-    """
+    """JSON values of a module or a field's value, `packed` fields in base64; a `DataError` if it has none."""
     if isinstance(value, eqx.nn.MLP):
         return _encode_network(value, unit)
     if isinstance(value, eqx.Module):

@@ -1,40 +1,48 @@
-"""From slow and fast records to a whole fitted stage."""
+"""From slow and fast records to a whole fitted stage, in the terms of its user."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._choose_grid import LADDER
-from fits.loop._fit import check_fit
+from fits.loop._fit import check_fit, correlated
 from fits.loop._fit_checks import remarks_on
 from fits.loop._misfit import misfits, worst
-from fits.loop._result import FitError, FitResult
-from fits.loop._run import prepare_run
-from fits.loop._samples import refuse_many_steps
-from fits.stage._alternative import Alternative, fit_without_outliers
-from fits.stage._checks import implausible, refuse_undersampled
-from fits.stage._delay import GROSS_PCT, fit_without_delays, refuse_delays, widen_for_delays
-from fits.stage._run import gain_ahead, place_of_hysteresis
+from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate, RunReport
+from fits.loop._run import Run, prepare_run, refuse_many_steps
+from fits.stage._checks import check_gains, implausible, refuse_undersampled
+from fits.stage._delay import (
+    GROSS_PCT,
+    Alternative,
+    fit_without_delays,
+    fit_without_outliers,
+    refuse_delays,
+    widen_for_delays,
+)
+from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simulate_stage
 from fits.stage._solve import Problem, Solved
 from fits.stage._steps import Plan, refine_problem, start_problem
-from fits.stage._summary import summarise
 from fits.stage._uncertainty import Precision
+from fits.stats._identifiability import unseen_directions
+from fits.stats._metrics import TWO_SIDED_95
+from fits.stats._noise import WHITE
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
+
+# A coordinate, of the order of 1, that is known no better than this is hardly seen.
+_UNSEEN_SD = 0.5
 
 
 def default_stage(hold: Hold = "first") -> Stage:
     """The stage of Section 3.1: driver, Preisach operator and mechanics, with all gain in the operator.
 
-    A gain anywhere else would only be seen together with it.
-
-    Parameters
-    ----------
-    hold
-        How the command runs between samples: `first` for lines, `smooth` for curves, `zero` for steps that each begin
-        at a sample and are not seen by it yet.
+    A gain anywhere else would only be seen together with it. `hold` says how the command runs between samples:
+    `first` for lines, `smooth` for curves, `zero` for steps that each begin at a sample and are not seen by it yet.
     """
     flat = Preisach(
         GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
@@ -76,29 +84,18 @@ def fit_stage(
         present values. By default the stage of `default_stage`.
     levels
         Number of switching voltages; chosen from the slow runs by default.
-    holdout
-        Fraction at the end of every run that is only predicted, or records that are.
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. One for all holds for records
         that are held out, too; theirs is unknown where each fitted run has its own.
-    loss
-        `squares`, or `huber`, to which outliers count less.
-    progress
-        Told what is being done, a sentence at a time.
-
-    Returns
-    -------
-    FitResult
-        Never the start: a fit that fails raises.
+    holdout, loss, progress
+        See `fit`, as for what is returned.
 
     Raises
     ------
     DataError
         If the records cannot be fitted, do not show the dynamics, or are not of one rig.
-    FitError
-        If a solver fails.
-    RuntimeError
-        If JAX computes in single precision.
+    FitError, RuntimeError
+        If a solver fails, or JAX computes in single precision.
     """
     found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
     solved, runs = found.solved, found.solved.runs
@@ -144,10 +141,7 @@ def fit_stage(
 
 @dataclass(frozen=True)
 class Solution:
-    """What the fit of a stage found before it is compared with anything, and what was asked for.
-
-    `failure` says why this is only the best place that was found; None where the fit converged.
-    """
+    """What the fit of a stage found, for what plan; or the best place, and the `failure` that it ended with."""
 
     solved: Solved
     precision: Precision
@@ -166,9 +160,10 @@ def solve_stage(
     finest: int = LADDER[-1],
     accept_best: bool = False,
 ) -> Solution:
-    """Fit a stage, on a grid of at most the finest levels; other arguments and errors are those of `fit_stage`.
+    """Fit a stage, on a grid of at most the finest levels; see `fit_stage`.
 
-    `accept_best` takes the best place for an answer where the fit does not become stationary.
+    `accept_best`, for those who go on from there, takes the best place for an answer where the fit does not become
+    stationary, and estimates an unknown past beside the rest.
     """
     fraction, _, range_V = check_fit(records, holdout, loss)
     for record in records:
@@ -184,7 +179,9 @@ def solve_stage(
             "insert one, or use hold='first'"
         )
     plan = Plan(
-        tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold, accept_best
+        *(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold),
+        accept_best=accept_best,
+        estimated=accept_best,
     )
     found = _refined(plan, start_problem(plan, stage, levels, finest))
     settled = plan.behind(found.solved)
@@ -202,3 +199,55 @@ def _refined(plan: Plan, problem: Problem) -> Solution:
             raise
         # What the best place leaves may show why.
         return Solution(*refine_problem(replace(plan, accept_best=True), problem), plan, failure)
+
+
+def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
+    """Put the fit of a stage, and held-out runs, into figures; a `DataError` if the runs are not of one rig."""
+    coordinates, solved, stage = precision.chain.coordinates, precision.solved, precision.solved.stage
+    remarks = check_gains(stage, solved.runs, refuse=True)
+    covariance = precision.covariance(precision.influence())
+    sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    names, value, slope = solved.parameters()
+    ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * TWO_SIDED_95 * sd))) for sign in (-1, 1)]
+    # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
+    width = np.where(sd > _UNSEEN_SD, np.abs(ends[1] - ends[0]) / (2 * TWO_SIDED_95), np.abs(slope) * sd)
+    parameters = tuple(
+        ParameterEstimate(name, unit, *map(float, figures))
+        for (name, unit), *figures in zip(names, value, width, *ends, strict=True)
+    )
+    unseen = unseen_directions(precision.information, [name for name, _ in names], slope / value)
+    reports = []
+    weighing = solved.weighing
+    for run, noise_um, correlation in zip(solved.runs, weighing.noise_um, weighing.correlation, strict=True):
+        figures = {"noise_um": noise_um, "correlation_samples": correlation, "substeps": run.stride}
+        reports.append(_report(stage, run, **figures))
+        if correlation > WHITE:
+            remarks.append(f"{run.record.source}: {correlated(correlation, 'creep, rate, a second mode, drift')}")
+    reports += [_report(stage, run) for run in held]
+    return FitResult(
+        model=_with_offset(stage, reports[0].offset_um).with_substeps(max(run.stride for run in solved.runs)),
+        uncertainty=precision.uncertainty(),
+        status=FitStatus.CONVERGED,
+        remarks=(*remarks, *unseen),
+        runs=tuple(reports),
+        smoothness=None if solved.hyper is None else float(np.exp(solved.hyper.log_density)),
+        parameters=parameters,
+        correlation=covariance / np.maximum(np.outer(sd, sd), 1e-300),
+        unseen=unseen,
+    )
+
+
+def _with_offset(stage: Stage, offset_um: float) -> Stage:
+    """Put a sensor's offset where the stage has room for one."""
+    for name, part in zip(stage.names, stage.parts, strict=True):
+        if hasattr(part, "offset_um"):
+            return stage.swap(name, eqx.tree_at(lambda p: p.offset_um, part, part.offset_um + offset_um))
+    return stage
+
+
+def _report(stage: Stage, run: Run, **figures: Any) -> RunReport:
+    # A run that was only predicted still has an offset of its own.
+    counted = run if run.fitted.any() else replace(run, fitted=run.known)
+    predicted = run.displacement_um - residual_of(stage, counted)
+    offset = float(np.mean((predicted - simulate_stage(stage, counted))[counted.fitted]))
+    return RunReport.of(run, predicted, offset, run.start, **figures)

@@ -1,4 +1,4 @@
-"""Measured frequency responses: from periodic multisines to the best linear approximation and its variance."""
+"""Measured frequency responses: from periodic multisines, or read as an analyser writes them."""
 
 import os
 from dataclasses import dataclass
@@ -6,29 +6,36 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
 
 from fits.io._errors import DataError
 from fits.io._plausible import SHORTEST_STEP_s, check_size
-from fits.io._table import data_error, open_table
+from fits.io._table import Table, open_table
 
 # A line is excited if the input reaches this share of its largest.
 _EXCITED = 0.01
 # Variances are averaged over this many neighbouring lines: few realizations alone make poor weights.
 _SMOOTH = 9
+_REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
+_MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"
+# What a unit is checked by, of each column.
+_UNITS = {
+    "frequency_Hz": "Hz",
+    _REAL: "um/V",
+    _IMAGINARY: "um/V",
+    _VARIANCE: "um^2/V^2",
+    _MAGNITUDE: "um/V",
+    _DECIBEL: "dB",
+    _DEGREES: "deg",
+    _RADIANS: "rad",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Multisine:
     """Steady-state response to periodic inputs: `r` realizations of `q` periods, `n` samples each.
 
-    Attributes
-    ----------
-    interval_s
-        Between samples.
-    voltage_V, displacement_um
-        Shapes `(r, q, n, m)` and `(r, q, n, p)`.
-    source
-        Name of the file.
+    Voltages and displacements have shapes `(r, q, n, m)` and `(r, q, n, p)`.
     """
 
     interval_s: float
@@ -68,19 +75,10 @@ class Multisine:
 
 @dataclass(frozen=True, eq=False)
 class ResponseData:
-    """A measured frequency response.
+    """A measured frequency response: increasing frequencies, shape `(f,)`, and complex responses, `(f, p, m)`.
 
-    Attributes
-    ----------
-    frequency_Hz
-        Shape `(f,)`, increasing.
-    response_um_per_V
-        Shape `(f, p, m)`, complex.
-    variance_um2_per_V2
-        Of the complex response, from noise and distortion together, shape `(f, p, m)`; None where it is not known,
-        and then all lines weigh the same.
-    noise_variance_um2_per_V2
-        The part of it that differs between periods; None for a single period.
+    The variance of the latter, `(f, p, m)`, holds noise and distortion; where it is None, all lines weigh the same.
+    The noise variance is the part of it that differs between periods; None for a single period.
     """
 
     frequency_Hz: NDArray[np.float64]
@@ -109,12 +107,8 @@ class ResponseData:
 def read_multisine(path: str | os.PathLike[str]) -> Multisine:
     """Read `time_s, realization, period, u1_V, u2_V, ..., y1_um, y2_um, ...` from a CSV file.
 
-    Rows are ordered by realization, then period, then time. Time may start anew with each realization.
-
-    Raises
-    ------
-    DataError
-        One sentence with file and column, what was expected and what to do.
+    Rows are ordered by realization, then period, then time, which may start anew with each realization. A `DataError`
+    says in one sentence with file and column what was expected and what to do.
     """
     table = open_table(path)
     inputs = [f"u{i}_V" for i in range(1, len(table.names) + 1) if f"u{i}_V" in table.names]
@@ -122,9 +116,7 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
     needed = ("time_s", "realization", "period", *(inputs or ["u1_V"]), *(outputs or ["y1_um"]))
     for name in needed:
         if name not in table.names:
-            raise data_error(
-                table.path, f"expected a column '{name}', found none; rename or add it", table.header_line
-            )
+            raise table.error(f"expected a column '{name}', found none; rename or add it")
     values, _ = table.read(needed)
     for name in needed:
         check_size(table, name, values[name], {"V": "V", "um": "um", "s": "s"}.get(name.rpartition("_")[2], "1"))
@@ -137,20 +129,16 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
         or np.any(order != np.arange(len(starts)))
         or len(starts) != periods * len(np.unique(group[0]))
     ):
-        raise data_error(
-            table.path,
+        raise table.error(
             "expected every realization with the same periods of the same length, in order; cut or sort the rows",
-            table.header_line,
-            "period",
+            column="period",
         )
     if periods * lengths[0] < 2:
-        raise data_error(table.path, "expected two samples or more per realization, found one", table.header_line)
+        raise table.error("expected two samples or more per realization, found one")
     steps = np.diff(values["time_s"].reshape(-1, periods * lengths[0]), axis=1)
     interval_s = float(np.mean(steps))
     if not interval_s >= SHORTEST_STEP_s or np.max(np.abs(steps - interval_s)) > 0.01 * interval_s:
-        raise data_error(
-            table.path, "expected even time steps of 1e-12 s or more; sample evenly", table.header_line, "time_s"
-        )
+        raise table.error("expected even time steps of 1e-12 s or more; sample evenly", column="time_s")
     shape = (-1, periods, lengths[0])
     u, y = (np.stack([values[name].reshape(shape) for name in names], axis=-1) for names in (inputs, outputs))
     return Multisine(interval_s, u, y, os.path.basename(table.path))
@@ -161,12 +149,8 @@ def estimate_response(record: Multisine) -> ResponseData:
 
     Least squares over the realizations of what periods have averaged; see Pintelon and Schoukens, *System
     Identification: A Frequency Domain Approach* (2012), chapter 4. What differs between periods is noise; what
-    differs between realizations is noise and nonlinear distortion together. Voltages count as exact.
-
-    Raises
-    ------
-    DataError
-        If there are no more realizations than inputs, or the inputs are not independent.
+    differs between realizations is noise and nonlinear distortion together. Voltages count as exact. A `DataError` if
+    there are no more realizations than inputs, or the inputs are not independent.
     """
     frequency_Hz, u, y = record.spectra()
     gain, total = approximate(record, u, y)
@@ -199,6 +183,56 @@ def approximate(record: Multisine, u: NDArray[Any], y: NDArray[Any]) -> tuple[ND
 
 
 def smooth(variance: NDArray[Any]) -> NDArray[Any]:
-    half = min(_SMOOTH, len(variance) - 1 | 1) // 2
-    padded = np.pad(variance, ((half, half), (0, 0)), mode="reflect")
-    return np.mean(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0), axis=-1)
+    """Mean over neighbouring lines, shape `(f, p)`."""
+    width = 2 * (min(_SMOOTH, len(variance) - 1 | 1) // 2) + 1
+    return convolve1d(variance, np.full(width, 1 / width), axis=0, mode="mirror")
+
+
+def read_response(path: str | os.PathLike[str]) -> ResponseData:
+    """Read a frequency response as an analyser writes it: a row per line, frequencies increasing.
+
+    The columns are `frequency_Hz`, then `real_um_per_V` and `imag_um_per_V`, or a magnitude (`magnitude_um_per_V`, or
+    `magnitude_dB` for 20 log10 of um/V) and a phase (`phase_deg` or `phase_rad`). A column `variance_um2_per_V2`, of
+    the complex response, may stand beside them. The data are of shape `(f, 1, 1)`, for `fit_response`. A `DataError`
+    says in one sentence with file and column what was expected and what to do.
+    """
+    table = open_table(path)
+    magnitude = _one_of(table, _MAGNITUDE, _DECIBEL)
+    phase = _one_of(table, _DEGREES, _RADIANS)
+    cartesian = _REAL in table.names and _IMAGINARY in table.names
+    if "frequency_Hz" not in table.names or cartesian == bool(magnitude and phase):
+        raise table.error(
+            f"expected the columns frequency_Hz and either {_REAL} and {_IMAGINARY} or {_MAGNITUDE} (or {_DECIBEL}) "
+            f"and {_DEGREES} (or {_RADIANS}), found {', '.join(table.names)}; rename or drop columns"
+        )
+    shown = (_REAL, _IMAGINARY) if cartesian else (magnitude, phase)
+    known = (_VARIANCE,) if _VARIANCE in table.names else ()
+    values, _ = table.read(("frequency_Hz", *shown, *known))
+    for name, unit in _UNITS.items():
+        if name in ("frequency_Hz", *shown, *known):
+            check_size(table, name, values[name], unit)
+    first, second = (values[name] for name in shown)
+    for name, wrong, expected in (
+        ("frequency_Hz", np.diff(values["frequency_Hz"], prepend=-np.inf) <= 0, "frequencies that increase"),
+        ("frequency_Hz", values["frequency_Hz"] < 0, "frequencies from 0 Hz on"),
+        (_MAGNITUDE, (first < 0) & (shown[0] == _MAGNITUDE), "magnitudes that are not negative"),
+        *((name, values[name] <= 0, "positive variances") for name in known),
+    ):
+        if np.any(wrong):
+            row = int(np.argmax(wrong))
+            raise table.error(f"expected {expected}; correct or sort the rows", row, name)
+    if cartesian:
+        response = first + 1j * second
+    else:
+        size = 10 ** (first / 20) if magnitude == _DECIBEL else first
+        response = size * np.exp(1j * (np.deg2rad(second) if phase == _DEGREES else second))
+    return ResponseData(
+        values["frequency_Hz"], response[:, None, None], values[_VARIANCE][:, None, None] if known else None
+    )
+
+
+def _one_of(table: Table, *names: str) -> str:
+    found = [name for name in names if name in table.names]
+    if len(found) > 1:
+        raise table.error(f"expected one of {' and '.join(names)}, found both; drop one")
+    return found[0] if found else ""

@@ -12,12 +12,13 @@ import optimistix as optx
 from jaxtyping import Array, Complex, Float
 from numpy.typing import NDArray
 from optimistix import RESULTS
+from scipy.ndimage import convolve1d
 from scipy.signal import find_peaks, peak_widths
 
 from fits.io._errors import DataError
 from fits.loop._result import FitError, FitStatus
 from fits.stage._frequency import Multisine, ResponseData, approximate, smooth
-from microid import Coordinates, HystereticModes, Modes, ParameterInfo, with_plays
+from microid import Coordinates, HystereticModes, Modes, with_plays
 
 _M = TypeVar("_M", Modes, HystereticModes)
 _Band = tuple[float, float] | None
@@ -64,12 +65,11 @@ def fit_response(data: ResponseData, modes: int = 2, band_Hz: _Band = None, coup
     ----------
     data
         One input and output or several.
-    modes
-        Number of modes. One more than the band shows stands for the next one above it.
+    modes, coupled
+        Number of modes, of which one more than the band shows stands for the next one above it; and whether damping
+        may couple them, by `quadrature_um_per_V`, zero otherwise.
     band_Hz
         Lowest and highest frequency to fit; all by default.
-    coupled
-        Whether damping may couple the modes: fits `quadrature_um_per_V`, zero otherwise.
 
     Raises
     ------
@@ -109,17 +109,11 @@ def fit_hysteresis(
     ----------
     record
         More realizations than inputs: they tell how much of the spectra is distortion, which the weights are made of.
-    start
-        Modes to start from, usually of `fit_response`.
-    threshold_V
-        Thresholds of the plays, shape `(K,)`, not zero, where a play is the voltage itself.
+    start, threshold_V
+        Modes to start from, usually of `fit_response`, and thresholds of the plays, shape `(K,)`, not zero, where a
+        play is the voltage itself.
     band_Hz, coupled
-        See `fit_response`.
-
-    Raises
-    ------
-    DataError, FitError
-        See `fit_response`.
+        See `fit_response`, as for what is raised.
     """
     frequency, u, y = record.spectra()
     modes = start if isinstance(start, Modes) else start.model
@@ -220,13 +214,9 @@ def _with_gains(model: _M, gains: Float[Array, "p b m"], coupled: bool) -> _M:
     return eqx.tree_at(lambda model: tuple(getattr(_modes(model), name) for name in _GAINS), model, new)
 
 
-def _is_gain(info: ParameterInfo) -> bool:
-    return info.path.rpartition(".")[2] in _GAINS
-
-
 @eqx.filter_jit
 def _solve(model: _M, spectra: _Spectra) -> tuple[_M, Any]:
-    coordinates = Coordinates(model, lambda info: not _is_gain(info))
+    coordinates = Coordinates(model, lambda info: info.path.rpartition(".")[2] not in _GAINS)
     start = coordinates.of(model)
 
     def residual(z: Float[Array, " n"], _: None = None) -> Float[Array, "p n"]:
@@ -294,8 +284,9 @@ def _start(spectra: _Spectra, response: NDArray[Any], count: int) -> Modes:
     """Modes at the highest peaks of the singular values; those that have none go where the least is explained."""
     frequency = np.asarray(spectra.frequency_Hz)
     found: list[tuple[float, float, float]] = []
+    average = np.full(_FEW_LINES, 1 / _FEW_LINES)
     for curve in np.linalg.svd(response, compute_uv=False).T:
-        level = _average(np.log(np.maximum(curve, 1e-12 * np.max(np.abs(response)))))
+        level = convolve1d(np.log(np.maximum(curve, 1e-12 * np.max(np.abs(response)))), average, mode="nearest")
         peaks, about = find_peaks(level, prominence=_PROMINENCE)
         width = peak_widths(np.exp(2 * level), peaks)[0] * np.mean(np.diff(frequency))
         found += zip(about["prominences"], frequency[peaks], width / (2 * frequency[peaks]), strict=True)
@@ -309,9 +300,9 @@ def _start(spectra: _Spectra, response: NDArray[Any], count: int) -> Modes:
         model = Modes(jnp.asarray(naturals), jnp.asarray(dampings), zero, zero, zero.sum(axis=0))
         if len(at) == count:
             return model
-        squares = np.asarray(_squares(model, spectra))
-        near = np.abs(frequency[:, None] - naturals) < 0.05 * naturals
-        at.append((float(frequency[np.argmax(np.where(np.any(near, axis=1), 0, _average(squares)))]), 0.01))
+        squares = convolve1d(np.asarray(_squares(model, spectra)), average, mode="nearest")
+        near = np.any(np.abs(frequency[:, None] - naturals) < 0.05 * naturals, axis=1)
+        at.append((float(frequency[np.argmax(np.where(near, 0, squares))]), 0.01))
 
 
 @eqx.filter_jit
@@ -320,7 +311,3 @@ def _squares(model: Modes, spectra: _Spectra) -> Float[Array, " f"]:
     best = _with_gains(model, spectra.eliminated(model)[1], spectra.coupled)
     left = spectra.wanted - jnp.swapaxes(best.frequency_response(spectra.frequency_Hz), 1, 2)
     return jnp.sum(jnp.abs(left) ** 2, axis=(1, 2))
-
-
-def _average(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.convolve(np.pad(values, _FEW_LINES // 2, mode="edge"), np.ones(_FEW_LINES) / _FEW_LINES, "valid")

@@ -67,18 +67,9 @@ _PACKED = ("columns_um", "coordinates", "mean_um")
 
 @dataclass(frozen=True)
 class ModelFile:
-    """What a model file holds.
+    """What a model file holds: a module of `microid`, usually a `Preisach` or a `Stage`, and its uncertainty.
 
-    Attributes
-    ----------
-    model
-        A module of `microid`, usually a `Preisach` or a `Stage`.
-    uncertainty
-        Of its predictions.
-    report
-        What is known of the fit, as `fit_report` makes it.
-    written_by
-        Program and version.
+    `report` is what is known of the fit, as `fit_report` makes it, and `written_by` the program and its version.
     """
 
     model: eqx.Module
@@ -93,23 +84,10 @@ def save_model(
     uncertainty: Uncertainty | StageUncertainty | None,
     report: Mapping[str, Any],
 ) -> None:
-    """Write a model file, whole or not at all.
+    """Write a model file, whole or not at all; the same model gives the same bytes.
 
-    Parameters
-    ----------
-    path
-        File to write; the same model gives the same bytes.
-    model
-        Any module made of public classes of `microid`.
-    uncertainty
-        Of its predictions.
-    report
-        JSON values under string keys, such as `fit_report` makes.
-
-    Raises
-    ------
-    DataError
-        If the model or the report cannot be written, or the file cannot be.
+    The model is any module made of public classes of `microid`, the report JSON values under string keys, such as
+    `fit_report` makes. A `DataError` if one of them cannot be written, or the file cannot be.
     """
     try:
         text = model_text(model, uncertainty, report)
@@ -145,17 +123,7 @@ def model_text(
 
 
 def load_model(path: str | os.PathLike[str]) -> ModelFile:
-    """Read a model file.
-
-    Parameters
-    ----------
-    path
-        Written by `save_model`.
-
-    Returns
-    -------
-    ModelFile
-        Every number is bit by bit what was written.
+    """Read a model file that `save_model` wrote: every number is bit by bit what was written.
 
     Raises
     ------
@@ -168,18 +136,18 @@ def load_model(path: str | os.PathLike[str]) -> ModelFile:
         raise RuntimeError('model files hold float64: jax.config.update("jax_enable_x64", True)')
     name = os.fspath(path)
     content = _read(name)
+    again = "write the file again with 'microid fit'"
     try:
-        model = decode(content["model"], "model")
-        uncertainty = decode(content["uncertainty"], "uncertainty")
+        model, uncertainty = (decode(content[part], part) for part in ("model", "uncertainty"))
     except DataError as error:
-        raise DataError(f"{name}: {error}; write the file again with 'microid fit'.") from error
+        raise DataError(f"{name}: {error}; {again}.") from error
     if not isinstance(model, eqx.Module) or not isinstance(uncertainty, Uncertainty | StageUncertainty | None):
-        raise DataError(f"{name}: expected a model and its uncertainty; write the file again with 'microid fit'.")
+        raise DataError(f"{name}: expected a model and its uncertainty; {again}.")
     if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
-        raise DataError(f"{name}: the uncertainty does not fit the stage; write the file again with 'microid fit'.")
+        raise DataError(f"{name}: the uncertainty does not fit the stage; {again}.")
     columns = 0 if uncertainty is None or uncertainty.grid is None else uncertainty.grid.columns
     if uncertainty is not None and uncertainty.columns_um.shape[1] != columns:
-        raise DataError(f"{name}: the uncertainty does not fit its grid; write the file again with 'microid fit'.")
+        raise DataError(f"{name}: the uncertainty does not fit its grid; {again}.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
 
 
@@ -227,11 +195,8 @@ def _hash(content: Mapping[str, Any]) -> str:
 def _pretty(value: Any, indent: str = "") -> str:
     """Write objects that hold objects over several lines, and arrays of numbers on one."""
     inner = indent + " "
-    if (
-        isinstance(value, dict)
-        and any(isinstance(item, dict | list) for item in value.values())
-        and "unit" not in value
-    ):
+    nested = isinstance(value, dict) and any(isinstance(item, dict | list) for item in value.values())
+    if nested and "unit" not in value:
         items = [f"{inner}{json.dumps(key)}: {_pretty(item, inner)}" for key, item in value.items()]
         return "{\n" + ",\n".join(items) + f"\n{indent}}}"
     if isinstance(value, list) and any(isinstance(item, dict | str) for item in value):

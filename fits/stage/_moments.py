@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
-from fits.loop._run import Run
-from fits.loop._samples import Samples
+from fits.loop._run import Run, Samples
 from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
 from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
 
@@ -22,10 +21,7 @@ _PIECE = 2048
 
 
 def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
-    """Coordinates of what a fit of a stage moves: all that is free, but for offsets and the grid's own parameters.
-
-    A `ValueError` where nothing is left to move.
-    """
+    """Coordinates of what is free but for offsets and the `grid`'s own; a `ValueError` where nothing is left."""
     place = place_of_hysteresis(stage)
     name = None if place is None or not grid else stage.names[place]
 
@@ -37,10 +33,7 @@ def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
 
 
 class Chain(eqx.Module):
-    """A stage in the coordinates of its fit: of all parameters but those of the grid and the offsets.
-
-    The grid stands at a place in the chain; both are None where no grid is fitted.
-    """
+    """A stage in the coordinates of its fit; the grid and its place are None where no grid is fitted."""
 
     coordinates: Coordinates[Stage]
     place: int | None = eqx.field(static=True)
@@ -140,10 +133,7 @@ class RunSums:
 def run_sums(
     chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"], run: Run, free: bool = True
 ) -> RunSums:
-    """Pass one run through the regression, linearised at some coordinates and columns.
-
-    The columns are part of it only if they are `free`.
-    """
+    """Pass one run through the regression on coordinates and, if they are `free`, columns, linearised there."""
     samples, size = run.samples, chain.size if free else 0
     out, slope, nuisance = linearise(chain, z, columns_um, run)
     weight = np.asarray(samples.weight)
@@ -151,7 +141,7 @@ def run_sums(
     root = np.sqrt(weight)
     known = size + slope.shape[1]
     rows = np.empty((min(len(weight), _PIECE), known + nuisance.shape[1]))
-    sums = Moments(np.zeros((rows.shape[1],) * 2), np.zeros(rows.shape[1]), np.zeros(()), np.zeros(()))
+    sums = Moments.empty(rows.shape[1])
     for first, columns in pieces(chain, z, run, free):
         piece = slice(first, first + columns.shape[0])
         used = rows[: columns.shape[0]]
@@ -226,11 +216,10 @@ def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterato
 
 
 def split_moments(total: Moments, size: int, damping: float) -> tuple[Moments, np.ndarray, np.ndarray]:
-    """Eliminate the last unknowns of a regression, all but the first `size`.
+    """Eliminate the last unknowns of a regression, all but the first `size`, with Marquardt's damping.
 
-    Returns the moments of those that stay, with the best of the others for each; the best of the others without them,
-    shape `(p,)`; and what that loses for each of them, shape `(p, D)`. Marquardt's damping is the share of the
-    diagonal that is added to the eliminated ones' own block.
+    Returns the moments of those that stay, the others at their best for each; the best of the others without them,
+    shape `(p,)`; and what that loses for each of them, shape `(p, D)`.
     """
     gram, cross = np.asarray(total.gram), np.asarray(total.cross_um)
     block = gram[size:, size:]

@@ -11,7 +11,7 @@ import numpy as np
 from fits.io._limits import Ranges, joined, measured_ranges
 from fits.io._record import Record
 from fits.loop._run import Run, prepare_run
-from fits.stage._run import place_of_hysteresis, range_of
+from fits.stage._run import as_stage, place_of_hysteresis, range_of
 from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
 
 # Steps in a period of the resonance: a sampled sine misses less than 2 % of its peak.
@@ -82,15 +82,11 @@ def fine_steps(stage: Stage, interval_s: float, count: int) -> int:
 def motion(
     stage: Stage, record: Record, range_V: tuple[float, float], initial: str = "unknown"
 ) -> tuple[Ranges, np.ndarray]:
-    """Extremes of what a command makes a stage do, between its samples as well.
+    """Extremes of what a command makes a stage do, between its samples as well, and the displacement at the samples.
 
-    The displacement of the record is not looked at. `range_V` is that of the switching voltages, as commands.
-
-    Returns
-    -------
-    tuple
-        Ranges of voltage, slew, displacement (without the sensor's offset, which is the stage's own), velocity,
-        acceleration and driver current; and the displacement at the samples in um, shape `(n,)`.
+    The former are ranges of voltage, slew, displacement (without the sensor's offset, which is the stage's own),
+    velocity, acceleration and driver current, the latter in um, shape `(n,)`. The displacement of the record is not
+    looked at. `range_V` is that of the switching voltages, as commands.
     """
     n = len(record)
     stride = fine_steps(stage, float(np.median(np.diff(record.time_s))), n)
@@ -124,15 +120,14 @@ def predicted_ranges(
     if `every` range is asked for.
     """
     ranges = measured_ranges(replace(program, displacement_um=displacement_um))
-    stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
+    stage = as_stage(model)
     if len(program) < 2:
         return ranges
     range_V = range_of(stage)
     if not np.isfinite(range_V[0]):
         # No hysteresis remembers anything of it.
         range_V = _range(program.voltage_V)
-    rings = fine_steps(stage, float(np.median(np.diff(program.time_s))), len(program)) > 1
-    if not (rings or every):
+    if not every and fine_steps(stage, float(np.median(np.diff(program.time_s))), len(program)) == 1:
         return ranges
     between, _ = motion(stage, program, range_V, initial)
     return joined([between, ranges]) if every else joined([ranges, {"displacement": between["displacement"]}])
@@ -161,13 +156,9 @@ def reached_by(
     """What records have shown of a rig: the displacement as measured, its derivatives as a fitted stage has them.
 
     Noise would make derivatives of the measurement larger than anything the rig did. Each record has a state before
-    it and samples that do not depend on an unknown past, shape `(n,)`; see `motion`.
-
-    Returns
-    -------
-    tuple
-        The ranges, with displacements as the sensor reads them in the first record; and for each record what the
-        sensor reads, in um, where the stage's own displacement is zero.
+    it and samples that do not depend on an unknown past, shape `(n,)`; see `motion`. Returns the ranges, where
+    displacements are as the sensor reads them in the first record; and for each record what the sensor reads, in um,
+    where the stage's own displacement is zero.
     """
     found, offsets_um = [], []
     for record, state, sure in zip(records, states, known, strict=True):

@@ -1,6 +1,6 @@
-"""The whole posterior of a stage's parameters, by NUTS: for those who do not trust a standard deviation."""
+"""For those who do not trust a standard deviation: draws from a posterior by NUTS, and the profile likelihood."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -8,29 +8,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.stats import chi2
 
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.loop._design import Grid, columns_of
+from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
-from fits.loop._samples import Samples
+from fits.loop._run import Run, Samples
 from fits.stage._moments import offsets_out
-from fits.stage._run import nuisance_columns, prepare_again, project_out, residual_of, respond
-from fits.stage._solve import Weighing
-from microid import Coordinates, Stage
+from fits.stage._run import free_grid, nuisance_columns, prepare_again, project_out, residual_of, respond
+from fits.stage._solve import Problem, Solved, Weighing, prior_precision, solve_chain
+from microid import Coordinates, Stage, parameter_table
+
+# Half of the width that is looked at, in standard deviations of the quadratic approximation.
+_WIDTH = 3.5
 
 
 @dataclass(frozen=True)
 class Draws:
-    """Draws from a posterior.
+    """Draws from a posterior: names of the parameters, and values in their units, shape `(draws, p)`.
 
-    Attributes
-    ----------
-    names
-        Of the parameters.
-    values
-        In their units, shape `(draws, p)`.
-    divergences
-        Number of trajectories that went astray; more than a few mean that the draws are not to be trusted.
+    `divergences` are trajectories that went astray; more than a few mean that the draws are not to be trusted.
     """
 
     names: tuple[str, ...]
@@ -45,9 +44,8 @@ def _potential(
     coordinates, runs, precision = data
     stage, total = coordinates(z), jnp.zeros(())
     for samples, share in zip(runs, precision, strict=True):
-        off = project_out(
-            nuisance_columns(stage, samples), samples.weight, samples.displacement_um - respond(stage, samples)
-        )
+        left = samples.displacement_um - respond(stage, samples)
+        off = project_out(nuisance_columns(stage, samples), samples.weight, left)
         total = total + share * jnp.sum(samples.weight * off**2) / 2
     return total
 
@@ -68,14 +66,10 @@ def sample_posterior(
 
     Parameters
     ----------
-    result
-        From `fit_stage` of the same records; where the sampler starts.
-    records, holdout, initial
-        As they were given there.
-    draws, warmup
-        Number of draws, and of steps to adapt before.
-    seed
-        Of the sampler.
+    result, records, holdout, initial
+        From `fit_stage`, where the sampler starts, and what was given there.
+    draws, warmup, seed
+        Number of draws, of steps to adapt before, and the seed of the sampler.
 
     Raises
     ------
@@ -108,3 +102,113 @@ def sample_posterior(
         lost = int(np.sum(np.asarray(sampler.get_extra_fields()["diverging"])))
     values = np.asarray(jax.vmap(coordinates.values)(z))
     return Draws(tuple(parameter.name for parameter in result.parameters), values, lost)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Profile of one parameter.
+
+    Attributes
+    ----------
+    values, deviance
+        Where it was held, and twice the loss of log likelihood there, shape `(k,)`; a parabola where the standard
+        deviation says all.
+    lower, upper
+        Ends of the 95 % interval; the last value looked at where the deviance stays below its bound.
+    """
+
+    name: str
+    unit: str
+    values: np.ndarray
+    deviance: np.ndarray
+    lower: float
+    upper: float
+
+
+def profile_stage(
+    result: FitResult[Stage],
+    records: Sequence[Record],
+    name: str,
+    *,
+    points: int = 9,
+    holdout: float = 0.2,
+    initial: str = "unknown",
+    progress: Callable[[str], None] = lambda _: None,
+) -> Profile:
+    """Hold one parameter of a fitted stage at several values and fit all others again.
+
+    Parameters
+    ----------
+    result, records, holdout, initial
+        From `fit_stage`, with the squares as loss, and what was given there.
+    name, points
+        Of the parameter, such as `mechanics.damping_ratio`, and number of values: evenly spread over seven standard
+        deviations, less where a bound comes before.
+    progress
+        Told what is being done.
+
+    Raises
+    ------
+    DataError
+        If no such parameter was fitted.
+    FitError
+        If one of the fits fails.
+    """
+    names = [parameter.name for parameter in result.parameters]
+    if name not in names or name.endswith("]"):
+        raise DataError(f"no single parameter {name!r} was fitted: choose one of {', '.join(names)}")
+    at = result[name]
+    part, field = name.split(".", 1)
+    spec = next(row.spec for row in parameter_table(result.model) if result.model.named(row.path) == name)
+    low, high = at.value - _WIDTH * at.sd, at.value + _WIDTH * at.sd
+    if low <= spec.lower:
+        low = spec.lower + 0.01 * (at.value - spec.lower)
+    if high >= spec.upper:
+        high = spec.upper - 0.01 * (spec.upper - at.value)
+    values = np.linspace(low, high, points)
+    runs = prepare_again(result.model, records, initial, holdout)
+    fitted = result.model.with_substeps(1)
+    stroke_um = max(float(np.ptp(run.displacement_um)) for run in runs)
+    best = _solved(fitted, runs, Hyper.start(), stroke_um)
+
+    def deviance(value: float) -> float:
+        progress(f"{name} = {value:.6g} {at.unit}")
+        held = fitted.swap(part, eqx.tree_at(lambda p: getattr(p, field), fitted[part], jnp.asarray(value)))
+        return _deviance(best, held.freeze(name))
+
+    found = np.array([deviance(float(value)) for value in values])
+    # Its square root is nearly straight.
+    root = np.sign(values - at.value) * np.sqrt(np.maximum(found, 0.0))
+    bound = float(chi2.ppf(0.95, 1)) ** 0.5
+    lower, upper = (float(np.interp(sign * bound, root, values)) for sign in (-1, 1))
+    return Profile(name, at.unit, values, found, lower, upper)
+
+
+def _solved(stage: Stage, runs: Sequence[Run], hyper: Hyper | None, stroke_um: float) -> Solved:
+    """Fit what is free of a stage; a `ValueError` where nothing is."""
+    fitted = free_grid(stage)
+    if fitted is None:
+        problem = Problem.of(stage, None, np.zeros(0), None, stroke_um)
+    else:
+        law = fitted[1]
+        grid = Grid(law.density.lower_V, law.density.upper_V, law.density.levels)
+        problem = Problem.of(stage, grid, np.asarray(columns_of(law)), hyper, stroke_um)
+    return solve_chain(problem, runs, "squares", lambda _: None)
+
+
+def _deviance(best: Solved, stage: Stage) -> float:
+    """Twice the loss of log posterior with the rest of a stage fitted again, noise and prior as they are at best."""
+    runs, stroke_um = best.runs, best.problem.stroke_um
+    try:
+        solved = _solved(stage, runs, best.hyper, stroke_um)
+    except ValueError:
+        # Nothing else may move.
+        left, columns = [residual_of(stage, run) for run in runs], np.zeros(0)
+    else:
+        left, columns = solved.residuals_um, solved.columns_um
+    misfit = best.weighing.cost_um2(runs, left) - best.weighing.cost_um2(runs, best.residuals_um)
+    deviance = misfit / best.weighing.least_um**2
+    if not len(columns):
+        return deviance
+    prior = prior_precision(best.problem.chain, best.hyper, stroke_um)
+    return deviance + float(columns @ prior @ columns - best.columns_um @ prior @ best.columns_um)

@@ -14,14 +14,14 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
-from fits.loop._run import Run, command_range_V, known_samples, prepare_run
-from fits.loop._samples import Samples
+from fits.loop._past import past_columns
+from fits.loop._run import Run, Samples, command_range_V, known_samples, prepare_run
 from fits.loop._uncertainty import refuse_outside
-from fits.stage._past import past_columns
 from microid import (
     AbstractEffect,
     AbstractHysteresis,
     AbstractLinear,
+    GridDensity,
     LinearSystem,
     Preisach,
     Signal,
@@ -45,8 +45,8 @@ def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
 def nuisance_columns(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, `(n, k)`: an offset in um, its past, and how the stage moved before.
 
-    The latter are the free motions of what follows the hysteresis, or of the whole chain without one. A voltage at
-    the piezo that still settles when the record begins is not among them.
+    The latter are free motions of what follows the hysteresis, or of the whole chain without one. What still settles
+    ahead of the hysteresis when the record begins is not among them.
     """
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
@@ -98,6 +98,24 @@ def place_of_hysteresis(stage: Stage) -> int | None:
     return places[0] if places else None
 
 
+def as_stage(model: Preisach | Stage) -> Stage:
+    """A model as a stage: a hysteresis alone is one of a single part."""
+    return model if isinstance(model, Stage) else Stage.of(hysteresis=model)
+
+
+def hysteresis_of(stage: Stage) -> Any:
+    """The part of a stage that holds its hysteresis, with what is around it; None where there is none."""
+    place = place_of_hysteresis(stage)
+    return None if place is None else stage.parts[place]
+
+
+def free_grid(stage: Stage) -> tuple[str, Preisach] | None:
+    """Name and Preisach operator of a stage that is fitted on a grid; None where it is frozen, or of another kind."""
+    law, name = hysteresis_of(stage), stage.names[place_of_hysteresis(stage) or 0]
+    on_grid = isinstance(law, Preisach) and isinstance(law.density, GridDensity)
+    return (name, law) if on_grid and name not in stage.frozen else None
+
+
 def gain_ahead(stage: Stage) -> float | None:
     """Voltage at the hysteresis per command, at rest; None without one, a `DataError` where it is not positive."""
     place = place_of_hysteresis(stage)
@@ -132,7 +150,7 @@ def ahead(stage: Stage, place: int, samples: Samples, rest_V: float | None = Non
 
 
 def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
-    """Mark what no longer depends on a past that is `initial` once the lag ahead of the hysteresis is known.
+    """Mark what no longer depends on a past that is `initial`, behind the lag ahead of the hysteresis.
 
     All of them, where less than half of those that are fitted would be left.
     """
@@ -151,13 +169,11 @@ def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
 
 def range_of(stage: Stage) -> tuple[float, float]:
     """Commands that a stage was fitted on, in V; unlimited without a Preisach operator."""
-    place = place_of_hysteresis(stage)
-    law = None if place is None else innermost(stage.parts[place])
-    if isinstance(law, Preisach):
-        gain = gain_ahead(stage)
-        assert gain is not None
-        return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
-    return -np.inf, np.inf
+    law, gain = hysteresis_of(stage), gain_ahead(stage)
+    law = None if law is None else innermost(law)
+    if gain is None or not isinstance(law, Preisach):
+        return -np.inf, np.inf
+    return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
 
 
 def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout: float) -> list[Run]:
@@ -172,14 +188,13 @@ def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout
 def prepare_program(stage: Stage, record: Record, initial: str) -> tuple[Stage, Run]:
     """Make a voltage program ready for a stage, and the stage for intervals that are divided already.
 
-    A `DataError` if the voltage leaves the range that the stage was fitted on, or the stage has an effect of another
-    column that the program lacks.
+    A `DataError` if it leaves the range that the stage was fitted on, or lacks a column that the stage depends on.
     """
     range_V = range_of(stage)
     refuse_outside(record, *range_V)
     needed = {name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs}
     needed -= {name for name, column in COLUMNS.items() if column.optional}
-    program = replace(record, displacement_um=None, extra=dict(record.extra))
+    program = replace(record, displacement_um=None)
     missing = sorted(needed - set(columns_beside(program)))
     if missing:
         raise DataError(

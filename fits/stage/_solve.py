@@ -1,7 +1,9 @@
 """Fitting a whole stage: damped Gauss-Newton steps, the columns of the hysteresis solved for exactly in each."""
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +17,7 @@ from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run
 from fits.stage._moments import Chain, RunSums, run_sums, split_moments
 from fits.stage._run import residual_of
-from fits.stage._weighing import Weighing
-from fits.stats._noise import huber_weight
+from fits.stats._noise import correlation_samples, huber_weight
 from microid import Stage
 
 _ROUNDS, _ROUGH = 40, 12
@@ -29,13 +30,63 @@ _ROUNDING = 1e-20
 
 
 @dataclass(frozen=True)
+class Weighing:
+    """How much a sample of each run counts, by the standard deviation of the run's residual.
+
+    So many samples as `correlation` are worth one independent one; `counted` is the same as the samples are counted.
+    No run counts as quieter than the part `least_noise_share` of the loudest.
+    """
+
+    noise_um: tuple[float, ...]
+    correlation: tuple[float, ...]
+    counted: tuple[float, ...]
+    least_noise_share: float = 0.0
+
+    @classmethod
+    def of(cls, runs: Sequence[Run], residuals: Sequence[np.ndarray], *counted: float) -> "Weighing":
+        """Weigh runs by what a fit leaves of them, all equally correlated unless `counted` is given."""
+        noise, correlation = [], []
+        for run, residual in zip(runs, residuals, strict=True):
+            left = residual[run.fitted]
+            noise.append(float(np.sqrt(np.average(left**2, weights=run.fit_weight[run.fitted]))))
+            correlation.append(correlation_samples([left]))
+        each = float(np.exp(np.mean(np.log(correlation))))
+        return cls(tuple(noise), tuple(correlation), counted or (each,) * len(noise))
+
+    def alike(self) -> "Weighing":
+        """As if all runs had the same noise, and no sample any of another."""
+        noise = (float(np.sqrt(np.mean(np.square(self.noise_um)))),) * len(self.noise_um)
+        return replace(self, noise_um=noise, counted=(1.0,) * len(noise))
+
+    @property
+    def least_um(self) -> float:
+        """The smallest noise, in which the joint problem is measured."""
+        return max(min(self.noise_um), self.least_noise_share * max(self.noise_um))
+
+    @property
+    def shares(self) -> list[float]:
+        """Independent samples of the quietest run that a sample of each run is worth."""
+        noises = zip(self.noise_um, self.counted, strict=True)
+        return [(self.least_um / max(um, self.least_um)) ** 2 / each for um, each in noises]
+
+    def total(self, sums: Sequence[RunSums]) -> Moments:
+        """Moments of all runs."""
+        return reduce(operator.add, (one.moments.scaled(k, 1.0) for one, k in zip(sums, self.shares, strict=True)))
+
+    def cost_um2(self, runs: Sequence[Run], residuals: Sequence[np.ndarray]) -> float:
+        """Sum of squares that goes with `total`."""
+        each = zip(runs, residuals, self.shares, strict=True)
+        return sum(share * float(np.sum(run.fit_weight * left**2)) for run, left, share in each)
+
+
+@dataclass(frozen=True)
 class Problem:
     """A stage to be fitted, where its fit begins, and what the user should know.
 
-    The unit of the columns is `stroke_um`; `hyper` is their smoothness and noise to start from, None to leave them as
-    they are. No run counts as quieter than the part `least_noise_share` of the loudest: where more than noise is
-    left, one run would otherwise be fitted ever better, and so count for ever more, at the cost of the others. Where
-    a part was left out, `full` is the stage with it, roughly fitted.
+    The columns' unit is `stroke_um`; `hyper` is the smoothness and noise to start from, None to leave columns as they
+    are. Where more than noise is left, one run would be fitted ever better, and count ever more, at the cost of
+    others: none counts as quieter than the part `least_noise_share` of the loudest. `full` is the stage before a part
+    was left out.
     """
 
     stage: Stage
@@ -59,10 +110,9 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solved:
-    """Where a fit ended: coordinates, shape `(p,)`, and columns of the grid, shape `(D,)`.
+    """Where a fit ended: coordinates `(p,)`, columns of the grid `(D,)`, smoothness and noise if there is one.
 
-    `hyper` is the smoothness and noise of the grid, None without one. The runs have the weights of their samples, and
-    the sums are the regression at the end.
+    The runs have the weights of their samples, and the sums are the regression at the end.
     """
 
     problem: Problem

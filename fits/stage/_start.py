@@ -33,11 +33,7 @@ _LEADING, _REFINED, _KEPT = 200, 4, 3
 
 @dataclass(frozen=True)
 class MeasuredResponse:
-    """Frequency response of the linear part of a stage, as the runs show it, shape `(f,)` each.
-
-    It is the complex displacement per displacement that the hysteresis alone would give; the coherence is the share
-    of the power that follows the input.
-    """
+    """Complex response to what the hysteresis alone would give, and its coherence, shape `(f,)` each."""
 
     frequency_Hz: np.ndarray
     response: np.ndarray
@@ -45,10 +41,7 @@ class MeasuredResponse:
 
 
 def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
-    """Estimate the frequency response from a drive, shape `(n,)`, to the displacement of a run (Welch).
-
-    The fitted samples are used, from the first to the last.
-    """
+    """Frequency response (Welch) from a drive, `(n,)`, to the displacement, over the samples that are fitted."""
     which = np.flatnonzero(run.fitted)
     piece = slice(which[0], which[-1] + 1)
     time = run.record.time_s[piece]
@@ -137,8 +130,7 @@ def _distinct(points: Iterable[np.ndarray], apart: float) -> list[np.ndarray]:
 class _LogResponse:
     """Measured and modelled responses compared by their logarithms, in which poles far away still pull.
 
-    A driver is one coordinate, the logarithm of its time constant; a mechanics two, those of its natural frequency
-    and its damping ratio.
+    Coordinates are logarithms: of a driver's time constant, of a mechanics' natural frequency and damping ratio.
     """
 
     frequency_Hz: np.ndarray

@@ -24,11 +24,11 @@ from fits.stage._checks import (
     speed_Hz,
 )
 from fits.stage._moments import offsets_out
-from fits.stage._run import place_of_hysteresis, settled_samples, simulate_stage
+from fits.stage._run import free_grid, hysteresis_of, settled_samples, simulate_stage
 from fits.stage._solve import Problem, Solved, solve_chain
 from fits.stage._start import measure_response, start_stages
 from fits.stage._uncertainty import Precision
-from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Stage
+from microid import Driver, Hold, Mechanics, Preisach, Stage
 
 # Runs whose voltage moves less than this many times faster than that of the slowest are slow.
 _SLOW = 4.0
@@ -45,10 +45,9 @@ _VANISHED, _RESTARTED = 1e-2, 0.3
 
 @dataclass(frozen=True)
 class Plan:
-    """What was asked for.
+    """What was asked for, and whether an unknown past is `estimated`.
 
-    The command of each run is so many s later as `shifts_s` say, and of each those samples are fitted that have
-    `settled`, shape `(n,)`; none and all by default.
+    Commands come `shifts_s` later, and samples that have `settled`, `(n,)`, are fitted.
     """
 
     records: tuple[Record, ...]
@@ -60,6 +59,7 @@ class Plan:
     gain: float | None
     hold: Hold
     accept_best: bool
+    estimated: bool = False
     shifts_s: tuple[float, ...] = ()
     settled: tuple[np.ndarray, ...] = ()
 
@@ -67,6 +67,11 @@ class Plan:
         """The records, each interval divided into so many steps."""
         shifts = self.shifts_s or (0.0,) * len(self.records)
         return [self.run(k, stride, shift) for k, shift in enumerate(shifts)]
+
+    @property
+    def interval_s(self) -> float:
+        """Shortest of the sampling intervals."""
+        return min(float(np.median(np.diff(record.time_s))) for record in self.records)
 
     def run(self, k: int, stride: int, shift_s: float = 0.0) -> Run:
         """One of them, its command that much later."""
@@ -77,9 +82,9 @@ class Plan:
             there = (time >= record.time_s[0]) & (time <= record.time_s[-1])
             usable = there if usable is None else there & usable
             later = np.interp(time, record.time_s, record.voltage_V)
-            record = replace(record, voltage_V=later, extra=dict(record.extra))
+            record = replace(record, voltage_V=later)
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
-        return prepare_run(record, *settings, usable)
+        return prepare_run(record, *settings, usable, self.estimated)
 
     def smoothed(self) -> "Plan":
         """The same without readings that jump out and back, of which a start must not be read off."""
@@ -106,12 +111,11 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     plan, asked = plan.smoothed(), stage
     speed = [speed_Hz(record) for record in plan.records]
     slow = [k for k, one in enumerate(speed) if one <= _SLOW * min(speed)]
-    place = place_of_hysteresis(stage)
-    law = None if place is None else stage.parts[place]
+    fitted = free_grid(stage)
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
     runs = plan.runs(1)
-    name = stage.names[place or 0]
-    if isinstance(law, Preisach) and isinstance(law.density, GridDensity) and name not in stage.frozen:
+    if fitted is not None:
+        name = fitted[0]
         refuse_slopes([plan.records[k] for k in slow])
         loose = [stage.named(row.path) for row in offsets_out(stage, True).table if row.path.endswith(".gain")]
         if loose:
@@ -123,8 +127,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         stroke, tried, _ = choose_grid([runs[k] for k in slow], levels, plan.progress, finest)
         grid, hyper = tried.data.grid, tried.solution.hyper
         columns = np.asarray(tried.solution.columns) * stroke
-        law = grid.model(columns, np.zeros(()))
-        stage = stage.swap(name, law)
+        stage = stage.swap(name, grid.model(columns, np.zeros(())))
     drives = hysteresis_alone(stage, runs)
     fast = [k for k in range(len(plan.records)) if k not in slow] or slow
     responses = [measure_response(runs[k], drives[k]) for k in fast]
@@ -176,9 +179,8 @@ def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence
     )
     if len(drivers) != 1 or len(mechanics) != 1 or grid is None or problem.hyper is None:
         return None
-    interval_s = min(float(np.median(np.diff(record.time_s))) for record in plan.records)
     old: Any = stage[drivers[0]]
-    simple = stage.without(mechanics[0]).swap(drivers[0], Driver(jnp.asarray(_LAG * interval_s), old.gain))
+    simple = stage.without(mechanics[0]).swap(drivers[0], Driver(jnp.asarray(_LAG * plan.interval_s), old.gain))
     simpler = Problem.of(simple, grid, problem.columns_um, problem.hyper, problem.stroke_um)
     simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, mechanics[0]),))
     plan.progress("a lag without a resonance")
@@ -193,8 +195,7 @@ def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence
 
 def hysteresis_alone(stage: Stage, runs: Sequence[Run]) -> list[np.ndarray]:
     """What the hysteresis of a stage would give by itself for each run, in um, shape `(n,)`."""
-    place = place_of_hysteresis(stage)
-    law: Any = None if place is None else stage.parts[place]
+    law = hysteresis_of(stage)
     if isinstance(law, Preisach):
         return [simulate_run(law, run) for run in runs]
     commands = [run.record.voltage_V for run in runs]
@@ -230,11 +231,10 @@ def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     from no time constant at all there is no way back.
     """
     stage = solved.stage
-    interval_s = min(float(np.median(np.diff(record.time_s))) for record in plan.records)
     changed = False
     for name, part in zip(stage.names, stage.parts, strict=True):
-        if isinstance(part, Driver) and float(part.time_constant_s) < _VANISHED * interval_s:
-            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_RESTARTED * interval_s)))
+        if isinstance(part, Driver) and float(part.time_constant_s) < _VANISHED * plan.interval_s:
+            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_RESTARTED * plan.interval_s)))
             changed = True
     if plan.hold != "zero" or not changed:
         return solved.z

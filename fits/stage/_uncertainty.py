@@ -1,4 +1,4 @@
-"""How sure the fit of a stage is: of its parameters, however the noise is coloured, and of its predictions."""
+"""How sure the fit of a stage is: of its parameters, however coloured the noise, of predictions and of plants."""
 
 from collections.abc import Sequence
 
@@ -9,12 +9,12 @@ from scipy import fft
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._design import Grid
+from fits.loop._design import Grid, columns_of
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
-from fits.loop._uncertainty import AbstractUncertainty, Prediction
-from fits.stage._moments import Chain, RunSums, along
-from fits.stage._run import prepare_program, simulate_stage
+from fits.loop._uncertainty import AbstractUncertainty, Prediction, Uncertainty
+from fits.stage._moments import Chain, RunSums, along, offsets_out
+from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._noise import WHITE, correlation_samples, shared_square
 from microid import Preisach, Stage
@@ -31,20 +31,9 @@ class StageUncertainty(AbstractUncertainty):
     """Independent perturbations of a stage, each one standard deviation long.
 
     The variance of a prediction is the sum of the squared changes under all of them, to first order; sensor noise is
-    not in it.
-
-    Attributes
-    ----------
-    coordinates
-        Perturbations of the stage's coordinates, shape `(k, p)`.
-    columns_um
-        And of the columns of its grid, shape `(k, D)`; `D = 0` without one.
-    mean_um
-        What each does to the mean of the first run, which its offset makes up for, shape `(k,)`.
-    discrepancy_um
-        Standard deviation of the model's own error, as neighbouring residuals show it.
-    grid
-        The columns; None without a grid.
+    not in it. Each perturbation moves the stage's `coordinates`, shape `(k, p)`, the columns of its grid, shape
+    `(k, D)`, where `D = 0` without one, and the mean of the first run by `mean_um`, which the offset makes up for.
+    `discrepancy_um` is the standard deviation of the model's own error, as neighbouring residuals show it.
     """
 
     coordinates: Float[Array, "k p"]
@@ -177,3 +166,87 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
     spectrum = np.maximum(fft.rfft(kernel).real, 0.0)
     moved = fft.irfft(fft.rfft(influence, size, axis=1) * spectrum, size, axis=1)[:, :n]
     return np.asarray(influence @ moved.T)
+
+
+def predict(
+    model: Preisach | Stage, uncertainty: AbstractUncertainty | None, record: Record, initial: str = "negative"
+) -> Prediction:
+    """Predict the displacement of a voltage program, with its uncertainty.
+
+    Parameters
+    ----------
+    model, uncertainty
+        From a fit or a model file; without an uncertainty the standard deviations are NaN.
+    record, initial
+        The program, whose displacement, if any, is not looked at; and the memory before its first sample: `negative`,
+        `positive` or `demagnetised`.
+
+    Raises
+    ------
+    DataError
+        If the voltage leaves the range that the model was fitted on, a stage has an effect of another column that the
+        program lacks, or the uncertainty is that of another kind of model.
+    """
+    if uncertainty is not None:
+        return uncertainty.predict(model, record, initial)
+    stage, run = prepare_program(as_stage(model), record, initial)
+    return Prediction(simulate_stage(stage, run), np.full(len(record), np.nan))
+
+
+def draw_plants(
+    model: Preisach | Stage, uncertainty: Uncertainty | StageUncertainty | None, count: int, *, seed: int = 0
+) -> tuple[Stage, ...]:
+    """Draw stages from the covariance of a fit.
+
+    Parameters
+    ----------
+    model, uncertainty
+        From a fit or a model file.
+    count, seed
+        How many stages in all, 1 or more, of which the first is the fitted one; and the seed of the draws.
+
+    Returns
+    -------
+    tuple of Stage
+        All of one structure; a hysteresis alone becomes a stage of one part. Weights and slopes that a draw would
+        make negative are zero. The model's own error (`discrepancy_um`) is not in them.
+
+    Raises
+    ------
+    DataError
+        If there is no uncertainty to draw from, or it is not that of the model.
+    """
+    if count < 1:
+        raise ValueError(f"count must be 1 or more, got {count}")
+    stage = as_stage(model)
+    if count == 1:
+        return (stage,)
+    if isinstance(model, Stage) and isinstance(uncertainty, StageUncertainty):
+        moves = [np.asarray(x) for x in (uncertainty.coordinates, uncertainty.columns_um, uncertainty.mean_um)]
+    elif isinstance(model, Preisach) and isinstance(uncertainty, Uncertainty):
+        none = np.zeros((uncertainty.columns_um.shape[0], 0))
+        moves = [none, np.asarray(uncertainty.columns_um), -np.asarray(uncertainty.offset_um)]
+    else:
+        raise DataError(
+            "the model says nothing of its uncertainty, expected one to draw plants from: fit it again, or take one"
+        )
+    draws = np.random.default_rng(seed).standard_normal((count - 1, len(moves[0])))
+    scattered = np.concatenate([np.zeros((1, len(moves[0]))), draws])
+    return tuple(_moved(stage, uncertainty.grid, *(one @ x for x in moves)) for one in scattered)
+
+
+def _moved(stage: Stage, grid: Grid | None, along: np.ndarray, columns_um: np.ndarray, mean_um: float) -> Stage:
+    """A stage moved in its coordinates, its columns, and in what the mean of the first run fixes."""
+    if len(along):
+        coordinates = offsets_out(stage, grid is not None)
+        stage = coordinates(coordinates.of(stage) + jnp.asarray(along))
+    place = place_of_hysteresis(stage)
+    if grid is None or place is None:
+        return stage
+    name, law = stage.names[place], stage.parts[place]
+    if not isinstance(law, Preisach):
+        raise DataError(f"{name!r} is a {type(law).__name__}: take off what is around the hysteresis")
+    levels = law.density.levels
+    columns = np.asarray(columns_of(law)) + interpolation(grid.levels, levels) @ columns_um
+    fine = Grid(law.density.lower_V, law.density.upper_V, levels)
+    return stage.swap(name, fine.model(np.maximum(columns, 0.0), law.offset_um - float(mean_um)))

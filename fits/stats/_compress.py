@@ -6,7 +6,6 @@ voltages and a 4 x 4 mixing matrix. What a fit costs then depends on the path, n
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -20,9 +19,9 @@ _NEGLIGIBLE = 1e-14
 class Compressed:
     """Groups of four voltages, in the order of the path.
 
-    A group stands for samples by `mix @ response(voltage_V) ~ target_um`, whose sums of squares and products equal
-    those of the samples; the squares that no response could explain are in `residue_um2`. `block` is -1, and `mix`
-    zero, where samples are not used; `count` is their number, each as often as it counts.
+    Sums of squares and products of `mix @ response(voltage_V) ~ target_um` equal those of the samples; the squares
+    that no response could explain are in `residue_um2`. `block` is -1, and `mix` zero, where samples are not used;
+    `count` is their number, each as often as it counts.
     """
 
     voltage_V: np.ndarray
@@ -75,7 +74,10 @@ def compress(
     cross = np.add.reduceat(powers[:, :_SLOTS] * displacement_um[:, None], first)[dense]
     energy = np.add.reduceat(share * displacement_um**2, first)[dense]
     hankel = moments[:, np.arange(_SLOTS)[:, None] + np.arange(_SLOTS)[None, :]]
-    nodes, lagrange = _nodes()
+    # Chebyshev-Lobatto nodes, which include the ends, so that every reversal stays in the path; and the coefficients
+    # of the polynomials that are 1 at one of them.
+    nodes = (1 - np.cos(np.pi * np.arange(_SLOTS) / (_SLOTS - 1))) / 2
+    lagrange = np.linalg.inv(np.vander(nodes, increasing=True)).T
     root, right, left = _square_root(lagrange @ hankel @ lagrange.T, cross @ lagrange.T, energy)
     voltage[dense] = start[dense, None] + span[dense, None] * nodes
     mix[dense], target[dense], residue[dense] = root, right, left
@@ -89,14 +91,6 @@ def compress(
         count=np.where(used, np.add.reduceat(share, first), 0.0),
         residue_um2=np.where(used, residue, 0.0),
     )
-
-
-@lru_cache
-def _nodes() -> tuple[np.ndarray, np.ndarray]:
-    """Chebyshev-Lobatto nodes on [0, 1], and the coefficients of the polynomials that are 1 at one of them."""
-    # They include the ends, so that every reversal stays in the path.
-    nodes = (1 - np.cos(np.pi * np.arange(_SLOTS) / (_SLOTS - 1))) / 2
-    return nodes, np.linalg.inv(np.vander(nodes, increasing=True)).T
 
 
 def _group_starts(visit_starts: np.ndarray, block: np.ndarray) -> np.ndarray:

@@ -13,16 +13,9 @@ _SPAN = 0.95
 
 @dataclass(frozen=True)
 class Errors:
-    """How far a prediction is from a measurement.
+    """How far a prediction is from a measurement: root mean square and largest absolute error over some samples.
 
-    Attributes
-    ----------
-    samples
-        Number of samples compared.
-    rms_um, max_um
-        Root mean square and largest absolute error.
-    range_um
-        Range of the measurement that the percentages refer to.
+    Percentages refer to the range of the measurement.
     """
 
     samples: int
@@ -42,20 +35,10 @@ class Errors:
 
 
 def errors(measured_um: np.ndarray, predicted_um: np.ndarray, range_um: float | None = None) -> Errors:
-    """Compare a prediction with a measurement.
+    """Compare a prediction with a measurement, shape `(n,)` each, in um.
 
-    Parameters
-    ----------
-    measured_um, predicted_um
-        Shape `(n,)`, in um.
-    range_um
-        What percentages refer to: the range of the whole run, where these samples are a part of it. By default the
-        range of `measured_um`.
-
-    Raises
-    ------
-    ValueError
-        If there is nothing to compare, or the range is zero.
+    Percentages refer to `range_um`, that of the whole run where these samples are a part of it; by default that of
+    the measurement. A `ValueError` if there is nothing to compare, or the range is zero.
     """
     if range_um is None:
         range_um = float(np.ptp(measured_um)) if len(measured_um) else 0.0
@@ -67,20 +50,10 @@ def errors(measured_um: np.ndarray, predicted_um: np.ndarray, range_um: float | 
 
 
 def loop_width_pct(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float | None:
-    """Width of the widest loop in percent of its height (Eq. 34).
+    """Width of the widest loop in percent of its height (Eq. 34), from a voltage and a displacement of shape `(n,)`.
 
-    The paper divides by the largest displacement, which depends on where the sensor's zero is; here the loop's own
-    height is meant (errata 34 and 38).
-
-    Parameters
-    ----------
-    voltage_V, displacement_um
-        Shape `(n,)`.
-
-    Returns
-    -------
-    float or None
-        None where the record holds no up and down branch of the largest excursion.
+    None where the record holds no up and down branch of the largest excursion. The paper divides by the largest
+    displacement, which depends on where the sensor's zero is; here the loop's own height is meant (errata 34 and 38).
     """
     low, high = voltage_V.min(), voltage_V.max()
     span = high - low
@@ -92,15 +65,10 @@ def loop_width_pct(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float 
     if len(passages) < 2:
         return None
     level = np.linspace(low + (1 - _SPAN) * span, high - (1 - _SPAN) * span, 201)
-    widths = []
-    for first, second in pairwise(_branch(voltage_V, displacement_um, passage, level) for passage in passages):
-        widths.append(np.max(np.abs(first - second)))
+    branches = []
+    for first, last in passages:
+        piece = slice(first, last + 1)
+        order = np.argsort(voltage_V[piece], kind="stable")
+        branches.append(np.interp(level, voltage_V[piece][order], displacement_um[piece][order]))
+    widths = [np.max(np.abs(one - other)) for one, other in pairwise(branches)]
     return float(100 * np.median(widths) / np.ptp(displacement_um))
-
-
-def _branch(
-    voltage_V: np.ndarray, displacement_um: np.ndarray, passage: tuple[int, int], level: np.ndarray
-) -> np.ndarray:
-    piece = slice(passage[0], passage[1] + 1)
-    order = np.argsort(voltage_V[piece], kind="stable")
-    return np.interp(level, voltage_V[piece][order], displacement_um[piece][order])

@@ -50,8 +50,7 @@ class Band:
 def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -> Band:
     """Find a narrow band between 2 and 200 Hz that goes on throughout and that the command does not play.
 
-    Bins of the spectrum are compared with the median of those around; a band of noise has the chance of so many
-    exponential variables.
+    Bins of the spectrum are compared with the median around: those of noise are exponential variables.
     """
     none = Band(0.0, 0.0, 0.0, 0.0, 0.0)
     n = len(residual_um)
@@ -96,7 +95,7 @@ def band_of(residual_um: np.ndarray, interval_s: float, command_V: np.ndarray) -
 def _strongest(power: np.ndarray, inside: np.ndarray) -> tuple[int, int, float, np.ndarray]:
     """Bin of the strongest band, its width in bins, log-probability of as much by chance, and what is around.
 
-    One bin, or the mean of some where that is more by far: one of noise may be low in the very middle of a band.
+    A band wider than a bin counts where its mean is stronger by far: noise may be low in the very middle of a band.
     """
     found = []
     for wide in _WIDTHS:

@@ -1,9 +1,12 @@
-"""How many samples of a residual are worth one independent one."""
+"""Noise of a sensor and of residuals: how large, how correlated, and where a record shows it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
 
 # Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
 _HUBER = 1.345
@@ -12,18 +15,14 @@ WHITE = 1.2
 LOSSES = ("squares", "huber")
 # Sokal's window: sum the correlations up to this many correlation times.
 _WINDOW = 5.0
-
-
 # Neighbours this close share an error of the model, but not white noise.
 _NEIGHBOURS = 10
+# A command that rests for this many samples is idle from a third of the rest on.
+_FEWEST_AT_REST = 24
 
 
 def shared_square(residual: np.ndarray) -> float:
-    """Mean square of the part of a residual that neighbouring samples share, in its unit squared.
-
-    That is the mean of the autocovariances at lags 1 to 10: white noise has none, model discrepancy has. As an
-    estimate it can come out negative.
-    """
+    """Mean autocovariance at lags 1 to 10: about zero for white noise, which may make it negative."""
     centred = residual - residual.mean()
     furthest = min(_NEIGHBOURS, len(residual) - 1)
     products = [float(np.mean(centred[lag:] * centred[:-lag])) for lag in range(1, furthest + 1)]
@@ -33,11 +32,10 @@ def shared_square(residual: np.ndarray) -> float:
 def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     """Estimate the integrated correlation time of the residuals of some runs, in samples; 1 for white noise.
 
-    Least squares rests on `n / correlation_samples` samples' worth of evidence. See A. Sokal, "Monte Carlo Methods in
+    Least squares rests on `n / correlation_samples` independent samples. See A. Sokal, "Monte Carlo Methods in
     Statistical Mechanics" (1997), section 3.
     """
-    longest = max(len(r) for r in residuals)
-    total = np.zeros(longest)
+    total = np.zeros(max(len(r) for r in residuals))
     for residual in residuals:
         n = len(residual)
         spectrum = np.abs(fft.rfft(residual - residual.mean(), fft.next_fast_len(2 * n))) ** 2
@@ -45,8 +43,7 @@ def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     if total[0] <= 0:
         return 1.0
     time = 1 + 2 * np.cumsum(total[1:] / total[0])
-    lag = np.arange(1, longest)
-    inside = np.flatnonzero(lag >= _WINDOW * time)
+    inside = np.flatnonzero(np.arange(1, len(total)) >= _WINDOW * time)
     return float(max(1.0, time[inside[0]] if len(inside) else time.max(initial=1.0)))
 
 
@@ -57,3 +54,96 @@ def huber_weight(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     # The median absolute deviation is not moved by the outliers themselves.
     spread = 1.4826 * float(np.median(np.abs(left - middle))) + 1e-300
     return np.asarray(_HUBER / np.maximum(np.abs(residual_um - middle) / spread, _HUBER))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one run: its innovations' standard deviation, and how it depends on its past.
+
+    `past` holds the coefficients of an autoregression, none for white noise. `spread` is the factor by which a sample
+    is noisier than that, shape `(n,)`; None where all are alike.
+    """
+
+    innovation_um: float
+    past: np.ndarray
+    spread: np.ndarray | None = None
+
+    @property
+    def total_um(self) -> float:
+        """Standard deviation of the noise itself."""
+        if len(self.past) == 0:
+            return self.innovation_um
+        impulse = np.zeros(4096)
+        impulse[0] = 1.0
+        return self.innovation_um * float(np.linalg.norm(lfilter([1.0], np.r_[1.0, -self.past], impulse)))
+
+    @property
+    def correlation_samples(self) -> float:
+        """Samples that are worth one independent one."""
+        return float((self.innovation_um / (1 - np.sum(self.past)) / self.total_um) ** 2)
+
+    def whiten(self, values: np.ndarray) -> np.ndarray:
+        """Turn noise into independent numbers of variance one, along the first axis."""
+        # SciPy filters no array without columns.
+        if len(self.past) and values.size:
+            values = lfilter(np.r_[1.0, -self.past], [1.0], values, axis=0)
+        if self.spread is not None:
+            values = values / self.spread.reshape(-1, *(1,) * (values.ndim - 1))
+        return values / self.innovation_um
+
+
+def rough_noise_um(residual_um: np.ndarray) -> float:
+    """Standard deviation of white noise in a residual, by its second differences, whatever slowly changes."""
+    second = np.diff(residual_um, 2)
+    return float(1.4826 * np.median(np.abs(second - np.median(second))) / 6**0.5)
+
+
+def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Noise:
+    """Learn the noise of a residual by Yule-Walker, its order by BIC; `freedom` unknowns were fitted to it."""
+    n = len(residual_um)
+    inflate = (n / max(n - freedom, n / 2)) ** 0.5
+    lags = np.array([residual_um[: n - k] @ residual_um[k:] / n for k in range(order + 1)])
+    best, past, variance = np.inf, np.zeros(0), lags[0]
+    for k in range(order + 1):
+        coefficients = solve_toeplitz(lags[:k], lags[1 : k + 1]) if k else np.zeros(0)
+        error = lags[0] - coefficients @ lags[1 : k + 1]
+        score = n * np.log(error) + k * np.log(n)
+        # A correlation too small to matter is not worth a filter.
+        if score < best - 6:
+            best, past, variance = score, coefficients, error
+    return Noise(float(np.sqrt(variance)) * inflate, past)
+
+
+def stretches(flags: np.ndarray) -> list[tuple[int, int]]:
+    """First sample, and that after the last, of each stretch of flags that are set."""
+    edges = np.flatnonzero(np.diff(flags.astype(int), prepend=0, append=0))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def idle_stretches(voltage_V: np.ndarray, settling: int) -> list[slice]:
+    """Stretches in which the command has rested for a while, and for so many samples at least."""
+    found = []
+    for first, stop in stretches(np.diff(voltage_V) == 0):
+        begin = max(first + (stop - first) // 3, first + settling)
+        if stop - begin >= 2 * _FEWEST_AT_REST // 3:
+            found.append(slice(begin, stop))
+    return found
+
+
+def quantum_um(values_um: np.ndarray) -> float:
+    """Last digit of a sensor: the spacing of which all readings are multiples; 0 where there is none."""
+    distinct = np.unique(values_um)
+    if len(distinct) < 3 or len(distinct) > 0.7 * len(values_um):
+        return 0.0
+    gaps = np.diff(distinct)
+    gaps = gaps[gaps > 1e-9 * float(np.ptp(distinct))]
+    smallest = float(np.quantile(gaps, 0.05))
+    spacing = float(np.median(gaps[gaps < 1.5 * smallest]))
+    turns = (distinct - distinct[0]) / spacing
+    # Refined over the whole range, where a small error of the spacing adds up.
+    whole = np.round(turns)
+    for _ in range(3):
+        spacing = float(whole @ (distinct - distinct[0]) / (whole @ whole))
+        whole = np.round((distinct - distinct[0]) / spacing)
+    off = np.abs((distinct - distinct[0]) / spacing - whole)
+    return spacing if float(np.mean(off < 0.1)) > 0.95 else 0.0

@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, signal
 
-FloatArray = NDArray[np.float64]
+from fits.io._quantity import FloatArray
 
 # A Blackman-Harris window spreads a line over this many bins to either side, and nothing above -92 dB beyond.
 _LOBE = 4
@@ -31,16 +30,10 @@ class NoiseBand:
 
 @dataclass(frozen=True)
 class NoiseLine:
-    """A narrow line above the floor of the noise.
+    """A narrow line above the floor of the noise, centred at a frequency.
 
-    Attributes
-    ----------
-    frequency_Hz
-        Centre of the line's power.
-    amplitude_um, amplitude_sd_um
-        Of the sine, half its peak-to-peak value, and its standard deviation from the floor around it.
-    false_alarm
-        Probability, at most, that noise without any line shows one as clear as this anywhere in its spectrum.
+    The amplitude is that of the sine, half its peak-to-peak value; its standard deviation comes from the floor around
+    it. `false_alarm` is the probability, at most, that noise without any line shows one as clear as this anywhere.
     """
 
     frequency_Hz: float

@@ -1,91 +1,47 @@
-"""Convex quadratics over non-negative variables: block principal pivoting, as an optimistix minimiser."""
+"""Convex quadratics over non-negative variables: block principal pivoting."""
 
-from collections.abc import Callable
-from typing import Any
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
-from optimistix import RESULTS
+from jax import lax
+from jaxtyping import Array, Bool, Float
 
 # Exchanges that may fail to reduce the number of violations before they are made one at a time.
 _PATIENCE = 3
 
 
-class _State(eqx.Module):
-    hessian: Float[Array, "D D"]
-    linear: Float[Array, " D"]
-    free: Bool[Array, " D"]
-    wrong: Bool[Array, " D"]
-    fewest: Int[Array, ""]
-    patience: Int[Array, ""]
-    left: Float[Array, ""]
-    aux: Any
-
-
-class BlockPivoting(optx.AbstractMinimiser[Float[Array, " D"], Any, _State]):
-    """Minimise a strictly convex quadratic subject to `y >= 0`, to the optimality conditions.
+def minimise_nonnegative(
+    hessian: Float[Array, "D D"], linear: Float[Array, " D"], start: Float[Array, " D"], atol: float, most_steps: int
+) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
+    """Minimise the convex `y @ hessian @ y / 2 + linear @ y` subject to `y >= 0`; and say whether that succeeded.
 
     Every step solves for the variables that are free, the others being zero, and exchanges all those of either kind
-    that violate their condition; where that stops helping, one at a time, which must end (Judice & Pires, Comput.
-    Oper. Res. 21, 1994; Kim & Park, SIAM J. Sci. Comput. 33, 2011). Variables that the data want to be zero become
-    exactly zero. SciPy's `nnls` takes one at a time and runs neither compiled nor in batches. The Hessian is taken
-    once, at the start, or from `options["hessian"]`; variables that start above zero start free. `atol` is the
-    largest violation of the conditions; `rtol` and `norm`, part of every optimistix solver, are not used.
+    that violate their optimality condition by more than `atol`; where that stops helping, one at a time, which must
+    end (Judice & Pires, Comput. Oper. Res. 21, 1994; Kim & Park, SIAM J. Sci. Comput. 33, 2011). Variables that the
+    data want to be zero become exactly zero. SciPy's `nnls` takes one at a time and runs neither compiled nor in
+    batches. Variables that start above zero start free. The values are NaN where the Hessian has no Cholesky factor.
     """
 
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Scalar]
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:  # type: ignore[no-untyped-def]
-        """Take the Hessian at the start, and the gradient at zero."""
-        del f_struct, aux_struct, tags
-        hessian = options["hessian"] if "hessian" in options else jax.hessian(lambda z: fn(z, args)[0])(y)
-        linear, aux = jax.grad(lambda z: fn(z, args), has_aux=True)(jnp.zeros_like(y))
-        nothing = jnp.zeros_like(y, dtype=bool)
-        far = jnp.asarray(jnp.inf, dtype=y.dtype)
-        return _State(hessian, linear, y > 0, nothing, jnp.asarray(y.size + 1), jnp.asarray(_PATIENCE), far, aux)
-
-    def step(self, fn, y, args, options, state, tags):  # type: ignore[no-untyped-def]
-        """Exchange what violated its condition, and solve for the variables that are free now."""
-        del options, tags
-        free = state.free ^ state.wrong
-        reduced = jnp.where(free[:, None] & free[None, :], state.hessian, jnp.diag(jnp.diagonal(state.hessian)))
-        y = jax.scipy.linalg.solve(reduced, jnp.where(free, -state.linear, 0), assume_a="pos")
-        gradient = state.hessian @ y + state.linear
-        violation = jnp.where(free, -y, -gradient)
-        wrong = violation > self.atol
+    # Minimiser, free variables, those to exchange, fewest violations, patience, largest violation, and steps.
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        _, free, wrong, fewest, patience, _, steps = state
+        free = free ^ wrong
+        reduced = jnp.where(free[:, None] & free[None, :], hessian, jnp.diag(jnp.diagonal(hessian)))
+        y = jax.scipy.linalg.solve(reduced, jnp.where(free, -linear, 0), assume_a="pos")
+        violation = jnp.where(free, -y, -(hessian @ y + linear))
+        wrong = violation > atol
         count = jnp.sum(wrong)
-        fewer = count < state.fewest
-        patience = jnp.where(fewer, _PATIENCE, state.patience - 1)
+        patience = jnp.where(count < fewest, _PATIENCE, jnp.maximum(patience - 1, -1))
         last = jnp.arange(y.size) == jnp.max(jnp.where(wrong, jnp.arange(y.size), -1))
-        y = jnp.maximum(y, 0)
-        return (
-            y,
-            _State(
-                state.hessian,
-                state.linear,
-                free,
-                jnp.where(patience >= 0, wrong, last),
-                jnp.minimum(count, state.fewest),
-                jnp.maximum(patience, -1),
-                jnp.maximum(jnp.max(violation), 0),
-                state.aux,
-            ),
-            state.aux,
-        )
+        exchanged = jnp.where(patience >= 0, wrong, last)
+        left = jnp.maximum(jnp.max(violation), 0)
+        return jnp.maximum(y, 0), free, exchanged, jnp.minimum(count, fewest), patience, left, steps + 1
 
-    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], RESULTS]:  # type: ignore[no-untyped-def]
-        """Stop once the optimality conditions hold."""
-        del fn, args, options, tags
+    def goes_on(state: tuple[Array, ...]) -> Bool[Array, ""]:
         # A comparison with NaN must end the search too.
-        broken = jnp.any(~jnp.isfinite(y))
-        return broken | (state.left <= self.atol), RESULTS.where(broken, RESULTS.nonfinite, RESULTS.successful)
+        return (state[5] > atol) & (state[6] < most_steps) & jnp.all(jnp.isfinite(state[0]))
 
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):  # type: ignore[no-untyped-def]
-        """Report how far from optimal the end is."""
-        del fn, args, options, tags, result
-        return y, aux, {"violation": state.left}
+    far = jnp.asarray(jnp.inf, dtype=start.dtype)
+    counts = jnp.asarray(start.size + 1), jnp.asarray(_PATIENCE)
+    first: tuple[Array, ...] = start, start > 0, jnp.zeros_like(start, dtype=bool), *counts, far, jnp.asarray(0)
+    y, *_, left, _ = lax.while_loop(goes_on, step, first)
+    return y, (left <= atol) & jnp.all(jnp.isfinite(y))

@@ -3,20 +3,16 @@
 The smoothness is stated, not found from the data as `fits.fit` does; the noise level is found.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, design
-from fits.loop._evidence import effective, posterior_of, renew_noise
 from fits.loop._moments import Moments
-from fits.loop._prior import Hyper, Roughness
-from fits.stats._nonnegative import BlockPivoting
+from fits.loop._prior import Hyper, Roughness, effective, posterior_of, renew_noise
+from fits.stats._nonnegative import minimise_nonnegative
 from fits.sweeps._devices import by_rows
 from microid import Staircase
 
@@ -90,24 +86,9 @@ def _one(
     hyper = lax.fori_loop(0, _ROUNDS, renew, hyper)
     posterior = posterior_of(moments, rough, hyper)
     scale = jnp.sqrt(jnp.diagonal(posterior.precision))
-    solver: Any = BlockPivoting(rtol=0.0, atol=_ATOL, norm=optx.max_norm)
-    precision = posterior.precision / (scale[:, None] * scale[None, :])
-    solution: Any = optx.minimise(
-        _distance,
-        solver,
-        jnp.maximum(posterior.mean * scale, 0),
-        args=(precision, posterior.mean * scale),
-        options={"hessian": precision},
-        max_steps=_STEPS,
-        throw=False,
-    )
-    found = solution.value / scale * stroke
+    precision, mode = posterior.precision / (scale[:, None] * scale[None, :]), posterior.mean * scale
+    solution, success = minimise_nonnegative(precision, -(precision @ mode), jnp.maximum(mode, 0), _ATOL, _STEPS)
+    found = solution / scale * stroke
     offset = mean - mean_column @ found
     noise = jnp.exp(hyper.log_variance / 2) * stroke
-    return found, offset, noise, columns @ found + offset, solution.result == optx.RESULTS.successful
-
-
-def _distance(y: Float[Array, " k"], args: tuple[Float[Array, "k k"], Float[Array, " k"]]) -> Float[Array, ""]:
-    precision, mean = args
-    off = y - mean
-    return off @ (precision @ off) / 2
+    return found, offset, noise, columns @ found + offset, success

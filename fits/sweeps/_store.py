@@ -20,8 +20,7 @@ import numpy as np
 
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import DataError
-from fits.io._file_set import flush
-from fits.io._places import usable_folder
+from fits.io._file_set import flush, usable_folder
 from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
 from fits.io._temporary import is_temporary
 from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of

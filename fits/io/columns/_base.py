@@ -9,39 +9,23 @@ from fits.io._quantity import FloatArray, Quantity, split_unit
 from fits.io._record import Record
 
 
-def _as_it_is(values: FloatArray, record: Record) -> FloatArray:
-    return values
-
-
 @dataclass(frozen=True)
 class Column:
     """A column besides time, voltage and displacement. To add one, put one file that registers it into this folder.
 
-    Attributes
-    ----------
-    quantity
-        Headers of its name in one of its units are recognised when a file is read, and converted.
-    name
-        What effects call it in `needs`; the name of the quantity if empty.
-    recognised
-        Whether a column of some header, with its values of shape `(n,)` in a record, is this one; by default one of
-        the name of this one is.
-    cleaned
-        What effects get: the values, shape `(n,)`, in the unit of the quantity, without what would mislead them.
-    shown_if_constant
-        Whether one that does not change says something.
-    optional
-        Whether effects that use it do without where it is missing.
-    title
-        As in "the residual goes with the temperature"; a diagnosis does not look whether it does if empty.
-    use
-        Why the next experiment should record it: what follows its name in that advice.
+    Headers of the name of the `quantity` in one of its units are recognised when a file is read, and converted.
+    `name` is what effects call it in `needs`, that of the quantity if empty. `recognised` tells whether a column of
+    some header, with its values of shape `(n,)` in a record, is this one; by default one of its name is. Effects get
+    what `cleaned` makes of the values, shape `(n,)`, in the unit of the quantity: without what would mislead them.
+    `shown_if_constant` says whether one that does not change says something, `optional` whether effects that use it
+    do without where it is missing. The `title` is as in "the residual goes with the temperature"; a diagnosis does
+    not look whether it does if empty. `use` is why the next experiment should record it, behind its name.
     """
 
     quantity: Quantity
     name: str = ""
     recognised: Callable[[str, FloatArray, Record], bool] | None = None
-    cleaned: Callable[[FloatArray, Record], FloatArray] = _as_it_is
+    cleaned: Callable[[FloatArray, Record], FloatArray] = lambda values, record: values
     shown_if_constant: bool = False
     optional: bool = False
     title: str = ""

@@ -15,10 +15,7 @@ def _recognised(name: str, values: FloatArray, record: Record) -> bool:
 
 
 def _first_smoothed(values: FloatArray, record: Record) -> FloatArray:
-    """Replace the first value by that of a line through the first readings.
-
-    What lags behind the temperature starts from rest at it, so that its noise would act like a step.
-    """
+    """Replace the first value by that of a line through the first readings: what lags behind begins at rest there."""
     count = int(_BEGINNING * len(values))
     if count < 3:
         return values
