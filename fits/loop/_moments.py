@@ -107,12 +107,10 @@ def gather(grid: Grid, runs: Sequence[Run]) -> Data:
         path = run.path
         branches = run.voltage_V, run.displacement_um, path.anchor_V, path.rising
         groups = compress(*branches, blocks_of(run), levels_V, run.weight)
-        past = (
-            past_columns(jnp.asarray(groups.voltage_V.ravel()))
-            if run.has_past
-            else np.zeros((groups.block.size * 4, 0))
-        )
-        sums = _sums(grid, groups, path.starts[0], np.asarray(past).reshape(len(groups.block), 4, -1))
+        past = np.zeros((groups.voltage_V.size, 0))
+        if run.has_past:
+            past = np.asarray(past_columns(jnp.asarray(groups.voltage_V.ravel())))
+        sums = _sums(grid, groups, path.starts[0], past.reshape(*groups.voltage_V.shape, past.shape[1]))
         total, mean = _without_nuisance(reduce(operator.add, sums), grid.columns)
         centred.append([total, *(_without_nuisance(part, grid.columns)[0] for part in sums)])
         means.append(mean)
@@ -132,9 +130,11 @@ def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) ->
         voltage = np.pad(groups.voltage_V[piece].ravel(), (0, 4 * pad[1]), mode="edge")
         mix = np.pad(groups.mix[piece], (pad, (0, 0), (0, 0)))
         mixed, start = _regress(grid, table, jnp.asarray(voltage), start, jnp.asarray(mix))
-        more = np.einsum("gij,gjk->gik", mix[: len(past[piece])], past[piece]).reshape(-1, past.shape[2])
-        rows = np.asarray(mixed)[: len(more)]
-        rows = np.concatenate([rows[:, :-1], more, rows[:, -1:]], axis=1)
+        beside = np.einsum("gij,gjk->gik", groups.mix[piece], past[piece]).reshape(
+            4 * len(past[piece]), past.shape[2]
+        )
+        rows = np.asarray(mixed)[: len(beside)]
+        rows = np.concatenate([rows[:, :-1], beside, rows[:, -1:]], axis=1)
         for block in np.unique(groups.block[piece]):
             if block < 0:
                 continue
