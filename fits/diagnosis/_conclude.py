@@ -131,9 +131,10 @@ def conclude(
     extension = extend_stage(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
     weak = max((cause.z for cause in kept), default=0.0) < _WEAK_Z
-    if kept and (misfit.share < _EXPLAINED_SHARE or predicts_worse(extension.compared[: len(baseline.runs)], weak)):
+    parts = extension.compared[: len(baseline.runs)], extension.compared[len(baseline.runs) :]
+    if kept and (misfit.share < _EXPLAINED_SHARE or any(predicts_worse(part, weak) for part in parts)):
         suspects = ", ".join(cause.name for cause in kept)
-        why = "predicts what was kept aside worse"
+        why = "predicts what was held out worse"
         if misfit.share < _EXPLAINED_SHARE:
             why = f"explains only {misfit.share:.0%} of what is left"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")

@@ -25,11 +25,9 @@ _BLOCKS = 24
 _ROUNDS = 6
 # Relative spread of strengths that are the same in all runs.
 _SAME_IN_ALL_RUNS = 0.3
-# What was kept aside must not be predicted so many times worse, in squares; by causes with weak evidence, not worse
-# beyond chance.
-_MOST_WORSE = 1.1
-# Standard deviations from which on a difference counts.
-_SURE_Z = 1.5
+# What was held out must not be predicted so many times worse, in squares, nor worse by so many standard deviations:
+# by causes with weak evidence, and by others.
+_MOST_WORSE, _WEAK_Z, _STRONG_Z = 1.1, 1.5, 3.0
 
 
 @dataclass(frozen=True)
@@ -137,7 +135,7 @@ _without = eqx.filter_jit(project_out)
 
 
 def predicts_worse(compared: Sequence[Compared], weak: bool) -> bool:
-    """Whether the extended stage predicts what was kept aside of the fitted runs worse than the plain one."""
+    """Whether the extended stage predicts what was held out worse than the plain one does."""
     held = [one for one in compared if one.held_out.any()]
     if not held:
         return False
@@ -145,10 +143,9 @@ def predicts_worse(compared: Sequence[Compared], weak: bool) -> bool:
         np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)]) ** 2
         for pick in ([one.before_um for one in held], [one.after_um for one in held])
     )
-    if np.sum(after) > _MOST_WORSE * np.sum(before):
-        return True
     sums = np.add.reduceat(after - before, np.arange(0, len(before), BLOCK))
-    return bool(weak and np.sum(sums) > _SURE_Z * np.linalg.norm(sums - np.mean(sums)))
+    least = (_WEAK_Z if weak else _STRONG_Z) * np.linalg.norm(sums - np.mean(sums))
+    return bool(np.sum(after) > _MOST_WORSE * np.sum(before) or np.sum(sums) > least)
 
 
 def gain_of(compared: Sequence[Compared], noise_um: float, source: str) -> Gain:
