@@ -8,7 +8,7 @@ import numpy as np
 from scipy import signal
 
 from fits.io._errors import DataError
-from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, solve_grid
+from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, relaxation_of, solve_grid
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, LevelTrial
@@ -105,7 +105,8 @@ def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compa
     found = correlation_samples(left)
     if found > WHITE:
         correlation = found
-        solution = solve_grid(data, stroke, correlation, hyper)
+        relaxation = relaxation_of(runs, stroke, correlation, hyper)
+        solution = solve_grid(data, stroke, correlation, hyper, relaxation)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
     return GridTrial(data, solution, correlation, error, discrepancy)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import nnls
 
-from fits.loop._moments import Data, Moments, blocks_of
+from fits.loop._moments import BLOCKS, Data, Moments, blocks_of, gather, grid_of
 from fits.loop._prior import (
     Hyper,
     Posterior,
@@ -43,6 +43,10 @@ _STEPS_PER_COLUMN = 30
 _MOST_COLUMNS = 1100
 # At least this many columns are bounded at first.
 _FIRST_BOUNDED = 64
+# E-folds by which curvature may count less, and the part of the squared error of predicted blocks that is worth it.
+_RELAXATIONS, _WORTH = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0), 0.01
+# Blocks are made of so many pieces at most, each as long as what is left stays alike.
+_MOST_PIECES = 40
 
 
 @dataclass(frozen=True)
@@ -71,17 +75,20 @@ class GridSolution:
     hyper: Hyper
 
 
-def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -> GridSolution:
+def solve_grid(
+    data: Data, stroke_um: float, correlation: float, start: Hyper, relaxation: float = 0.0
+) -> GridSolution:
     """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on.
 
-    So many samples as `correlation` are worth one independent one. A `FitError` if the regression does not converge.
+    So many samples as `correlation` are worth one independent one. Curvature counts less by so many e-folds as
+    `relaxation` says than the evidence has it. A `FitError` if the regression does not converge.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
     if data.grid.levels > EVIDENCE_LEVELS:
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
         few, even = moments.project(basis), rough.project(basis)
-        hyper = maximise_evidence(few, even, start)
+        hyper = maximise_evidence(few, even, start).relaxed(relaxation)
         posterior = posterior_of(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
         determined = effective(even, hyper, posterior_of(few, even, hyper))
@@ -89,7 +96,7 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
         if abs(float(renewed.log_variance - hyper.log_variance)) > _SAME_NOISE:
             hyper, posterior = renewed, posterior_of(moments, rough, renewed)
     else:
-        hyper = maximise_evidence(moments, rough, start)
+        hyper = maximise_evidence(moments, rough, start).relaxed(relaxation)
         posterior = posterior_of(moments, rough, hyper)
     if np.all(np.asarray(posterior.mean) >= 0):
         return GridSolution(posterior.mean, posterior, hyper)
@@ -97,6 +104,35 @@ def solve_grid(data: Data, stroke_um: float, correlation: float, start: Hyper) -
     if not found:
         raise FitError(FitStatus.MAX_STEPS)
     return GridSolution(columns, posterior, hyper)
+
+
+def relaxation_of(runs: Sequence[Run], stroke_um: float, correlation: float, start: Hyper) -> float:
+    """By how many e-folds curvature counts less than the evidence has it, so that blocks are predicted best.
+
+    The evidence takes what a model cannot follow for noise, and smooths away what it could. Blocks are made of short
+    pieces of the whole record: consecutive fifths of a record that swings ever farther would ask what lies beyond.
+    """
+    count = sum(float(run.fitted.sum()) for run in runs)
+    pieces = int(np.clip(count / correlation, BLOCKS, _MOST_PIECES))
+    data = gather(grid_of(runs, EVIDENCE_LEVELS), runs, pieces)
+    rough = roughness(EVIDENCE_LEVELS)
+    hyper = maximise_evidence(data.total.scaled(1 / correlation, stroke_um), rough, start)
+    whole = reduce(operator.add, data.blocks)
+
+    def error(efolds: float) -> float:
+        square = 0.0
+        for block in data.blocks:
+            rest = jax.tree.map(operator.sub, whole, block)
+            posterior = posterior_of(rest.scaled(1 / correlation, stroke_um), rough, hyper.relaxed(efolds))
+            columns, found = non_negative(posterior)
+            one = block.scaled(1.0, stroke_um)
+            off = one.energy_um2 - 2 * columns @ one.cross_um + columns @ one.gram @ columns
+            square += float(off) if found else np.inf
+        return square
+
+    errors = {efolds: error(efolds) for efolds in _RELAXATIONS}
+    best = min(errors, key=lambda efolds: errors[efolds])
+    return best if errors[best] < (1 - _WORTH) * errors[0.0] else 0.0
 
 
 def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:

@@ -87,10 +87,10 @@ class Data:
     means: tuple[RunMean, ...]
 
 
-def blocks_of(run: Run) -> np.ndarray:
-    """Number consecutive fifths of the fitted samples, -1 elsewhere, shape `(n,)`."""
+def blocks_of(run: Run, pieces: int = BLOCKS) -> np.ndarray:
+    """Number fifths of the fitted samples, -1 elsewhere, shape `(n,)`: each is every fifth of so many pieces."""
     order = np.cumsum(run.fitted) - 1
-    return np.where(run.fitted, order * BLOCKS // max(1, run.fitted.sum()), -1)
+    return np.where(run.fitted, order * pieces // max(1, run.fitted.sum()) % BLOCKS, -1)
 
 
 def grid_of(runs: Sequence[Run], levels: int) -> Grid:
@@ -98,15 +98,15 @@ def grid_of(runs: Sequence[Run], levels: int) -> Grid:
     return Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), levels)
 
 
-def gather(grid: Grid, runs: Sequence[Run]) -> Data:
-    """Pass runs with displacement through the regression once."""
+def gather(grid: Grid, runs: Sequence[Run], pieces: int = BLOCKS) -> Data:
+    """Pass runs with displacement through the regression once; blocks are made of so many pieces of each run."""
     centred: list[list[Moments]] = []
     means = []
     levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
     for run in runs:
         path = run.path
         branches = run.voltage_V, run.displacement_um, path.anchor_V, path.rising
-        groups = compress(*branches, blocks_of(run), levels_V, run.weight)
+        groups = compress(*branches, blocks_of(run, pieces), levels_V, run.weight)
         past = np.zeros((groups.voltage_V.size, 0))
         if run.has_past:
             past = np.asarray(past_columns(jnp.asarray(groups.voltage_V.ravel())))
@@ -138,10 +138,10 @@ def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) ->
         for block in np.unique(groups.block[piece]):
             if block < 0:
                 continue
-            # Blocks are consecutive, so this is one slice; NumPy hands `a.T @ a` to BLAS as a rank-k update.
-            which = np.flatnonzero(groups.block[piece] == block)
-            part = rows[4 * which[0] : 4 * (which[-1] + 1)]
-            target = groups.target_um[piece][which[0] : which[-1] + 1].ravel()
+            which = groups.block[piece] == block
+            # NumPy hands `a.T @ a` to BLAS as a rank-k update.
+            part = rows[np.repeat(which, 4)]
+            target = groups.target_um[piece][which].ravel()
             energy = target @ target + groups.residue_um2[piece][which].sum()
             count = np.asarray(groups.count[piece][which].sum(), dtype=float)
             sums[block] = sums[block] + Moments(part.T @ part, target @ part, energy, count)

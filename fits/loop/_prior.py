@@ -41,6 +41,11 @@ class Hyper(eqx.Module):
         weight = jnp.asarray(np.log(1e-2))
         return cls(weight, weight, weight, jnp.asarray(np.log(1e-6)))
 
+    def relaxed(self, efolds: float) -> "Hyper":
+        """The same with all curvature counting less by so many e-folds."""
+        weights = jax.tree.map(lambda weight: weight - efolds, self)
+        return eqx.tree_at(lambda h: h.log_variance, weights, self.log_variance)
+
 
 class Roughness(eqx.Module):
     """Quadratic forms that measure the squared curvature of what `Hyper` weighs, in the columns of a `Grid`."""
