@@ -61,8 +61,8 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Exte
         stage = baseline.stage.with_substeps(plain_steps(ready))
         return Extension(stage, _compare(ready, ready.bench, None, ready.regression, (), False), ())
     # What followed along the tangent is put into the stage itself.
-    bare = found.projector.bare
-    regression = regress(bare.move(bare.residual - bare.join(model.change_um)), ())
+    beside = found.projector
+    regression = regress(beside.move(beside.residual - beside.join(model.change_um)), ())
     effects = shared_effects(model, len(baseline.runs))
     steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))
     stage = with_effects(regression.baseline.stage, effects).with_substeps(steps)

@@ -203,9 +203,8 @@ def is_smoothness_confirmed(projector: Projector, model: Refit) -> bool:
 
 def _follow(projector: Projector, model: Refit, finest: bool = False) -> tuple[Bench, Projector]:
     """Move the baseline to where the causes leave it."""
-    # What roughness beyond the grid would explain is not put into the grid.
-    bare = projector.bare
-    return _linearised_at(bare.move(bare.residual - bare.join(model.change_um)), projector, model, finest)
+    moved = projector.move(projector.residual - projector.join(model.change_um))
+    return _linearised_at(moved, projector, model, finest)
 
 
 def _linearised_at(

@@ -6,6 +6,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr, solve_triangular
+from scipy.linalg.lapack import dpstrf
 from scipy.optimize import minimize
 
 from fits.diagnosis._baseline import Baseline
@@ -19,8 +20,8 @@ from fits.stats._noise import Noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
 _ROUGHEST = 0.5
-# Squares of singular values of the tangent, over the largest, below which the runs show nothing.
-_SHOWN = 1e-10
+# Part of a column of the tangent, in squares, below which what the others leave of it is rounding.
+_SHOWN = 1e-9
 # Part of a direction that must be its own.
 _INDEPENDENT = 1e-6
 # The farthest that a coordinate moves at a time.
@@ -60,11 +61,15 @@ class Projector:
         self._live = size > 0
         self._scale = np.where(self._live, size, 1.0)
         matrix /= self._scale
-        value, vector = np.linalg.eigh(matrix.T @ matrix)
-        # Directions that the runs do not show have nothing to be projected on.
-        shown = value > _SHOWN * value[-1]
-        self._inverse = vector[:, shown] / np.sqrt(value[shown])
-        self._root = (vector[:, shown] * np.sqrt(value[shown])).T
+        self._gram = matrix.T @ matrix
+        # A Cholesky factor, pivoted: columns that the others make up have nothing of their own to be projected on.
+        factor, pivots, rank, _ = dpstrf(self._gram, tol=_SHOWN, lower=1)
+        lower, order = np.tril(factor)[:, :rank], pivots - 1
+        self._inverse = np.zeros((len(order), rank))
+        self._inverse[order[:rank]] = solve_triangular(lower[:rank], np.eye(rank), lower=True).T
+        self._root = np.zeros((rank, len(order)))
+        self._root[:, order] = lower.T
+        self._bare = np.r_[0 : regression.size, at : len(order)]
         self._matrix: np.ndarray | None = matrix
         self._q: np.ndarray | None = None
         self.residual = self.join(regression.residuals)
@@ -73,7 +78,7 @@ class Projector:
     @property
     def bare(self) -> "Projector":
         """The same without roughness of the density beyond its grid."""
-        return Projector(self.regression, self.noise)
+        return Projector(self.regression, self.noise) if any(self.roughness) else self
 
     @property
     def freedom(self) -> float:
@@ -158,7 +163,10 @@ class Projector:
         return square / count if count else float("nan")
 
     def move(self, joined: np.ndarray) -> Baseline:
-        """The baseline moved so that it follows a joined signal best, with columns that stay non-negative."""
+        """The baseline moved so that it follows a joined signal best, with columns that stay non-negative.
+
+        What roughness beyond the grid would explain is not put into the grid.
+        """
         baseline, held = self.regression.baseline, 1.0
         while True:
             dz, columns_um = self._followed(joined, held)
@@ -171,9 +179,10 @@ class Projector:
         """Steps of coordinates that a precision holds, and non-negative columns, that follow a joined signal."""
         baseline = self.regression.baseline
         columns = baseline.chain.size
-        gram = self.root.T @ self.root
-        cross = gram @ self._answer(joined)
-        live = self._live[columns:]
+        scale = self._scale[self._bare]
+        gram = self._gram[np.ix_(self._bare, self._bare)] * scale * scale[:, None]
+        cross = (self._root.T @ (self.orthonormal.T @ joined))[self._bare] * scale
+        live = self._live[self._bare][columns:]
         coordinate = np.arange(len(live)) < self.regression.size - columns
         block = gram[columns:, columns:][np.ix_(live, live)]
         block = block + np.diag(1e-12 * np.diagonal(block) + held * coordinate[live])
