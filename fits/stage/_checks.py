@@ -82,9 +82,7 @@ def refuse_unidentifiable(
     is returned instead.
     """
     stage = solved.stage
-    information = marginal_information(
-        solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
-    )
+    information = marginal_information(solved.weighing.total(solved.sums), 0, None, solved.weighing.least_um**2)
     named, value, derivative = solved.parameters()
     slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
     names = [name for name, _ in named]

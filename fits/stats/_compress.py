@@ -78,7 +78,7 @@ def compress(
     # of the polynomials that are 1 at one of them.
     nodes = (1 - np.cos(np.pi * np.arange(_SLOTS) / (_SLOTS - 1))) / 2
     lagrange = np.linalg.inv(np.vander(nodes, increasing=True)).T
-    root, right, left = _square_root(lagrange @ hankel @ lagrange.T, cross @ lagrange.T, energy)
+    root, right, left = square_root(lagrange @ hankel @ lagrange.T, cross @ lagrange.T, energy)
     voltage[dense] = start[dense, None] + span[dense, None] * nodes
     mix[dense], target[dense], residue[dense] = root, right, left
 
@@ -105,12 +105,15 @@ def _group_starts(visit_starts: np.ndarray, block: np.ndarray) -> np.ndarray:
     return np.flatnonzero(border | packed)
 
 
-def _square_root(
-    gram: np.ndarray, cross: np.ndarray, energy: np.ndarray
+def square_root(
+    gram: np.ndarray, cross: np.ndarray, energy: np.ndarray, negligible: float = _NEGLIGIBLE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Factor `gram = root' root` and solve `root' target = cross`, dropping directions that hold nothing."""
+    """Factor each `gram = root' root`, solve `root' target = cross`, and what that leaves of the energies.
+
+    Directions that hold less than a part of the largest are dropped.
+    """
     value, vector = np.linalg.eigh(gram)
-    kept = value > _NEGLIGIBLE * value[:, -1:]
+    kept = value > negligible * value[:, -1:]
     scale = np.sqrt(np.where(kept, value, 0.0))
     root = scale[:, :, None] * np.swapaxes(vector, 1, 2)
     seen = np.einsum("gij,gi->gj", vector, cross)
