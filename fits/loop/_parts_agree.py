@@ -7,9 +7,8 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._fit_checks import remarks_on
 from fits.loop._grid import non_negative, solve_grid
-from fits.loop._misfit import Misfit, compare_gains, misfits, worst
+from fits.loop._misfit import Misfit, compare_gains, misfits, remarks_on, worst
 from fits.loop._moments import gather, grid_of
 from fits.loop._prior import Hyper, posterior_of, roughness
 from fits.loop._result import FitError

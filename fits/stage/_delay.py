@@ -8,8 +8,7 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.loop._design import columns_of
-from fits.loop._fit_checks import outlying
-from fits.loop._misfit import Misfit, misfits
+from fits.loop._misfit import Misfit, misfits, outlying
 from fits.loop._result import FitError, FitResult
 from fits.loop._run import Run
 from fits.stage._moments import along, linearise, pieces

@@ -11,7 +11,7 @@ import numpy as np
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid
-from fits.loop._fit_checks import without_impulses
+from fits.loop._misfit import without_impulses
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, prepare_run, simulate_run
 from fits.stage._checks import (
