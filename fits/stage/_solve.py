@@ -4,6 +4,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -229,6 +230,14 @@ def solve_chain(
     if rough or accept_best:
         return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
     raise FitError(FitStatus.MAX_STEPS)
+
+
+def try_chain(problem: Problem, runs: Sequence[Run], *settings: Any, **further: Any) -> Solved | None:
+    """Fit as `solve_chain` does; None where that fails."""
+    try:
+        return solve_chain(problem, runs, *settings, **further)
+    except (FitError, np.linalg.LinAlgError):
+        return None
 
 
 def prior_precision(chain: Chain, hyper: Hyper | None, stroke_um: float) -> np.ndarray:

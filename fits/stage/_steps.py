@@ -25,7 +25,7 @@ from fits.stage._checks import (
 )
 from fits.stage._moments import offsets_out
 from fits.stage._run import free_grid, hysteresis_of, settled_samples, simulate_stage
-from fits.stage._solve import Problem, Solved, solve_chain
+from fits.stage._solve import Problem, Solved, solve_chain, try_chain
 from fits.stage._start import measure_response, start_stages
 from fits.stage._uncertainty import Precision
 from microid import Driver, Hold, Mechanics, Preisach, Stage
@@ -180,11 +180,8 @@ def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence
     simpler = Problem.of(simple, grid, problem.columns_um, problem.hyper, problem.stroke_um)
     simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, mechanics[0]),))
     plan.progress("a lag without a resonance")
-    try:
-        solved = solve_chain(simpler, runs, plan.loss, plan.progress)
-    except (FitError, np.linalg.LinAlgError):
-        return None
-    if likelihood_ratio(solved, drives) < WORTH or float(np.max(Precision(solved).sd())) > UNSEEN:
+    solved = try_chain(simpler, runs, plan.loss, plan.progress)
+    if solved is None or likelihood_ratio(solved, drives) < WORTH or float(np.max(Precision(solved).sd())) > UNSEEN:
         return None
     return solved.onward
 
