@@ -20,7 +20,7 @@ _HIGHEST_RESONANCE = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
 UNSEEN, _LOST = 0.5, 5.0
 # Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
-WORTH = 40.0
+_WORTH = 40.0
 # A run that leaves so many times what the quietest leaves moves in ways that its samples do not show.
 _LARGEST_NOISE_RATIO = 3.0
 # Ranges of voltage that differ by less than this, as a fraction, are alike.
@@ -100,7 +100,7 @@ def refuse_unidentifiable(
         if isinstance(part, Mechanics)
     ]
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST_RESONANCE * fastest.rate_Hz]
-    seen = likelihood_ratio(solved, drives) >= WORTH
+    seen = shows_poles(solved, drives)
     some = bool(unidentified) and (len(unidentified) == len(poles) or not fast)
     driven = any(isinstance(part, Driver) for part in stage.parts)
     if may_drop and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
@@ -192,8 +192,8 @@ def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence
     return None
 
 
-def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
-    """Twice the logarithm of how much likelier poles make the run that shows them best.
+def shows_poles(solved: Solved, drives: Sequence[np.ndarray]) -> bool:
+    """Whether poles make the run that shows them best likelier by far, by the logarithm of the likelihood ratio.
 
     Slow runs may become less likely: the hysteresis read off them holds the driver's lag, which now counts twice.
     """
@@ -202,7 +202,7 @@ def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
         x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
         left = y - y.mean() - x * (x @ y / (x @ x))
         ratios.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
-    return max(ratios)
+    return max(ratios) >= _WORTH
 
 
 def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:

@@ -146,6 +146,17 @@ class WithoutDelays:
         """Say what the columns of the runs look like."""
         return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
 
+    def refused(self) -> DataError:
+        """Say that the delays kept a fit from an answer."""
+        return DataError(f"{self.words()}, and no fit was found with that: {_REMEDY}")
+
+    def widen(self, fit: FitResult[Stage]) -> FitResult[Stage]:
+        """Name the delays, and widen intervals by what they did; a `DataError` if that leaves nothing to say."""
+        other, said = Alternative.of(self.solved), self.words()
+        if moved := other.contradicted(fit):
+            raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")
+        return other.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
+
 
 def fit_without_delays(
     plan: Plan, solved: Solved, precision: Precision | None, left: Sequence[Misfit]
@@ -216,20 +227,6 @@ def fit_without_delays(
 def _solved_with(plan: Plan, start: Problem, stride: int, shifts_s: np.ndarray) -> Solved | None:
     """Fit again with the command of each run that much later, as well as can be; None where that fails."""
     return try_chain(start, plan.shifted(shifts_s).runs(stride), plan.loss, plan.progress, accept_best=True)
-
-
-def refuse_delays(undelayed: WithoutDelays | None) -> None:
-    """Refuse runs whose delays kept a fit from an answer, in a `DataError`; nothing where there are none."""
-    if undelayed is not None:
-        raise DataError(f"{undelayed.words()}, and no fit was found with that: {_REMEDY}")
-
-
-def widen_for_delays(fit: FitResult[Stage], undelayed: WithoutDelays) -> FitResult[Stage]:
-    """Name delays, and widen intervals by what they did; a `DataError` if a fit says nothing because of them."""
-    other, said = Alternative.of(undelayed.solved), undelayed.words()
-    if moved := other.contradicted(fit):
-        raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")
-    return other.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
 
 
 def _scores(plan: Plan, solved: Solved, shifts: np.ndarray) -> list[Delay]:

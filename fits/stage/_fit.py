@@ -16,14 +16,7 @@ from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate, RunReport
 from fits.loop._run import Run, prepare_run, refuse_many_steps
 from fits.stage._checks import check_gains, implausible, refuse_undersampled
-from fits.stage._delay import (
-    GROSS_PCT,
-    Alternative,
-    fit_without_delays,
-    fit_without_outliers,
-    refuse_delays,
-    widen_for_delays,
-)
+from fits.stage._delay import GROSS_PCT, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simulate_stage
 from fits.stage._solve import Problem, Solved
 from fits.stage._steps import Plan, refine_problem, start_problem
@@ -109,8 +102,8 @@ def fit_stage(
     # What is sampled too slowly may look late; a delay is believed that leaves little else.
     if undelayed is None or any(one.far for one in undelayed.left()):
         refuse_undersampled(solved.stage, runs, left)
-    if found.failure is not None or simplified:
-        refuse_delays(undelayed)
+    if undelayed is not None and (found.failure is not None or simplified):
+        raise undelayed.refused()
     if found.failure is not None:
         raise found.failure
     gross = worst(left)
@@ -127,7 +120,7 @@ def fit_stage(
     held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
     summary = summarise(found.precision, held)
     if undelayed is not None:
-        summary = widen_for_delays(summary, undelayed)
+        summary = undelayed.widen(summary)
     outliers = fit_without_outliers(found.plan, solved)
     if outliers is not None:
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")

@@ -14,15 +14,7 @@ from fits.loop._choose_grid import choose_grid
 from fits.loop._misfit import without_impulses
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, prepare_run, simulate_run
-from fits.stage._checks import (
-    UNSEEN,
-    WORTH,
-    check_gains,
-    likelihood_ratio,
-    refuse_slopes,
-    refuse_unidentifiable,
-    speed_Hz,
-)
+from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
 from fits.stage._moments import offsets_out
 from fits.stage._run import free_grid, hysteresis_of, settled_samples, simulate_stage
 from fits.stage._solve import Problem, Solved, solve_chain, try_chain
@@ -181,7 +173,7 @@ def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence
     simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, mechanics[0]),))
     plan.progress("a lag without a resonance")
     solved = try_chain(simpler, runs, plan.loss, plan.progress)
-    if solved is None or likelihood_ratio(solved, drives) < WORTH or float(np.max(Precision(solved).sd())) > UNSEEN:
+    if solved is None or not shows_poles(solved, drives) or float(np.max(Precision(solved).sd())) > UNSEEN:
         return None
     return solved.onward
 
