@@ -92,23 +92,6 @@ def _sd(uncertainty: Uncertainty, voltage_V: Float[Array, " n"], start: Staircas
     return jnp.sqrt(jnp.sum(each, axis=0) + uncertainty.discrepancy_um**2)
 
 
-@eqx.filter_jit
-def perturbations(
-    grid: Grid,
-    factor_um: Float[Array, "D k"],
-    mean_response: Float[Array, " D"],
-    offset_sd_um: Float[Array, ""],
-    discrepancy_um: Float[Array, ""],
-) -> Uncertainty:
-    """Turn a factor of the covariance of the columns, `factor @ factor.T`, into perturbations of a model.
-
-    The offset, fixed by the mean displacement of a run, makes up for what each does to that, and has its deviation.
-    """
-    columns = jnp.concatenate([factor_um.T, jnp.zeros((1, grid.columns))])
-    offsets = jnp.append(-(mean_response @ factor_um), offset_sd_um)
-    return Uncertainty(columns, offsets, discrepancy_um, grid)
-
-
 def refuse_outside(record: Record, lower_V: float, upper_V: float) -> None:
     """Refuse, in a `DataError`, a program that leaves the range that a model was fitted on."""
     slack = 1e-9 * (upper_V - lower_V) if np.isfinite(upper_V - lower_V) else 0.0
