@@ -12,11 +12,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from fits.loop._design import columns_of
 from fits.loop._grid import Estimate
-from fits.loop._moments import Data
+from fits.loop._moments import Data, square_root
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
-from fits.stats._compress import square_root
 from fits.stats._noise import correlation_samples, shared_square
 from microid import FAMILIES, Coordinates, Preisach, Reversible
 

@@ -101,14 +101,8 @@ def refuse_unidentifiable(
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST_RESONANCE * fastest.rate_Hz]
     seen = shows_poles(solved, drives)
     some = bool(unidentified) and (len(unidentified) == len(poles) or not fast)
-    if (
-        may_drop
-        and seen
-        and named_parts(stage, Driver)
-        and mechanics
-        and (some or beyond)
-        and all(map(_resolved, solved.runs))
-    ):
+    lacking = mechanics and (some or beyond) and named_parts(stage, Driver)
+    if may_drop and seen and lacking and all(map(_resolved, solved.runs)):
         return (beyond or mechanics)[0][0]
     if unidentified and not fast and len(unidentified) < len(poles):
         raise DataError(
