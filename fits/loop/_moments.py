@@ -206,7 +206,7 @@ def gather(grid: Grid, runs: Sequence[Run]) -> Data:
     means = []
     levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
     for run in runs:
-        sums = _sums(grid, compress(run, levels_V), run.path.starts[0])
+        sums = _sums(grid, compress(run, levels_V), run.path.pieces[0][1])
         total, mean = _centre(reduce(operator.add, sums))
         centred.append([total, *(_centre(part)[0] for part in sums)])
         means.append(mean)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid
-from fits.loop._run import Run, prepare_run, simulate_run, voltage_pieces
+from fits.loop._run import Run, prepare_run, simulate_run
 from microid import Preisach, Stage, Staircase, everett, remember
 
 _BATCH = 32
@@ -64,7 +64,7 @@ class Uncertainty(AbstractUncertainty):
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
         """Standard deviation of the predicted displacement of a run, shape `(n,)`; it is that of any such model."""
         del model
-        out = [_sd(self, voltage, start) for voltage, start in voltage_pieces(run)]
+        out = [_sd(self, voltage, start) for voltage, start in run.path.pieces]
         return np.concatenate(out)[: len(run.record)]
 
     def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
