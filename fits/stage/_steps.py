@@ -208,8 +208,8 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
 def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
 
-    A command that jumps at every sample has all of the driver's answer between two: whole steps do not see it, and
-    from no time constant at all there is no way back.
+    Whole steps do not see one that answers between two samples, and from no time constant at all there is no way
+    back.
     """
     stage = solved.stage
     changed = False
