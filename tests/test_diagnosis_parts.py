@@ -18,8 +18,8 @@ from fits.diagnosis._noise import floor_of, jitter_s, spikes
 from fits.diagnosis._projector import Projector, learn_roughness
 from fits.diagnosis._score import Family, Probe, evidence, score
 from fits.stage._motion import pass_signal
-from fits.stats._narrow_band import band_of
 from fits.stats._noise import Noise, learn_noise, quantum_um
+from fits.stats._noise_spectrum import band_of
 from microid import EFFECTS, AbstractPart, Scene, Signal
 
 WHITE = np.zeros(0)

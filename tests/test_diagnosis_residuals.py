@@ -23,8 +23,8 @@ from fits.diagnosis._residual_tests import (
     irregular,
     run_regressors,
 )
-from fits.stats._narrow_band import Band
 from fits.stats._noise import Noise
+from fits.stats._noise_spectrum import Band
 
 
 def plain_projector(lengths=(600, 800)):

@@ -7,9 +7,8 @@ import pytest
 from _wrong_records import bench, delayed, in_ms, joined, read, said, stuck, thinned, with_outliers
 
 import fits
-from fits.loop._fit_checks import impulsive
-from fits.loop._fit_checks import stuck as told_stuck
-from fits.loop._misfit import sensor_noise_um
+from fits.loop._misfit import impulsive, sensor_noise_um
+from fits.loop._misfit import stuck as told_stuck
 
 LEVELS = 16
 ALARMS = ("BEFORE", "AFTER", "stuck", "outliers", "apart", "samples are")

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 import fits
 from fits.loop._design import Grid, columns_of
 from fits.loop._moments import gather
-from fits.loop._prior import Hyper, _negative_log, interpolation, maximise_evidence, posterior_of, roughness
+from fits.loop._prior import Hyper, Posterior, _negative_log, interpolation, maximise_evidence, roughness
 from fits.loop._run import prepare_run, simulate_run
 from fits.stats._noise import correlation_samples, shared_square
 from fits.stats._nonnegative import minimise_nonnegative
@@ -95,7 +95,7 @@ def test_posterior_is_that_of_dense_bayesian_regression(problem):
     grid, runs, data = problem
     hyper = Hyper(*(jnp.asarray(v) for v in (-2.0, -3.0, -1.0, -4.0)))
     rough = roughness(LEVELS)
-    posterior = posterior_of(data.total, rough, hyper)
+    posterior = Posterior.of(data.total, rough, hyper)
     design = _dense(grid, runs)
     target = np.concatenate([run.displacement_um - run.displacement_um.mean() for run in runs])
     precision = design.T @ design * np.exp(4.0) + np.asarray(rough.precision(hyper))

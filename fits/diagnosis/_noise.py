@@ -10,8 +10,8 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 from fits.io._record import Record
 from fits.loop._run import Run
-from fits.stats._narrow_band import DRIFT, Band, MAINS_Hz, band_of
 from fits.stats._noise import Noise, idle_stretches, learn_noise, quantum_um, rough_noise_um
+from fits.stats._noise_spectrum import DRIFT, Band, MAINS_Hz, band_of
 from microid.effects import Statistic
 
 # So many samples at rest are enough to read the noise from.

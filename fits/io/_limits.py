@@ -44,10 +44,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Extreme:
-    """What a command is predicted to reach of a quantity of `UNITS`, in its unit, beside its limits.
-
-    It goes from `low` to `high` where `lowest` to `highest` is allowed; these are infinite where nothing is limited.
-    """
+    """What a command makes of a quantity, `low` to `high`, beside limits, which are infinite where there are none."""
 
     name: str
     low: float
@@ -122,10 +119,7 @@ def measured_ranges(record: Record, offset_um: float = 0.0) -> Ranges:
 
 
 def reached_in(report: Mapping[str, Any]) -> Ranges:
-    """What the runs of a model reached, by what its file keeps under `fit`; empty where that says nothing.
-
-    Displacements are as the sensor read them in the first run, whose offset is the model's.
-    """
+    """What the runs of a model reached, by its file's `fit`, displacements as in the first run; or nothing."""
     listed = report.get("runs")
     runs = (
         [run for run in listed if isinstance(run, Mapping) and run.get("reached")] if isinstance(listed, list) else []

@@ -18,10 +18,7 @@ LARGEST_EXTRA = 1e30
 
 
 def check_size(table: Table, column: str, values: FloatArray, unit: str, given: str = "") -> None:
-    """Refuse, in a `DataError`, values too large to be measurements, shape `(n,)`, in some unit.
-
-    Voltages and displacements that change must also change by enough. `given` is the unit in the file, if another.
-    """
+    """Refuse values, `(n,)`, that are too large, or change too little, to be measured; `given` is the file's unit."""
     most = _LARGEST_BY_UNIT.get(unit, _LARGEST)
     wrong = ~(np.abs(values) <= most)
     remedy = f"correct the cell, or the unit {given or unit}"

@@ -42,10 +42,9 @@ Problem = tuple[int, str]
 
 @dataclass(frozen=True)
 class Table:
-    r"""A CSV file of which the header is read and the body is still text.
+    r"""A CSV file of which the header is read and the body is still text, with lines that all end in `\n`.
 
-    `path` is as the user gave it, headers are without quotes and spaces around them, physical lines are counted from
-    1, and the separator is a comma, a semicolon or a tab. All lines of the body end in ``\n``.
+    Headers are without quotes and spaces around them, and physical lines are counted from 1.
     """
 
     path: str

@@ -21,7 +21,7 @@ from fits.loop._prior import interpolation
 from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
 from fits.loop._shapes import solve_shape
-from fits.loop._uncertainty import Uncertainty, perturbations
+from fits.loop._uncertainty import Uncertainty
 from fits.stats._noise import LOSSES, WHITE
 from microid import FAMILIES, Preisach, Staircase
 
@@ -161,17 +161,15 @@ def check_fit(
 
 
 def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
-    mean = data.means[0]
-    response = mean.response
+    """Perturbations by the columns of a factor of the covariance, and of the sensor offset alone."""
+    mean, response = data.means[0], data.means[0].response
     if found.levels < data.grid.levels:
         response = interpolation(found.levels, data.grid.levels).T @ response
-    return perturbations(
-        Grid(data.grid.lower_V, data.grid.upper_V, found.levels),
-        found.factor_um,
-        jnp.asarray(response),
-        jnp.asarray(found.noise_um * (found.correlation / mean.count) ** 0.5),
-        jnp.asarray(found.discrepancy_um),
-    )
+    grid = Grid(data.grid.lower_V, data.grid.upper_V, found.levels)
+    columns = jnp.concatenate([found.factor_um.T, jnp.zeros((1, grid.columns))])
+    # The mean displacement of a run fixes the offset: it makes up for what a perturbation does to that.
+    moved, sd = -(jnp.asarray(response) @ found.factor_um), found.noise_um * (found.correlation / mean.count) ** 0.5
+    return Uncertainty(columns, jnp.append(moved, sd), jnp.asarray(found.discrepancy_um), grid)
 
 
 def _with_offset(model: Preisach, offset_um: float) -> Preisach:

@@ -13,16 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import nnls
 
 from fits.loop._moments import BLOCKS, Data, Moments, blocks_of, gather, grid_of
-from fits.loop._prior import (
-    Hyper,
-    Posterior,
-    effective,
-    interpolation,
-    maximise_evidence,
-    posterior_of,
-    renew_noise,
-    roughness,
-)
+from fits.loop._prior import Hyper, Posterior, effective, interpolation, maximise_evidence, renew_noise, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
 from fits.stats._noise import shared_square
@@ -89,15 +80,15 @@ def solve_grid(
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
         few, even = moments.project(basis), rough.project(basis)
         hyper = maximise_evidence(few, even, start).relaxed(relaxation)
-        posterior = posterior_of(moments, rough, hyper)
+        posterior = Posterior.of(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
-        determined = effective(even, hyper, posterior_of(few, even, hyper))
+        determined = effective(even, hyper, Posterior.of(few, even, hyper))
         renewed = renew_noise(moments, hyper, posterior, determined)
         if abs(float(renewed.log_variance - hyper.log_variance)) > _SAME_NOISE:
-            hyper, posterior = renewed, posterior_of(moments, rough, renewed)
+            hyper, posterior = renewed, Posterior.of(moments, rough, renewed)
     else:
         hyper = maximise_evidence(moments, rough, start).relaxed(relaxation)
-        posterior = posterior_of(moments, rough, hyper)
+        posterior = Posterior.of(moments, rough, hyper)
     if np.all(np.asarray(posterior.mean) >= 0):
         return GridSolution(posterior.mean, posterior, hyper)
     columns, found = non_negative(posterior)
@@ -123,7 +114,7 @@ def relaxation_of(runs: Sequence[Run], stroke_um: float, correlation: float, sta
         square = 0.0
         for block in data.blocks:
             rest = jax.tree.map(operator.sub, whole, block)
-            posterior = posterior_of(rest.scaled(1 / correlation, stroke_um), rough, hyper.relaxed(efolds))
+            posterior = Posterior.of(rest.scaled(1 / correlation, stroke_um), rough, hyper.relaxed(efolds))
             columns, found = non_negative(posterior)
             one = block.scaled(1.0, stroke_um)
             off = one.energy_um2 - 2 * columns @ one.cross_um + columns @ one.gram @ columns
@@ -220,7 +211,7 @@ def grid_estimate(
     if levels < data.grid.levels:
         basis = interpolation(levels, data.grid.levels)
         moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
-        posterior = posterior_of(moments, roughness(data.grid.levels).project(basis), solution.hyper)
+        posterior = Posterior.of(moments, roughness(data.grid.levels).project(basis), solution.hyper)
     return Estimate(
         model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
         levels=levels,
@@ -249,7 +240,7 @@ def cross_validate(
     for number, block in enumerate(blocks):
         if not block.count > 0:
             continue
-        posterior = posterior_of((whole - block).scaled(1 / correlation, stroke_um), rough, hyper)
+        posterior = Posterior.of((whole - block).scaled(1 / correlation, stroke_um), rough, hyper)
         columns = np.asarray(posterior.mean if basis is None else basis @ posterior.mean)
         model = data.grid.model(columns * stroke_um, np.zeros(()))
         # A short run may have no sample in a block.

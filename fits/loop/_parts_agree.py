@@ -7,11 +7,10 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.loop._fit_checks import remarks_on
 from fits.loop._grid import non_negative, solve_grid
-from fits.loop._misfit import Misfit, compare_gains, misfits, worst
+from fits.loop._misfit import Misfit, compare_gains, misfits, remarks_on, worst
 from fits.loop._moments import gather, grid_of
-from fits.loop._prior import Hyper, posterior_of, roughness
+from fits.loop._prior import Hyper, Posterior, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, simulate_run
 from fits.stats._noise import WHITE, correlation_samples
@@ -85,7 +84,7 @@ class SeparateFits:
         """What a run leaves that is fitted alone as smoothly as all are, at its fitted samples, in um."""
         data = gather(grid_of([run], _LEVELS), [run])
         moments = data.total.scaled(1.0, self.stroke_um)
-        columns, _ = non_negative(posterior_of(moments, roughness(_LEVELS), self.hyper))
+        columns, _ = non_negative(Posterior.of(moments, roughness(_LEVELS), self.hyper))
         return left_of(data.grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
 
 

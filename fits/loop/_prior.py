@@ -141,6 +141,16 @@ class Posterior(eqx.Module):
     precision: Float[Array, "D D"]
     root: Float[Array, "D D"]
 
+    @classmethod
+    @eqx.filter_jit
+    def of(cls, moments: Moments, rough: Roughness, hyper: Hyper) -> "Posterior":
+        """Condition the prior on the data."""
+        variance = jnp.exp(hyper.log_variance)
+        precision = jnp.asarray(moments.gram / variance + rough.precision(hyper))
+        root = jnp.linalg.cholesky(precision)
+        mean = jax.scipy.linalg.cho_solve((root, True), moments.cross_um / variance)
+        return cls(mean, precision, root)
+
     @eqx.filter_jit
     def factor(self) -> Float[Array, "D D"]:
         """Factor of the covariance: `factor @ factor.T` is the inverse of the precision."""
@@ -170,17 +180,6 @@ def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> Hyper
     solution: Any = optx.minimise(_negative_log, solver, start, args=(moments, rough), max_steps=256, throw=False)
     # Out of steps on a flat evidence, the best place so far is as good as any; the regression itself must converge.
     return solution.value
-
-
-@eqx.filter_jit
-def posterior_of(moments: Moments, rough: Roughness, hyper: Hyper) -> Posterior:
-    """Condition the prior on the data."""
-    prior = rough.precision(hyper)
-    variance = jnp.exp(hyper.log_variance)
-    precision = jnp.asarray(moments.gram / variance + prior)
-    root = jnp.linalg.cholesky(precision)
-    mean = jax.scipy.linalg.cho_solve((root, True), moments.cross_um / variance)
-    return Posterior(mean, precision, root)
 
 
 @eqx.filter_jit

@@ -66,35 +66,6 @@ class Samples(eqx.Module):
     beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
 
 
-def refine(
-    record: Record, weight: np.ndarray, start: Staircase, stride: int, moving: bool, has_past: bool, hold: Hold
-) -> Samples:
-    """Fill up a record, divide its intervals into steps, and take a displacement that it lacks for zero."""
-    refuse_many_steps(record, stride)
-    n, time_s = len(record), record.time_s
-    pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
-    step = (time_s[-1] - time_s[0]) / (n - 1)
-    share = np.arange((n + pad[1] - 1) * stride + 1) / stride
-    _, voltage_V = refined(jnp.ones(()), jnp.asarray(np.pad(record.voltage_V, pad, mode="edge")), stride, hold)
-    if np.max(np.abs(np.diff(time_s) - step)) <= _EVEN * step:
-        time: Any = np.asarray(step / stride)
-    else:
-        longer = np.concatenate([time_s, time_s[-1] + step * np.arange(1, pad[1] + 1)])
-        time = np.interp(share, np.arange(n + pad[1]), longer)
-    measured = np.zeros(n) if record.displacement_um is None else record.displacement_um
-    return Samples(
-        time_s=jnp.asarray(time),
-        voltage_V=voltage_V,
-        displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
-        weight=jnp.asarray(np.pad(weight, pad)),
-        start=Start(memory=resized(start, _EXTREMES)),
-        stride=stride,
-        moving=moving,
-        has_past=has_past,
-        beside={name: jnp.asarray(np.interp(share, np.arange(n), v)) for name, v in columns_beside(record).items()},
-    )
-
-
 def resized(start: Staircase, size: int) -> Staircase:
     """Give a memory room for so many extremes at least."""
     pad = jnp.full(max(0, size - start.extremes_V.shape[0]), start.extremes_V[0])
@@ -114,11 +85,11 @@ def refuse_many_steps(record: Record, stride: int) -> None:
 class Path:
     """A voltage followed by the memory of relays.
 
-    `starts` are the memories at the beginning of every piece. Each sample lies on a branch that hangs from the
-    remembered extreme `anchor_V` and is `rising` or not, shape `(n,)`.
+    All `pieces` have one length, and each the memory that it begins with. Each sample lies on a branch that hangs
+    from the remembered extreme `anchor_V` and is `rising` or not, shape `(n,)`.
     """
 
-    starts: tuple[Staircase, ...]
+    pieces: tuple[tuple[Float[Array, " k"], Staircase], ...]
     anchor_V: np.ndarray
     rising: np.ndarray
 
@@ -178,12 +149,54 @@ class Run:
     @cached_property
     def path(self) -> Path:
         """The voltage followed by the memory, as the fit of a hysteresis alone needs it."""
-        return _walk(self.voltage_V, self.start)
+        voltage = self.voltage_V
+        # The last piece is filled up with its final value, which changes no memory.
+        padded = np.pad(voltage, (0, -len(voltage) % _PIECE), mode="edge")
+        for size in _STAIRCASES:
+            memory, anchors, risings, pieces = resized(self.start, size), [], [], []
+            for piece in map(jnp.asarray, padded.reshape(-1, _PIECE)):
+                pieces.append((piece, memory))
+                anchor, rising, memory = _remember(piece, memory)
+                anchors.append(anchor)
+                risings.append(rising)
+                # Without room for all extremes.
+                if np.isnan(memory.extremes_V[0]):
+                    break
+            else:
+                return Path(tuple(pieces), *(np.concatenate(each)[: len(voltage)] for each in (anchors, risings)))
+        raise DataError(
+            f"the voltage nests more than {_STAIRCASES[-1]} loops into each other: that is noise, not a drive; "
+            "use the commanded voltage"
+        )
 
     @cached_property
     def samples(self) -> Samples:
-        """The run padded and refined in time, as the fit of a stage needs it."""
-        return refine(self.record, self.fit_weight, self.start, self.stride, self.moving, self.has_past, self.hold)
+        """The run padded and refined in time, as the fit of a stage needs it; a displacement it lacks is zero."""
+        record, stride = self.record, self.stride
+        refuse_many_steps(record, stride)
+        n, time_s = len(record), record.time_s
+        pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
+        step = (time_s[-1] - time_s[0]) / (n - 1)
+        share = np.arange((n + pad[1] - 1) * stride + 1) / stride
+        voltage = jnp.asarray(np.pad(record.voltage_V, pad, mode="edge"))
+        if np.max(np.abs(np.diff(time_s) - step)) <= _EVEN * step:
+            time: Any = np.asarray(step / stride)
+        else:
+            longer = np.concatenate([time_s, time_s[-1] + step * np.arange(1, pad[1] + 1)])
+            time = np.interp(share, np.arange(n + pad[1]), longer)
+        measured = np.zeros(n) if record.displacement_um is None else record.displacement_um
+        beside = {name: np.interp(share, np.arange(n), v) for name, v in columns_beside(record).items()}
+        return Samples(
+            time_s=jnp.asarray(time),
+            voltage_V=refined(jnp.ones(()), voltage, stride, self.hold)[1],
+            displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
+            weight=jnp.asarray(np.pad(self.fit_weight, pad)),
+            start=Start(memory=resized(self.start, _EXTREMES)),
+            stride=stride,
+            moving=self.moving,
+            has_past=self.has_past,
+            beside={name: jnp.asarray(values) for name, values in beside.items()},
+        )
 
     def weighed(self, residual_um: np.ndarray) -> np.ndarray:
         """Make a residual as large as it counts, shape `(n,)`."""
@@ -280,34 +293,6 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
     return next(known for known in found if 2 * known.sum() >= found[-1].sum())
 
 
-def _walk(voltage: np.ndarray, start: Staircase) -> Path:
-    for size in _STAIRCASES:
-        memory, found = resized(start, size), []
-        for piece in _split(voltage):
-            anchor, rising, after = _remember(jnp.asarray(piece), memory)
-            found.append((memory, anchor, rising))
-            memory = after
-        # Without room for all extremes the memory is NaN, and stays so.
-        if not np.isnan(memory.extremes_V[0]):
-            starts, anchors, risings = zip(*found, strict=True)
-            return Path(starts, np.concatenate(anchors)[: len(voltage)], np.concatenate(risings)[: len(voltage)])
-    raise DataError(
-        f"the voltage nests more than {_STAIRCASES[-1]} loops into each other: that is noise, not a drive; "
-        "use the commanded voltage"
-    )
-
-
-def _split(values: np.ndarray) -> list[np.ndarray]:
-    """Cut values into pieces of one length; the last is filled up with its final value, which changes no memory."""
-    padded = np.pad(values, (0, -len(values) % _PIECE), mode="edge")
-    return list(padded.reshape(-1, _PIECE))
-
-
-def voltage_pieces(run: Run) -> list[tuple[Float[Array, " n"], Staircase]]:
-    """The voltage of a run in pieces of one length, each with the memory that it begins with."""
-    return [(jnp.asarray(v), start) for v, start in zip(_split(run.voltage_V), run.path.starts, strict=True)]
-
-
 @eqx.filter_jit
 def _remember(
     voltage_V: Float[Array, " n"], start: Staircase
@@ -324,5 +309,5 @@ def _respond(model: Preisach, voltage_V: Float[Array, " n"], start: Staircase) -
 
 def simulate_run(model: Preisach, run: Run) -> np.ndarray:
     """Predict the displacement of a run by a hysteresis alone, in um, shape `(n,)`."""
-    out = [_respond(model, voltage, start) for voltage, start in voltage_pieces(run)]
+    out = [_respond(model, voltage, start) for voltage, start in run.path.pieces]
     return np.concatenate(out)[: len(run.record)]

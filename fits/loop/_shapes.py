@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from fits.loop._design import columns_of
 from fits.loop._grid import Estimate
-from fits.loop._moments import Data, Moments
+from fits.loop._moments import Data, square_root
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
@@ -118,7 +118,8 @@ def solve_shape(
 
     keys = jax.random.split(key, starts)
     coordinates = Coordinates(draw(keys[0]), free=lambda info: info.path != "offset_um")
-    root, target = _square_root(moments)
+    gram, cross, energy = (np.asarray(x)[None] for x in (moments.gram, moments.cross_um, moments.energy_um2))
+    root, target = (jnp.asarray(x[0]) for x in square_root(gram, cross, energy, _NEGLIGIBLE)[:2])
     rough = roughness(grid.levels).reversible[grid.weights :, grid.weights :]
     values, vectors = jnp.linalg.eigh(rough * jnp.exp(hyper.log_reversible))
     slopes = jnp.sqrt(jnp.maximum(values, 0))[:, None] * vectors.T
@@ -173,13 +174,3 @@ def solve_shape(
         discrepancy_um=max(0.0, shared) ** 0.5,
     )
     return estimate, agree
-
-
-@eqx.filter_jit
-def _square_root(moments: Moments) -> tuple[Float[Array, "D D"], Float[Array, " D"]]:
-    """Factor the moments: `root' root` is the Gram matrix, `root' target` the cross products."""
-    value, vector = jnp.linalg.eigh(moments.gram)
-    kept = value > _NEGLIGIBLE * value[-1]
-    scale = jnp.sqrt(jnp.where(kept, value, 0))
-    seen = vector.T @ moments.cross_um
-    return scale[:, None] * vector.T, jnp.where(kept, seen / jnp.where(kept, scale, 1), 0)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid
-from fits.loop._run import Run, prepare_run, simulate_run, voltage_pieces
+from fits.loop._run import Run, prepare_run, simulate_run
 from microid import Preisach, Stage, Staircase, everett, remember
 
 _BATCH = 32
@@ -64,7 +64,7 @@ class Uncertainty(AbstractUncertainty):
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
         """Standard deviation of the predicted displacement of a run, shape `(n,)`; it is that of any such model."""
         del model
-        out = [_sd(self, voltage, start) for voltage, start in voltage_pieces(run)]
+        out = [_sd(self, voltage, start) for voltage, start in run.path.pieces]
         return np.concatenate(out)[: len(run.record)]
 
     def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
@@ -90,23 +90,6 @@ def _sd(uncertainty: Uncertainty, voltage_V: Float[Array, " n"], start: Staircas
     # In batches: all at once would take k times the memory of a simulation.
     each = lax.map(variance, (uncertainty.columns_um, uncertainty.offset_um), batch_size=_BATCH)
     return jnp.sqrt(jnp.sum(each, axis=0) + uncertainty.discrepancy_um**2)
-
-
-@eqx.filter_jit
-def perturbations(
-    grid: Grid,
-    factor_um: Float[Array, "D k"],
-    mean_response: Float[Array, " D"],
-    offset_sd_um: Float[Array, ""],
-    discrepancy_um: Float[Array, ""],
-) -> Uncertainty:
-    """Turn a factor of the covariance of the columns, `factor @ factor.T`, into perturbations of a model.
-
-    The offset, fixed by the mean displacement of a run, makes up for what each does to that, and has its deviation.
-    """
-    columns = jnp.concatenate([factor_um.T, jnp.zeros((1, grid.columns))])
-    offsets = jnp.append(-(mean_response @ factor_um), offset_sd_um)
-    return Uncertainty(columns, offsets, discrepancy_um, grid)
 
 
 def refuse_outside(record: Record, lower_V: float, upper_V: float) -> None:

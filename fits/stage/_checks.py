@@ -8,7 +8,7 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._misfit import Misfit, compare_gains
 from fits.loop._run import Run
-from fits.stage._run import residual_of, simulate_stage
+from fits.stage._run import named_parts, residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
 from fits.stats._noise import correlation_samples
 from microid import Driver, Mechanics, Stage
@@ -20,7 +20,7 @@ _HIGHEST_RESONANCE = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
 UNSEEN, _LOST = 0.5, 5.0
 # Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
-WORTH = 40.0
+_WORTH = 40.0
 # A run that leaves so many times what the quietest leaves moves in ways that its samples do not show.
 _LARGEST_NOISE_RATIO = 3.0
 # Ranges of voltage that differ by less than this, as a fraction, are alike.
@@ -34,6 +34,9 @@ _UPPER = 0.1
 # Poles that piezo stages have, from slow macro stages and weak amplifiers to small ones with strong ones.
 _USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
 _POLES = ("time_constant_s", "natural_frequency_Hz")
+# Remedies.
+_BEYOND = "add a run with steps, a chirp or a multisine that goes beyond the resonance"
+_FASTER, _OR_ALONE = "sample at 5 times the resonance or more", "or fit the hysteresis alone with --model loop"
 
 
 def refuse_slopes(records: Sequence[Record]) -> None:
@@ -82,9 +85,7 @@ def refuse_unidentifiable(
     is returned instead.
     """
     stage = solved.stage
-    information = marginal_information(
-        solved.weighing.total(solved.sums), 0, np.zeros((0, 0)), solved.weighing.least_um**2
-    )
+    information = marginal_information(solved.weighing.total(solved.sums), 0, None, solved.weighing.least_um**2)
     named, value, derivative = solved.parameters()
     slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
     names = [name for name, _ in named]
@@ -96,21 +97,16 @@ def refuse_unidentifiable(
     unidentified = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > _LOST]
     sources = ", ".join(run.record.source for run in solved.runs)
     fastest = max(solved.runs, key=lambda run: run.rate_Hz)
-    mechanics = [
-        (name, float(part.natural_frequency_Hz))
-        for name, part in zip(stage.names, stage.parts, strict=True)
-        if isinstance(part, Mechanics)
-    ]
+    mechanics = [(name, float(part.natural_frequency_Hz)) for name, part in named_parts(stage, Mechanics)]
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST_RESONANCE * fastest.rate_Hz]
-    seen = likelihood_ratio(solved, drives) >= WORTH
+    seen = shows_poles(solved, drives)
     some = bool(unidentified) and (len(unidentified) == len(poles) or not fast)
-    driven = any(isinstance(part, Driver) for part in stage.parts)
-    if may_drop and seen and driven and mechanics and (some or beyond) and all(map(_resolved, solved.runs)):
+    lacking = mechanics and (some or beyond) and named_parts(stage, Driver)
+    if may_drop and seen and lacking and all(map(_resolved, solved.runs)):
         return (beyond or mechanics)[0][0]
     if unidentified and not fast and len(unidentified) < len(poles):
         raise DataError(
-            f"{sources}: these runs are all about as slow, and do not show {', '.join(unidentified)}; add a run with "
-            "steps, a chirp or a multisine that goes beyond the resonance"
+            f"{sources}: these runs are all about as slow, and do not show {', '.join(unidentified)}; {_BEYOND}"
         )
     if len(unidentified) == len(poles) or not seen:
         noise = solved.weighing.noise_um
@@ -125,24 +121,21 @@ def refuse_unidentifiable(
             if _resolved(loud):
                 raise DataError(
                     f"{loud.record.source}: no lag and no resonance was found that explains what moves in it: "
-                    f"{what}; record it for longer, with a slower chirp or a longer period, or fit the hysteresis "
-                    "alone with --model loop"
+                    f"{what}; record it for longer, with a slower chirp or a longer period, {_OR_ALONE}"
                 )
             raise DataError(
                 f"{loud.record.source}: sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it: "
-                f"{what}; sample at 5 times the resonance or more, or fit the hysteresis alone with --model loop"
+                f"{what}; {_FASTER}, {_OR_ALONE}"
             )
         raise DataError(
             f"{sources}: the displacement follows the voltage without delay or ringing, so these runs hold nothing "
-            "of the driver and the mechanics; add a run with steps, a chirp or a multisine that goes beyond the "
-            "resonance, check that voltage and displacement are not exchanged, or fit the hysteresis alone with "
-            "--model loop"
+            f"of the driver and the mechanics; {_BEYOND}, check that voltage and displacement are not exchanged, "
+            f"{_OR_ALONE}"
         )
     if beyond:
         raise DataError(
             f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, and what moves there is explained best "
-            "by a resonance beyond half of that, so these runs do not show where it is: sample at 5 times the "
-            "resonance or more, or fit the hysteresis alone with --model loop"
+            f"by a resonance beyond half of that, so these runs do not show where it is: {_FASTER}, {_OR_ALONE}"
         )
     return None
 
@@ -150,9 +143,7 @@ def refuse_unidentifiable(
 def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit]) -> None:
     """Refuse, in a `DataError`, a resonance that runs cannot show: sampled too slowly for it, they leave much."""
     finest = max(run.rate_Hz for run in runs)
-    for part in stage.parts:
-        if not isinstance(part, Mechanics):
-            continue
+    for _, part in named_parts(stage, Mechanics):
         resonance = float(part.natural_frequency_Hz)
         for run, one in zip(runs, left, strict=True):
             blind = _HIGHEST_RESONANCE * finest < resonance
@@ -161,8 +152,7 @@ def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit
                 raise DataError(
                     f"{one.source}: sampled at {run.rate_Hz:.4g} Hz, which is too slow for what moves in it: "
                     f"{one.share_pct:.3g} % of its stroke stay unexplained, {one.times_noise:.3g} times the sensor's "
-                    f"noise, and the resonance would lie {where}; sample at 5 times the resonance or more, or fit "
-                    "the hysteresis alone with --model loop"
+                    f"noise, and the resonance would lie {where}; {_FASTER}, {_OR_ALONE}"
                 )
 
 
@@ -194,8 +184,8 @@ def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence
     return None
 
 
-def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
-    """Twice the logarithm of how much likelier poles make the run that shows them best.
+def shows_poles(solved: Solved, drives: Sequence[np.ndarray]) -> bool:
+    """Whether poles make the run that shows them best likelier by far, by the logarithm of the likelihood ratio.
 
     Slow runs may become less likely: the hysteresis read off them holds the driver's lag, which now counts twice.
     """
@@ -204,7 +194,7 @@ def likelihood_ratio(solved: Solved, drives: Sequence[np.ndarray]) -> float:
         x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
         left = y - y.mean() - x * (x @ y / (x @ x))
         ratios.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
-    return max(ratios)
+    return max(ratios) >= _WORTH
 
 
 def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:

@@ -8,13 +8,12 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.loop._design import columns_of
-from fits.loop._fit_checks import outlying
-from fits.loop._misfit import Misfit, misfits
-from fits.loop._result import FitError, FitResult
+from fits.loop._misfit import Misfit, misfits, outlying
+from fits.loop._result import FitResult
 from fits.loop._run import Run
 from fits.stage._moments import along, linearise, pieces
-from fits.stage._run import nuisance_columns, project_out, simulate_stage
-from fits.stage._solve import Problem, Solved, solve_chain
+from fits.stage._run import hysteresis_of, nuisance_columns, project_out, simulate_stage
+from fits.stage._solve import Problem, Solved, try_chain
 from fits.stage._start import best_shifts, measure_response, start_stages
 from fits.stage._steps import Plan, hysteresis_alone
 from fits.stage._uncertainty import NO_PRECISION, Precision, sandwich
@@ -57,11 +56,10 @@ class Alternative:
     high: np.ndarray
 
     @classmethod
-    def of(cls, precision: Precision) -> "Alternative":
+    def of(cls, solved: Solved) -> "Alternative":
         """Read it off a solution."""
-        z, values = precision.solved.z, precision.chain.coordinates.values
-        sd = precision.sd()
-        ends = (np.asarray(values(jnp.asarray(z + k * TWO_SIDED_95 * sd))) for k in (0, -1, 1))
+        sd, values = Precision(solved).sd(), solved.problem.chain.coordinates.values
+        ends = (np.asarray(values(jnp.asarray(solved.z + k * TWO_SIDED_95 * sd))) for k in (0, -1, 1))
         return cls(*ends)
 
     @classmethod
@@ -101,11 +99,8 @@ def fit_without_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Alterna
         return None
     runs = [replace(run, fitted=run.fitted & ~one) for run, one in zip(solved.runs, bad, strict=True)]
     plan.progress(f"fitting without the outliers of {', '.join(sources)}")
-    try:
-        found = solve_chain(solved.onward, runs, plan.loss, plan.progress, accept_best=True)
-    except (FitError, np.linalg.LinAlgError):
-        return None
-    return sources, Alternative.of(Precision(found))
+    found = try_chain(solved.onward, runs, plan.loss, plan.progress, accept_best=True)
+    return None if found is None else (sources, Alternative.of(found))
 
 
 @dataclass(frozen=True)
@@ -142,7 +137,6 @@ class WithoutDelays:
 
     delays: tuple[Delay, ...]
     solved: Solved
-    precision: Precision
 
     def left(self) -> list[Misfit]:
         """What stays of each run without its delay."""
@@ -151,6 +145,17 @@ class WithoutDelays:
     def words(self) -> str:
         """Say what the columns of the runs look like."""
         return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
+
+    def refused(self) -> DataError:
+        """Say that the delays kept a fit from an answer."""
+        return DataError(f"{self.words()}, and no fit was found with that: {_REMEDY}")
+
+    def widen(self, fit: FitResult[Stage]) -> FitResult[Stage]:
+        """Name the delays, and widen intervals by what they did; a `DataError` if that leaves nothing to say."""
+        other, said = Alternative.of(self.solved), self.words()
+        if moved := other.contradicted(fit):
+            raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")
+        return other.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
 
 
 def fit_without_delays(
@@ -173,20 +178,17 @@ def fit_without_delays(
     shifts = np.zeros(len(plan.records))
     far = [k for k, one in enumerate(left) if one.times_noise > _SEARCHED_NOISE]
     searched = _search(plan, solved, far)
+    found: Solved | None = solved
     if searched is not None:
         shifts, start = searched
-    elif precision is None or not any(one.seen for one in _scores(plan, solved, precision, shifts)):
+        found = _solved_with(plan, start, solved.runs[0].stride, shifts)
+    elif precision is None or not any(one.seen for one in _scores(plan, solved, shifts)):
         return None
-    found, sure = solved, precision
-    if np.any(shifts):
-        again = _solved_with(plan, start, solved.runs[0].stride, shifts)
-        if again is None:
-            return None
-        found, sure = again
-    assert sure is not None
+    if found is None:
+        return None
     known: list[Delay] = []
     for _ in range(_ROUNDS):
-        more = _scores(plan, found, sure, shifts)
+        more = _scores(plan, found, shifts)
         known = [replace(one, delay_s=one.delay_s + shift) for one, shift in zip(more, shifts, strict=True)]
         # One at a time, the surest first: the parameters bend to a delay, which makes other runs look late, too.
         steps = [one.delay_s / one.sd_s if total.seen else 0.0 for one, total in zip(more, known, strict=True)]
@@ -200,13 +202,13 @@ def fit_without_delays(
             plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts + step)} ms")
             start = replace(start, z=found.z, columns_um=found.columns_um)
             again = _solved_with(plan, start, solved.runs[0].stride, shifts + step)
-            if again is not None and again[0].weighing.noise_um[first] <= _NO_WORSE * found.weighing.noise_um[first]:
+            if again is not None and again.weighing.noise_um[first] <= _NO_WORSE * found.weighing.noise_um[first]:
                 break
             step /= 2
         else:
             break
         assert again is not None
-        shifts, (found, sure) = shifts + step, again
+        shifts, found = shifts + step, again
     seen = tuple(
         one
         for one, shift, miss, before, after in zip(
@@ -219,34 +221,17 @@ def fit_without_delays(
         return None
     if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd()) < _MOVED_SD:
         return None
-    return WithoutDelays(seen, found, sure)
+    return WithoutDelays(seen, found)
 
 
-def _solved_with(plan: Plan, start: Problem, stride: int, shifts_s: np.ndarray) -> tuple[Solved, Precision] | None:
+def _solved_with(plan: Plan, start: Problem, stride: int, shifts_s: np.ndarray) -> Solved | None:
     """Fit again with the command of each run that much later, as well as can be; None where that fails."""
-    try:
-        found = solve_chain(start, plan.shifted(shifts_s).runs(stride), plan.loss, plan.progress, accept_best=True)
-    except (FitError, np.linalg.LinAlgError):
-        return None
-    return found, Precision(found)
+    return try_chain(start, plan.shifted(shifts_s).runs(stride), plan.loss, plan.progress, accept_best=True)
 
 
-def refuse_delays(undelayed: WithoutDelays | None) -> None:
-    """Refuse runs whose delays kept a fit from an answer, in a `DataError`; nothing where there are none."""
-    if undelayed is not None:
-        raise DataError(f"{undelayed.words()}, and no fit was found with that: {_REMEDY}")
-
-
-def widen_for_delays(fit: FitResult[Stage], undelayed: WithoutDelays) -> FitResult[Stage]:
-    """Name delays, and widen intervals by what they did; a `DataError` if a fit says nothing because of them."""
-    other, said = Alternative.of(undelayed.precision), undelayed.words()
-    if moved := other.contradicted(fit):
-        raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")
-    return other.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
-
-
-def _scores(plan: Plan, solved: Solved, precision: Precision, shifts: np.ndarray) -> list[Delay]:
+def _scores(plan: Plan, solved: Solved, shifts: np.ndarray) -> list[Delay]:
     """Delays to first order beside all parameters, each run's alone; of the noise, that of the run itself counts."""
+    precision = Precision(solved)
     chain, size = precision.chain, precision.chain.size
     here, stage = (jnp.asarray(solved.z), jnp.asarray(solved.columns_um)), solved.stage
     whole = precision.gram + precision.prior
@@ -283,7 +268,7 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
     """Large delays of the runs that are far from noise: shifts, and what to go on from; None where none helps."""
     # As it began: a delay bends the hysteresis of a joint fit, and the slow runs hardly feel it.
     problem, stage = solved.onward, solved.problem.stage
-    law = None if problem.chain.place is None else stage.parts[problem.chain.place]
+    law = hysteresis_of(stage) if problem.chain.size else None
     columns_um = np.asarray(columns_of(law)) if isinstance(law, Preisach) else np.zeros(0)
     drives = hysteresis_alone(stage, solved.runs)
     shifts, best = np.zeros(len(plan.records)), solved
@@ -293,10 +278,8 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
         if not len(response.frequency_Hz):
             continue
         step = min(1.0 / run.rate_Hz, 0.1 / response.frequency_Hz.max())
-        tried = best_shifts(stage, response, step * np.arange(-_FARTHEST_SAMPLES, _FARTHEST_SAMPLES + 1))[
-            :_MOST_TRIED
-        ]
-        for shift in (shift for shift in tried if shift):
+        tried = best_shifts(stage, response, step * np.arange(-_FARTHEST_SAMPLES, _FARTHEST_SAMPLES + 1))
+        for shift in filter(None, tried[:_MOST_TRIED]):
             there = shifts.copy()
             there[k] = shift
             plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
@@ -305,10 +288,7 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
             for candidate in start_stages(stage, [moved])[:1]:
                 z = np.asarray(problem.chain.coordinates.of(candidate))
                 start = replace(problem, z=z, columns_um=columns_um, hyper=None)
-                try:
-                    found = solve_chain(start, runs, plan.loss, plan.progress, rough=True)
-                except (FitError, np.linalg.LinAlgError):
-                    continue
-                if found.cost < best.cost + float(run.fitted.sum()) * np.log(_BETTER):
+                found = try_chain(start, runs, plan.loss, plan.progress, rough=True)
+                if found is not None and found.cost < best.cost + float(run.fitted.sum()) * np.log(_BETTER):
                     best, shifts = found, there
     return (shifts, replace(problem, z=best.z, columns_um=columns_um)) if np.any(shifts) else None

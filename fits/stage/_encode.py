@@ -61,16 +61,11 @@ def decode(item: Any, where: str, spec: ParameterSpec | None = None) -> Any:
 
 def _classes() -> dict[str, type[eqx.Module]]:
     """Find the classes that a file may name: nothing else is ever called."""
-    public = {name: getattr(microid, name) for name in dir(microid) if not name.startswith("_")}
-    modules = {
-        name: value for name, value in public.items() if inspect.isclass(value) and issubclass(value, eqx.Module)
-    }
+    public = (getattr(microid, name) for name in dir(microid) if not name.startswith("_"))
+    models = (one for one in public if inspect.isclass(one) and issubclass(one, eqx.Module))
     plugins = (*microid.EFFECTS, *microid.FAMILIES.values(), *microid.hysteresis.LAWS.values())
-    return (
-        {name: cls for name, cls in modules.items() if not inspect.isabstract(cls)}
-        | {plugin.__name__: plugin for plugin in plugins}
-        | {"Grid": Grid, "StageUncertainty": StageUncertainty, "Uncertainty": Uncertainty}
-    )
+    known: list[Any] = [one for one in models if not inspect.isabstract(one)]
+    return {one.__name__: one for one in (*known, *plugins, Grid, StageUncertainty, Uncertainty)}
 
 
 def _fields(cls: type[eqx.Module]) -> dict[str, dataclasses.Field[Any]]:
@@ -182,13 +177,8 @@ def _encode_network(network: eqx.nn.MLP, unit: str) -> dict[str, Any]:
     if not names:
         raise DataError(f"it holds a network whose activation is not one of {', '.join(_ACTIVATIONS)}")
     layers = [{key: encode(getattr(layer, key), unit) for key in ("weight", "bias")} for layer in network.layers]
-    return {
-        "type": "MLP",
-        "activation": names[0],
-        "in_size": network.in_size,
-        "out_size": network.out_size,
-        "layers": layers,
-    }
+    sizes = {"in_size": network.in_size, "out_size": network.out_size}
+    return {"type": "MLP", "activation": names[0], **sizes, "layers": layers}
 
 
 def _decode_network(item: dict[str, Any], where: str, spec: ParameterSpec | None) -> eqx.nn.MLP:
@@ -208,25 +198,16 @@ def _decode_network(item: dict[str, Any], where: str, spec: ParameterSpec | None
         for number, layer in enumerate(layers)
         for key in ("weight", "bias")
     ]
-
     if not all(isinstance(array, jax.Array) and array.ndim for array in arrays):
         raise DataError(f"{where}: expected arrays in the layers of the network")
-
-    def empty() -> eqx.nn.MLP:
-        return eqx.nn.MLP(
-            item["in_size"],
-            item["out_size"],
-            width_size=arrays[0].shape[0],
-            depth=len(layers) - 1,
-            activation=_ACTIVATIONS[item["activation"]],
-            key=jax.random.key(0),
-        )
 
     def slots(network: eqx.nn.MLP) -> list[Any]:
         return [getattr(layer, key) for layer in network.layers for key in ("weight", "bias")]
 
     try:
-        skeleton = eqx.filter_eval_shape(empty)
+        sizes = item["in_size"], item["out_size"], arrays[0].shape[0], len(layers) - 1
+        activation, key = _ACTIVATIONS[item["activation"]], jax.random.key(0)
+        skeleton = eqx.filter_eval_shape(eqx.nn.MLP, *sizes, activation=activation, key=key)
     except (TypeError, ValueError, IndexError) as error:
         raise DataError(f"{where}: the sizes of the network make no sense") from error
     if [slot.shape for slot in slots(skeleton)] != [array.shape for array in arrays]:

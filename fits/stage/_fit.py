@@ -12,30 +12,27 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
-from fits.loop._fit_checks import remarks_on
-from fits.loop._misfit import misfits, worst
+from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate, RunReport
 from fits.loop._run import Run, prepare_run, refuse_many_steps
 from fits.stage._checks import check_gains, implausible, refuse_undersampled
-from fits.stage._delay import (
-    GROSS_PCT,
-    Alternative,
-    fit_without_delays,
-    fit_without_outliers,
-    refuse_delays,
-    widen_for_delays,
-)
+from fits.stage._delay import GROSS_PCT, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simulate_stage
 from fits.stage._solve import Problem, Solved
 from fits.stage._steps import Plan, refine_problem, start_problem
 from fits.stage._uncertainty import Precision
-from fits.stats._identifiability import unseen_directions
 from fits.stats._metrics import TWO_SIDED_95
 from fits.stats._noise import WHITE
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
 
 # A coordinate, of the order of 1, that is known no better than this is hardly seen.
 _UNSEEN_SD = 0.5
+# A coordinate, which is scaled to be of the order of 1, that is known no better than this is not known.
+_UNKNOWN = 1.0
+# Entries of a direction below this share of its largest are left out of its name.
+_FAINT = 0.15
+# Exponents this close to 1 or -1 are taken for them.
+_WHOLE = 0.1
 
 
 def default_stage(hold: Hold = "first") -> Stage:
@@ -105,8 +102,8 @@ def fit_stage(
     # What is sampled too slowly may look late; a delay is believed that leaves little else.
     if undelayed is None or any(one.far for one in undelayed.left()):
         refuse_undersampled(solved.stage, runs, left)
-    if found.failure is not None or simplified:
-        refuse_delays(undelayed)
+    if undelayed is not None and (found.failure is not None or simplified):
+        raise undelayed.refused()
     if found.failure is not None:
         raise found.failure
     gross = worst(left)
@@ -123,7 +120,7 @@ def fit_stage(
     held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
     summary = summarise(found.precision, held)
     if undelayed is not None:
-        summary = widen_for_delays(summary, undelayed)
+        summary = undelayed.widen(summary)
     outliers = fit_without_outliers(found.plan, solved)
     if outliers is not None:
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
@@ -251,3 +248,37 @@ def _report(stage: Stage, run: Run, **figures: Any) -> RunReport:
     predicted = run.displacement_um - residual_of(stage, counted)
     offset = float(np.mean((predicted - simulate_stage(stage, counted))[counted.fitted]))
     return RunReport.of(run, predicted, offset, run.start, **figures)
+
+
+def unseen_directions(information: np.ndarray, names: Sequence[str], relative: np.ndarray) -> tuple[str, ...]:
+    """Name the combinations of parameters that the data leave open, one sentence each, in the order of ignorance.
+
+    `information` is the precision of the coordinates, whatever else is unknown, shape `(p, p)`; `relative` the change
+    of each parameter's logarithm per coordinate, shape `(p,)`.
+    """
+    values, vectors = np.linalg.eigh(information)
+    sentences = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value * _UNKNOWN**2 > 1:
+            break
+        sentences.append(_sentence(vector * relative, names))
+    return tuple(sentences)
+
+
+def _sentence(direction: np.ndarray, names: Sequence[str]) -> str:
+    # A parameter at its bound does not move with its coordinate.
+    direction = np.where(np.isfinite(direction), direction, 0.0)
+    size = np.abs(direction)
+    moved = [k for k in np.argsort(-size, kind="stable") if size[k] > _FAINT * size.max()]
+    if not moved:
+        return f"some combination of {', '.join(names)} is not seen in these runs"
+    if len(moved) == 1:
+        return f"{names[moved[0]]} is not seen in these runs"
+    exponents = direction[moved] / direction[moved[0]]
+    if len(moved) == 2 and abs(abs(exponents[1]) - 1) < _WHOLE:
+        one, other = names[moved[0]], names[moved[1]]
+        # Along the direction one rises as the other falls, or with it: their product, or ratio, stays.
+        joint = f"{one} * {other}" if exponents[1] < 0 else f"{one} / {other}"
+        return f"only {joint} is seen, not each"
+    listed = f"{', '.join(names[k] for k in moved[:-1])} and {names[moved[-1]]}"
+    return f"of {listed} only {len(moved) - 1} combinations are seen, not each"

@@ -98,6 +98,11 @@ def place_of_hysteresis(stage: Stage) -> int | None:
     return places[0] if places else None
 
 
+def named_parts(stage: Stage, *kinds: type) -> list[tuple[str, Any]]:
+    """Names and parts of some kinds, in the order of the signal."""
+    return [pair for pair in zip(stage.names, stage.parts, strict=True) if isinstance(pair[1], kinds)]
+
+
 def as_stage(model: Preisach | Stage) -> Stage:
     """A model as a stage: a hysteresis alone is one of a single part."""
     return model if isinstance(model, Stage) else Stage.of(hysteresis=model)

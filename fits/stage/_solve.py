@@ -4,6 +4,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -231,6 +232,14 @@ def solve_chain(
     raise FitError(FitStatus.MAX_STEPS)
 
 
+def try_chain(problem: Problem, runs: Sequence[Run], *settings: Any, **further: Any) -> Solved | None:
+    """Fit as `solve_chain` does; None where that fails."""
+    try:
+        return solve_chain(problem, runs, *settings, **further)
+    except (FitError, np.linalg.LinAlgError):
+        return None
+
+
 def prior_precision(chain: Chain, hyper: Hyper | None, stroke_um: float) -> np.ndarray:
     """Precision of the columns before the data, in 1/um^2, shape `(D, D)`; zero where they are given."""
     if hyper is None:
@@ -280,28 +289,26 @@ def _step(
     damping: float,
 ) -> tuple[np.ndarray, np.ndarray, Hyper | None, float, float]:
     """Change of coordinates, columns, their smoothness, noise variance in um^2, and standard deviations moved."""
-    if hyper is None or chain.grid is None:
-        _, step, _ = split_moments(total, 0, damping)
-        variance = weighing.least_um**2
-        information = marginal_information(total, 0, np.zeros((0, 0)), variance)
-        return step, columns_um, hyper, variance, float(step @ information @ step / len(step)) ** 0.5
-    reduced, answer, follow = split_moments(total, chain.size, damping)
-    solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, 1.0, hyper)
-    columns = np.asarray(solution.columns) * stroke_um
-    step = answer - follow @ columns
-    variance = float(jnp.exp(solution.hyper.log_variance)) * stroke_um**2
-    if not variance > _ROUNDING * stroke_um**2:
-        # The search for the noise went astray.
-        raise FitError(FitStatus.NONFINITE)
-    prior = scale_free(prior_precision(chain, solution.hyper, stroke_um), columns)
-    information = marginal_information(total, chain.size, prior, variance)
-    return step, columns, solution.hyper, variance, float(step @ information @ step / len(step)) ** 0.5
+    columns, variance, prior = columns_um, weighing.least_um**2, None
+    size = 0 if hyper is None else chain.size
+    reduced, step, follow = split_moments(total, size, damping)
+    if hyper is not None and chain.grid is not None:
+        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, 1.0, hyper)
+        columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
+        step = step - follow @ columns
+        variance = float(jnp.exp(hyper.log_variance)) * stroke_um**2
+        if not variance > _ROUNDING * stroke_um**2:
+            # The search for the noise went astray.
+            raise FitError(FitStatus.NONFINITE)
+        prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)
+    information = marginal_information(total, size, prior, variance)
+    return step, columns, hyper, variance, float(step @ information @ step / len(step)) ** 0.5
 
 
-def marginal_information(total: Moments, size: int, prior: np.ndarray, variance: float) -> np.ndarray:
+def marginal_information(total: Moments, size: int, prior: np.ndarray | None, variance: float) -> np.ndarray:
     """Precision of the coordinates, whatever the first `size` unknowns, the columns, may be, shape `(p, p)`."""
     gram = np.asarray(total.gram) / variance
-    if size == 0:
+    if size == 0 or prior is None:
         return gram
     root = np.linalg.cholesky(gram[:size, :size] + prior)
     half = np.linalg.solve(root, gram[:size, size:])

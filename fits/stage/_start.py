@@ -11,6 +11,7 @@ from scipy import signal
 from scipy.optimize import least_squares
 
 from fits.loop._run import Run
+from fits.stage._run import named_parts
 from microid import AbstractLinear, Driver, Mechanics, Stage
 
 # Segments whose spectra are averaged.
@@ -77,20 +78,12 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
     Drivers and mechanics that are not frozen are replaced; other linear parts are taken as they are. Returns distinct
     candidates, the best first; the stage itself where the responses say nothing.
     """
-    free = [
-        (name, part)
-        for name, part in zip(stage.names, stage.parts, strict=True)
-        if isinstance(part, Driver | Mechanics) and name not in stage.frozen
-    ]
+    free = [(name, part) for name, part in named_parts(stage, Driver, Mechanics) if name not in stage.frozen]
     responses = [one for one in responses if len(one.frequency_Hz) >= _LINES]
     if not free or not responses:
         return [stage]
     moved = [name for name, _ in free]
-    fixed = [
-        part
-        for name, part in zip(stage.names, stage.parts, strict=True)
-        if isinstance(part, AbstractLinear) and name not in moved
-    ]
+    fixed = [part for name, part in named_parts(stage, AbstractLinear) if name not in moved]
     problem = _LogResponse.of(responses, [isinstance(part, Driver) for _, part in free], fixed)
     found: list[tuple[float, np.ndarray]] = []
     for x in _distinct(problem.ranked()[1][:_LEADING], _COARSE)[:_REFINED]:
@@ -105,7 +98,7 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
 
 def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) -> list[float]:
     """Order delays, the best first, by how well they and some poles explain a response; of neighbours the best."""
-    parts = [part for part in stage.parts if isinstance(part, Driver | Mechanics)]
+    parts = [part for _, part in named_parts(stage, Driver, Mechanics)]
     if not parts or len(response.frequency_Hz) < _LINES:
         return []
     problem = _LogResponse.of([response], [isinstance(part, Driver) for part in parts], [])

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,21 +10,13 @@ import numpy as np
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid
-from fits.loop._fit_checks import without_impulses
+from fits.loop._misfit import without_impulses
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, prepare_run, simulate_run
-from fits.stage._checks import (
-    UNSEEN,
-    WORTH,
-    check_gains,
-    likelihood_ratio,
-    refuse_slopes,
-    refuse_unidentifiable,
-    speed_Hz,
-)
+from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
 from fits.stage._moments import offsets_out
-from fits.stage._run import free_grid, hysteresis_of, settled_samples, simulate_stage
-from fits.stage._solve import Problem, Solved, solve_chain
+from fits.stage._run import free_grid, hysteresis_of, named_parts, settled_samples, simulate_stage
+from fits.stage._solve import Problem, Solved, solve_chain, try_chain
 from fits.stage._start import measure_response, start_stages
 from fits.stage._uncertainty import Precision
 from microid import Driver, Hold, Mechanics, Preisach, Stage
@@ -173,22 +164,16 @@ def _no_resonance(plan: Plan, name: str) -> str:
 def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence[np.ndarray]) -> Problem | None:
     """Fit hysteresis and driver together, without mechanics; None where the driver's lag does not show."""
     stage, grid = problem.stage, problem.chain.grid
-    drivers, mechanics = (
-        [n for n, p in zip(stage.names, stage.parts, strict=True) if isinstance(p, kind)]
-        for kind in (Driver, Mechanics)
-    )
+    drivers, mechanics = (named_parts(stage, kind) for kind in (Driver, Mechanics))
     if len(drivers) != 1 or len(mechanics) != 1 or grid is None or problem.hyper is None:
         return None
-    old: Any = stage[drivers[0]]
-    simple = stage.without(mechanics[0]).swap(drivers[0], Driver(jnp.asarray(_LAG * plan.interval_s), old.gain))
+    (name, old), (dropped, _) = drivers[0], mechanics[0]
+    simple = stage.without(dropped).swap(name, Driver(jnp.asarray(_LAG * plan.interval_s), old.gain))
     simpler = Problem.of(simple, grid, problem.columns_um, problem.hyper, problem.stroke_um)
-    simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, mechanics[0]),))
+    simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, dropped),))
     plan.progress("a lag without a resonance")
-    try:
-        solved = solve_chain(simpler, runs, plan.loss, plan.progress)
-    except (FitError, np.linalg.LinAlgError):
-        return None
-    if likelihood_ratio(solved, drives) < WORTH or float(np.max(Precision(solved).sd())) > UNSEEN:
+    solved = try_chain(simpler, runs, plan.loss, plan.progress)
+    if solved is None or not shows_poles(solved, drives) or float(np.max(Precision(solved).sd())) > UNSEEN:
         return None
     return solved.onward
 
@@ -227,13 +212,13 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
 def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
 
-    A command that jumps at every sample has all of the driver's answer between two: whole steps do not see it, and
-    from no time constant at all there is no way back.
+    Whole steps do not see one that answers between two samples, and from no time constant at all there is no way
+    back.
     """
     stage = solved.stage
     changed = False
-    for name, part in zip(stage.names, stage.parts, strict=True):
-        if isinstance(part, Driver) and float(part.time_constant_s) < _VANISHED * plan.interval_s:
+    for name, part in named_parts(stage, Driver):
+        if float(part.time_constant_s) < _VANISHED * plan.interval_s:
             stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_RESTARTED * plan.interval_s)))
             changed = True
     if plan.hold != "zero" or not changed:

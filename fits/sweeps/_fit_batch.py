@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from fits.loop._design import Grid, design
 from fits.loop._moments import Moments
-from fits.loop._prior import Hyper, Roughness, effective, posterior_of, renew_noise
+from fits.loop._prior import Hyper, Posterior, Roughness, effective, renew_noise
 from fits.stats._nonnegative import minimise_nonnegative
 from fits.sweeps._devices import by_rows
 from microid import Staircase
@@ -80,11 +80,11 @@ def _one(
     hyper = Hyper(weight_of, weight_of, weight_of, jnp.log(jnp.asarray(_NOISE)))
 
     def renew(_: int, hyper: Hyper) -> Hyper:
-        posterior = posterior_of(moments, rough, hyper)
+        posterior = Posterior.of(moments, rough, hyper)
         return renew_noise(moments, hyper, posterior, effective(rough, hyper, posterior))
 
     hyper = lax.fori_loop(0, _ROUNDS, renew, hyper)
-    posterior = posterior_of(moments, rough, hyper)
+    posterior = Posterior.of(moments, rough, hyper)
     scale = jnp.sqrt(jnp.diagonal(posterior.precision))
     precision, mode = posterior.precision / (scale[:, None] * scale[None, :]), posterior.mean * scale
     solution, success = minimise_nonnegative(precision, -(precision @ mode), jnp.maximum(mode, 0), _ATOL, _STEPS)
