@@ -21,9 +21,7 @@ class _Sweep(click.Group):
 
 @click.group(cls=_Sweep, invoke_without_command=True, subcommand_metavar="SWEEP.toml | show DIR [OPTIONS]")
 @click.option(
-    "--example",
-    type=click.Choice([*kinds.examples()]),
-    help="Print a commented SWEEP.toml of about 1,000 rows.",
+    "--example", type=click.Choice([*kinds.examples()]), help="Print a commented SWEEP.toml of about 1,000 rows."
 )
 @click.pass_context
 def sweep(context: click.Context, example: str | None) -> None:

@@ -17,11 +17,7 @@ INTERVAL_s = 1e-3
 UPPER_V = 120.0
 # Pair of poles and single pole of the loop in rad/s, and the filter of the derivative in s.
 _STEP = (86.0, 27.0, 1e-3)
-_TRACK = {
-    "HC+PID": (30.0, 30.0, 8e-3),
-    "HC+BP-PID": (30.0, 30.0, 8e-3),
-    "HC+CMAC-PID": (25.0, 25.0, 1e-2),
-}
+_TRACK = {"HC+PID": (30.0, 30.0, 8e-3), "HC+BP-PID": (30.0, 30.0, 8e-3), "HC+CMAC-PID": (25.0, 25.0, 1e-2)}
 # The network starts at the gains of the PID controller, and may take them this factor up and down.
 _SPAN, _NETWORK_RATE_per_um2, _NETWORK_um = 1.5, 1e-3, 20.0
 _LEVELS, _GENERALISATION, _TABLE_V = (64, 64), 32, 2.0

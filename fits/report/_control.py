@@ -13,24 +13,13 @@ from jaxtyping import Array, Float
 from fits.control._gains import printed_gains
 from fits.control._make import Loop, Made
 from fits.control._tune_result import Tuning
-from microid import (
-    ControlledRun,
-    Margins,
-    Stage,
-    Start,
-    step_metrics,
-    tracking_errors,
-)
+from microid import ControlledRun, Margins, Stage, Start, step_metrics, tracking_errors
 
 SCHEMA = "microid.control/1"
 
 
 def control_json(
-    loop: Loop,
-    made: Made,
-    run: ControlledRun,
-    about: Mapping[str, Any],
-    remarks: Sequence[str],
+    loop: Loop, made: Made, run: ControlledRun, about: Mapping[str, Any], remarks: Sequence[str]
 ) -> dict[str, Any]:
     """Gather all that is told, as JSON values; what is infinite is None.
 

@@ -45,11 +45,7 @@ class _Times(msgspec.Struct):
     samples: Annotated[int, Meta(ge=3, le=_SAMPLES, description=f"a number from 3 to {_SAMPLES:,}")] = 1000
     interval_s: Annotated[
         float,
-        Meta(
-            ge=SHORTEST_STEP_s,
-            le=_LONGEST_s,
-            description=f"a time from {SHORTEST_STEP_s:g} to {_LONGEST_s:g} s",
-        ),
+        Meta(ge=SHORTEST_STEP_s, le=_LONGEST_s, description=f"a time from {SHORTEST_STEP_s:g} to {_LONGEST_s:g} s"),
     ] = 1e-4
 
 

@@ -52,11 +52,7 @@ class _Design(msgspec.Struct):
 
 
 def read_plan(
-    table: Mapping[str, Any],
-    parameters: Sequence[Parameter],
-    repeats: int,
-    seed: int,
-    load: Callable[[str], bytes],
+    table: Mapping[str, Any], parameters: Sequence[Parameter], repeats: int, seed: int, load: Callable[[str], bytes]
 ) -> Plan:
     """Read `[[axis]]`, `[design]` and `[list]` of a sweep.
 

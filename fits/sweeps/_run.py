@@ -115,11 +115,7 @@ def run_sweep(
 
 
 def _computed(
-    sweep: Sweep,
-    chunks: list[int],
-    client: Any,
-    tell: Callable[[int], None],
-    progress: Callable[[str], None],
+    sweep: Sweep, chunks: list[int], client: Any, tell: Callable[[int], None], progress: Callable[[str], None]
 ) -> Iterator[tuple[int, Rows]]:
     """Chunks as they come."""
     if client is None:

@@ -14,15 +14,7 @@ from fits.sweeps._devices import block_rows, by_rows, in_turn, place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, stage_parameters, varied
 from fits.sweeps._types import AbstractJob, Block, Facts, Output, Request, Rows
-from microid import (
-    AbstractLinear,
-    Preisach,
-    Stage,
-    Start,
-    margins,
-    simulate_loop,
-    step_metrics,
-)
+from microid import AbstractLinear, Preisach, Stage, Start, margins, simulate_loop, step_metrics
 
 KEYS = ("model", "initial", "reference", "controller")
 _OUTPUTS = (
