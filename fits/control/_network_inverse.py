@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
@@ -116,7 +116,7 @@ def fit_network_inverse(
             f"{record.source}: expected {_FEWEST} samples or more in which voltage and displacement move, found "
             f"{len(record)}; give a longer record."
         )
-    network = _network(2 + extremes, width, depth, jax.random.key(seed))
+    network = _network(2 + extremes, "scalar", width, depth, activation=jnp.tanh, key=jax.random.key(seed))
     middle, half = (voltage.max() + voltage.min()) / 2, np.ptp(voltage) / 2
     lowest, span, dead = (jnp.asarray(x) for x in (displacement.min(), np.ptp(displacement), 4.0 * noise_um))
     inverse = NetworkInverse(network, lowest, span, jnp.asarray(middle), jnp.asarray(half), dead, extremes)
@@ -126,14 +126,8 @@ def fit_network_inverse(
     return eqx.tree_at(lambda inverse: inverse.network, inverse, trained)
 
 
-@eqx.filter_jit
-def _network(inputs: int, width: int, depth: int, key: PRNGKeyArray) -> eqx.nn.MLP:
-    return eqx.nn.MLP(inputs, "scalar", width, depth, activation=jnp.tanh, key=key)
-
-
-@eqx.filter_jit
-def _features(inverse: NetworkInverse, displacement_um: Float[Array, " n"]) -> Float[Array, "n k"]:
-    return inverse.features(displacement_um)
+_network = eqx.filter_jit(eqx.nn.MLP)
+_features = eqx.filter_jit(lambda inverse, displacement_um: inverse.features(displacement_um))
 
 
 @eqx.filter_jit

@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from fits.control._tune_problem import Figures, Goal, overshoot_pct
@@ -13,6 +14,8 @@ from microid import AbstractController, ControlledRun, Margins
 _Controller = TypeVar("_Controller", bound=AbstractController)
 # Tuning keeps limits to a share of 2e-3.
 _TOLERANCE = 3e-3
+# Figures of which a report has the largest of all references.
+_HIGHEST = ("error_max_um", "overshoot_pct", "command_max_V")
 
 
 @dataclass(frozen=True)
@@ -76,24 +79,13 @@ class Tuning(Generic[_Controller]):
 
 def reports(found: Figures) -> tuple[LoopReport, ...]:
     """One report per plant."""
-
-    def worst(values: Any, plant: int) -> float:
-        return float(np.max(np.asarray(values)[plant]))
-
     out = []
     for k in range(found.error_um2.shape[0]):
-        one = jax.tree.map(lambda leaf, k=k: leaf[k], found.margins)
-        out.append(
-            LoopReport(
-                one,
-                worst(found.error_um2, k) ** 0.5,
-                worst(found.error_max_um, k),
-                worst(found.overshoot_pct, k),
-                float(np.min(np.asarray(found.command_min_V)[k])),
-                worst(found.command_max_V, k),
-                worst(found.command_step_V, k),
-            )
-        )
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], found)
+        highest = {name: float(jnp.max(getattr(one, name))) for name in _HIGHEST}
+        rms, lowest = float(jnp.max(one.error_um2)) ** 0.5, float(jnp.min(one.command_min_V))
+        step = float(jnp.max(one.command_step_V))
+        out.append(LoopReport(one.margins, rms, command_min_V=lowest, command_step_max_V=step, **highest))
     return tuple(out)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 from fits.io._printable import plain
 from fits.machining._budget import AxisBudget, Budget
 from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport
+from fits.report._json import columns
 
 _TOTALS = ("signed", "worst_case", "root_sum_square")
 
@@ -73,7 +74,7 @@ def _table(axes: Sequence[AxisSensitivity], level: int, voltage: bool) -> list[s
     lines = [
         f"{title}: {axis.gain:.6g} {axis.gain_unit}, {axis.stroke:.5g} {unit} at {axis.loaded_stroke_um:.4g} um of "
         f"the loaded piezo, level {level}",
-        *_columns(rows),
+        *(f"  {row}" for row in columns(rows, ">")),
         f"  root sum of squares {axis.rss_pct:.2f} %, worst case {axis.worst_case_pct:.2f} %",
     ]
     if voltage:
@@ -128,10 +129,10 @@ def describe_budget(found: Budget) -> str:
         + (", zeroed at rest" if found.zeroed else " and its offset")
         + (f", at {found.arm_mm:g} mm from the axes of rotation" if found.arm_mm else ""),
         "",
-        *_columns([("", *parts), *map(_row, axes)]),
+        *(f"  {row}" for row in columns([("", *parts), *map(_row, axes)], ">")),
         "",
         "shares of the squares in rss:",
-        *_columns([("", "driving", "machining", "measuring"), *shares]),
+        *(f"  {row}" for row in columns([("", "driving", "machining", "measuring"), *shares], ">")),
         "",
         "driving: the largest of a full loop, with its sign; machining: worst case over the tolerances at a fixed "
         "elongation, and at a fixed voltage",
@@ -156,10 +157,3 @@ def _row(axis: AxisBudget) -> tuple[str, ...]:
         plain(axis.root_sum_square, 3),
         f"{100 * axis.root_sum_square / axis.stroke:.2f}",
     )
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align cells, the first of a row to the left and all others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    sides = ["<", *">" * (len(widths) - 1)]
-    return ["  " + "  ".join(f"{c:{s}{w}}" for c, s, w in zip(row, sides, widths, strict=True)) for row in rows]
