@@ -25,13 +25,7 @@ _AGAIN_s = 0.05
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal that asks the command to end; what cleans up after Ctrl-C does so after this.
-
-    Attributes
-    ----------
-    number
-        Of the signal.
-    """
+    """A signal, by its number, that asks the command to end; what cleans up after Ctrl-C does so after this."""
 
     def __init__(self, number: int):
         super().__init__()

@@ -149,11 +149,10 @@ class Maker:
     progress: Callable[[str], None]
 
     def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
-        """Make a controller by the name of its kind, with its tuning and what is to be said of it.
+        """Make a controller by the name of its kind, and tune it if no gains are given.
 
-        It is tuned if no gains are given. Frequencies are those of resonators; without them those that are given, or
-        the strongest in the reference. A `DataError` says that reference or gains do not suit the controller; of a
-        `FitError` see `tune_controller`.
+        Frequencies are those of resonators; without them those of the gains, or the strongest in the reference. A
+        `DataError` says that reference or gains do not suit the controller; of a `FitError` see `tune_controller`.
         """
         loop, kind = self.loop, CONTROLLERS[name]
         tuning: Tuning[Any] | None = None

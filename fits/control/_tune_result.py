@@ -22,16 +22,8 @@ _HIGHEST = ("error_max_um", "overshoot_pct", "command_max_V")
 class LoopReport:
     """One plant under a tuned controller; figures of several references are the worst.
 
-    Attributes
-    ----------
-    margins
-        Of the linearised loop; the hysteresis stands at its steepest slope.
-    error_rms_um, error_max_um
-        Over the samples that count.
-    overshoot_pct
-        See `Goal`.
-    command_min_V, command_max_V, command_step_max_V
-        Range of the command, and its largest change between samples.
+    The margins are those of the linearised loop, where the hysteresis is steepest; errors are over the samples that
+    count; see `Goal` for the overshoot, and `command_step_max_V` is the largest change between samples.
     """
 
     margins: Margins

@@ -56,17 +56,8 @@ class Claim:
 def paper_claims(design: Design) -> tuple[Claim, ...]:
     """Judge all that the paper says of its Fig. 7 by the derivatives of a design.
 
-    The paper gives no tolerance for angles (erratum 9), so its lengths are compared with lengths.
-
-    Parameters
-    ----------
-    design
-        The paper's, or another.
-
-    Raises
-    ------
-    DataError, RuntimeError
-        See `sensitivities`.
+    The paper gives no tolerance for angles (erratum 9), so its lengths are compared with lengths. Errors are those of
+    `sensitivities`.
     """
     report = sensitivities(design, _AXES)
     x, z, alpha, gamma = (report[axis] for axis in _AXES)
@@ -103,17 +94,8 @@ def sign_change_guides(design: Design) -> float | None:
     """Number of guiding legs at which the output in x no longer depends on `t1`, to first order.
 
     A thicker hinge lowers the unloaded ratio of the bridge and raises the stiffness of its output, on which the
-    guides are a load. With few guides the first wins, with many the second.
-
-    Parameters
-    ----------
-    design
-        Its own number of guides plays no role.
-
-    Returns
-    -------
-    float or None
-        None where no number does that.
+    guides are a load. With few guides the first wins, with many the second. None where no number does that; the
+    design's own number of guides plays no role.
     """
     guides = float(_sign_change(design.geometry, design.constants))
     return guides if np.isfinite(guides) and guides > 0 else None

@@ -128,17 +128,10 @@ class SensitivityReport:
 
 
 def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> SensitivityReport:
-    """Differentiate the motion of a stage with respect to its dimensions.
+    """Differentiate the motion of a stage with respect to its dimensions, for all axes by default.
 
     The derivatives are those of the implicit motion functions (Eq. 4, with the inverse that the paper leaves out,
     erratum 6).
-
-    Parameters
-    ----------
-    design
-        Dimensions, tolerances and constants.
-    axes
-        Which; all by default.
 
     Raises
     ------

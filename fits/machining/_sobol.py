@@ -109,12 +109,9 @@ def outputs_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Evaluate a function of points in the unit cube, shape `(samples, count)`, where the indices need it.
 
-    Returns
-    -------
-    tuple
-        Outputs at two independent sets of points of a scrambled Sobol sequence, each of shape `(samples,)`, and at
-        the first with one coordinate after the other taken from the second, shape `(count, samples)`. The mean is
-        taken out.
+    Outputs at two independent sets of points of a scrambled Sobol sequence come back, each of shape `(samples,)`, and
+    at the first with one coordinate after the other taken from the second, shape `(count, samples)`; less the mean of
+    the first two.
     """
     first, second = np.hsplit(stats.qmc.Sobol(2 * count, seed=seed, bits=64).random(samples), 2)
     both = [function(first), function(second)]

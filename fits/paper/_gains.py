@@ -38,11 +38,8 @@ def placed_pid(mode: PaperMode, pair_rad_per_s: float, single_rad_per_s: float, 
 
     The loop's polynomial `s³ + (2 zeta w + g w² Kd) s² + w² (1 + g Kp) s + g w² Ki` becomes `(s + p)² (s + q)`, with
     p and q the places of the pair and of the single pole, but for the driver, the sampling and the filter of the
-    derivative, whose time constant is `filter_s`.
-
-    For a step, of which the feedforward already makes one, the weights of the reference are such that the answer is
-    that of `p² / (s + p)²`, which does not overshoot. Otherwise they are 1, and what moves slowly is followed without
-    lag.
+    derivative. For a step, of which the feedforward already makes one, the weights of the reference are such that the
+    answer is that of `p² / (s + p)²`, which does not overshoot; otherwise they are 1, for tracking without lag.
     """
     w, zeta, g = mode.natural_rad_per_s, mode.damping_ratio, mode.gain_um_per_V
     p, q = pair_rad_per_s, single_rad_per_s

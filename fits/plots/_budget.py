@@ -13,19 +13,9 @@ _PARTS = {"driving": "0.3", "machining": "0.65", "measuring": "0.95"}
 
 
 def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw the parts of the worst case of each axis in percent of its stroke, and the root sum of squares, in a file.
+    """Draw the parts of the worst case of each axis in percent of its stroke, and the root sum of squares.
 
-    Parameters
-    ----------
-    found
-        From `budget`.
-    folder
-        Existing folder for `budget.png`; 200 dots per inch.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
+    `budget.png` is written into an existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
     """
     axes = list(found.axes.values())
     places = range(len(axes))

@@ -25,23 +25,11 @@ def plot_compensation(
     """Draw the loop, the inverse loop, the compensated output against its reference, and the error.
 
     The loop is that of the uncompensated stage: the model driven by the straight line through the compensating
-    voltage over its reference. The error is that of the model, with the band in which the stage is expected.
+    voltage over its reference. The error is that of the model, with the band in which the stage is expected, by the
+    standard deviation of the displacement from `predict`, shape `(n,)`; without one no band is drawn.
 
-    Parameters
-    ----------
-    model, reference, initial
-        What `compensate` was given.
-    compensation
-        From `compensate`.
-    displacement_sd_um
-        Standard deviation of the model's displacement, shape `(n,)`, from `predict`; no band is drawn if None.
-    folder
-        Existing folder for `compensation.png`; 200 dots per inch. The paths come back.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
+    Model, reference and initial memory are those that `compensate` was given. `compensation.png` is written into an
+    existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
     """
     wanted, voltage, reached = compensation.reference_um, compensation.voltage_V, compensation.displacement_um
     straight_V = _straight(wanted, voltage)

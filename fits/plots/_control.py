@@ -25,21 +25,9 @@ def plot_control(
 ) -> list[Path]:
     """Draw a run, and the loop gain and sensitivity of every plant.
 
-    Parameters
-    ----------
-    run
-        From `microid.simulate_loop`.
-    controller, delay
-        As they were given there.
-    plants
-        Stages that the controller is to work with, the one that was run first.
-    folder
-        Existing folder for `run.png` and `margins.png`; 200 dots per inch. The paths come back.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
+    The run is from `microid.simulate_loop`, the controller and its delay in samples as they were given there; the
+    first plant is the one that was run. `run.png` and `margins.png` are written into an existing folder, at 200 dots
+    per inch; a `DataError` says if they cannot be.
     """
     time_s = np.asarray(run.time_s)
     picture = figure(WIDE_in, 5.2)

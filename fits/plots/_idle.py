@@ -14,21 +14,10 @@ _MOST_LINES = 5
 
 
 def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation, in a file.
+    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
 
-    Parameters
-    ----------
-    reference
-        What `idle_noise` was given.
-    noise
-        From `idle_noise`.
-    folder
-        Existing folder for `idle.png`; 200 dots per inch.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
+    The noise is that of the record, from `idle_noise`. `idle.png` is written into an existing folder, at 200 dots per
+    inch; a `DataError` says if it cannot be.
     """
     picture = figure(WIDE_in, 4.8, gap=0.08)
     grid = picture.add_gridspec(2, 8)

@@ -33,22 +33,9 @@ def plot_fit(
 ) -> list[Path]:
     """Draw a fit: loops, density, Everett surface and, where something was held out, its prediction.
 
-    Parameters
-    ----------
-    result
-        From `fit`.
-    records, holdout, initial
-        What `fit` was given.
-    folder
-        Existing folder for `loops.png`, `density.png`, `everett.png` and `heldout.png`; 200 dots per inch. The paths
-        come back.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
-    ValueError
-        If the records are not those of the result.
+    Records, holdout and initial memory are those that `fit` was given; a ValueError says that they are not those of
+    the result. `loops.png`, `density.png`, `everett.png` and `heldout.png` are written into an existing folder, at
+    200 dots per inch; a `DataError` says if they cannot be.
     """
     fraction, aside = held_out(holdout, len(records), len(result.runs))
     range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)

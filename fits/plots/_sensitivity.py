@@ -54,19 +54,9 @@ class _Panel:
 def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os.PathLike[str]) -> list[Path]:
     """Draw which dimensions matter, and the output error over the machining error of each (Fig. 7).
 
-    Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel.
-
-    Parameters
-    ----------
-    design, report
-        What `sensitivities` was given, and what it found.
-    folder
-        Existing folder for `tornado.png` and `machining_error.png`; 200 dots per inch.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
+    Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel. The
+    report is that of the design, from `sensitivities`. `tornado.png` and `machining_error.png` are written into an
+    existing folder, at 200 dots per inch; a `DataError` says if they cannot be.
     """
     panels = _panels(design, report)
     claims = paper_claims(design) if _is_the_papers(design) else ()

@@ -37,22 +37,10 @@ def plot_stage(
 ) -> list[Path]:
     """Draw the fit of a stage: frequency response, runs with their residuals, and the loop of the slowest run.
 
-    Parameters
-    ----------
-    result
-        From `fit_stage`.
-    records, holdout, initial
-        What `fit_stage` was given.
-    folder
-        Existing folder for `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
-        out) and `loop.png`; 200 dots per inch. The paths come back.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
-    ValueError
-        If the records are not those of the result.
+    Records, holdout and initial memory are those that `fit_stage` was given; a ValueError says that they are not
+    those of the result. `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
+    out) and `loop.png` are written into an existing folder, at 200 dots per inch; a `DataError` says if they cannot
+    be.
     """
     fraction, aside = held_out(holdout, len(records), len(result.runs))
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)

@@ -27,17 +27,9 @@ _KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexp
 
 
 def report_html(diagnosis: Diagnosis) -> str:
-    """Write a diagnosis as a page for people: on a screen, a phone or paper.
+    """Write a diagnosis as an HTML page for people, on a screen, a phone or paper, with style and pictures in it.
 
-    Parameters
-    ----------
-    diagnosis
-        From `diagnose`.
-
-    Returns
-    -------
-    str
-        HTML, with style and pictures in it. The same diagnosis gives the same text.
+    The same diagnosis gives the same text.
     """
     length, causes, ahead = Lengths(diagnosis), diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]

@@ -20,18 +20,9 @@ def diagnosis_schema() -> dict[str, Any]:
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Turn a diagnosis into values that strict JSON can hold.
+    """Turn a diagnosis into values that strict JSON can hold, as `diagnosis_schema` describes them.
 
-    Parameters
-    ----------
-    diagnosis
-        From `diagnose`.
-
-    Returns
-    -------
-    dict
-        As `diagnosis_schema` describes it; a number that is not known is None. The samples of the runs and of the
-        next program are not in it.
+    A number that is not known is None. The samples of the runs and of the next program are left out.
     """
     ahead = diagnosis.next_experiment
     noise = ("false_alarm", "noise_um", "noise_source", "noise_samples")

@@ -24,12 +24,9 @@ _OF_FITTED = ("noise_um", "correlation_samples", "substeps")
 
 
 def fit_report(result: FitResult[Any]) -> dict[str, Any]:
-    """Put what is known of a fit into JSON values.
+    """Put what is known of a fit into JSON values, which a model file keeps under `fit`.
 
-    Returns
-    -------
-    dict
-        What a model file keeps under `fit`. Errors and limits that do not exist are None.
+    Errors and limits that do not exist are None.
     """
     model = result.model
     law: Any = model

@@ -40,12 +40,7 @@ def _effect_json(effect: DimensionEffect, output_unit: str) -> dict[str, Any]:
 def describe_sensitivity(report: SensitivityReport, voltage: bool = False) -> str:
     """Put sensitivities into tables, one for each axis or two that are alike, without a newline at the end.
 
-    Parameters
-    ----------
-    report
-        From `sensitivities`.
-    voltage
-        Whether to add the relative changes at a fixed voltage.
+    With `voltage`, the relative changes at a fixed voltage are added.
     """
     note = (
         "at plus one tolerance and a fixed elongation of the piezo; per 10 um of the dimension, at full stroke; "

@@ -40,8 +40,8 @@ class Controllers(eqx.Module):
     """Controllers of one kind that differ in some numbers, whose names in the sweep begin with `controller.`.
 
     What is found by the stage or the reference is found for the nominal ones: those differ from row to row, and the
-    controller does not know of it. `numbers` are those of a row where they do not vary, without what the controller
-    finds by the nominal plant; that is None where it needs to find nothing. Readings are late by `delay` samples.
+    controller does not know of it. `numbers` are those that do not vary; the plant is None where nothing is to be
+    found by it. Readings are late by `delay` samples.
     """
 
     kind: type[AbstractController] = eqx.field(static=True)

@@ -41,12 +41,10 @@ def place(rows: Any) -> Any:
 
 
 def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Jit a function of rows. Where its rows are on several devices, each runs it for its own ones.
-
-    Nothing goes from device to device: each does for its block what it would do with that block alone.
+    """Compile a function of rows; where these are on several devices, each runs it for its own, with no exchange.
 
     `own` names the arguments whose arrays have the rows along their first axis, as all results have. Other arrays
-    belong to all rows. What the decorator makes takes arguments by place.
+    belong to all rows. Arguments are taken by place.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -78,12 +76,10 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
-    """Call a function for block after block on one CPU.
+    """Call a function for block after block on one CPU; arguments and results have the rows along their first axis.
 
-    For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads
-    of several CPU devices that factor many matrices at once wait for each other for ever.
-
-    The arguments have the rows of all blocks along their first axis, and so have the results.
+    For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads of
+    several CPU devices that factor many matrices at once wait for each other for ever.
     """
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         count = _shares(rows)

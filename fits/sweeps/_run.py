@@ -67,10 +67,8 @@ def run_sweep(
 
     Parameters
     ----------
-    sweep
-        From `read_sweep`.
-    out
-        Folder for the results.
+    sweep, out
+        From `read_sweep`, and the folder for the results.
     resume
         Go on with the sweep that is in the folder.
     cluster
@@ -81,8 +79,8 @@ def run_sweep(
     Raises
     ------
     DataError
-        If the folder, the disk or the cluster does not allow it; the sentence says what to do. Rows that fail do
-        not raise: they are kept with their reason.
+        If the folder, the disk or the cluster does not allow it. Rows that fail do not raise: they are kept with the
+        reason.
     RuntimeError
         If JAX computes in single precision.
     """

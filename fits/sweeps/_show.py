@@ -17,22 +17,10 @@ SCHEMA = "microid.sweep.summary/1"
 
 
 def open_sweep(folder: str | os.PathLike[str]) -> Any:
-    """Open the results of a sweep, finished or not.
+    """Open the results of a sweep, finished or not, as an `xarray.Dataset` along `row`.
 
-    Parameters
-    ----------
-    folder
-        What the sweep was given by `--out`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Along `row`; swept parameters are coordinates. Rows that are not there yet are NaN with a status of 0.
-
-    Raises
-    ------
-    DataError
-        If the folder holds no sweep or a broken one, or xarray and zarr are not installed.
+    Swept parameters are coordinates. Rows that are not there yet are NaN with a status of 0. A `DataError` says that
+    the folder holds no sweep or a broken one, or that xarray and zarr are not installed.
     """
     about_of(folder)
     need("zarr")

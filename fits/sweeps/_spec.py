@@ -35,22 +35,9 @@ class _Run(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that can run.
+    """A sweep that can run: its TOML and where that is from, the files it names, its rows and what is done with each.
 
-    Attributes
-    ----------
-    text, name
-        The TOML, and where it is from.
-    inputs
-        Contents of the files it names.
-    kind, seed
-        As stated.
-    plan, job, facts
-        Its rows, and what is done with each.
-    memory_MB, chunk_rows
-        What a chunk may take, and the rows of one if they are stated.
-    folder
-        Where its sources are.
+    `memory_MB` is what a chunk may take, `chunk_rows` its rows if they are stated; sources are in `folder`.
     """
 
     text: str

@@ -120,10 +120,9 @@ class Rows:
 class Facts:
     """What is known of a job before it runs: all that may be varied, and all that comes out.
 
-    So many rows as there are in a block are computed together by one device. A row's numbers may depend on its place
-    in the block, and on nothing else of the rows beside it; rows that go `alone` are on one device whatever the
-    number of devices. Sources are names of the rows there are by themselves, such as files; without them only the
-    axes make rows. Coordinates are values along the outputs' own axes: name to axis, unit and values.
+    A block of rows is computed together by one device. A row's numbers may depend on its place in the block, and on
+    nothing else of the rows beside it; rows that go `alone` are on one device. Sources, such as files, are rows by
+    themselves. Coordinates are values along the outputs' own axes: name to axis, unit and values.
     """
 
     parameters: tuple[Parameter, ...]
