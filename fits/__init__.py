@@ -62,21 +62,21 @@ if TYPE_CHECKING:
     from fits.machining._idle import read_idle as read_idle
     from fits.machining._monte_carlo import AxisSpread as AxisSpread
     from fits.machining._monte_carlo import MonteCarlo as MonteCarlo
+    from fits.machining._monte_carlo import SecondOrder as SecondOrder
     from fits.machining._monte_carlo import monte_carlo as monte_carlo
-    from fits.machining._second_order import SecondOrder as SecondOrder
-    from fits.machining._second_order import second_order as second_order
+    from fits.machining._monte_carlo import second_order as second_order
     from fits.machining._sensitivity import AxisSensitivity as AxisSensitivity
     from fits.machining._sensitivity import DimensionEffect as DimensionEffect
     from fits.machining._sensitivity import SensitivityReport as SensitivityReport
     from fits.machining._sensitivity import sensitivities as sensitivities
     from fits.machining._sobol import SobolIndices as SobolIndices
     from fits.machining._sobol import sobol as sobol
-    from fits.plots._budget import plot_budget as plot_budget
-    from fits.plots._compensation import plot_compensation as plot_compensation
+    from fits.plots._control import plot_compensation as plot_compensation
     from fits.plots._control import plot_control as plot_control
     from fits.plots._idle import plot_idle as plot_idle
     from fits.plots._loop import plot_fit as plot_fit
-    from fits.plots._sensitivity import plot_sensitivity as plot_sensitivity
+    from fits.plots._machining import plot_budget as plot_budget
+    from fits.plots._machining import plot_sensitivity as plot_sensitivity
     from fits.plots._stage import plot_stage as plot_stage
     from fits.plots._sweep import plot_sweep as plot_sweep
     from fits.report._diagnosis import report_html as report_html
@@ -166,7 +166,7 @@ _HOMES = {
     "Reference": "io._record",
     "ResponseData": "stage._frequency",
     "RunReport": "loop._result",
-    "SecondOrder": "machining._second_order",
+    "SecondOrder": "machining._monte_carlo",
     "SensitivityReport": "machining._sensitivity",
     "SobolIndices": "machining._sobol",
     "StageUncertainty": "stage._uncertainty",
@@ -204,12 +204,12 @@ _HOMES = {
     "paper_claims": "machining._claims",
     "paper_design": "machining._design",
     "open_sweep": "sweeps._show",
-    "plot_budget": "plots._budget",
-    "plot_compensation": "plots._compensation",
+    "plot_budget": "plots._machining",
+    "plot_compensation": "plots._control",
     "plot_control": "plots._control",
     "plot_fit": "plots._loop",
     "plot_idle": "plots._idle",
-    "plot_sensitivity": "plots._sensitivity",
+    "plot_sensitivity": "plots._machining",
     "plot_stage": "plots._stage",
     "plot_sweep": "plots._sweep",
     "predict": "stage._predict",
@@ -228,7 +228,7 @@ _HOMES = {
     "run_sweep": "sweeps._run",
     "sample_posterior": "stage._posterior",
     "save_model": "stage._model_file",
-    "second_order": "machining._second_order",
+    "second_order": "machining._monte_carlo",
     "sensitivities": "machining._sensitivity",
     "sensitivity_json": "report._machining",
     "sign_change_guides": "machining._claims",

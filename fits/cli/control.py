@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import paths_in, progress_to_stderr, refuse_overwriting
+from fits.cli._common import Given, in_sentences, paths_in, progress_to_stderr, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 

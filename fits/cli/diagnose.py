@@ -12,8 +12,15 @@ import click
 if TYPE_CHECKING:
     from fits.diagnosis._result import Diagnosis, EffectParameter
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import bar_to_stderr, fraction_or_files, paths_in, print_result, refuse_overwriting
+from fits.cli._common import (
+    Given,
+    bar_to_stderr,
+    fraction_or_files,
+    in_sentences,
+    paths_in,
+    print_result,
+    refuse_overwriting,
+)
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 

@@ -16,12 +16,12 @@ from fits.machining._design import paper_design
 from fits.machining._idle import idle_noise
 from fits.machining._sensitivity import sensitivities
 from fits.paper._gains import INTERVAL_s
-from fits.paper._loop import PaperRun
 from fits.paper._runs import (
     LEVELS,
     TRAINING_RUNS,
     Identified,
     LEAD_s,
+    PaperRun,
     PaperStand,
     compensated,
     identify,
@@ -29,8 +29,8 @@ from fits.paper._runs import (
 )
 from fits.paper._tables import AXIS_TITLES, PAPER, Measured, PaperResult, paper_json, paper_page, render
 from fits.plots._idle import plot_idle
+from fits.plots._machining import plot_sensitivity
 from fits.plots._paper import plot_inverse, plot_loop, plot_steps, plot_tracking
-from fits.plots._sensitivity import plot_sensitivity
 from fits.stats._metrics import errors, loop_width_pct
 from microid.control import step_metrics, tracking_errors
 

@@ -18,8 +18,7 @@ from fits.io._record import Reference
 from fits.io._typed import nearest
 from fits.sweeps._programs import Program
 from fits.sweeps._stages import memory_before, range_of
-from fits.sweeps._toml import number
-from fits.sweeps._types import FloatArray, Parameter, check_plain
+from fits.sweeps._types import FloatArray, Parameter, check_plain, number
 from microid import (
     CONTROLLERS,
     PID,

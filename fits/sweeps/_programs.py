@@ -20,8 +20,7 @@ from fits.io._table import open_table
 from fits.io._typed import check_keys, typed
 from fits.io._units import recognise
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._toml import in_a_file, number
-from fits.sweeps._types import Block, FloatArray, Parameter
+from fits.sweeps._types import Block, FloatArray, Parameter, in_a_file, number
 
 # Parameters of each shape beside offset and amplitude.
 SHAPES: dict[str, tuple[str, ...]] = {

@@ -14,8 +14,7 @@ from msgspec import Meta
 from fits.io._errors import DataError, shown
 from fits.io._typed import typed
 from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
-from fits.sweeps._toml import number
-from fits.sweeps._types import Parameter, check_plain, code_of
+from fits.sweeps._types import Parameter, check_plain, code_of, number
 
 _PREFIXES = {"k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
 _BASES = ("s", "V", "m", "Hz", "Pa", "rad")

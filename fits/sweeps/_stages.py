@@ -13,8 +13,7 @@ from fits.control._tune import parameter_values
 from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
 from fits.sweeps._devices import by_rows
-from fits.sweeps._toml import in_a_file
-from fits.sweeps._types import Parameter, Request
+from fits.sweeps._types import Parameter, Request, in_a_file
 from microid import (
     Driver,
     GridDensity,

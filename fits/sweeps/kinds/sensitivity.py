@@ -18,8 +18,7 @@ from fits.machining._design import Design, paper_design
 from fits.machining._design_file import read_design
 from fits.machining._sensitivity import SHORT_um
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._toml import in_a_file
-from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows
+from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows, in_a_file
 
 _Tree = TypeVar("_Tree", m.Geometry, m.Actuation)
 KEYS = ("stage", "sensitivity")
