@@ -1,5 +1,6 @@
 """The job `fit`: loop fits of many records, in one batch or one by one."""
 
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
@@ -54,46 +55,50 @@ class _Options(msgspec.Struct):
     smoothness: Annotated[float, Meta(ge=1e-12, le=1e6, description="a weight from 1e-12 to 1e6")] = 0.01
 
 
+@dataclass(frozen=True, eq=False)
 class FitJob(AbstractJob):
-    """Fits of a Preisach operator."""
+    """Fits of a Preisach operator: records, options of all rows, and the memory before each, of `INITIAL_STATES`."""
 
-    def __init__(self, records: Files | Simulated, options: _Options, initial: str):
-        """Take the records, the options of all rows, and the memory before each record, one of `INITIAL_STATES`."""
-        self._records, self._options, self._initial = records, options, initial
-        self._batch = options.method == "batch"
+    records: Files | Simulated
+    options: _Options
+    initial: str
+
+    @property
+    def _batch(self) -> bool:
+        return self.options.method == "batch"
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
         outputs = list(_OUTPUTS)
-        if self._options.weights:
-            size = len(_packed(self._options.levels or 0)[0])
+        if self.options.weights:
+            size = len(_packed(self.options.levels or 0)[0])
             outputs.append(Output("weights_um", "um", "weights of Eq. 9, packed row by row", (("weight", size),)))
-        levels = float(self._options.levels or _DEFAULT_LEVELS)
+        levels = float(self.options.levels or _DEFAULT_LEVELS)
         parameters: tuple[Parameter, ...] = (
-            *self._records.parameters,
-            Parameter("fit.holdout", "1", self._options.holdout, 0.0, 0.9),
-            choice("fit.initial", INITIAL_STATES, self._initial),
+            *self.records.parameters,
+            Parameter("fit.holdout", "1", self.options.holdout, 0.0, 0.9),
+            choice("fit.initial", INITIAL_STATES, self.initial),
         )
-        if not self._options.weights:
+        if not self.options.weights:
             # Rows of other levels have other weights.
             parameters += (Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),)
         if self._batch:
-            parameters += (Parameter("fit.smoothness", "1", self._options.smoothness, 1e-12, 1e6),)
+            parameters += (Parameter("fit.smoothness", "1", self.options.smoothness, 1e-12, 1e6),)
         block = _BLOCK if self._batch else 1
-        return Facts(parameters, tuple(outputs), block, self._records.sources, alone=not self._batch)
+        return Facts(parameters, tuple(outputs), block, self.records.sources, alone=not self._batch)
 
     def compute(self, block: Block) -> Rows:
         """Fit the records of some blocks; see `AbstractJob.compute`."""
-        records, holdout = self._records.records(block), block.numbers("fit.holdout", self._options.holdout)
-        initial = block.words("fit.initial", INITIAL_STATES, self._initial)
+        records, holdout = self.records.records(block), block.numbers("fit.holdout", self.options.holdout)
+        initial = block.words("fit.initial", INITIAL_STATES, self.initial)
         if self._batch:
-            levels = block.numbers("fit.levels", self._options.levels or _DEFAULT_LEVELS).astype(int)
+            levels = block.numbers("fit.levels", self.options.levels or _DEFAULT_LEVELS).astype(int)
             return self._together(
-                records, holdout, initial, levels, block.numbers("fit.smoothness", self._options.smoothness)
+                records, holdout, initial, levels, block.numbers("fit.smoothness", self.options.smoothness)
             )
         swept = block.values.get("fit.levels")
-        numbers = [self._options.levels] * len(records) if swept is None else swept.astype(int).tolist()
+        numbers = [self.options.levels] * len(records) if swept is None else swept.astype(int).tolist()
         found = [_alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
         return Rows.one_by_one(self.facts.outputs, found)
 
@@ -105,7 +110,7 @@ class FitJob(AbstractJob):
         levels: NDArray[np.int64],
         smoothness: FloatArray,
     ) -> Rows:
-        count, samples = len(records), self._options.samples
+        count, samples = len(records), self.options.samples
         voltage, displacement = np.zeros((count, samples)), np.zeros((count, samples))
         fitted, known = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
         limits, extremes, used = np.tile([0.0, 1.0], (count, 1)), np.zeros((count, _PLACES)), np.ones(count, "i4")
@@ -130,7 +135,7 @@ class FitJob(AbstractJob):
         # The whole block on each number of levels there is in it, of which every row takes its own: what is found
         # for a row depends on its place in the block, and not on what the rows beside it ask for.
         found = {number: _fitted(number, rows) for number in np.unique(levels).tolist()}
-        names = [name for name in found[int(levels[0])] if name != "weights_um" or self._options.weights]
+        names = [name for name in found[int(levels[0])] if name != "weights_um" or self.options.weights]
         outputs = {name: np.array([found[n][name][k] for k, n in enumerate(levels.tolist())]) for name in names}
         predicted, success = outputs.pop("predicted_um"), outputs.pop("success")
         for start_name, samples_of in (("", fitted > 0), ("heldout_", known & (fitted == 0))):
@@ -143,8 +148,8 @@ class FitJob(AbstractJob):
         return Rows(outputs, tuple(reasons))
 
     def _why_not(self, record: Record) -> str:
-        if len(record) > self._options.samples:
-            return f"the record has {len(record)} samples; raise fit.samples, which is {self._options.samples}"
+        if len(record) > self.options.samples:
+            return f"the record has {len(record)} samples; raise fit.samples, which is {self.options.samples}"
         if record.displacement_um is None or np.ptp(record.displacement_um) == 0 or np.ptp(record.voltage_V) == 0:
             return "nothing moves in the record"
         return ""
