@@ -171,7 +171,10 @@ class Maker:
             which = "margins are" if tuning is None else "what was tuned, and margins, are"
             said.append(f"{which} those of its PID controller, before it learns")
         stated = {"seed": self.seed} | own
-        numbers, more = with_defaults(own_settings(kind), stated, self._task(), lambda each: _option(name, each))
+        places = {"frequency_Hz": "--frequency"}
+        numbers, more = with_defaults(
+            own_settings(kind), stated, self._task(), lambda x: places.get(x, f"--controller {name}: {x}")
+        )
         remarks += [*said, *more]
         if "frequency_Hz" in numbers:
             self._check_frequencies(np.atleast_1d(numbers["frequency_Hz"]))
@@ -252,10 +255,6 @@ class Maker:
         near = np.sort(frequency_Hz)
         if np.any(np.diff(near) <= _SAME_FREQUENCY * near[1:]):
             raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
-
-
-def _option(controller: str, setting: str) -> str:
-    return "--frequency" if setting == "frequency_Hz" else f"--controller {controller}: {setting}"
 
 
 def _limited(pid: PID, limits_V: tuple[float, float]) -> PID:

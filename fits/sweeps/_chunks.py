@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fits.sweeps._devices import device_count
 from fits.sweeps._spec import Sweep, outside
-from fits.sweeps._types import DONE, FAILED, Block, Output, Parameter, Rows
+from fits.sweeps._types import DONE, FAILED, Block, Output, Rows
 
 # A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
 # Rows that go one by one are slow ones, of which few are to be lost.
@@ -37,15 +37,12 @@ def bytes_per_row(sweep: Sweep) -> int:
 
 def swept_of(sweep: Sweep) -> tuple[Output, ...]:
     """The variables that hold the values of the axes."""
-    known = {parameter.name: parameter for parameter in sweep.facts.parameters}
-    return tuple(kept_as(known[axis.parameter], axis.relative) for axis in sweep.plan.axes)
-
-
-def kept_as(parameter: Parameter, relative: bool) -> Output:
-    """How the values of an axis are kept: numbers in their unit, or words."""
-    widest = max(map(len, parameter.words), default=0)
-    dtype = f"U{widest}" if widest else "f8"
-    return Output(parameter.name, "1" if relative else parameter.unit, "swept", dtype=dtype)
+    known, found = {parameter.name: parameter for parameter in sweep.facts.parameters}, []
+    for axis in sweep.plan.axes:
+        parameter = known[axis.parameter]
+        dtype = f"U{max(map(len, parameter.words))}" if parameter.words else "f8"
+        found.append(Output(parameter.name, "1" if axis.relative else parameter.unit, "swept", dtype=dtype))
+    return tuple(found)
 
 
 def source_of(sweep: Sweep) -> Output:

@@ -86,7 +86,11 @@ def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, refer
     known = (*settings, "kind", "delay_samples")
     for key in given:
         if key not in known:
-            raise DataError(_unknown(key, name, known))
+            owners = [other for other, each in CONTROLLERS.items() if key in [one.name for one in each.settings]]
+            of = f", which is of {' and '.join(owners)}" if owners else ""
+            raise DataError(
+                f"controller.{key}: expected a known key of {name}, found {shown(key)}{of}; {nearest(key, known)}"
+            )
     delay = given.get("delay_samples", 0)
     if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= 100:
         raise DataError(f"controller.delay_samples: expected a number from 0 to 100, found {shown(delay)}.")
@@ -118,12 +122,6 @@ def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, refer
             f"{' and '.join(left) or 'another kind'}."
         ) from error
     return found
-
-
-def _unknown(key: str, name: str, known: tuple[str, ...]) -> str:
-    owners = [other for other, kind in CONTROLLERS.items() if key in [setting.name for setting in kind.settings]]
-    of = f", which is of {' and '.join(owners)}" if owners else ""
-    return f"controller.{key}: expected a known key of {name}, found {shown(key)}{of}; {nearest(key, known)}"
 
 
 def _check(setting: Setting, value: float, interval_s: float) -> None:

@@ -145,31 +145,22 @@ def _read_signal(path: Any, name: str, unit: str, load: Callable[[str], bytes]) 
     """The signal of a file, and its interval."""
     if not isinstance(path, str):
         raise DataError(f"{name}.file: expected the name of a CSV file, found {shown(path)}; give one.")
-    time_s, given = in_a_file(load(path), path, _read_voltage if unit == "V" else _read_displacement)
+    column = f"{'voltage' if unit == 'V' else 'displacement'}_{unit}"
+
+    def read(file: Path) -> tuple[FloatArray, FloatArray]:
+        # What is no record is refused before anything of it is shown.
+        if not any(map(recognise, open_table(file).names)):
+            raise DataError(
+                f"{file}: expected the columns time_s and {column}, found none that is known; name another."
+            )
+        record = read_csv(file, required=("time_s", column)) if unit == "V" else read_reference(file)
+        return record.time_s, getattr(record, column)
+
+    time_s, given = in_a_file(load(path), path, read)
     interval = np.diff(time_s)
     if np.ptp(interval) > _EVEN * np.mean(interval):
         raise DataError(f"{name}.file: {path} is not sampled evenly, which a sweep needs; resample it.")
     return given, float(np.mean(interval))
-
-
-def _needs(path: Path, *columns: str) -> None:
-    """Refuse a file that is no record before anything of it is shown."""
-    if not any(map(recognise, open_table(path).names)):
-        raise DataError(
-            f"{path}: expected the columns {' and '.join(columns)}, found none that is known; name another."
-        )
-
-
-def _read_voltage(path: Path) -> tuple[FloatArray, FloatArray]:
-    _needs(path, "time_s", "voltage_V")
-    record = read_csv(path, required=("time_s", "voltage_V"))
-    return record.time_s, record.voltage_V
-
-
-def _read_displacement(path: Path) -> tuple[FloatArray, FloatArray]:
-    _needs(path, "time_s", "displacement_um")
-    reference = read_reference(path)
-    return reference.time_s, reference.displacement_um
 
 
 def drive(program: Program, block: Block, values: Mapping[str, Array]) -> Float[Array, "n t"]:

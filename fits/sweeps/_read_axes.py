@@ -61,7 +61,10 @@ def read_plan(
     known = {parameter.name: parameter for parameter in parameters}
     listed: dict[str, list[tuple[Axis, np.ndarray]]] = {}
     drawn: list[Axis] = []
-    for k, entry in enumerate(_tables(table, "axis")):
+    entries = table.get("axis", [])
+    if not isinstance(entries, list) or not all(isinstance(each, dict) for each in entries):
+        raise DataError("axis: expected tables [[axis]], found something else; double the brackets.")
+    for k, entry in enumerate(entries):
         axis, values = _axis(entry, f"axis[{k}]", known)
         if values is None:
             drawn.append(axis)
@@ -81,7 +84,10 @@ def read_plan(
         groups.append(_list(table["list"], known, load))
     design = table.get("design")
     if drawn:
-        groups.append(_drawn(design, drawn, seed))
+        if not isinstance(design, dict):
+            raise DataError("design: expected how axes without a count are drawn; add [design] with method and rows.")
+        how = typed(design, _Design, "design")
+        groups.append(Drawn(tuple(drawn), how.method, how.rows, seed))
     elif design is not None:
         raise DataError("design: expected axes to draw, found none; give axes low and high without a count.")
     names = [axis.parameter for group in groups for axis in group.axes]
@@ -94,13 +100,6 @@ def read_plan(
     if math.prod(len(group) for group in groups) * repeats > _MOST_ROWS:
         raise DataError("axis: these are more rows than can be counted; leave out some.")
     return plan
-
-
-def _tables(table: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
-    found = table.get(name, [])
-    if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
-        raise DataError(f"{name}: expected tables [[{name}]], found something else; double the brackets.")
-    return found
 
 
 def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) -> tuple[Axis, np.ndarray | None]:
@@ -209,13 +208,6 @@ def _split(unit: str) -> tuple[int, str]:
     """Power of ten of a unit's prefix, and the unit without it."""
     prefixed = unit[:1] in _PREFIXES and unit[1:] in _BASES
     return (_PREFIXES[unit[0]], unit[1:]) if prefixed else (0, unit)
-
-
-def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:
-    if not isinstance(design, dict):
-        raise DataError("design: expected how axes without a count are drawn; add [design] with method and rows.")
-    found = typed(design, _Design, "design")
-    return Drawn(tuple(axes), found.method, found.rows, seed)
 
 
 def read_list(content: bytes, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:

@@ -107,11 +107,9 @@ def _best(data: Any, about: dict[str, Any], done: np.ndarray, by: str | None, la
     there = np.flatnonzero(done & np.isfinite(values))
     order = there[np.argsort(-values[there] if largest else values[there], kind="stable")[:5]]
     names = [*about["parameters"], by]
-    return [{"row": int(row)} | {name: _plain(data[name].values[row]) for name in names} for row in order]
-
-
-def _plain(value: Any) -> float | str:
-    return value if isinstance(value, str) else float(value)
+    rows = [{name: data[name].values[row] for name in names} for row in order]
+    plain = [{name: x if isinstance(x, str) else float(x) for name, x in row.items()} for row in rows]
+    return [{"row": int(row)} | values for row, values in zip(order, plain, strict=True)]
 
 
 def describe(summary: dict[str, Any]) -> str:

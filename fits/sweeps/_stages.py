@@ -52,18 +52,6 @@ def nominal_stage() -> Stage:
     )
 
 
-def stage_from(text: bytes | None, name: str) -> Stage:
-    """Read a stage from the content of a model file, or make the nominal one where there is none."""
-    if text is None:
-        return nominal_stage()
-    model = in_a_file(text, name, load_model).model
-    if isinstance(model, Preisach):
-        return Stage.of(hysteresis=model)
-    if isinstance(model, Stage):
-        return model
-    raise DataError(f"{name}: expected a stage or a Preisach model, found a {type(model).__name__}; fit one first.")
-
-
 def requested_stage(request: Request) -> tuple[Stage, str]:
     """The stage and the initial memory that a sweep names by `model` and `initial`."""
     name, initial = request.table.get("model", NOMINAL), request.table.get("initial", INITIAL[0])
@@ -71,7 +59,12 @@ def requested_stage(request: Request) -> tuple[Stage, str]:
         raise DataError(f'model: expected "{NOMINAL}" or the name of a model file, found {shown(name)}; give one.')
     if initial not in INITIAL:
         raise DataError(f"initial: expected one of {', '.join(INITIAL)}, found {shown(initial)}; choose one.")
-    return stage_from(None if name == NOMINAL else request.load(name), name), initial
+    model = nominal_stage() if name == NOMINAL else in_a_file(request.load(name), name, load_model).model
+    if isinstance(model, Preisach):
+        return Stage.of(hysteresis=model), initial
+    if isinstance(model, Stage):
+        return model, initial
+    raise DataError(f"{name}: expected a stage or a Preisach model, found a {type(model).__name__}; fit one first.")
 
 
 def stage_parameters(stage: Stage) -> tuple[Parameter, ...]:
