@@ -41,18 +41,16 @@ _WORTH_SAYING = 1e-4
 
 @dataclass(frozen=True)
 class Compensation:
-    """A voltage for a reference, and what the model does with it.
+    """A voltage for a reference, and what the model does with it; all arrays have the shape `(n,)`.
 
     Attributes
     ----------
-    voltage_V
-        Shape `(n,)`, within the limits.
+    voltage_V, reference_um
+        Within the limits, and what was asked for.
     displacement_um
-        Response of the whole model, sensor offset included, shape `(n,)`.
-    reference_um
-        What was asked for, shape `(n,)`.
+        Response of the whole model, sensor offset included.
     clipped
-        Samples out of reach, where the nearest voltage or displacement that can be reached was taken, shape `(n,)`.
+        Samples out of reach, where the nearest voltage or displacement that can be reached was taken.
     remarks
         What keeps a stage from following, one sentence each.
     """

@@ -102,7 +102,6 @@ class Loop:
         resolution_V: float | None = None,
         plant: int = 0,
     ) -> ControlledRun:
-        """Run a controller on one of the plants."""
         return simulate_loop(
             controller,
             self.plants[plant],

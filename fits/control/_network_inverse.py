@@ -85,23 +85,12 @@ def fit_network_inverse(
     ----------
     record
         Measured voltage and displacement, begun at negative saturation.
-    width, depth
-        Of the network's hidden layers.
-    extremes
-        How many remembered extremes it sees.
-    samples
-        At most so many are used, evenly spaced.
-    steps
-        At most, of the Levenberg-Marquardt method.
-    noise_um
-        Standard deviation of the sensor's noise.
-    seed
-        Of the weights to start with.
-
-    Returns
-    -------
-    NetworkInverse
-        Call it with a displacement.
+    width, depth, extremes
+        Of the network's hidden layers, and how many remembered extremes it sees.
+    samples, steps
+        At most so many samples, evenly spaced, and steps of the Levenberg-Marquardt method.
+    noise_um, seed
+        Standard deviation of the sensor's noise, and the seed of the first weights.
 
     Raises
     ------

@@ -69,7 +69,7 @@ def tune_controller(
     """Tune a controller on models, by the derivatives of whole closed loops.
 
     Gains are searched for in their logarithm (a BFGS method within an augmented Lagrangian for the limits), from the
-    controller that is given and from places drawn around it.
+    controller that is given and from places drawn around it. The best that was found within all limits comes back.
 
     Parameters
     ----------
@@ -91,17 +91,8 @@ def tune_controller(
     free
         Paths of the parameters that move, such as `"pid"` or `"integral_V_per_um_s"`; by default gains: what
         cannot be negative, is not zero and is no time.
-    starts
-        Number of places to search from.
-    seed
-        Of the places.
-    progress
-        Told what is being done.
-
-    Returns
-    -------
-    Tuning
-        The best that was found within all limits.
+    starts, seed, progress
+        Number of places to search from, the seed of those that are drawn, and what is told of each.
 
     Raises
     ------

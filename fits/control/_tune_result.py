@@ -47,12 +47,10 @@ class Tuning(Generic[_Controller]):
         Of the controller it began with, and of this one; see `Goal`.
     converged
         Whether nothing is left to gain nearby: the slope of the cost is small, or balanced by limits.
-    plants
-        One report per plant, the nominal one first.
+    plants, remarks
+        One report per plant, the nominal one first; and what the user should know, one sentence each.
     gains
         Before and after, in their units, by their path in the controller.
-    remarks
-        What the user should know, one sentence each.
     """
 
     controller: _Controller
@@ -70,7 +68,6 @@ class Tuning(Generic[_Controller]):
 
 
 def reports(found: Figures) -> tuple[LoopReport, ...]:
-    """One report per plant."""
     out = []
     for k in range(found.error_um2.shape[0]):
         one = jax.tree.map(lambda leaf, k=k: leaf[k], found)

@@ -93,8 +93,7 @@ def allocate(
     voltage
         Impose the voltage of the piezos instead of their elongation.
     curvature_share
-        No tolerance goes beyond where the second order of its dimension alone takes this share of a budget; infinite
-        for the first order however far.
+        No tolerance goes beyond where the second order of its dimension alone takes this share of a budget.
 
     Raises
     ------

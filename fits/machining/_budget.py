@@ -123,10 +123,8 @@ class Budget:
 
     Attributes
     ----------
-    axes
-        By name.
-    driving
-        Of the piezo.
+    axes, driving
+        Budgets by name, and the driving error of the piezo.
     measures
         What the displacement of the model was: the piezo's elongation (`pzt`), or the output of an axis.
     noise_um, zeroed
@@ -165,14 +163,10 @@ def budget(
 
     Parameters
     ----------
-    design
-        Dimensions, tolerances and constants.
+    design, idle
+        Dimensions, tolerances and constants; and the noise of the sensor, from `idle_noise`.
     model
         The fitted hysteresis of a piezo; of a stage, what slow commands see. All piezos are taken to be like it.
-    idle
-        From `idle_noise`.
-    axes
-        Which; all by default.
     measures
         What the displacement of the model is: the piezo's elongation, or the output of an axis, which is then divided
         by its gain.

@@ -29,20 +29,9 @@ _WIDTH, _INDENT = 110, " " * 12
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of the paper, judged by the numbers of a design.
+    """A statement of the paper, in other words, judged by the numbers of a design.
 
-    Attributes
-    ----------
-    axes
-        Which it is about.
-    statement
-        What the paper says, in other words.
-    verdict
-        `agree`, `partly` or `disagree`.
-    number, unit
-        What decides.
-    reason
-        What the number is, and why the verdict.
+    The verdict is `agree`, `partly` or `disagree`. A number with its unit decides, and the reason says what it is.
     """
 
     axes: tuple[m.Axis, ...]
@@ -207,7 +196,6 @@ def _rank(axis: AxisSensitivity, name: str) -> str:
 
 
 def _share_of_largest(axis: AxisSensitivity, name: str) -> float:
-    """Effect of a dimension over the largest."""
     return _ratio(axis[name].relative_change_pct, axis.dimensions[0].relative_change_pct)
 
 

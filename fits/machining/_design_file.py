@@ -99,7 +99,6 @@ def write_design(design: Design, path: str | os.PathLike[str]) -> None:
 
 
 def design_text(design: Design) -> str:
-    """Put the design of a stage into TOML."""
     lines = [
         f'schema = "{SCHEMA}"',
         "# 0: Euler-Bernoulli leaves between rigid blocks; 1: elastic roots, shear, links.",

@@ -95,24 +95,11 @@ class IdleNoise:
         return tuple(_remarks(self))
 
     def error_um(self, zeroed: bool = True, coverage: float = 2.0) -> float:
-        """Measuring error that enters Eq. 1, of a single reading within a time as long as the record.
+        """Measuring error in um that enters Eq. 1, of a single reading within a time as long as the record.
 
-        Parameters
-        ----------
-        zeroed
-            Whether the sensor is zeroed at rest, which removes the mean. Otherwise its size is added.
-        coverage
-            Coverage factor: how many standard deviations the random part counts; 2 covers 95 % of normal noise.
-
-        Returns
-        -------
-        float
-            In um. The random part is at least that of an even spread over one quantum of the readings.
-
-        Raises
-        ------
-        ValueError
-            If the coverage factor is not positive.
+        The mean is added, by its size, unless the sensor is zeroed at rest, which removes it. The random part counts
+        by the coverage factor, of which 2 covers 95 % of normal noise, and is at least that of an even spread over
+        one quantum of the readings. A ValueError says that the factor is not positive.
         """
         if not coverage > 0:
             raise ValueError(f"expected a positive coverage factor, got {coverage}")
@@ -150,17 +137,7 @@ def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = 
 
 
 def idle_noise(reference: Reference) -> IdleNoise:
-    """Describe the noise of an idle record (Eq. 6 and Fig. 8).
-
-    Parameters
-    ----------
-    reference
-        From `read_idle`: readings at rest, evenly sampled.
-
-    Returns
-    -------
-    IdleNoise
-        Offset and random part apart, spectrum, lines and Allan deviation.
+    """Describe the noise of an idle record from `read_idle` (Eq. 6 and Fig. 8).
 
     Raises
     ------

@@ -30,16 +30,12 @@ _AGREE, _STANDARD_ERRORS = 0.02, 3.0
 
 @dataclass(frozen=True)
 class SecondOrder:
-    """Spread of a gain that is a quadratic function of the dimensions' errors.
+    """Spread of the gain of an axis as a quadratic function of the errors of the `k` dimensions that it depends on.
 
     Attributes
     ----------
-    axis, unit
-        Which, and the unit of its gain: `um/um` or `rad/um`; per um of free elongation with `voltage`.
-    distribution, voltage
-        As asked for.
-    names
-        Dimensions that the gain depends on, `k` of them.
+    unit
+        Of the gain: `um/um` or `rad/um`; per um of free elongation with `voltage`.
     gain, gradient, hessian
         At the nominal dimensions, and derivatives per mm or rad, shapes `(k,)` and `(k, k)`.
     first_order_sd, mean_shift
@@ -75,7 +71,7 @@ class SecondOrder:
 def second_order(
     design: Design, axis: Axis, distribution: Distribution = "normal", *, voltage: bool = False
 ) -> SecondOrder:
-    r"""Expand the gain of an axis to second order in the dimensions' errors.
+    r"""Expand the gain of an axis to second order in the dimensions' errors; see `monte_carlo` for the arguments.
 
     With the covariance :math:`\Sigma`, gradient g and Hessian H, the mean shifts by :math:`\tfrac12 \mathrm{tr} H
     \Sigma` and the variance is
@@ -88,17 +84,6 @@ def second_order(
     normal ones. Correlated dimensions that are not normal have joint fourth moments that this leaves out. Third
     derivatives add to the variance at the same power of the tolerances unless the gradient vanishes; they are left
     out, too.
-
-    Parameters
-    ----------
-    design
-        Dimensions and tolerances.
-    axis
-        One of `AXES`.
-    distribution
-        `normal` with the tolerance as three standard deviations; `uniform` or `triangular` over the tolerance.
-    voltage
-        Impose the voltage of the piezo instead of its elongation.
 
     Raises
     ------
@@ -204,15 +189,11 @@ def monte_carlo(
     design
         Dimensions, tolerances and which of them go together. The correlation of those is that of the dimensions,
         whatever their distribution: a Gaussian copula joins them, and each keeps its own distribution.
-    samples
-        Number of stages drawn.
+    samples, seed
+        Number of stages drawn, from 1000 to 30 million, and the seed of the draws.
     distribution
         Of each dimension: `normal` with the tolerance as three standard deviations; `uniform` or `triangular` over
         the tolerance.
-    seed
-        Of the draws.
-    axes
-        Some of `AXES`.
     voltage
         Impose the voltage of the piezos instead of their elongation.
     progress
@@ -222,7 +203,7 @@ def monte_carlo(
     ------
     DataError
         If there is no such axis or distribution, a tolerance is as large as its dimension, or the number of samples
-        is not between 1000 and 30 million.
+        is out of bounds.
     """
     check(design, axes, distribution)
     if not _FEWEST_SAMPLES <= samples <= _MOST_SAMPLES:

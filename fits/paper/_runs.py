@@ -48,7 +48,6 @@ class PaperRun:
     command_V: np.ndarray
 
     def last(self, samples: int) -> "PaperRun":
-        """The end of it."""
         runs = self.displacement_um, self.reading_um, self.command_V
         return PaperRun(self.reference_um[-samples:], *(values[:, -samples:] for values in runs))
 

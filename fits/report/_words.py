@@ -20,12 +20,10 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def plain(name: str) -> str:
-    """Turn a name into words."""
     return name.replace("_", " ")
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:
-    """Join names as a sentence does."""
     words = [plain(name) for name in names]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}" if words else ""
 
@@ -93,7 +91,6 @@ def percent(share: float) -> str:
 
 
 def chance(p: float) -> str:
-    """Write a probability."""
     if not math.isfinite(p):
         return NONE
     if p < _SMALLEST_P:

@@ -70,7 +70,6 @@ class Listed(AbstractGroup):
         return self.table.shape[1]
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
-        """Values at some places, shape `(axes, n)`."""
         return np.asarray(self.table[:, place])
 
 
@@ -101,7 +100,6 @@ class Drawn(AbstractGroup):
         return self.rows
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
-        """Values at some places, shape `(axes, n)`."""
         chance = np.empty((len(place), len(self.axes)))
         if self.method == "latin_hypercube":
             chance[:] = _hypercube(len(self.axes), self.rows, self.seed)[place]
@@ -139,7 +137,6 @@ class Plan:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Of all groups."""
         return tuple(axis for group in self.groups for axis in group.axes)
 
     def __len__(self) -> int:

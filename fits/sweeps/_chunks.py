@@ -51,12 +51,10 @@ def source_of(sweep: Sweep) -> Output:
 
 
 def chunk_count(sweep: Sweep) -> int:
-    """How many chunks there are."""
     return -(-len(sweep.plan) // chunk_rows(sweep))
 
 
 def rows_of(sweep: Sweep, chunk: int) -> NDArray[np.int64]:
-    """Numbers of the rows of a chunk."""
     size = chunk_rows(sweep)
     return np.arange(chunk * size, min(len(sweep.plan), (chunk + 1) * size), dtype=np.int64)
 

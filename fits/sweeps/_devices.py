@@ -23,12 +23,10 @@ def block_rows(samples: int) -> int:
 
 
 def on_cpu() -> bool:
-    """Whether the devices are CPUs."""
     return jax.default_backend() == "cpu"
 
 
 def device_count() -> int:
-    """Number of local devices."""
     return jax.local_device_count()
 
 

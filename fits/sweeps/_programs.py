@@ -71,7 +71,6 @@ class Program:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """What may be varied."""
         lower = {"frequency_Hz": 0.0, "frequency_end_Hz": 0.0}
         upper = {"step_s": self.last_s}
         return tuple(

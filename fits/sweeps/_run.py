@@ -43,7 +43,6 @@ class _Progress:
         self._began = self._told = time.monotonic()
 
     def __call__(self, rows: int) -> None:
-        """Count rows."""
         self._done, self._new = self._done + rows, self._new + rows
         now = time.monotonic()
         if now - self._told >= _EVERY_s or self._done == self._rows:
@@ -115,7 +114,6 @@ def run_sweep(
 def _computed(
     sweep: Sweep, chunks: list[int], client: Any, tell: Callable[[int], None], progress: Callable[[str], None]
 ) -> Iterator[tuple[int, Rows]]:
-    """Chunks as they come."""
     if client is None:
         for chunk in chunks:
             yield chunk, compute_chunk(sweep, chunk, tell)

@@ -41,7 +41,6 @@ class Parameter:
 
     @property
     def range_words(self) -> str:
-        """Its bounds and unit in words."""
         unit = "" if self.unit == "1" else f" {self.unit}"
         return f"{self.lower:g} to {self.upper:g}{unit}"
 
@@ -91,7 +90,6 @@ class Output:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one row."""
         return tuple(length for _, length in self.dims)
 
     @property
