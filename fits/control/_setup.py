@@ -39,6 +39,11 @@ class Setup:
     remarks: tuple[str, ...]
 
 
+def held(stage: Stage) -> Stage:
+    """The same stage under a zero-order hold of its command."""
+    return Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
+
+
 def setup(
     model: Preisach | Stage,
     reference: Reference,
@@ -53,8 +58,7 @@ def setup(
     those of the model. A `DataError` says that the times are uneven or too few, that the stage cannot be stepped or
     inverted, or that the limits are not within the model's range.
     """
-    stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
-    stage = Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
+    stage = held(model if isinstance(model, Stage) else Stage.of(hysteresis=model))
     interval = _interval_s(reference)
     try:
         sampled = SampledStage(stage, interval)

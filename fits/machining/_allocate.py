@@ -113,8 +113,15 @@ def allocate(
     price = np.array([(cost or {}).get(name, 1.0) for name in names])
     lever = np.array([lever_mm(design.geometry, name) for name in names])
     lower, upper = (np.log(bound / lever / tolerance) for bound in bounds_mm)
-    pairs = [_derivatives_pct(design, axis, names, voltage) for axis in axes]
-    first, second = (np.array(each) for each in zip(*pairs, strict=True))
+    model, first, second = (
+        gain_model(design, voltage),
+        np.empty((len(axes), len(names))),
+        np.empty((len(axes), len(names))),
+    )
+    # Derivatives with respect to each dimension alone, in percent of the gain per mm or rad.
+    for k, axis in enumerate(axes):
+        value, slopes = gradient(model, twin(axis), names)
+        first[k], second[k] = 100 * slopes / value, 100 * np.diagonal(hessian(model, twin(axis), names)) / value
     budget = np.array([[budget_pct[axis]] for axis in axes])
     # Where the second order of a dimension alone comes to its share of a budget.
     curved = np.sqrt(2 * curvature_share * budget / np.maximum(np.abs(second), 1e-300)).min(axis=0)
@@ -199,13 +206,6 @@ class _Problem:
                 f"the solver stopped before the cheapest tolerances: {residual:.1g} of the cost is not balanced"
             )
         return found, dict(zip(tight.tolist(), weights[: len(tight)].tolist(), strict=True))
-
-
-def _derivatives_pct(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool) -> tuple[_Vector, _Vector]:
-    """First and second derivatives with respect to each dimension alone, in percent of the gain per mm or rad."""
-    at = gain_model(design, voltage), twin(axis), names
-    value, slopes = (np.asarray(found) for found in gradient(*at))
-    return 100 * slopes / value, 100 * np.diagonal(hessian(*at)) / value
 
 
 def _lowest_budgets(budget_pct: Mapping[Axis, float]) -> tuple[Axis, ...]:

@@ -188,9 +188,9 @@ def budget(
         raise DataError(f"expected an arm above 0 mm, found {arm_mm:g}; give the distance from the axis of rotation.")
     driving = _driving(design, model, measures, arm_mm)
     noise_um = idle.error_um(zeroed)
-    found = once_per_function(
-        axes, lambda axis: _of_axis(design, axis, driving, _measuring_error(axis, noise_um, arm_mm))
-    )
+    # In um, and in urad where the arm is known.
+    measuring = {"um": noise_um, "rad": None if arm_mm is None else 1e3 * noise_um / arm_mm}
+    found = once_per_function(axes, lambda axis: _of_axis(design, axis, driving, measuring[m.MOTIONS[axis].unit]))
     remarks = (*_remarks(design, found, driving, arm_mm), *(f"Idle record: {remark}" for remark in idle.remarks))
     return Budget(found, driving, measures, noise_um, zeroed, arm_mm, design.level, remarks)
 
@@ -264,13 +264,6 @@ def _combined(design: Design, slopes: Mapping[str, Array], scale: float) -> tupl
     changes = scale * np.array([float(slopes[name]) * design.tolerance[name] for name in slopes])
     variance = float(changes @ design.correlation([*slopes]) @ changes)
     return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
-
-
-def _measuring_error(axis: m.Axis, noise_um: float, arm_mm: float | None) -> float | None:
-    """Measuring error in um, or in urad where the arm is known."""
-    if m.MOTIONS[axis].unit == "um":
-        return noise_um
-    return None if arm_mm is None else 1e3 * noise_um / arm_mm
 
 
 def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, arm_mm: float | None) -> list[str]:

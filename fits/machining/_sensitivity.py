@@ -206,7 +206,12 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
     slopes = np.array([float(derived.slopes[name]) for name in names])
     changes = slopes * tolerance / gain
     exact = gains_at(design, axis, np.diag(tolerance)) / gain - 1
-    by_voltage = _by_voltage(design, derived.by_voltage)
+    imposed = derived.by_voltage
+    by_voltage = {
+        name: 100 * float(slope) * design.tolerance[name] / float(imposed.output)
+        for name, slope in imposed.dimensions.items()
+        if slope != 0
+    }
     refuse_infinite(
         axis, [*changes, *exact, *slopes, *by_voltage.values(), float(derived.stroke), gain if gain > 0 else math.nan]
     )
@@ -237,15 +242,5 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
         dimensions=tuple(sorted(effects, key=lambda effect: -abs(effect.relative_change_pct))),
         rss_pct=100 * math.sqrt(max(variance, 0.0)),
         worst_case_pct=100 * float(np.abs(changes).sum()),
-        voltage_change_pct=by_voltage,
+        voltage_change_pct=dict(sorted(by_voltage.items(), key=lambda item: -abs(item[1]))),
     )
-
-
-def _by_voltage(design: Design, found: m.Sensitivity) -> dict[str, float]:
-    """Relative changes in percent of all dimensions that have any, largest first."""
-    changes = {
-        name: 100 * float(slope) * design.tolerance[name] / float(found.output)
-        for name, slope in found.dimensions.items()
-        if slope != 0
-    }
-    return dict(sorted(changes.items(), key=lambda item: -abs(item[1])))

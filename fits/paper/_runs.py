@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 import data_synth
 from data_synth import PaperBench
@@ -139,14 +138,11 @@ def identify(piezo: data_synth.PaperPiezo, seeds: list[np.random.Generator], fol
         result = fit([record], levels=LEVELS, holdout=0.0, initial="negative")
         assert record.displacement_um is not None
         slope = float(np.ptp(record.displacement_um) / np.ptp(record.voltage_V))
-        rest = _at_bias(result.model, jnp.asarray([data_synth.PAPER_BIAS_V]))
+        density = result.model.density
+        saturated = positive_saturation(density.lower_V, density.upper_V)
+        rest = eqx.filter_jit(result.model)(jnp.asarray([data_synth.PAPER_BIAS_V]), saturated)
         found.append(Identified(result, record, float(rest[0]), slope))
     return found
-
-
-@eqx.filter_jit
-def _at_bias(model: Preisach, voltage_V: Float[Array, " n"]) -> Float[Array, " n"]:
-    return model(voltage_V, positive_saturation(model.density.lower_V, model.density.upper_V))
 
 
 def identify_modes(

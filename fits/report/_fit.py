@@ -199,7 +199,7 @@ def _parameters(report: Mapping[str, Any]) -> list[str]:
     rows = [
         (
             one["name"],
-            f"{_value(one)} ± {_sd(one)}",
+            f"{_value(one)} ± {'unknown' if one['sd'] is None else format(one['sd'], '.2g')}",
             f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})",
             "" if one["unit"] == "1" else one["unit"],
         )
@@ -212,10 +212,6 @@ def _parameters(report: Mapping[str, Any]) -> list[str]:
         if value is not None and abs(value) > _WORTH_SAYING:
             lines.append(f"correlated     {names[i]} and {names[j]}: {value:+.2f}")
     return lines
-
-
-def _sd(parameter: Mapping[str, Any]) -> str:
-    return "unknown" if parameter["sd"] is None else f"{parameter['sd']:.2g}"
 
 
 def _value(parameter: Mapping[str, Any], key: str = "value") -> str:
