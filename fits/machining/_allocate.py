@@ -113,11 +113,7 @@ def allocate(
     price = np.array([(cost or {}).get(name, 1.0) for name in names])
     lever = np.array([lever_mm(design.geometry, name) for name in names])
     lower, upper = (np.log(bound / lever / tolerance) for bound in bounds_mm)
-    model, first, second = (
-        gain_model(design, voltage),
-        np.empty((len(axes), len(names))),
-        np.empty((len(axes), len(names))),
-    )
+    model, (first, second) = gain_model(design, voltage), np.empty((2, len(axes), len(names)))
     # Derivatives with respect to each dimension alone, in percent of the gain per mm or rad.
     for k, axis in enumerate(axes):
         value, slopes = gradient(model, twin(axis), names)

@@ -128,6 +128,9 @@ class Identified:
         return found.voltage_V[1:]
 
 
+_at = eqx.filter_jit(lambda model, voltage_V, start: model(voltage_V, start))
+
+
 def identify(piezo: data_synth.PaperPiezo, seeds: list[np.random.Generator], folder: Path) -> list[Identified]:
     """Measure the piezo once per generator, through a CSV, and fit its hysteresis."""
     found = []
@@ -138,9 +141,8 @@ def identify(piezo: data_synth.PaperPiezo, seeds: list[np.random.Generator], fol
         result = fit([record], levels=LEVELS, holdout=0.0, initial="negative")
         assert record.displacement_um is not None
         slope = float(np.ptp(record.displacement_um) / np.ptp(record.voltage_V))
-        density = result.model.density
-        saturated = positive_saturation(density.lower_V, density.upper_V)
-        rest = eqx.filter_jit(result.model)(jnp.asarray([data_synth.PAPER_BIAS_V]), saturated)
+        saturated = positive_saturation(result.model.density.lower_V, result.model.density.upper_V)
+        rest = _at(result.model, jnp.asarray([data_synth.PAPER_BIAS_V]), saturated)
         found.append(Identified(result, record, float(rest[0]), slope))
     return found
 

@@ -20,6 +20,7 @@ from fits.report._words import (
     parameter_name,
     percent,
     plain,
+    shown_unit,
     sigmas,
 )
 
@@ -99,11 +100,7 @@ def _environment() -> Environment:
     for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number"):
         made.filters[name] = getattr(_words, name)
     made.filters["without_dot"] = lambda text: text.rstrip(".")
-    made.filters["parameter_row"] = lambda one: (
-        parameter_name(one),
-        *estimate(one),
-        _words.shown_unit(one.unit) or "1",
-    )
+    made.filters["parameter_row"] = lambda one: (parameter_name(one), *estimate(one), shown_unit(one.unit) or "1")
     made.tests["finite"] = math.isfinite
     made.globals["SIGMA"] = SIGMA
     return made

@@ -115,8 +115,8 @@ def parse_sweep(text: str, name: str, load: Callable[[str], bytes], folder: Path
         plan = read_plan(table, facts.parameters, max(1, len(facts.sources)), seed, kept)
         if chunk_rows is not None and chunk_rows % job.facts.block:
             raise DataError(
-                f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, found "
-                f"{chunk_rows}; correct it, or leave it out."
+                f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, "
+                f"found {chunk_rows}; correct it, or leave it out."
             )
         return Sweep(text, name, inputs, kind, seed, plan, job, facts, options.memory_MB, chunk_rows, folder)
     except DataError as error:
