@@ -90,7 +90,10 @@ def plot_compensation(
     existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
     """
     wanted, voltage, reached = compensation.reference_um, compensation.voltage_V, compensation.displacement_um
-    straight_V = _straight(wanted, voltage)
+    # A voltage proportional to the reference, within the voltages used.
+    centred = wanted - wanted.mean()
+    gain = float(centred @ voltage) / (float(centred @ centred) or np.inf)
+    straight_V = np.clip(voltage.mean() + gain * centred, voltage.min(), voltage.max())
     plain = simulate_model(model, Record(reference.time_s, straight_V, None, source=reference.source), initial)
 
     picture = figure(WIDE_in, 4.8, gap=0.08)
@@ -112,11 +115,3 @@ def plot_compensation(
     label(error, "time (s)", "error (µm)", "error")
     legend(picture, (loop, inverse, error))
     return [save(picture, Path(folder) / "compensation.png")]
-
-
-def _straight(wanted_um: np.ndarray, voltage_V: np.ndarray) -> np.ndarray:
-    """A voltage proportional to the reference, within the voltages used."""
-    centred = wanted_um - wanted_um.mean()
-    power = float(centred @ centred)
-    gain = float(centred @ voltage_V) / power if power > 0 else 0.0
-    return np.clip(voltage_V.mean() + gain * centred, voltage_V.min(), voltage_V.max())

@@ -60,20 +60,18 @@ def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os
     report is that of the design, from `sensitivities`. `tornado.png` and `machining_error.png` are written into an
     existing folder, at 200 dots per inch; a `DataError` says if they cannot be.
     """
-    panels = _panels(design, report)
-    claims = paper_claims(design) if _is_the_papers(design) else ()
-    return [
-        save(_tornado(panels), Path(folder) / "tornado.png"),
-        save(_machining_error(design, panels, claims), Path(folder) / "machining_error.png"),
-    ]
-
-
-def _panels(design: Design, report: SensitivityReport) -> list[_Panel]:
     panels = []
     for axes in report.alike():
         title = ", ".join(AXIS_SIGNS.get(each.axis, each.axis) for each in axes)
         panels.append(_Panel(axes[0], title, _curves(design, axes[0].axis)))
-    return panels
+    paper = paper_design()
+    same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
+    same = same and design.guides == paper.guides and design.tolerance == paper.tolerance
+    claims = paper_claims(design) if same else ()
+    return [
+        save(_tornado(panels), Path(folder) / "tornado.png"),
+        save(_machining_error(design, panels, claims), Path(folder) / "machining_error.png"),
+    ]
 
 
 def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
@@ -83,12 +81,6 @@ def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
     gains = gains_at(design, axis, errors).reshape(len(names), _STEPS)
     nominal = gains[0, _STEPS // 2]
     return {name: gains[i] / nominal - 1 for i, name in enumerate(names)}
-
-
-def _is_the_papers(design: Design) -> bool:
-    paper = paper_design()
-    same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
-    return same and design.guides == paper.guides and design.tolerance == paper.tolerance
 
 
 def _tornado(panels: Sequence[_Panel]) -> Figure:

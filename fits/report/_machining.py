@@ -6,7 +6,7 @@ from typing import Any
 
 from fits.io._printable import plain
 from fits.machining._budget import AxisBudget, Budget
-from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport
+from fits.machining._sensitivity import AxisSensitivity, SensitivityReport
 from fits.report._json import columns
 
 _TOTALS = ("signed", "worst_case", "root_sum_square")
@@ -19,6 +19,10 @@ def sensitivity_json(report: SensitivityReport) -> dict[str, Any]:
 
 
 def _sensitivity_json(axis: AxisSensitivity) -> dict[str, Any]:
+    parameters = {effect.name: dataclasses.asdict(effect) for effect in axis.dimensions}
+    for values in parameters.values():
+        del values["name"]
+        values[f"output_change_{axis.output_unit}_per_10um"] = values.pop("output_change_per_10um")
     return {
         "gain": axis.gain,
         "gain_unit": axis.gain_unit,
@@ -26,15 +30,9 @@ def _sensitivity_json(axis: AxisSensitivity) -> dict[str, Any]:
         f"stroke_{axis.output_unit}": axis.stroke,
         "rss_pct": axis.rss_pct,
         "worst_case_pct": axis.worst_case_pct,
-        "parameters": {effect.name: _effect_json(effect, axis.output_unit) for effect in axis.dimensions},
+        "parameters": parameters,
         "fixed_voltage": {name: {"relative_change_pct": change} for name, change in axis.voltage_change_pct.items()},
     }
-
-
-def _effect_json(effect: DimensionEffect, output_unit: str) -> dict[str, Any]:
-    values = {key: value for key, value in dataclasses.asdict(effect).items() if key != "name"}
-    values[f"output_change_{output_unit}_per_10um"] = values.pop("output_change_per_10um")
-    return values
 
 
 def describe_sensitivity(report: SensitivityReport, voltage: bool = False) -> str:

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.sweeps._devices import device_count
 from fits.sweeps._spec import Sweep, outside
 from fits.sweeps._types import DONE, FAILED, Block, Output, Rows
 
@@ -65,7 +65,7 @@ def compute_chunk(sweep: Sweep, chunk: int, tell: Callable[[int], None] = lambda
     The rows have the swept values beside the outputs, and `status`; `tell` is called with the number that is added.
     """
     rows, facts = rows_of(sweep, chunk), sweep.facts
-    together = facts.block * (1 if facts.alone else device_count())
+    together = facts.block * (1 if facts.alone else jax.local_device_count())
     parts = []
     for first in range(0, len(rows), together):
         parts.append(_blocks(sweep, rows[first : first + together], together))

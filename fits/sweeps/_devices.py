@@ -22,14 +22,6 @@ def block_rows(samples: int) -> int:
     return int(min(_LARGEST_BLOCK, 2 ** max(0, int(np.log2(max(fit, 1.0))))))
 
 
-def on_cpu() -> bool:
-    return jax.default_backend() == "cpu"
-
-
-def device_count() -> int:
-    return jax.local_device_count()
-
-
 def place(rows: Any) -> Any:
     """Put arrays on the devices, a block of their first axis on each, or on one if they cannot share it evenly."""
     if _shares(rows) == 1:
@@ -89,7 +81,8 @@ def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
 
 
 def _shares(rows: Any) -> int:
-    return 1 if any(len(leaf) % device_count() for leaf in jax.tree.leaves(rows)) else device_count()
+    count = jax.local_device_count()
+    return 1 if any(len(leaf) % count for leaf in jax.tree.leaves(rows)) else count
 
 
 def _mesh(rows: Any) -> Mesh | None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
@@ -19,7 +20,7 @@ from fits.loop._prior import roughness
 from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES, initial_state, known_samples
 from fits.stats._metrics import errors
-from fits.sweeps._devices import in_turn, on_cpu, place
+from fits.sweeps._devices import in_turn, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
@@ -135,17 +136,15 @@ class FitJob(AbstractJob):
         # The whole block on each number of levels there is in it, of which every row takes its own: what is found
         # for a row depends on its place in the block, and not on what the rows beside it ask for.
         found = {number: _fitted(number, rows) for number in np.unique(levels).tolist()}
-        names = [name for name in found[int(levels[0])] if name != "weights_um" or self.options.weights]
-        outputs = {name: np.array([found[n][name][k] for k, n in enumerate(levels.tolist())]) for name in names}
-        predicted, success = outputs.pop("predicted_um"), outputs.pop("success")
-        for start_name, samples_of in (("", fitted > 0), ("heldout_", known & (fitted == 0))):
-            figures = [_errors(displacement[k], predicted[k], samples_of[k], known[k]) for k in range(count)]
-            outputs[f"{start_name}e_rms_pct"] = np.array([each[0] for each in figures])
-            outputs[f"{start_name}e_max_pct"] = np.array([each[1] for each in figures])
-        for k in range(count):
-            if not reasons[k] and not (success[k] and np.isfinite(outputs["e_rms_pct"][k])):
-                reasons[k] = "the regression did not converge"
-        return Rows(outputs, tuple(reasons))
+        each: list[dict[str, Any] | str] = []
+        for k, number in enumerate(levels.tolist()):
+            row = {name: value[k] for name, value in found[number].items()}
+            for start_name, chosen in (("", fitted[k] > 0), ("heldout_", known[k] & (fitted[k] == 0))):
+                figures = _errors(displacement[k], row["predicted_um"], chosen, known[k])
+                row |= {f"{start_name}e_rms_pct": figures[0], f"{start_name}e_max_pct": figures[1]}
+            converged = row["success"] and np.isfinite(row["e_rms_pct"])
+            each.append(reasons[k] or (row if converged else "the regression did not converge"))
+        return Rows.one_by_one(self.facts.outputs, each)
 
     def _why_not(self, record: Record) -> str:
         if len(record) > self.options.samples:
@@ -186,7 +185,7 @@ def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[An
         fits: BatchFit = fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
         return fits
 
-    found = in_turn(regress, *rows) if on_cpu() else regress(*map(place, rows))
+    found = in_turn(regress, *rows) if jax.default_backend() == "cpu" else regress(*map(place, rows))
     packed = _packed(levels)
     weights = np.asarray(found.columns_um)[:, : len(packed[0])] * node_areas(levels)[packed]
     return {
