@@ -36,6 +36,10 @@ def fit_report(result: FitResult[Any]) -> dict[str, Any]:
         law = None if place is None else model.parts[place]
         named = zip(model.names, model.parts, strict=True)
         parts["parts"] = [{"name": name, "type": type(part).__name__} for name, part in named]
+        known = {name: strict(getattr(result, name)) for name in ("parameters", "correlation", "unseen")}
+    else:
+        known = {name: getattr(result, name) for name in ("noise_um", "correlation_samples", "smoothness")}
+        known["trials"] = [dict(vars(trial)) for trial in result.trials]
     grid = dict.fromkeys(("family", "levels", "lower_V", "upper_V"))
     if isinstance(law, Preisach):
         lower, upper = float(law.density.lower_V), float(law.density.upper_V)
@@ -44,32 +48,13 @@ def fit_report(result: FitResult[Any]) -> dict[str, Any]:
         "status": result.status.name.lower(),
         **parts,
         **grid,
-        **(_of_stage(result) if isinstance(model, Stage) else _of_hysteresis(result)),
+        **known,
+        "misfit": _misfit(result.misfit),
+        "discrepancy_um": float(result.uncertainty.discrepancy_um),
         "in_sample": _errors(result.in_sample),
         "held_out": _errors(result.held_out),
         "runs": [_run(run, _OF_FITTED if isinstance(model, Stage) else ()) for run in result.runs],
         "remarks": [remark for remark in result.remarks if remark not in result.unseen],
-    }
-
-
-def _of_hysteresis(result: FitResult[Any]) -> dict[str, Any]:
-    return {
-        "noise_um": result.noise_um,
-        "correlation_samples": result.correlation_samples,
-        "discrepancy_um": float(result.uncertainty.discrepancy_um),
-        "smoothness": result.smoothness,
-        "trials": [{"levels": trial.levels, "error_um": trial.error_um} for trial in result.trials],
-        "misfit": _misfit(result.misfit),
-    }
-
-
-def _of_stage(result: FitResult[Any]) -> dict[str, Any]:
-    return {
-        "parameters": strict(result.parameters),
-        "correlation": strict(result.correlation),
-        "unseen": list(result.unseen),
-        "misfit": _misfit(result.misfit),
-        "discrepancy_um": float(result.uncertainty.discrepancy_um),
     }
 
 
