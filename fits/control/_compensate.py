@@ -180,7 +180,7 @@ def _led(
     clip: bool,
     bind: str,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Lead the driver, within the limits; which samples were cut, and what to say of that."""
+    """Compensate the driver's lag within the limits: the command, which samples were cut, and remarks on that."""
     asked_V = command(stage, reference.time_s, static_V)
     if stage.hold == "zero":
         # A step stands for the line across its interval.

@@ -110,7 +110,7 @@ def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: s
 
 
 def turns(reference_um: np.ndarray, doubt_um: float) -> list[str]:
-    """Say that a reference turns faster than its samples show, if the doubt from `demand` is that large."""
+    """Remark that the reference turns faster than its samples show, if the doubt from `demand` is that large."""
     if doubt_um <= _WORTH_SAYING * float(np.ptp(reference_um)):
         return []
     return [
@@ -120,7 +120,7 @@ def turns(reference_um: np.ndarray, doubt_um: float) -> list[str]:
 
 
 def begins_in_motion(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: float) -> list[str]:
-    """Say that a stage at rest cannot take up a reference that moves; needed and doubt are from `demand`."""
+    """Remark that a stage at rest cannot take up a reference that moves; needed and doubt are from `demand`."""
     start_um = abs(float(needed_um[0] - reference_um[0]))
     if start_um <= max(_WORTH_SAYING * float(np.ptp(reference_um)), doubt_um):
         return []
@@ -131,7 +131,7 @@ def begins_in_motion(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: 
 
 
 def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarray:
-    """Lead the driver: the command whose response is that of a static voltage, shape `(n,)`."""
+    """Compensate the driver's lag: the command that gives the piezo a static voltage, shape `(n,)`."""
     gain = gains_of(stage).ahead
     return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(gain * static_V)))
 

@@ -53,7 +53,7 @@ def replaced(controller: _Controller, values: Mapping[str, np.ndarray]) -> _Cont
 
 
 def printed_gains(controller: AbstractController, pid: PID) -> dict[str, np.ndarray]:
-    """All that makes a controller again, by path: its own fields, and those of its PID controller."""
+    """All parameters that make a controller again, by path: its own, and those of its PID controller."""
     values = parameter_values(controller)
     if isinstance(controller, PID):
         return values

@@ -23,7 +23,7 @@ _SAME_FREQUENCY = 1e-3
 
 
 def own_settings(controller: type[m.AbstractController]) -> list[m.Setting]:
-    """What may be stated of a controller beside the fields of its PID controller."""
+    """Settings of a controller beside the fields of its PID controller."""
     return [setting for setting in m.settings_of(controller) if setting.name not in PID_SETTINGS]
 
 
@@ -171,7 +171,7 @@ class Maker:
             raise DataError(f"{name}: {error}; choose pid.") from error
         if given is not None or kind.learns:
             return Made(replaced(made, own), pid, tuning, remarks)
-        tuning = self._tuned(self._calmed(made))
+        tuning = self._tuned(self._with_margin(made))
         return Made(tuning.controller, pid, tuning, [*remarks, *(x for x in tuning.remarks if x not in remarks)])
 
     def _task(self) -> m.ControlTask:
@@ -203,8 +203,8 @@ class Maker:
             progress=self.progress,
         )
 
-    def _calmed(self, controller: Any) -> Any:
-        """A controller whose own gains are halved until its loop can be tuned."""
+    def _with_margin(self, controller: Any) -> Any:
+        """Halve a controller's own gains until the loop is stable with some margin, so that it can be tuned."""
         for _ in range(_HALVINGS):
             every = self.loop.margins(controller)
             if all(bool(one.stable) and float(one.sensitivity_peak) < _MOST_PEAK for one in every):
@@ -217,7 +217,7 @@ class Maker:
     def _stated(
         self, kind: type[m.AbstractController], given: Given | None, frequency_Hz: Sequence[float]
     ) -> tuple[dict[str, np.ndarray], list[str]]:
-        """What is given of a controller beside its PID controller, by path, and what is to be said of it."""
+        """Parameters that are given beside those of the PID controller, by path, and remarks on them."""
         own = {} if given is None else {name: x for name, x in given.others.items() if name in kind.own}
         several = [setting.name for setting in own_settings(kind) if setting.several]
         found = {name: np.atleast_1d(own[name]) for name in several if name in own}

@@ -28,14 +28,8 @@ _STEPS = 1000
 class Driving:
     """What hysteresis adds to a piezo that is taken for proportional, over one loop of its whole range (Eq. 7).
 
-    Attributes
-    ----------
-    stroke_um
-        Elongation between the lowest and the highest voltage.
-    slope_um_per_V
-        The proportional elongation: the line from the lowest voltage that leaves the smallest squares over the loop.
-    highest_um, lowest_um
-        Largest elongation above that line and below it, with their signs.
+    The proportional elongation is the line from the lowest voltage that leaves the smallest squares over the loop;
+    the highest and lowest error, with their signs, are counted from it.
     """
 
     stroke_um: float
@@ -55,14 +49,10 @@ class AxisBudget:
 
     Attributes
     ----------
-    axis
-        Its name.
     output_unit
         `um` or `urad`, of all that follows but the sensitivity.
-    stroke
-        Output at full elongation.
-    piezo_sensitivity
-        Output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
+    stroke, piezo_sensitivity
+        Output at full elongation, and output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
     driving_highest, driving_lowest
         Largest driving errors to either side, with their signs.
     machining_signed, machining_worst_case, machining_root_sum_square

@@ -172,7 +172,7 @@ class PaperStand:
     modes: list[PaperMode]
 
     def bench(self, rng: np.random.Generator | None) -> data_synth.PaperBench:
-        """A bench per seed; without a generator, with a sensor that sees everything."""
+        """A bench per seed; without a generator, with an ideal sensor."""
         return data_synth.PaperBench(
             self.axis, self.piezo, rng=rng, benches=len(self.identified), interval_s=INTERVAL_s
         )

@@ -78,7 +78,7 @@ def plot_stage(
 
 
 def _speed_per_s(record: Record) -> float:
-    """How fast a voltage moves, for its size."""
+    """Root mean square rate of a voltage over its range, per s."""
     rate = np.diff(record.voltage_V) / np.diff(record.time_s)
     return float(np.sqrt(np.mean(rate**2)) / np.ptp(record.voltage_V))
 
@@ -115,7 +115,7 @@ def _static_um(stage: Stage, record: Record, state: str, fraction: float) -> np.
 
 
 def _linear(stage: Stage, frequency_Hz: np.ndarray) -> np.ndarray:
-    """Response of all linear parts over that at rest, complex, shape `(f,)`."""
+    """Frequency response of all linear parts over their static gain, complex, shape `(f,)`."""
     out = np.ones(len(frequency_Hz), dtype=complex)
     for part in stage.parts:
         if isinstance(part, AbstractLinear):

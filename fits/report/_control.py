@@ -109,7 +109,7 @@ def _step(time_s: np.ndarray, wanted_um: np.ndarray, moved_um: np.ndarray) -> St
 
 
 def describe_control(summary: Mapping[str, Any]) -> str:
-    """The same in words, from `control_json`."""
+    """Put what `control_json` gives into lines of text."""
     tracking, worst = summary["tracking"], summary["margins_worst"]
     lines = [f"{summary['controller']}, {summary['samples']} samples of {summary['interval_s']:.6g} s"]
     for path, value in summary["gains"].items():

@@ -107,7 +107,7 @@ def _environment() -> Environment:
 
 
 def _tiles(diagnosis: Diagnosis, length: Lengths) -> list[tuple[str, str]]:
-    """The first numbers to be read."""
+    """Key figures at the top of the page, by name."""
     gain, tiles = diagnosis.gain, []
     if diagnosis.causes:
         first = diagnosis.causes[0]
@@ -161,7 +161,7 @@ def _span(low: float, high: float, unit: str) -> str:
 
 
 def _facts(ahead: Experiment) -> list[tuple[str, Any]]:
-    """What the next experiment would tell apart, and by how much."""
+    """Figures of the next experiment, by name."""
     pairs = []
     if ahead.time_s.size > 1:
         pairs.append(("Duration", f"{number(float(ahead.time_s[-1] - ahead.time_s[0]))} s"))

@@ -37,7 +37,7 @@ class Axis:
     second: float = 1.0
 
     def quantile(self, chance: FloatArray) -> FloatArray:
-        """Values at probabilities."""
+        """Values at cumulative probabilities."""
         if self.distribution == "normal":
             return np.asarray(self.first + self.second * ndtri(np.clip(chance, _TINY, 1 - _TINY)))
         if self.distribution == "log":
@@ -127,9 +127,8 @@ def _hypercube(dimensions: int, rows: int, seed: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Plan:
-    """All rows: groups crossed with each other, of which the last runs fastest, for each of some repeats.
-
-    Repeats are rows there are by themselves, such as files.
+    """All rows: groups crossed with each other, of which the last runs fastest, repeated for each source, such as a
+    file.
     """
 
     groups: tuple[AbstractGroup, ...]
@@ -152,5 +151,5 @@ class Plan:
         return {axis.parameter: found[axis.parameter] for axis in self.axes}
 
     def repeat_of(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Which of the rows there are by themselves, shape `(n,)`."""
+        """Index of the source of each row, shape `(n,)`."""
         return rows // math.prod(len(group) for group in self.groups)

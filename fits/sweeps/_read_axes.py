@@ -53,10 +53,9 @@ class _Design(msgspec.Struct):
 def read_plan(
     table: Mapping[str, Any], parameters: Sequence[Parameter], repeats: int, seed: int, load: Callable[[str], bytes]
 ) -> Plan:
-    """Read `[[axis]]`, `[design]` and `[list]` of a sweep.
+    """Read `[[axis]]`, `[design]` and `[list]` of a sweep, whose rows are repeated for each of so many sources.
 
-    There are `repeats` rows by themselves; the seed is that of what is drawn, and `load` gives the content of a file.
-    A `DataError` says what is not as it should be.
+    The seed is that of random draws, and `load` gives the content of a file. A `DataError` says what is wrong.
     """
     known = {parameter.name: parameter for parameter in parameters}
     listed: dict[str, list[tuple[Axis, np.ndarray]]] = {}

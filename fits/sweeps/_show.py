@@ -32,7 +32,7 @@ def open_sweep(folder: str | os.PathLike[str]) -> Any:
 
 @contextmanager
 def readable(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn what decoders say of a broken file into one sentence."""
+    """Turn the errors of decoders of a broken file into a `DataError`."""
     try:
         yield
     except DataError:

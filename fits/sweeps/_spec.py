@@ -134,7 +134,7 @@ def _sum_of(path: Path) -> str:
 
 
 def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Replace rows outside the bounds by something harmless, and say why they fail."""
+    """Replace values out of bounds by nominal ones, and give the reason for each row that fails."""
     reasons = [""] * len(next(iter(values.values()), np.zeros(0)))
     kept = dict(values)
     parameters = {parameter.name: parameter for parameter in sweep.facts.parameters}

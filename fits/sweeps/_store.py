@@ -293,7 +293,7 @@ def _locked(folder: Path, out: str) -> Iterator[None]:
 
 @contextmanager
 def _sentences(folder: Path) -> Iterator[None]:
-    """Turn what a disk complains of into one sentence."""
+    """Turn an OSError of the disk into a `DataError`."""
     try:
         yield
     except OSError as error:

@@ -199,7 +199,7 @@ def number(found: Any, place: str) -> float:
 
 
 def in_a_file(content: bytes, name: str, read: Callable[[Path], Any]) -> Any:
-    """Read a content with what reads files; sentences name the file as the sweep does."""
+    """Read content by a function that reads files; its errors name the file as the sweep does."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / os.path.basename(name)
         path.write_bytes(content)
