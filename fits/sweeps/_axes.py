@@ -127,9 +127,7 @@ def _hypercube(dimensions: int, rows: int, seed: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Plan:
-    """All rows: groups crossed with each other, of which the last runs fastest, repeated for each source, such as a
-    file.
-    """
+    """All rows: groups crossed with each other, the last running fastest, repeated for each source such as a file."""
 
     groups: tuple[AbstractGroup, ...]
     repeats: int = 1
