@@ -33,21 +33,16 @@ class Allocation:
 
     Attributes
     ----------
-    design
-        With the new tolerances. Dimensions that no axis of the budget depends on keep theirs.
-    names
-        Dimensions whose tolerances were chosen.
+    design, names
+        With the new tolerances, and the dimensions whose tolerances were chosen. Those on which no axis of the budget
+        depends keep theirs.
     cost, cost_before
         Sum over these, with the new tolerances and the old ones.
     error_pct
         First-order error of each axis of the budget, in percent of its output.
-    active
-        Axes whose budget is used up. Of two axes that are one function of the same dimensions, the one with the
-        lower budget stands for both.
-    multipliers
-        Of the active axes: by how many percent the cost falls when the budget grows by one percent.
-    limit
-        As asked for.
+    active, multipliers
+        Axes whose budget is used up, and by how many percent the cost falls when the budget grows by one percent. Of
+        two axes that are one function of the same dimensions, the one with the lower budget stands for both.
     """
 
     design: Design

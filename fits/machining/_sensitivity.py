@@ -63,16 +63,14 @@ class DimensionEffect:
 
 @dataclass(frozen=True)
 class AxisSensitivity:
-    """The sensitivities of one axis.
+    """The sensitivities of one axis, whose outputs are in `output_unit`: `um` or `urad`.
 
     Attributes
     ----------
-    axis, output_unit
-        Its name, and `um` or `urad`.
     gain
         Output per elongation of the piezo for small strokes, in `output_unit` per um.
     loaded_stroke_um, stroke
-        Elongation of the loaded piezo at the highest voltage (Eq. 14), and the output there, in `output_unit`.
+        Elongation of the loaded piezo at the highest voltage (Eq. 14), and the output there.
     dimensions
         The arguments of Eq. 5, largest relative change first.
     rss_pct, worst_case_pct
