@@ -28,14 +28,11 @@ class NetworkInverse(eqx.Module):
     ----------
     network
         Takes the displacement, its direction and the remembered extremes, newest first; all from -1 to 1.
-    lowest_um, span_um
-        Range of the displacements it was trained on.
-    middle_V, half_V
-        Middle and half-width of the voltages.
-    dead_um
-        Turns of the displacement by less than this are not remembered: they are noise.
-    extremes
-        How many extremes are looked at.
+    lowest_um, span_um, middle_V, half_V
+        Range of the displacements it was trained on; middle and half-width of the voltages.
+    dead_um, extremes
+        Turns of the displacement by less than this are not remembered: they are noise; and how many extremes are
+        seen.
     """
 
     network: eqx.nn.MLP

@@ -114,18 +114,14 @@ def second_order(
 
 @dataclass(frozen=True)
 class AxisSpread:
-    """How the gain of an axis spreads, in its unit.
+    """How the gain of an axis spreads, in um/um or rad/um; per um of free elongation with a fixed voltage.
 
     Attributes
     ----------
-    axis, unit
-        Which, and the unit of its gain: `um/um` or `rad/um`; per um of free elongation with an imposed voltage.
     nominal, mean, sd, skewness
         Gain at the nominal dimensions, and statistics of the draws.
-    sd_error
-        Standard error of `sd`, from the fourth moment.
-    quantiles
-        By percentage: 0.135, 2.5, 50, 97.5 and 99.865.
+    sd_error, quantiles
+        Standard error of `sd`, from the fourth moment; and quantiles by percentage: 0.135, 2.5, 50, 97.5 and 99.865.
     first_order_sd, second
         Standard deviation from the gradient, and the expansion to second order where `flagged`, else `None`.
     """
