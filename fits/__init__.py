@@ -73,9 +73,9 @@ if TYPE_CHECKING:
     from fits.machining._sobol import sobol as sobol
     from fits.plots._control import plot_compensation as plot_compensation
     from fits.plots._control import plot_control as plot_control
-    from fits.plots._idle import plot_idle as plot_idle
     from fits.plots._loop import plot_fit as plot_fit
     from fits.plots._machining import plot_budget as plot_budget
+    from fits.plots._machining import plot_idle as plot_idle
     from fits.plots._machining import plot_sensitivity as plot_sensitivity
     from fits.plots._stage import plot_stage as plot_stage
     from fits.plots._sweep import plot_sweep as plot_sweep
@@ -208,7 +208,7 @@ _HOMES = {
     "plot_compensation": "plots._control",
     "plot_control": "plots._control",
     "plot_fit": "plots._loop",
-    "plot_idle": "plots._idle",
+    "plot_idle": "plots._machining",
     "plot_sensitivity": "plots._machining",
     "plot_stage": "plots._stage",
     "plot_sweep": "plots._sweep",
