@@ -33,13 +33,13 @@ class IdleNoise:
 
     The paper (section 4.2, Fig. 8) takes the *average* of an idle record, 0.103 um, for the measuring error. An
     average is an offset: zeroing the sensor removes it, and Eq. 1 is about displacements, where it cancels (errata
-    11). What is left is the random part, of which the paper says "3.18 %" without saying of what; of its own
-    figures only a standard deviation of 0.0318 um is consistent with its band of 0.05 to 0.15 um (errata 41). Here
-    both are in um, and `error_um` says what enters Eq. 1.
+    11). What is left is the random part, of which the paper says "3.18 %" without saying of what; of its own figures
+    only a standard deviation of 0.0318 um is consistent with its band of 0.05 to 0.15 um (errata 41). Here both are
+    in um, and `error_um` says what enters Eq. 1.
 
     Attributes
     ----------
-    samples, rate_Hz, duration_s
+    duration_s
         Length of the record; `samples` times the interval between them.
     mean_um, mean_sd_um
         The offset, and its standard error with the noise's own correlation.
@@ -47,8 +47,6 @@ class IdleNoise:
         Standard deviation about the mean, and about a straight line in time.
     drift_um_per_s, drift_sd_um_per_s
         Slope of that line, and its standard error with the noise's own correlation.
-    peak_to_peak_um
-        Highest reading less the lowest.
     resolution_um
         Quantum of the readings, be it the converter's or the last digit of the file; None where none shows.
     correlation_s
@@ -62,8 +60,6 @@ class IdleNoise:
         Overlapping Allan deviation of the readings, shape `(a,)`, and its approximate standard error.
     bias_instability_um, bias_instability_s
         Its minimum, and the averaging time at which it is reached: averaging any longer does not help.
-    source
-        Name of the file.
     """
 
     samples: int
