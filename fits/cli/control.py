@@ -158,21 +158,14 @@ def control(given: Given) -> None:
             longest = f"the reference's {wanted.time_s[-1]:g} s"
             raise DataError(f"--skip: expected less than {longest}, found {given.skip:g} s.")
         count = given.plants or (_PLANTS if known else 1)
-        stages = draw_plants(
-            held(plant) if isinstance(plant, Stage) else plant, loaded.uncertainty, count, seed=given.seed
-        )
+        nominal = held(plant) if isinstance(plant, Stage) else plant
+        stages = draw_plants(nominal, loaded.uncertainty, count, seed=given.seed)
         limits_of = {field: bound for name, field in _LIMITS.items() if (bound := getattr(given, name)) is not None}
         goal = Goal(given.effort, given.rate, **limits_of)
         rng = np.random.default_rng(given.seed)
         loop = Loop(ready, [held(one) for one in stages], given.noise, given.delay, given.resolution, skipped)
-        tune = Maker(
-            loop,
-            goal,
-            given.starts,
-            given.seed,
-            rng.normal(0, given.noise, len(wanted)) if given.noise else None,
-            progress,
-        )
+        noise = rng.normal(0, given.noise, len(wanted)) if given.noise else None
+        tune = Maker(loop, goal, given.starts, given.seed, noise, progress)
         try:
             made = tune.make(given.controller, known_gains, given.frequency)
         except FitError as error:
