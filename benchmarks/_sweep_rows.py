@@ -124,7 +124,7 @@ def _fits(repeats: int, seed: int, table: Table) -> None:
     rows = np.arange(count)
     relative = ("hysteresis.density.packed_um",)
     block = Block(plan.plan.values(rows), relative, rows, np.zeros(count, dtype=np.int64), seed)
-    source = plan.job._records  # type: ignore[attr-defined]
+    source = plan.job.records  # type: ignore[attr-defined]
     assert isinstance(source, Simulated)
     records = [record for record in source.records(block) if not isinstance(record, str)]
     few = records[:4]

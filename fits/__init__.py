@@ -33,16 +33,12 @@ if TYPE_CHECKING:
     from fits.machining._design import Design, Together, paper_design
     from fits.machining._design_file import read_design, write_design
     from fits.machining._idle import IdleNoise, idle_noise, read_idle
-    from fits.machining._monte_carlo import AxisSpread, MonteCarlo, monte_carlo
-    from fits.machining._second_order import SecondOrder, second_order
+    from fits.machining._monte_carlo import AxisSpread, MonteCarlo, SecondOrder, monte_carlo, second_order
     from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, sensitivities
     from fits.machining._sobol import SobolIndices, sobol
-    from fits.plots._budget import plot_budget
-    from fits.plots._compensation import plot_compensation
-    from fits.plots._control import plot_control
-    from fits.plots._idle import plot_idle
+    from fits.plots._control import plot_compensation, plot_control
     from fits.plots._loop import plot_fit
-    from fits.plots._sensitivity import plot_sensitivity
+    from fits.plots._machining import plot_budget, plot_idle, plot_sensitivity
     from fits.plots._stage import plot_stage
     from fits.plots._sweep import plot_sweep
     from fits.report._diagnosis import report_html

@@ -100,7 +100,7 @@ def draw(design, report, folder):
 @pytest.fixture
 def drawing(monkeypatch):
     def use(function):
-        module = types.ModuleType("fits.plots._sensitivity")
+        module = types.ModuleType("fits.plots._machining")
         module.plot_sensitivity = function
         monkeypatch.setitem(sys.modules, module.__name__, module)
 

@@ -11,8 +11,8 @@ import pytest
 from _diagnosis import KINDS, diagnosis, run_view
 
 from fits.diagnosis._result import EffectParameter, Gain, RunView
-from fits.plots._diagnosis import _envelope
 from fits.plots._residual_views import VIEWS
+from fits.plots._style import thinned
 from fits.report._diagnosis import report_html
 from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
 from fits.report._words import chance, estimate, number, parameter_name, percent, shown_unit, sigmas
@@ -165,7 +165,7 @@ def test_an_envelope_keeps_every_spike(rng):
     # No two within what becomes one point.
     spikes = 500 * rng.choice(200, 20, replace=False) + rng.integers(400, size=20)
     values[spikes] += 50
-    kept = _envelope(values, 2000)
+    kept = thinned(values, 2000)
     assert len(kept) <= 2002
     assert set(np.sort(spikes)[[0, -1]]) <= set(kept)
     assert np.isin(np.argmax(values), kept)

@@ -7,7 +7,7 @@ from scipy import signal, stats
 
 import fits
 from fits.machining._idle import idle_noise, read_idle
-from fits.plots._idle import plot_idle
+from fits.plots._machining import plot_idle
 from fits.stats._noise_spectrum import find_lines
 
 RATE_Hz = 1000.0

@@ -12,8 +12,7 @@ import microid as m
 from fits.io._errors import DataError
 from fits.machining._design import Together, paper_design
 from fits.machining._gains import gain_model, gains_of_many
-from fits.machining._monte_carlo import monte_carlo
-from fits.machining._second_order import second_order
+from fits.machining._monte_carlo import monte_carlo, second_order
 from fits.machining._tolerances import copula_root, from_normal
 
 LAWS = {

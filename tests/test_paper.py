@@ -14,7 +14,7 @@ import data_synth as ds
 import fits.paper._regenerate as paper
 import fits.paper._runs as runs
 from fits.paper._gains import PaperMode, paper_controller, placed_pid, shown_reference
-from fits.paper._loop import run_feedback, stacked
+from fits.paper._runs import run_feedback, stacked
 from fits.paper._tables import PAPER, Measured, PaperResult, paper_json, paper_page
 
 T = 1e-3

@@ -9,8 +9,8 @@ from _gain_formulas import ARGUMENTS, TABLE_1, gains, slopes
 from matplotlib.text import Text
 
 import fits
-import fits.plots._sensitivity
-from fits.plots._sensitivity import _spaced
+import fits.plots._machining
+from fits.plots._machining import _spaced
 
 LEG = {"alpha1": "la1", "alpha2": "la2", "alpha3": "la3"}
 AXES = ("z", "alpha", "gamma")
@@ -38,15 +38,15 @@ def other():
 
 def draw(design, axes, folder):
     figures = []
-    save = fits.plots._sensitivity.save
+    save = fits.plots._machining.save
 
     def remember(picture, path):
         figures.append(picture)
         return save(picture, path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fits.plots._sensitivity, "save", remember)
-        patch.setattr(fits.plots._sensitivity, "paper_claims", lambda _: CLAIMS)
+        patch.setattr(fits.plots._machining, "save", remember)
+        patch.setattr(fits.plots._machining, "paper_claims", lambda _: CLAIMS)
         paths = fits.plot_sensitivity(design, fits.sensitivities(design, axes), folder)
     return paths, figures
 

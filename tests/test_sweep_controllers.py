@@ -144,28 +144,28 @@ def made(
 
 def test_learning_controllers_are_laid_out_for_the_way_from_rest(rng):
     """A step at the first sample is none in the reference, but from where the stage stands."""
-    numbers = made("bp-pid", reference=STEP).job._controllers.numbers
+    numbers = made("bp-pid", reference=STEP).job.controllers.numbers
     assert float(numbers["scale_um"]) == pytest.approx(0.5)
-    numbers = made("cmac-pid", "learning_rate = 0.3", STEP).job._controllers.numbers
+    numbers = made("cmac-pid", "learning_rate = 0.3", STEP).job.controllers.numbers
     assert float(numbers["lower_um"]) == pytest.approx(-0.1)
     assert float(numbers["upper_um"]) == pytest.approx(5.1)
     # 5 um of the stage take some 40 V, of which the table holds half.
     assert 10 < float(numbers["limit_V"]) < 30
     assert float(numbers["learning_rate"]) == 0.3
-    stated = made("cmac-pid", "limit_V = 7.0", STEP).job._controllers.numbers
+    stated = made("cmac-pid", "limit_V = 7.0", STEP).job.controllers.numbers
     assert float(stated["limit_V"]) == 7.0
 
 
 def test_resonators_are_at_the_frequency_of_the_reference(rng):
     sine = 'shape = "sine"\nsamples = 200\ninterval_s = 1e-3\nfrequency_Hz = 33.0'
-    assert float(made("resonant", reference=sine).job._controllers.numbers["frequency_Hz"]) == 33.0
+    assert float(made("resonant", reference=sine).job.controllers.numbers["frequency_Hz"]) == 33.0
     time_s, frequency = np.arange(400) * 1e-3, rng.uniform(20, 60)
     lines = [f"{t},{np.sin(2 * np.pi * frequency * t)}" for t in time_s]
     content = "\n".join(["time_s,displacement_um", *lines]).encode()
     sweep = made("resonant", reference='file = "wanted.csv"', wanted=content)
-    assert float(sweep.job._controllers.numbers["frequency_Hz"]) == pytest.approx(frequency, rel=1e-3)
+    assert float(sweep.job.controllers.numbers["frequency_Hz"]) == pytest.approx(frequency, rel=1e-3)
     # What is stated is not made around the PID controller.
-    own = made("resonant", "resonant_V_per_um_s = 12.0\nlead_deg = 30.0", sine).job._controllers
+    own = made("resonant", "resonant_V_per_um_s = 12.0\nlead_deg = 30.0", sine).job.controllers
     assert own.plant is None
     assert float(own.at({}).lead_deg[0]) == 30.0
 

@@ -53,7 +53,7 @@ def words(chosen, kind="fit"):
 def records_of(sweep, rows):
     relative = tuple(axis.parameter for axis in sweep.plan.axes if axis.relative)
     block = Block(sweep.plan.values(rows), relative, rows, sweep.plan.repeat_of(rows), sweep.seed)
-    return sweep.job._records.records(block)
+    return sweep.job.records.records(block)
 
 
 def batch_of(record, levels, initial, smoothness=0.01, holdout=0.2):

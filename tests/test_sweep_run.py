@@ -75,7 +75,7 @@ def test_rows_agree_with_scipy_and_a_loop_of_relays(tmp_path, rng, seed):
 
 def test_rows_agree_with_the_stage_itself(rng):
     sweep = parsed(small(1))
-    stage, program = nominal_stage(), sweep.job._program
+    stage, program = nominal_stage(), sweep.job.program
     names = ("mechanics.damping_ratio", "driver.gain", "hysteresis.density.packed_um", "program.amplitude_V")
     ends = (0.01, 0.3), (0.5, 1.1), (0, 2), (1, 90)
     values = {name: rng.uniform(*each, 8) for name, each in zip(names, ends, strict=True)}

@@ -14,14 +14,7 @@ import click
 import fits.cli
 from fits.cli._common import NOTHING_LEFT, Stopped, heed_signals, leave, stopped, system_refuses
 from fits.io._errors import without_middle
-
-
-def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted and not context.resilient_parsing:
-        from fits.io._version import written_by
-
-        click.echo(written_by())
-        context.exit()
+from fits.io._version import written_by
 
 
 class _Commands(click.Group):
@@ -35,14 +28,7 @@ class _Commands(click.Group):
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
-@click.option(
-    "--version",
-    is_flag=True,
-    expose_value=False,
-    is_eager=True,
-    callback=_show_version,
-    help="Show the version and exit.",
-)
+@click.version_option(written_by(), message="%(version)s")
 def cli() -> None:
     """Identify a piezo-driven micro-positioner from CSV files of voltage and displacement.
 
@@ -60,7 +46,10 @@ for _found in pkgutil.iter_modules(fits.cli.__path__):
 def main() -> None:
     """Run the command."""
     heed_signals()
-    _bear_any_text()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # What cannot be shown, such as half a character in a file's name, is written as its code.
+            stream.reconfigure(errors="backslashreplace")
     try:
         try:
             cli(prog_name="microid")
@@ -70,10 +59,3 @@ def main() -> None:
             system_refuses(error)
     except Stopped as stop:
         leave(stop)
-
-
-def _bear_any_text() -> None:
-    """Write what a terminal or a file cannot show, such as half a character in a file's name, as its code."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")

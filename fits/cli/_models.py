@@ -12,16 +12,11 @@ from fits.stage._uncertainty import predict
 from microid import Preisach, Stage
 
 
-def preisach_of(path: str, loaded: ModelFile) -> Preisach:
-    """Return the hysteresis that a model file holds; a `DataError` where it holds something else."""
-    if isinstance(loaded.model, Preisach):
-        return loaded.model
-    raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
-
-
 def stage_or_preisach(path: str, loaded: ModelFile) -> Preisach | Stage:
     """Return the stage or the hysteresis that a model file holds; a `DataError` where it holds neither."""
-    return loaded.model if isinstance(loaded.model, Stage) else preisach_of(path, loaded)
+    if isinstance(loaded.model, Preisach | Stage):
+        return loaded.model
+    raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
 
 
 def predicted_by(path: str, loaded: ModelFile, program: Record, initial: str) -> Prediction:

@@ -48,12 +48,10 @@ quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")
 
 
 def out_csv(metavar: str) -> Callable[[Any], Any]:
-    """Declare the option of the CSV that is written."""
     return click.option("--out", required=True, metavar=metavar, help="CSV to write; .gz is compressed.")
 
 
 def plots(what: str) -> Callable[[Any], Any]:
-    """Declare the option of a folder for pictures."""
     return click.option("--plots", metavar="DIR", help=f"Folder for {what}; it is made if need be.")
 
 
@@ -64,7 +62,6 @@ def json_file(instead: str) -> Callable[[Any], Any]:
 
 
 def holdout(what: str) -> Callable[[Any], Any]:
-    """Declare the option of what is only predicted."""
     return click.option("--holdout", multiple=True, metavar="FRACTION|FILE", help=what)
 
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import length_mm, paths_in, refuse_clashes, with_paths
+from fits.cli._common import Given, in_sentences, length_mm, paths_in, refuse_clashes, with_paths
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -79,7 +78,7 @@ def budget(given: Given) -> None:
         text = finite_json(budget_json(found))
         drawn = []
         if drawings is not None:
-            from fits.plots._budget import plot_budget
+            from fits.plots._machining import plot_budget
 
             drawn = plot_budget(found, drawings)
         if unfinished is not None:

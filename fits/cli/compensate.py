@@ -3,8 +3,7 @@
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import paths_in, print_result, refuse_overwriting
+from fits.cli._common import Given, in_sentences, paths_in, print_result, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -43,7 +42,7 @@ def compensate(given: Given) -> None:
     from fits.io._read_csv import read_reference
     from fits.io._record import Record
     from fits.io._units import parse_columns
-    from fits.plots._compensation import plot_compensation
+    from fits.plots._control import plot_compensation
     from fits.stage._model_file import load_model
     from fits.stage._motion import predicted_ranges
     from microid import Preisach, Stage

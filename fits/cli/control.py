@@ -5,20 +5,13 @@ from __future__ import annotations
 import importlib.util
 import pkgutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import paths_in, progress_to_stderr, refuse_overwriting
+from fits.cli._common import Given, in_sentences, paths_in, progress_to_stderr, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
-
-if TYPE_CHECKING:
-    from fits.control._setup import Setup
-    from fits.io._record import Reference
-    from microid import Stage
 
 _PLANTS = 4
 # Finer steps, of um or V, are none.
@@ -110,7 +103,7 @@ def control(given: Given) -> None:
     from fits.cli._models import parse_rig_limits, stage_or_preisach
     from fits.control._gains import read_gains
     from fits.control._make import Loop, Maker
-    from fits.control._setup import setup
+    from fits.control._setup import held, setup
     from fits.control._tune_problem import Goal
     from fits.control._tune_result import passed_limits
     from fits.io._atomic import finite_json, write_csv
@@ -160,22 +153,19 @@ def control(given: Given) -> None:
             if not error.of_model:
                 raise
             raise DataError(f"{given.model}: {error}") from error
-        skipped = _skipped(wanted, ready, given.skip)
+        skipped = round(given.skip / ready.interval_s)
+        if skipped > len(wanted) - 2:
+            longest = f"the reference's {wanted.time_s[-1]:g} s"
+            raise DataError(f"--skip: expected less than {longest}, found {given.skip:g} s.")
         count = given.plants or (_PLANTS if known else 1)
-        held = _held(plant) if isinstance(plant, Stage) else plant
-        stages = draw_plants(held, loaded.uncertainty, count, seed=given.seed)
+        nominal = held(plant) if isinstance(plant, Stage) else plant
+        stages = draw_plants(nominal, loaded.uncertainty, count, seed=given.seed)
         limits_of = {field: bound for name, field in _LIMITS.items() if (bound := getattr(given, name)) is not None}
         goal = Goal(given.effort, given.rate, **limits_of)
         rng = np.random.default_rng(given.seed)
-        loop = Loop(ready, [_held(one) for one in stages], given.noise, given.delay, given.resolution, skipped)
-        tune = Maker(
-            loop,
-            goal,
-            given.starts,
-            given.seed,
-            rng.normal(0, given.noise, len(wanted)) if given.noise else None,
-            progress,
-        )
+        loop = Loop(ready, [held(one) for one in stages], given.noise, given.delay, given.resolution, skipped)
+        noise = rng.normal(0, given.noise, len(wanted)) if given.noise else None
+        tune = Maker(loop, goal, given.starts, given.seed, noise, progress)
         try:
             made = tune.make(given.controller, known_gains, given.frequency)
         except FitError as error:
@@ -245,16 +235,3 @@ def _judged(passed: dict[str, str], stated: dict[str, float | None], kind: str, 
             # Tuning kept it under the noise it heard.
             remarks.append(f"in this run, under fresh noise, a limit is passed: {words} ({option})")
     return remarks
-
-
-def _held(stage: Stage) -> Stage:
-    from microid import Stage
-
-    return Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
-
-
-def _skipped(reference: Reference, ready: Setup, skip_s: float) -> int:
-    count = round(skip_s / ready.interval_s)
-    if count > len(reference) - 2:
-        raise DataError(f"--skip: expected less than the reference's {reference.time_s[-1]:g} s, found {skip_s:g} s.")
-    return count

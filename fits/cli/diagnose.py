@@ -10,10 +10,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from fits.diagnosis._result import Diagnosis, EffectParameter
+    from fits.diagnosis._result import Diagnosis
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import bar_to_stderr, fraction_or_files, paths_in, print_result, refuse_overwriting
+from fits.cli._common import (
+    Given,
+    bar_to_stderr,
+    fraction_or_files,
+    in_sentences,
+    paths_in,
+    print_result,
+    refuse_overwriting,
+)
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -147,7 +154,9 @@ def _lines(diagnosis: "Diagnosis") -> list[str]:
         lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {cause.p_family:.1g}")
         if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
             lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
-        lines += [_parameter(each) for each in cause.parameters]
+        for each in cause.parameters:
+            unit = "" if each.unit == "1" else f" {each.unit}"
+            lines.append(f"    {each.name:24} {each.value:.4g} +- {each.sd:.2g}{unit}")
     if diagnosis.unexplained_rms_um > 0:
         lines.append(f"  unexplained: {diagnosis.unexplained_rms_um:.3g} um")
     gain = diagnosis.gain
@@ -159,8 +168,3 @@ def _lines(diagnosis: "Diagnosis") -> list[str]:
     if diagnosis.next_experiment is not None:
         lines.append(f"next experiment: {diagnosis.next_experiment.purpose}")
     return [*lines, *(f"Note: {remark}" for remark in diagnosis.remarks)]
-
-
-def _parameter(parameter: "EffectParameter") -> str:
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    return f"    {parameter.name:24} {parameter.value:.4g} +- {parameter.sd:.2g}{unit}"

@@ -3,8 +3,7 @@
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import print_result
+from fits.cli._common import Given, in_sentences, print_result
 
 _STATIC_ONLY = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
 

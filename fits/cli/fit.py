@@ -7,8 +7,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import fraction_or_files, paths_in, print_result, progress_to_stderr, refuse_overwriting
+from fits.cli._common import (
+    Given,
+    fraction_or_files,
+    in_sentences,
+    paths_in,
+    print_result,
+    progress_to_stderr,
+    refuse_overwriting,
+)
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 

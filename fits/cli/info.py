@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import print_result
+from fits.cli._common import Given, in_sentences, print_result
 from fits.io._errors import DataError
 
 if TYPE_CHECKING:

@@ -3,8 +3,7 @@
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import paths_in, progress_to_stderr
+from fits.cli._common import Given, in_sentences, paths_in, progress_to_stderr
 from fits.io._file_set import file_set
 
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import length_mm, paths_in, refuse_clashes, with_paths
+from fits.cli._common import Given, in_sentences, length_mm, paths_in, refuse_clashes, with_paths
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -63,7 +62,7 @@ def sensitivity(given: Given) -> None:
         )
         drawn = []
         if drawings is not None:
-            from fits.plots._sensitivity import plot_sensitivity
+            from fits.plots._machining import plot_sensitivity
 
             drawn = plot_sensitivity(design, report, drawings)
         if unfinished is not None:

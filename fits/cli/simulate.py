@@ -3,8 +3,7 @@
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import print_result, refuse_overwriting
+from fits.cli._common import Given, in_sentences, print_result, refuse_overwriting
 
 
 @click.command()

@@ -3,8 +3,7 @@
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, stopped
-from fits.cli._files import paths_in, print_result, progress_to_stderr
+from fits.cli._common import Given, in_sentences, paths_in, print_result, progress_to_stderr, stopped
 from fits.io._file_set import file_set
 from fits.sweeps import kinds
 
@@ -21,9 +20,7 @@ class _Sweep(click.Group):
 
 @click.group(cls=_Sweep, invoke_without_command=True, subcommand_metavar="SWEEP.toml | show DIR [OPTIONS]")
 @click.option(
-    "--example",
-    type=click.Choice([*kinds.examples()]),
-    help="Print a commented SWEEP.toml of about 1,000 rows.",
+    "--example", type=click.Choice([*kinds.examples()]), help="Print a commented SWEEP.toml of about 1,000 rows."
 )
 @click.pass_context
 def sweep(context: click.Context, example: str | None) -> None:

@@ -3,8 +3,7 @@
 import click
 
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences
-from fits.cli._files import paths_in, print_result
+from fits.cli._common import Given, in_sentences, paths_in, print_result
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 

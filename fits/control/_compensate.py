@@ -1,12 +1,13 @@
 """Feedforward: the voltage that makes a stage follow a reference (Eq. 19-21)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from fits.control._compensate_stage import (
     begins_in_motion,
@@ -20,7 +21,7 @@ from fits.control._compensate_stage import (
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
 from fits.loop._run import initial_state
-from microid import AbstractEffect, Inversion, Preisach, Stage, Staircase, invert
+from microid import AbstractEffect, Preisach, Stage, Staircase, invert
 
 Way = Literal["static", "dynamic"]
 
@@ -30,7 +31,7 @@ _PIECE = 8192
 _SLACK = 1e-9
 # What can be reached depends on the past, so it is found again until it stays; two or three times are usual.
 _PASSES = 50
-# Rounds for effects: each leaves of the error about what an effect changes in the slope, a few percent.
+# Rounds of fixed-point iteration for effects; each reduces the error to a few percent of what it was.
 _ROUNDS, _DONE = 12, 1e-9
 # At an end of the range what a stage needs may overshoot by this fraction of it, and is cut, before that is refused.
 _TOLERABLE = 0.01
@@ -40,18 +41,16 @@ _WORTH_SAYING = 1e-4
 
 @dataclass(frozen=True)
 class Compensation:
-    """A voltage for a reference, and what the model does with it.
+    """A voltage for a reference, and what the model does with it; all arrays have the shape `(n,)`.
 
     Attributes
     ----------
-    voltage_V
-        Shape `(n,)`, within the limits.
+    voltage_V, reference_um
+        Within the limits, and what was asked for.
     displacement_um
-        Response of the whole model, sensor offset included, shape `(n,)`.
-    reference_um
-        What was asked for, shape `(n,)`.
+        Response of the whole model, sensor offset included.
     clipped
-        Samples out of reach, where the nearest voltage or displacement that can be reached was taken, shape `(n,)`.
+        Samples out of reach, where the nearest voltage or displacement that can be reached was taken.
     remarks
         What keeps a stage from following, one sentence each.
     """
@@ -101,8 +100,9 @@ def compensate(
     if reference.displacement_um is None:
         raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
     wanted, time_s = reference.displacement_um, reference.time_s
-    if isinstance(model, Stage) and plain_of(model) is not model:
-        return _beside_effects(model, reference, initial, clip, limits_V, way)
+    if isinstance(model, Stage) and (plain := plain_of(model)) is not model:
+        without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
+        return _beside_effects(model, plain, reference, initial, without)
     law = static_equivalent(model) if isinstance(model, Stage) else model
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":
@@ -143,24 +143,19 @@ def compensate(
 
 
 def _beside_effects(
-    stage: Stage,
-    reference: Reference | Record,
-    initial: str,
-    clip: bool,
-    limits_V: tuple[float, float] | None,
-    way: Way,
+    stage: Stage, plain: Stage, reference: Reference | Record, initial: str, invert: Callable[..., Compensation]
 ) -> Compensation:
-    """Invert a stage with effects by the same stage without them, round after round."""
+    """Invert a stage with effects by fixed-point iteration with the inverse of the plain stage, which has none."""
     needs = sorted({name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs})
     if needs:
         raise DataError(
             f"the model depends on {', '.join(needs)}, which a reference does not tell; use baseline.json.",
             of_model=True,
         )
-    time_s, wanted, plain = reference.time_s, np.asarray(reference.displacement_um), plain_of(stage)
+    time_s, wanted = reference.time_s, np.asarray(reference.displacement_um)
     asked, before = wanted, np.inf
     for _ in range(_ROUNDS):
-        found = compensate(plain, Reference(time_s, asked, reference.source), initial, clip, limits_V, way)
+        found = invert(Reference(time_s, asked, reference.source))
         program = Record(time_s, found.voltage_V, None, source=reference.source)
         played = simulate_model(stage, program, initial)
         change = played - simulate_model(plain, program, initial)
@@ -185,7 +180,7 @@ def _led(
     clip: bool,
     bind: str,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Lead the driver, within the limits; which samples were cut, and what to say of that."""
+    """Compensate the driver's lag within the limits: the command, which samples were cut, and remarks on that."""
     asked_V = command(stage, reference.time_s, static_V)
     if stage.hold == "zero":
         # A step stands for the line across its interval.
@@ -235,8 +230,9 @@ def _follow(
     # Each pass makes at least one more sample right, since what can be reached depends on earlier ones only.
     for _ in range(_PASSES):
         before = voltage = np.clip(voltage, *limits)
-        lowest = _reach(model, np.maximum.accumulate(_earlier(voltage, tip)), limits[0], start)
-        highest = _reach(model, np.minimum.accumulate(_earlier(voltage, tip)), limits[1], start)
+        earlier = np.append(tip, voltage[:-1])
+        lowest = _reach(model, np.maximum.accumulate(earlier), limits[0], start)
+        highest = _reach(model, np.minimum.accumulate(earlier), limits[1], start)
         padded[:n] = np.clip(wanted_um, lowest, highest)
         padded[n:] = padded[n - 1]
         voltage = np.clip(np.asarray(_invert(model, jnp.asarray(padded), start).voltage_V)[:n], *limits)
@@ -245,10 +241,6 @@ def _follow(
         if np.allclose(voltage, before, rtol=0, atol=_SLACK * (limits[1] - limits[0])):
             return voltage, lowest, highest
     raise DataError("the reference keeps crossing what the voltage limits allow; widen --limits or shrink it.")
-
-
-def _earlier(voltage_V: np.ndarray, tip_V: float) -> np.ndarray:
-    return np.append(tip_V, voltage_V[:-1])
 
 
 def _reach(model: Preisach, extremes_V: np.ndarray, limit_V: float, start: Staircase) -> np.ndarray:
@@ -263,11 +255,5 @@ def _reach(model: Preisach, extremes_V: np.ndarray, limit_V: float, start: Stair
     return np.asarray(_respond(model, jnp.asarray(path), start))[1 : 2 * n : 2]
 
 
-@eqx.filter_jit
-def _invert(model: Preisach, displacement_um: Float[Array, " n"], start: Staircase) -> Inversion:
-    return invert(model, displacement_um, start)
-
-
-@eqx.filter_jit
-def _respond(model: Preisach, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
-    return model(voltage_V, start)
+_invert = eqx.filter_jit(invert)
+_respond = eqx.filter_jit(lambda model, voltage_V, start: model(voltage_V, start))

@@ -5,23 +5,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 import microid
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._run import initial_state, prepare_run, simulate_run
-from microid import (
-    AbstractEffect,
-    AbstractLinear,
-    GridDensity,
-    Preisach,
-    Reversible,
-    Stage,
-    Staircase,
-    Start,
-    innermost,
-)
+from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Reversible, Stage, Start, innermost
 
 # Doubt about the displacement needed, or a start in motion, that is worth a remark: a fraction of the span.
 _WORTH_SAYING = 0.01
@@ -121,7 +110,7 @@ def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: s
 
 
 def turns(reference_um: np.ndarray, doubt_um: float) -> list[str]:
-    """Say that a reference turns faster than its samples show, if the doubt from `demand` is that large."""
+    """Remark that the reference turns faster than its samples show, if the doubt from `demand` is that large."""
     if doubt_um <= _WORTH_SAYING * float(np.ptp(reference_um)):
         return []
     return [
@@ -131,7 +120,7 @@ def turns(reference_um: np.ndarray, doubt_um: float) -> list[str]:
 
 
 def begins_in_motion(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: float) -> list[str]:
-    """Say that a stage at rest cannot take up a reference that moves; needed and doubt are from `demand`."""
+    """Remark that a stage at rest cannot take up a reference that moves; needed and doubt are from `demand`."""
     start_um = abs(float(needed_um[0] - reference_um[0]))
     if start_um <= max(_WORTH_SAYING * float(np.ptp(reference_um)), doubt_um):
         return []
@@ -142,7 +131,7 @@ def begins_in_motion(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: 
 
 
 def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarray:
-    """Lead the driver: the command whose response is that of a static voltage, shape `(n,)`."""
+    """Compensate the driver's lag: the command that gives the piezo a static voltage, shape `(n,)`."""
     gain = gains_of(stage).ahead
     return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(gain * static_V)))
 
@@ -162,22 +151,17 @@ def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.
     uneven_s = np.abs(record.time_s - (record.time_s[0] + step_s * np.arange(n))).max()
     even = uneven_s <= _ROUNDING * max(np.abs(record.time_s).max(), step_s)
     time_s = step_s if even else record.time_s
-    start = initial_state(initial, lower, upper)
-    return np.asarray(_respond(model, jnp.asarray(time_s), jnp.asarray(record.voltage_V), start))
+    start = Start(memory=initial_state(initial, lower, upper))
+    return respond(model, time_s, record.voltage_V, start)
 
 
-@eqx.filter_jit
-def _demand(stage: Stage, time_s: Float[Array, " n"], reference_um: Float[Array, " n"]) -> Float[Array, " n"]:
-    return microid.piezo_demand(stage, time_s, reference_um)
+_demand = eqx.filter_jit(microid.piezo_demand)
+_command = eqx.filter_jit(microid.driver_command)
 
 
-@eqx.filter_jit
-def _command(stage: Stage, time_s: Float[Array, " n"], piezo_voltage_V: Float[Array, " n"]) -> Float[Array, " n"]:
-    return microid.driver_command(stage, time_s, piezo_voltage_V)
+def respond(stage: Stage, time_s: np.ndarray | float, voltage_V: np.ndarray, start: Start) -> np.ndarray:
+    """Displacement of a stage in um, shape `(n,)` as the voltage has; the time may be one interval."""
+    return np.asarray(_respond(stage, jnp.asarray(time_s), jnp.asarray(voltage_V), start))
 
 
-@eqx.filter_jit
-def _respond(
-    stage: Stage, time_s: Float[Array, "..."], voltage_V: Float[Array, " n"], start: Staircase
-) -> Float[Array, " n"]:
-    return stage(time_s, voltage_V, Start(memory=start))
+_respond = eqx.filter_jit(lambda stage, time_s, voltage_V, start: stage(time_s, voltage_V, start))

@@ -33,26 +33,18 @@ def export_c(
     """Write a header and a source in C99 that do what `model` and `microid.invert` do, sample by sample.
 
     The C needs no library, allocates nothing, loops a bounded number of times and computes in double precision. It
-    holds `8 ((N + 1)**2 + 8 (N - 1))` bytes of constants for `N` levels; a state takes 16 bytes per extreme.
+    holds `8 ((N + 1)**2 + 8 (N - 1))` bytes of constants for `N` levels; a state takes 16 bytes per extreme. The
+    paths of the two files come back.
 
     Parameters
     ----------
-    model
-        To export.
-    folder
-        Where `name.h` and `name.c` go; it is made if need be.
-    name
-        Of the files, and before every name in them.
+    folder, name
+        Where `name.h` and `name.c` go; it is made if need be. The name also stands before every name in them.
     size
         Extremes that a state remembers, two per nested loop. Where more are needed the smallest swing is dropped
         and the status says so: outputs are then off by no more than that swing until a wider loop wipes it out.
     limits_V
         Lowest and highest voltage that the inverse may give; the range of the model by default.
-
-    Returns
-    -------
-    list of Path
-        The header and the source.
 
     Raises
     ------

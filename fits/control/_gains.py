@@ -53,7 +53,7 @@ def replaced(controller: _Controller, values: Mapping[str, np.ndarray]) -> _Cont
 
 
 def printed_gains(controller: AbstractController, pid: PID) -> dict[str, np.ndarray]:
-    """All that makes a controller again, by path: its own fields, and those of its PID controller."""
+    """All parameters that make a controller again, by path: its own, and those of its PID controller."""
     values = parameter_values(controller)
     if isinstance(controller, PID):
         return values
@@ -65,10 +65,7 @@ def printed_gains(controller: AbstractController, pid: PID) -> dict[str, np.ndar
 def read_gains(text: str) -> Given:
     """Gains from the command line: three numbers, or a file as `--json` printed it, or with `gains` alone.
 
-    Raises
-    ------
-    DataError
-        If it is neither, or a value is missing, unknown, negative or no number.
+    A `DataError` says that it is neither, or that a value is missing, unknown, negative or no number.
     """
     try:
         values = [float(part) for part in text.split(",")]

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+import microid as m
 from fits.control._gains import PID_SETTINGS, Given, replaced
 from fits.control._setup import Setup
 from fits.control._tune import parameter_values, tune_controller
@@ -15,33 +16,19 @@ from fits.control._tune_problem import Goal
 from fits.control._tune_result import Tuning
 from fits.control._tune_start import relay_start, slope_array, steepest_slope
 from fits.io._errors import DataError
-from microid import (
-    CONTROLLERS,
-    PID,
-    AbstractController,
-    ControlledPlant,
-    ControlledRun,
-    ControlTask,
-    Margins,
-    Setting,
-    Stage,
-    margins,
-    settings_of,
-    simulate_loop,
-)
 
 _MOST_PEAK, _HALVINGS = 4.0, 20
 # Resonators that are nearer to each other than this share of their frequency fight.
 _SAME_FREQUENCY = 1e-3
 
 
-def own_settings(controller: type[AbstractController]) -> list[Setting]:
-    """What may be stated of a controller beside the fields of its PID controller."""
-    return [setting for setting in settings_of(controller) if setting.name not in PID_SETTINGS]
+def own_settings(controller: type[m.AbstractController]) -> list[m.Setting]:
+    """Settings of a controller beside the fields of its PID controller."""
+    return [setting for setting in m.settings_of(controller) if setting.name not in PID_SETTINGS]
 
 
 def with_defaults(
-    settings: Collection[Setting], stated: Mapping[str, Any], task: ControlTask, place: Callable[[str], str]
+    settings: Collection[m.Setting], stated: Mapping[str, Any], task: m.ControlTask, place: Callable[[str], str]
 ) -> tuple[dict[str, Any], list[str]]:
     """Settings as they are stated, or else their defaults, and what is to be said of these.
 
@@ -89,7 +76,7 @@ class Loop:
     """
 
     ready: Setup
-    plants: list[Stage]
+    plants: list[m.Stage]
     noise_um: float
     delay: int
     resolution_um: float | None
@@ -97,13 +84,12 @@ class Loop:
 
     def run(
         self,
-        controller: AbstractController,
+        controller: m.AbstractController,
         noise_um: np.ndarray | None,
         resolution_V: float | None = None,
         plant: int = 0,
-    ) -> ControlledRun:
-        """Run a controller on one of the plants."""
-        return simulate_loop(
+    ) -> m.ControlledRun:
+        return m.simulate_loop(
             controller,
             self.plants[plant],
             jnp.asarray(self.ready.reference_um),
@@ -116,10 +102,10 @@ class Loop:
             start=self.ready.start,
         )
 
-    def margins(self, controller: AbstractController) -> list[Margins]:
+    def margins(self, controller: m.AbstractController) -> list[m.Margins]:
         """Margins of every plant, at the steepest slope of its hysteresis."""
         return [
-            margins(controller.linear(), one, delay=self.delay, slope_um_per_V=slope_array(one))
+            m.margins(controller.linear(), one, delay=self.delay, slope_um_per_V=slope_array(one))
             for one in self.plants
         ]
 
@@ -131,8 +117,8 @@ class Made:
     There is no tuning where gains were given.
     """
 
-    controller: AbstractController
-    pid: PID
+    controller: m.AbstractController
+    pid: m.PID
     tuning: Tuning[Any] | None
     remarks: list[str]
 
@@ -149,13 +135,12 @@ class Maker:
     progress: Callable[[str], None]
 
     def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
-        """Make a controller by the name of its kind, with its tuning and what is to be said of it.
+        """Make a controller by the name of its kind, and tune it if no gains are given.
 
-        It is tuned if no gains are given. Frequencies are those of resonators; without them those that are given, or
-        the strongest in the reference. A `DataError` says that reference or gains do not suit the controller; of a
-        `FitError` see `tune_controller`.
+        Frequencies are those of resonators; without them those of the gains, or the strongest in the reference. A
+        `DataError` says that reference or gains do not suit the controller; of a `FitError` see `tune_controller`.
         """
-        loop, kind = self.loop, CONTROLLERS[name]
+        loop, kind = self.loop, m.CONTROLLERS[name]
         tuning: Tuning[Any] | None = None
         if given is None:
             self.progress("start by Ziegler and Nichols")
@@ -165,30 +150,33 @@ class Maker:
         else:
             pid = _limited(given.make_pid(loop.ready.interval_s), loop.ready.limits_V)
         remarks = [] if tuning is None else list(tuning.remarks)
-        if kind is PID:
+        if kind is m.PID:
             return Made(pid, pid, tuning, remarks)
         own, said = self._stated(kind, given, frequency_Hz)
         if kind.learns:
             which = "margins are" if tuning is None else "what was tuned, and margins, are"
             said.append(f"{which} those of its PID controller, before it learns")
         stated = {"seed": self.seed} | own
-        numbers, more = with_defaults(own_settings(kind), stated, self._task(), lambda each: _option(name, each))
+        places = {"frequency_Hz": "--frequency"}
+        numbers, more = with_defaults(
+            own_settings(kind), stated, self._task(), lambda x: places.get(x, f"--controller {name}: {x}")
+        )
         remarks += [*said, *more]
         if "frequency_Hz" in numbers:
             self._check_frequencies(np.atleast_1d(numbers["frequency_Hz"]))
         stage = loop.plants[0]
         try:
-            made = kind.of(pid, numbers, ControlledPlant(stage, slope_array(stage), loop.delay))
+            made = kind.of(pid, numbers, m.ControlledPlant(stage, slope_array(stage), loop.delay))
         except ValueError as error:
             raise DataError(f"{name}: {error}; choose pid.") from error
         if given is not None or kind.learns:
             return Made(replaced(made, own), pid, tuning, remarks)
-        tuning = self._tuned(self._calmed(made))
+        tuning = self._tuned(self._with_margin(made))
         return Made(tuning.controller, pid, tuning, [*remarks, *(x for x in tuning.remarks if x not in remarks)])
 
-    def _task(self) -> ControlTask:
+    def _task(self) -> m.ControlTask:
         ready, stage = self.loop.ready, self.loop.plants[0]
-        return ControlTask(
+        return m.ControlTask(
             stage,
             ready.interval_s,
             lambda: ready.reference_um,
@@ -215,8 +203,8 @@ class Maker:
             progress=self.progress,
         )
 
-    def _calmed(self, controller: Any) -> Any:
-        """A controller whose own gains are halved until its loop can be tuned."""
+    def _with_margin(self, controller: Any) -> Any:
+        """Halve a controller's own gains until the loop is stable with some margin, so that it can be tuned."""
         for _ in range(_HALVINGS):
             every = self.loop.margins(controller)
             if all(bool(one.stable) and float(one.sensitivity_peak) < _MOST_PEAK for one in every):
@@ -227,9 +215,9 @@ class Maker:
         return controller
 
     def _stated(
-        self, kind: type[AbstractController], given: Given | None, frequency_Hz: Sequence[float]
+        self, kind: type[m.AbstractController], given: Given | None, frequency_Hz: Sequence[float]
     ) -> tuple[dict[str, np.ndarray], list[str]]:
-        """What is given of a controller beside its PID controller, by path, and what is to be said of it."""
+        """Parameters that are given beside those of the PID controller, by path, and remarks on them."""
         own = {} if given is None else {name: x for name, x in given.others.items() if name in kind.own}
         several = [setting.name for setting in own_settings(kind) if setting.several]
         found = {name: np.atleast_1d(own[name]) for name in several if name in own}
@@ -255,9 +243,5 @@ class Maker:
             raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
 
 
-def _option(controller: str, setting: str) -> str:
-    return "--frequency" if setting == "frequency_Hz" else f"--controller {controller}: {setting}"
-
-
-def _limited(pid: PID, limits_V: tuple[float, float]) -> PID:
+def _limited(pid: m.PID, limits_V: tuple[float, float]) -> m.PID:
     return eqx.tree_at(lambda p: (p.lower_V, p.upper_V), pid, tuple(jnp.asarray(x) for x in limits_V))

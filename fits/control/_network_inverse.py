@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
@@ -28,14 +28,11 @@ class NetworkInverse(eqx.Module):
     ----------
     network
         Takes the displacement, its direction and the remembered extremes, newest first; all from -1 to 1.
-    lowest_um, span_um
-        Range of the displacements it was trained on.
-    middle_V, half_V
-        Middle and half-width of the voltages.
-    dead_um
-        Turns of the displacement by less than this are not remembered: they are noise.
-    extremes
-        How many extremes are looked at.
+    lowest_um, span_um, middle_V, half_V
+        Range of the displacements it was trained on; middle and half-width of the voltages.
+    dead_um, extremes
+        Turns of the displacement by less than this are not remembered: they are noise; and how many extremes are
+        seen.
     """
 
     network: eqx.nn.MLP
@@ -85,23 +82,12 @@ def fit_network_inverse(
     ----------
     record
         Measured voltage and displacement, begun at negative saturation.
-    width, depth
-        Of the network's hidden layers.
-    extremes
-        How many remembered extremes it sees.
-    samples
-        At most so many are used, evenly spaced.
-    steps
-        At most, of the Levenberg-Marquardt method.
-    noise_um
-        Standard deviation of the sensor's noise.
-    seed
-        Of the weights to start with.
-
-    Returns
-    -------
-    NetworkInverse
-        Call it with a displacement.
+    width, depth, extremes
+        Of the network's hidden layers, and how many remembered extremes it sees.
+    samples, steps
+        At most so many samples, evenly spaced, and steps of the Levenberg-Marquardt method.
+    noise_um, seed
+        Standard deviation of the sensor's noise, and the seed of the first weights.
 
     Raises
     ------
@@ -116,7 +102,7 @@ def fit_network_inverse(
             f"{record.source}: expected {_FEWEST} samples or more in which voltage and displacement move, found "
             f"{len(record)}; give a longer record."
         )
-    network = _network(2 + extremes, width, depth, jax.random.key(seed))
+    network = _network(2 + extremes, "scalar", width, depth, activation=jnp.tanh, key=jax.random.key(seed))
     middle, half = (voltage.max() + voltage.min()) / 2, np.ptp(voltage) / 2
     lowest, span, dead = (jnp.asarray(x) for x in (displacement.min(), np.ptp(displacement), 4.0 * noise_um))
     inverse = NetworkInverse(network, lowest, span, jnp.asarray(middle), jnp.asarray(half), dead, extremes)
@@ -126,14 +112,8 @@ def fit_network_inverse(
     return eqx.tree_at(lambda inverse: inverse.network, inverse, trained)
 
 
-@eqx.filter_jit
-def _network(inputs: int, width: int, depth: int, key: PRNGKeyArray) -> eqx.nn.MLP:
-    return eqx.nn.MLP(inputs, "scalar", width, depth, activation=jnp.tanh, key=key)
-
-
-@eqx.filter_jit
-def _features(inverse: NetworkInverse, displacement_um: Float[Array, " n"]) -> Float[Array, "n k"]:
-    return inverse.features(displacement_um)
+_network = eqx.filter_jit(eqx.nn.MLP)
+_features = eqx.filter_jit(lambda inverse, displacement_um: inverse.features(displacement_um))
 
 
 @eqx.filter_jit

@@ -39,6 +39,11 @@ class Setup:
     remarks: tuple[str, ...]
 
 
+def held(stage: Stage) -> Stage:
+    """The same stage under a zero-order hold of its command."""
+    return Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
+
+
 def setup(
     model: Preisach | Stage,
     reference: Reference,
@@ -47,15 +52,13 @@ def setup(
     initial: str = "negative",
     limits_V: tuple[float, float] | None = None,
 ) -> Setup:
-    """Make a model and a reference ready for a closed loop.
+    """Make a model and a reference ready for a closed loop, in which a hysteresis is a stage of one part.
 
-    A hysteresis becomes a stage of one part, which is at rest at the first sample of the reference. The feedforward
-    is none, the inverse of the hysteresis alone, or that of the whole stage; limits are by default the range that
-    the model was fitted on. A `DataError` says that the times are uneven or too few, that the stage cannot be stepped
-    or inverted, or that the limits are not within the model's range.
+    The feedforward is none, the inverse of the hysteresis alone, or that of the whole stage; limits are by default
+    those of the model. A `DataError` says that the times are uneven or too few, that the stage cannot be stepped or
+    inverted, or that the limits are not within the model's range.
     """
-    stage = model if isinstance(model, Stage) else Stage.of(hysteresis=model)
-    stage = Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
+    stage = held(model if isinstance(model, Stage) else Stage.of(hysteresis=model))
     interval = _interval_s(reference)
     try:
         sampled = SampledStage(stage, interval)

@@ -69,7 +69,7 @@ def tune_controller(
     """Tune a controller on models, by the derivatives of whole closed loops.
 
     Gains are searched for in their logarithm (a BFGS method within an augmented Lagrangian for the limits), from the
-    controller that is given and from places drawn around it.
+    controller that is given and from places drawn around it. The best that was found within all limits comes back.
 
     Parameters
     ----------
@@ -91,17 +91,8 @@ def tune_controller(
     free
         Paths of the parameters that move, such as `"pid"` or `"integral_V_per_um_s"`; by default gains: what
         cannot be negative, is not zero and is no time.
-    starts
-        Number of places to search from.
-    seed
-        Of the places.
-    progress
-        Told what is being done.
-
-    Returns
-    -------
-    Tuning
-        The best that was found within all limits.
+    starts, seed, progress
+        Number of places to search from, the seed of those that are drawn, and what is told of each.
 
     Raises
     ------
@@ -112,10 +103,10 @@ def tune_controller(
         although that is not an optimum.
     """
     stages = [plants] if isinstance(plants, Stage) else list(plants)
-    goal = Goal() if goal is None else goal
-    problem = _problem(
-        controller, stages, goal, reference_um, feedforward_V, noise_um, delay, resolution_um, start, skip, free
-    )
+    goal, signals = goal or Goal(), {"feedforward_V": feedforward_V, "noise_um": noise_um}
+    fixed = {"start": start or Start(), "delay": delay}
+    fixed["resolution_um"] = None if resolution_um is None else jnp.asarray(float(resolution_um))
+    problem = _problem(controller, stages, goal, reference_um, signals, skip, free, fixed)
     origin = jnp.zeros_like(problem.origin)
     figures, over, cost = judge(problem, origin)
     if not np.all(np.asarray(figures.stable)):
@@ -160,20 +151,17 @@ def _problem(
     stages: Sequence[Stage],
     goal: Goal,
     reference_um: ArrayLike,
-    feedforward_V: ArrayLike | None,
-    noise_um: ArrayLike | None,
-    delay: int,
-    resolution_um: float | None,
-    start: Start | None,
+    signals: dict[str, ArrayLike | None],
     skip: int,
     free: Sequence[str] | None,
+    fixed: dict[str, Any],
 ) -> Problem:
     kinds: set[Any] = {jax.tree.structure(one) for one in stages}
     if len(kinds) != 1:
         raise DataError("expected one plant or more, all of the same parts in the same order")
     reference = np.atleast_2d(np.asarray(reference_um, dtype=float))
-    given = {}
-    for name, signal in {"feedforward_V": feedforward_V, "noise_um": noise_um}.items():
+    given: dict[str, Any] = {}
+    for name, signal in signals.items():
         if signal is not None:
             signal = np.asarray(signal, dtype=float)
             if signal.shape not in (reference.shape, reference.shape[1:]):
@@ -199,15 +187,12 @@ def _problem(
         jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *stages),
         None if slopes[0] is None else jnp.asarray(np.asarray(slopes, dtype=float)),
         jnp.asarray(reference),
-        given["feedforward_V"],
-        given["noise_um"],
-        jnp.asarray((np.arange(reference.shape[1]) >= skip).astype(float)),
-        Start() if start is None else start,
-        (jnp.asarray(float(goal.effort_um_per_V)), jnp.asarray(float(goal.rate_um_per_V))),
-        {name: jnp.asarray(limit) for name, limit in goal.limits().items()},
-        jnp.asarray(goal.command_width_V()),
-        None if resolution_um is None else jnp.asarray(float(resolution_um)),
-        delay,
+        counts=jnp.asarray((np.arange(reference.shape[1]) >= skip).astype(float)),
+        weights_um_per_V=(jnp.asarray(float(goal.effort_um_per_V)), jnp.asarray(float(goal.rate_um_per_V))),
+        limits={name: jnp.asarray(limit) for name, limit in goal.limits().items()},
+        command_width_V=jnp.asarray(goal.command_width_V()),
+        **given,
+        **fixed,
     )
 
 

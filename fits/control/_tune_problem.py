@@ -106,7 +106,6 @@ class Problem(eqx.Module):
     delay: int = eqx.field(static=True)
 
     def controller(self, y: Float[Array, " n"]) -> Any:
-        """The controller at a place of the search."""
         return self.coordinates(self.origin + self.stretch * REACH * jnp.tanh(y / REACH))
 
 
@@ -130,7 +129,6 @@ class Figures(eqx.Module):
 
 
 def figures(problem: Problem, controller: Any) -> Figures:
-    """Close all loops."""
     linear = controller.linear()
 
     def around(plant: Stage, slope: Float[Array, ""] | None) -> tuple[Margins, tuple[Array, ...]]:

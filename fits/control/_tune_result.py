@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from fits.control._tune_problem import Figures, Goal, overshoot_pct
@@ -13,22 +14,16 @@ from microid import AbstractController, ControlledRun, Margins
 _Controller = TypeVar("_Controller", bound=AbstractController)
 # Tuning keeps limits to a share of 2e-3.
 _TOLERANCE = 3e-3
+# Figures of which a report has the largest of all references.
+_HIGHEST = ("error_max_um", "overshoot_pct", "command_max_V")
 
 
 @dataclass(frozen=True)
 class LoopReport:
     """One plant under a tuned controller; figures of several references are the worst.
 
-    Attributes
-    ----------
-    margins
-        Of the linearised loop; the hysteresis stands at its steepest slope.
-    error_rms_um, error_max_um
-        Over the samples that count.
-    overshoot_pct
-        See `Goal`.
-    command_min_V, command_max_V, command_step_max_V
-        Range of the command, and its largest change between samples.
+    The margins are those of the linearised loop, where the hysteresis is steepest; errors are over the samples that
+    count; see `Goal` for the overshoot, and `command_step_max_V` is the largest change between samples.
     """
 
     margins: Margins
@@ -52,12 +47,10 @@ class Tuning(Generic[_Controller]):
         Of the controller it began with, and of this one; see `Goal`.
     converged
         Whether nothing is left to gain nearby: the slope of the cost is small, or balanced by limits.
-    plants
-        One report per plant, the nominal one first.
+    plants, remarks
+        One report per plant, the nominal one first; and what the user should know, one sentence each.
     gains
         Before and after, in their units, by their path in the controller.
-    remarks
-        What the user should know, one sentence each.
     """
 
     controller: _Controller
@@ -75,25 +68,13 @@ class Tuning(Generic[_Controller]):
 
 
 def reports(found: Figures) -> tuple[LoopReport, ...]:
-    """One report per plant."""
-
-    def worst(values: Any, plant: int) -> float:
-        return float(np.max(np.asarray(values)[plant]))
-
     out = []
     for k in range(found.error_um2.shape[0]):
-        one = jax.tree.map(lambda leaf, k=k: leaf[k], found.margins)
-        out.append(
-            LoopReport(
-                one,
-                worst(found.error_um2, k) ** 0.5,
-                worst(found.error_max_um, k),
-                worst(found.overshoot_pct, k),
-                float(np.min(np.asarray(found.command_min_V)[k])),
-                worst(found.command_max_V, k),
-                worst(found.command_step_V, k),
-            )
-        )
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], found)
+        highest = {name: float(jnp.max(getattr(one, name))) for name in _HIGHEST}
+        rms, lowest = float(jnp.max(one.error_um2)) ** 0.5, float(jnp.min(one.command_min_V))
+        step = float(jnp.max(one.command_step_V))
+        out.append(LoopReport(one.margins, rms, command_min_V=lowest, command_step_max_V=step, **highest))
     return tuple(out)
 
 

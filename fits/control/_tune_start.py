@@ -26,12 +26,7 @@ _HALVINGS = 60
 class UltimatePoint:
     """Where a loop under a proportional controller oscillates for ever; about where one with a relay does.
 
-    Attributes
-    ----------
-    gain_V_per_um
-        The gain of the controller.
-    period_s
-        Of the oscillation.
+    The gain is that of the controller, and the period that of the oscillation.
     """
 
     gain_V_per_um: float
@@ -41,20 +36,8 @@ class UltimatePoint:
 def steepest_slope(stage: Stage) -> float | None:
     """Slope of a stage's hysteresis where it is steepest, in um/V: there the loop is least stable.
 
-    Parameters
-    ----------
-    stage
-        With a `Preisach`, whose slope is largest somewhere on its major loop, or with a `PrandtlIshlinskii`.
-
-    Returns
-    -------
-    float or None
-        None for a stage that is linear.
-
-    Raises
-    ------
-    DataError
-        If the hysteresis is another one.
+    That of a `Preisach` is found on its major loop, that of a `PrandtlIshlinskii` in closed form. None for a stage
+    that is linear; a `DataError` says that the hysteresis is another one.
     """
     place = place_of_hysteresis(stage)
     if place is None:
@@ -89,19 +72,9 @@ def slope_array(stage: Stage) -> Float[Array, ""] | None:
 def ultimate_point(stage: Stage, interval_s: float, *, delay: int = 0) -> UltimatePoint:
     """Find the ultimate point of a stage: where its sampled response, delay included, is real and most negative.
 
-    Parameters
-    ----------
-    stage
-        Of linear parts, and at most one hysteresis, for which its steepest slope stands.
-    interval_s
-        Between two samples of the controller.
-    delay
-        How many samples old the reading is.
-
-    Raises
-    ------
-    DataError
-        If the stage moves down for a voltage that goes up, or does not move at all.
+    The stage has linear parts and at most one hysteresis, for which its steepest slope stands. There are `interval_s`
+    between two samples of the controller, whose readings are `delay` samples old. A `DataError` says that the stage
+    moves down for a voltage that goes up, or does not move at all.
     """
     unit, slope = PID.from_times(1.0, jnp.inf, 0.0, interval_s), slope_array(stage)
 
@@ -133,24 +106,9 @@ def relay_start(plants: Stage | Sequence[Stage], interval_s: float, *, delay: in
     and the period at which a relay experiment would see the loop oscillate; here they come from the model. Stages
     with a light resonance are unstable under them, so the gains are halved until every plant has a gain margin of 2.
 
-    Parameters
-    ----------
-    plants
-        One stage, or several that are all to be stable; the first gives the ultimate point.
-    interval_s
-        Between two samples of the controller.
-    delay
-        How many samples old the reading is.
-
-    Returns
-    -------
-    PID
-        Without limits, with a filter of a tenth of the derivative's time.
-
-    Raises
-    ------
-    DataError
-        See `ultimate_point`; or if no gains are small enough.
+    There are `interval_s` between two samples of the controller, whose readings are `delay` samples old. Of several
+    plants the first gives the ultimate point. The controller has no limits, and a filter of a tenth of the
+    derivative's time. A `DataError` is that of `ultimate_point`, or says that no gains are small enough.
     """
     stages = [plants] if isinstance(plants, Stage) else list(plants)
     point = ultimate_point(stages[0], interval_s, delay=delay)

@@ -33,21 +33,16 @@ class Allocation:
 
     Attributes
     ----------
-    design
-        With the new tolerances. Dimensions that no axis of the budget depends on keep theirs.
-    names
-        Dimensions whose tolerances were chosen.
+    design, names
+        With the new tolerances, and the dimensions whose tolerances were chosen. Those on which no axis of the budget
+        depends keep theirs.
     cost, cost_before
         Sum over these, with the new tolerances and the old ones.
     error_pct
         First-order error of each axis of the budget, in percent of its output.
-    active
-        Axes whose budget is used up. Of two axes that are one function of the same dimensions, the one with the
-        lower budget stands for both.
-    multipliers
-        Of the active axes: by how many percent the cost falls when the budget grows by one percent.
-    limit
-        As asked for.
+    active, multipliers
+        Axes whose budget is used up, and by how many percent the cost falls when the budget grows by one percent. Of
+        two axes that are one function of the same dimensions, the one with the lower budget stands for both.
     """
 
     design: Design
@@ -93,8 +88,7 @@ def allocate(
     voltage
         Impose the voltage of the piezos instead of their elongation.
     curvature_share
-        No tolerance goes beyond where the second order of its dimension alone takes this share of a budget; infinite
-        for the first order however far.
+        No tolerance goes beyond where the second order of its dimension alone takes this share of a budget.
 
     Raises
     ------
@@ -104,18 +98,38 @@ def allocate(
     AllocationError
         If the solver fails.
     """
-    _check(design, budget_pct, cost or {}, limit, bounds_mm)
+    cost = cost or {}
+    check(design, tuple(budget_pct), "normal")
+    if limit not in _POWERS:
+        raise DataError(f"there is no limit {limit!r}: choose one of {', '.join(_POWERS)}")
+    if limit == "three_sigma":
+        why = "three standard deviations are allocated to independent dimensions only: choose the worst_case"
+        check_independent(design, why)
+    for what, given in (("budget", budget_pct), ("cost", cost)):
+        for name, value in given.items():
+            if not (np.isfinite(value) and value > 0):
+                raise DataError(f"the {what} of {name} is a positive number, got {value}")
+    unknown = [name for name in cost if name not in DIMENSIONS]
+    if unknown:
+        raise DataError(f"there is no dimension {unknown[0]!r}: choose some of {', '.join(DIMENSIONS)}")
+    if not 0 < bounds_mm[0] < bounds_mm[1] < np.inf:
+        raise DataError(
+            f"the bounds of tolerances are positive and in order, got {bounds_mm[0]:g} and {bounds_mm[1]:g} mm"
+        )
     axes = _lowest_budgets(budget_pct)
     names = tuple(dict.fromkeys(name for axis in axes for name in inputs_of(axis, voltage)))
     tolerance = tolerances(design, names)
     if not np.all(tolerance > 0):
         name = names[int(np.argmin(tolerance))]
         raise DataError(f"the cost of {name} at its present tolerance of zero is infinite: give it a positive one")
-    price = np.array([(cost or {}).get(name, 1.0) for name in names])
+    price = np.array([cost.get(name, 1.0) for name in names])
     lever = np.array([lever_mm(design.geometry, name) for name in names])
     lower, upper = (np.log(bound / lever / tolerance) for bound in bounds_mm)
-    pairs = [_derivatives_pct(design, axis, names, voltage) for axis in axes]
-    first, second = (np.array(each) for each in zip(*pairs, strict=True))
+    model, (first, second) = gain_model(design, voltage), np.empty((2, len(axes), len(names)))
+    # Derivatives with respect to each dimension alone, in percent of the gain per mm or rad.
+    for k, axis in enumerate(axes):
+        gain, slopes = gradient(model, twin(axis), names)
+        first[k], second[k] = 100 * slopes / gain, 100 * np.diagonal(hessian(model, twin(axis), names)) / gain
     budget = np.array([[budget_pct[axis]] for axis in axes])
     # Where the second order of a dimension alone comes to its share of a budget.
     curved = np.sqrt(2 * curvature_share * budget / np.maximum(np.abs(second), 1e-300)).min(axis=0)
@@ -202,13 +216,6 @@ class _Problem:
         return found, dict(zip(tight.tolist(), weights[: len(tight)].tolist(), strict=True))
 
 
-def _derivatives_pct(design: Design, axis: Axis, names: tuple[str, ...], voltage: bool) -> tuple[_Vector, _Vector]:
-    """First and second derivatives with respect to each dimension alone, in percent of the gain per mm or rad."""
-    at = gain_model(design, voltage), twin(axis), names
-    value, slopes = (np.asarray(found) for found in gradient(*at))
-    return 100 * slopes / value, 100 * np.diagonal(hessian(*at)) / value
-
-
 def _lowest_budgets(budget_pct: Mapping[Axis, float]) -> tuple[Axis, ...]:
     """Of axes that are one function of the same dimensions, the one with the lower budget."""
     found: dict[Axis, Axis] = {}
@@ -216,29 +223,3 @@ def _lowest_budgets(budget_pct: Mapping[Axis, float]) -> tuple[Axis, ...]:
         if twin(axis) not in found or budget < budget_pct[found[twin(axis)]]:
             found[twin(axis)] = axis
     return tuple(found.values())
-
-
-def _check(
-    design: Design,
-    budget_pct: Mapping[Axis, float],
-    cost: Mapping[str, float],
-    limit: str,
-    bounds_mm: tuple[float, float],
-) -> None:
-    check(design, tuple(budget_pct), "normal")
-    if limit not in _POWERS:
-        raise DataError(f"there is no limit {limit!r}: choose one of {', '.join(_POWERS)}")
-    if limit == "three_sigma":
-        why = "three standard deviations are allocated to independent dimensions only: choose the worst_case"
-        check_independent(design, why)
-    for what, given in (("budget", budget_pct), ("cost", cost)):
-        for name, value in given.items():
-            if not (np.isfinite(value) and value > 0):
-                raise DataError(f"the {what} of {name} is a positive number, got {value}")
-    unknown = [name for name in cost if name not in DIMENSIONS]
-    if unknown:
-        raise DataError(f"there is no dimension {unknown[0]!r}: choose some of {', '.join(DIMENSIONS)}")
-    if not 0 < bounds_mm[0] < bounds_mm[1] < np.inf:
-        raise DataError(
-            f"the bounds of tolerances are positive and in order, got {bounds_mm[0]:g} and {bounds_mm[1]:g} mm"
-        )

@@ -28,14 +28,8 @@ _STEPS = 1000
 class Driving:
     """What hysteresis adds to a piezo that is taken for proportional, over one loop of its whole range (Eq. 7).
 
-    Attributes
-    ----------
-    stroke_um
-        Elongation between the lowest and the highest voltage.
-    slope_um_per_V
-        The proportional elongation: the line from the lowest voltage that leaves the smallest squares over the loop.
-    highest_um, lowest_um
-        Largest elongation above that line and below it, with their signs.
+    The proportional elongation is the line from the lowest voltage that leaves the smallest squares over the loop;
+    the highest and lowest error, with their signs, are counted from it.
     """
 
     stroke_um: float
@@ -55,14 +49,10 @@ class AxisBudget:
 
     Attributes
     ----------
-    axis
-        Its name.
     output_unit
         `um` or `urad`, of all that follows but the sensitivity.
-    stroke
-        Output at full elongation.
-    piezo_sensitivity
-        Output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
+    stroke, piezo_sensitivity
+        Output at full elongation, and output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
     driving_highest, driving_lowest
         Largest driving errors to either side, with their signs.
     machining_signed, machining_worst_case, machining_root_sum_square
@@ -123,10 +113,8 @@ class Budget:
 
     Attributes
     ----------
-    axes
-        By name.
-    driving
-        Of the piezo.
+    axes, driving
+        Budgets by name, and the driving error of the piezo.
     measures
         What the displacement of the model was: the piezo's elongation (`pzt`), or the output of an axis.
     noise_um, zeroed
@@ -165,14 +153,10 @@ def budget(
 
     Parameters
     ----------
-    design
-        Dimensions, tolerances and constants.
+    design, idle
+        Dimensions, tolerances and constants; and the noise of the sensor, from `idle_noise`.
     model
         The fitted hysteresis of a piezo; of a stage, what slow commands see. All piezos are taken to be like it.
-    idle
-        From `idle_noise`.
-    axes
-        Which; all by default.
     measures
         What the displacement of the model is: the piezo's elongation, or the output of an axis, which is then divided
         by its gain.
@@ -194,9 +178,9 @@ def budget(
         raise DataError(f"expected an arm above 0 mm, found {arm_mm:g}; give the distance from the axis of rotation.")
     driving = _driving(design, model, measures, arm_mm)
     noise_um = idle.error_um(zeroed)
-    found = once_per_function(
-        axes, lambda axis: _of_axis(design, axis, driving, _measuring_error(axis, noise_um, arm_mm))
-    )
+    # In um, and in urad where the arm is known.
+    measuring = {"um": noise_um, "rad": None if arm_mm is None else 1e3 * noise_um / arm_mm}
+    found = once_per_function(axes, lambda axis: _of_axis(design, axis, driving, measuring[m.MOTIONS[axis].unit]))
     remarks = (*_remarks(design, found, driving, arm_mm), *(f"Idle record: {remark}" for remark in idle.remarks))
     return Budget(found, driving, measures, noise_um, zeroed, arm_mm, design.level, remarks)
 
@@ -270,13 +254,6 @@ def _combined(design: Design, slopes: Mapping[str, Array], scale: float) -> tupl
     changes = scale * np.array([float(slopes[name]) * design.tolerance[name] for name in slopes])
     variance = float(changes @ design.correlation([*slopes]) @ changes)
     return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
-
-
-def _measuring_error(axis: m.Axis, noise_um: float, arm_mm: float | None) -> float | None:
-    """Measuring error in um, or in urad where the arm is known."""
-    if m.MOTIONS[axis].unit == "um":
-        return noise_um
-    return None if arm_mm is None else 1e3 * noise_um / arm_mm
 
 
 def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, arm_mm: float | None) -> list[str]:

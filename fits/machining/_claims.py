@@ -29,20 +29,9 @@ _WIDTH, _INDENT = 110, " " * 12
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of the paper, judged by the numbers of a design.
+    """A statement of the paper, in other words, judged by the numbers of a design.
 
-    Attributes
-    ----------
-    axes
-        Which it is about.
-    statement
-        What the paper says, in other words.
-    verdict
-        `agree`, `partly` or `disagree`.
-    number, unit
-        What decides.
-    reason
-        What the number is, and why the verdict.
+    The verdict is `agree`, `partly` or `disagree`. A number with its unit decides, and the reason says what it is.
     """
 
     axes: tuple[m.Axis, ...]
@@ -56,28 +45,31 @@ class Claim:
 def paper_claims(design: Design) -> tuple[Claim, ...]:
     """Judge all that the paper says of its Fig. 7 by the derivatives of a design.
 
-    The paper gives no tolerance for angles (erratum 9), so its lengths are compared with lengths.
-
-    Parameters
-    ----------
-    design
-        The paper's, or another.
-
-    Raises
-    ------
-    DataError, RuntimeError
-        See `sensitivities`.
+    The paper gives no tolerance for angles (erratum 9), so its lengths are compared with lengths. Errors are those of
+    `sensitivities`.
     """
     report = sensitivities(design, _AXES)
     x, z, alpha, gamma = (report[axis] for axis in _AXES)
+    (_, grows, thicker), (bend, one_way, longer) = (_shape_of_curve(design, z[name]) for name in ("t4", "la2"))
+    longer += " The first-order differential that the paper draws is straight and can do neither."
+    severe, share = _leaders(gamma, ("t6", "t7", "l6"))
+    leading = f"Among the lengths {_changes(_lengths(gamma))}; the three named make up {share:.1f} % of the variance."
     xy: tuple[m.Axis, ...] = ("x", "y")
     tilts: tuple[m.Axis, ...] = ("alpha", "beta")
     return (
         Claim(xy, "t1, t2, l1 and la1 have a great influence", *_leaders_of_x(x)),
         Claim(xy, "t1 has a great influence", *_t1(design, x)),
         Claim(("z",), "t4 affects the error most", *_t4_of_z(z)),
-        Claim(("z",), "the effect of t4 grows gradually with the machining error", *_gradual(design, z)),
-        Claim(("z",), "the effect of la2 rises sharply, then falls and flattens", *_rise_and_fall(design, z)),
+        Claim(
+            ("z",),
+            "the effect of t4 grows gradually with the machining error",
+            *(_verdict(grows), z["t4"].relative_change_exact_pct, "%", thicker),
+        ),
+        Claim(
+            ("z",),
+            "the effect of la2 rises sharply, then falls and flattens",
+            *(_verdict(not one_way), bend, "%", longer),
+        ),
         Claim(tilts, "l is among the most severe", *_l(alpha)),
         Claim(tilts, "l5 can be neglected", *_negligible(alpha, "l5")),
         Claim(tilts, "t4 can be neglected", *_negligible(alpha, "t4")),
@@ -86,7 +78,7 @@ def paper_claims(design: Design) -> tuple[Claim, ...]:
             "t4 affects z most, and can be neglected in the rotations about x and y",
             *_same_amplifiers(z, alpha),
         ),
-        Claim(("gamma",), "t6, t7 and l6 are the most severe", *_leaders_of_gamma(gamma)),
+        Claim(("gamma",), "t6, t7 and l6 are the most severe", severe, share, "%", leading),
     )
 
 
@@ -103,17 +95,8 @@ def sign_change_guides(design: Design) -> float | None:
     """Number of guiding legs at which the output in x no longer depends on `t1`, to first order.
 
     A thicker hinge lowers the unloaded ratio of the bridge and raises the stiffness of its output, on which the
-    guides are a load. With few guides the first wins, with many the second.
-
-    Parameters
-    ----------
-    design
-        Its own number of guides plays no role.
-
-    Returns
-    -------
-    float or None
-        None where no number does that.
+    guides are a load. With few guides the first wins, with many the second. None where no number does that; the
+    design's own number of guides plays no role.
     """
     guides = float(_sign_change(design.geometry, design.constants))
     return guides if np.isfinite(guides) and guides > 0 else None
@@ -173,17 +156,6 @@ def _t4_of_z(z: AxisSensitivity) -> _Judgement:
     return _verdict(first.name == "t4", ratio >= _SEVERE), ratio, "", reason
 
 
-def _gradual(design: Design, z: AxisSensitivity) -> _Judgement:
-    _, one_way, reason = _shape_of_curve(design, z["t4"])
-    return _verdict(one_way), z["t4"].relative_change_exact_pct, "%", reason
-
-
-def _rise_and_fall(design: Design, z: AxisSensitivity) -> _Judgement:
-    bend, one_way, reason = _shape_of_curve(design, z["la2"])
-    reason += " The first-order differential that the paper draws is straight and can do neither."
-    return _verdict(not one_way), bend, "%", reason
-
-
 def _l(alpha: AxisSensitivity) -> _Judgement:
     first = alpha.dimensions[0]
     ratio = _ratio(first.relative_change_pct, alpha["l"].relative_change_pct)
@@ -213,19 +185,12 @@ def _same_amplifiers(z: AxisSensitivity, alpha: AxisSensitivity) -> _Judgement:
     return _verdict(agree), _ratio(of_alpha, of_z), "", reason
 
 
-def _leaders_of_gamma(gamma: AxisSensitivity) -> _Judgement:
-    verdict, share = _leaders(gamma, ("t6", "t7", "l6"))
-    changes = _changes(_lengths(gamma))
-    return verdict, share, "%", f"Among the lengths {changes}; the three named make up {share:.1f} % of the variance."
-
-
 def _rank(axis: AxisSensitivity, name: str) -> str:
     """Rank of a dimension by its effect, such as `2 of 5`."""
     return f"{[effect.name for effect in axis.dimensions].index(name) + 1} of {len(axis.dimensions)}"
 
 
 def _share_of_largest(axis: AxisSensitivity, name: str) -> float:
-    """Effect of a dimension over the largest."""
     return _ratio(axis[name].relative_change_pct, axis.dimensions[0].relative_change_pct)
 
 

@@ -37,21 +37,17 @@ class Together:
 
 @dataclass(frozen=True)
 class Design:
-    """What a machining error is counted from.
+    """A stage as it is designed: what a machining error is counted from.
 
     Attributes
     ----------
-    geometry
-        The dimensions.
     tolerance
         Largest error to either side of every dimension by name, in the dimension's unit. It stands for three standard
         deviations of a normal distribution, or for the half-width of a uniform or a triangular one.
     level
         0 for Euler-Bernoulli leaves between rigid blocks, 1 with elastic roots, shear and links.
-    guides
-        Guiding legs of a translation in x or y.
-    youngs_modulus_GPa
-        Of all flexures.
+    guides, youngs_modulus_GPa
+        Guiding legs of a translation in x or y; and the modulus of all flexures.
     actuation
         Piezos and moving masses.
     together

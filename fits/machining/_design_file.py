@@ -76,18 +76,11 @@ class _Stage(msgspec.Struct):
 
 
 def read_design(path: str | os.PathLike[str]) -> Design:
-    """Read the design of a stage, in mm and rad.
+    """Read the design of a stage, in mm and rad, from TOML as `write_design` writes it.
 
-    Parameters
-    ----------
-    path
-        TOML as `write_design` writes it. Lengths may be in mm, um or m and angles in rad, mrad or deg; a tolerance is
-        in the unit of its dimension, and 0.02 mm, for an angle over its leg, where none is given.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, or for the first thing in it that is not as it should be.
+    Lengths may be in mm, um or m and angles in rad, mrad or deg; a tolerance is in the unit of its dimension, and
+    0.02 mm, for an angle over its leg, where none is given. A `DataError` says that the file cannot be read, or names
+    the first thing in it that is not as it should be.
     """
     name = os.fspath(path)
     text = read_text(path, "the TOML file of a stage", MOST_TOML_BYTES)
@@ -101,18 +94,11 @@ def read_design(path: str | os.PathLike[str]) -> Design:
 
 
 def write_design(design: Design, path: str | os.PathLike[str]) -> None:
-    """Write the design of a stage as TOML, which `read_design` reads back to the last digit.
-
-    Raises
-    ------
-    DataError
-        As `atomic_path`.
-    """
+    """Write a design as TOML, which `read_design` reads back to the last digit; errors are those of `atomic_path`."""
     atomic_write_text(path, design_text(design))
 
 
 def design_text(design: Design) -> str:
-    """Put the design of a stage into TOML."""
     lines = [
         f'schema = "{SCHEMA}"',
         "# 0: Euler-Bernoulli leaves between rigid blocks; 1: elastic roots, shear, links.",

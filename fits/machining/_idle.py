@@ -33,13 +33,13 @@ class IdleNoise:
 
     The paper (section 4.2, Fig. 8) takes the *average* of an idle record, 0.103 um, for the measuring error. An
     average is an offset: zeroing the sensor removes it, and Eq. 1 is about displacements, where it cancels (errata
-    11). What is left is the random part, of which the paper says "3.18 %" without saying of what; of its own
-    figures only a standard deviation of 0.0318 um is consistent with its band of 0.05 to 0.15 um (errata 41). Here
-    both are in um, and `error_um` says what enters Eq. 1.
+    11). What is left is the random part, of which the paper says "3.18 %" without saying of what; of its own figures
+    only a standard deviation of 0.0318 um is consistent with its band of 0.05 to 0.15 um (errata 41). Here both are
+    in um, and `error_um` says what enters Eq. 1.
 
     Attributes
     ----------
-    samples, rate_Hz, duration_s
+    duration_s
         Length of the record; `samples` times the interval between them.
     mean_um, mean_sd_um
         The offset, and its standard error with the noise's own correlation.
@@ -47,8 +47,6 @@ class IdleNoise:
         Standard deviation about the mean, and about a straight line in time.
     drift_um_per_s, drift_sd_um_per_s
         Slope of that line, and its standard error with the noise's own correlation.
-    peak_to_peak_um
-        Highest reading less the lowest.
     resolution_um
         Quantum of the readings, be it the converter's or the last digit of the file; None where none shows.
     correlation_s
@@ -62,8 +60,6 @@ class IdleNoise:
         Overlapping Allan deviation of the readings, shape `(a,)`, and its approximate standard error.
     bias_instability_um, bias_instability_s
         Its minimum, and the averaging time at which it is reached: averaging any longer does not help.
-    source
-        Name of the file.
     """
 
     samples: int
@@ -95,24 +91,11 @@ class IdleNoise:
         return tuple(_remarks(self))
 
     def error_um(self, zeroed: bool = True, coverage: float = 2.0) -> float:
-        """Measuring error that enters Eq. 1, of a single reading within a time as long as the record.
+        """Measuring error in um that enters Eq. 1, of a single reading within a time as long as the record.
 
-        Parameters
-        ----------
-        zeroed
-            Whether the sensor is zeroed at rest, which removes the mean. Otherwise its size is added.
-        coverage
-            Coverage factor: how many standard deviations the random part counts; 2 covers 95 % of normal noise.
-
-        Returns
-        -------
-        float
-            In um. The random part is at least that of an even spread over one quantum of the readings.
-
-        Raises
-        ------
-        ValueError
-            If the coverage factor is not positive.
+        The mean is added, by its size, unless the sensor is zeroed at rest, which removes it. The random part counts
+        by the coverage factor, of which 2 covers 95 % of normal noise, and is at least that of an even spread over
+        one quantum of the readings. A ValueError says that the factor is not positive.
         """
         if not coverage > 0:
             raise ValueError(f"expected a positive coverage factor, got {coverage}")
@@ -150,17 +133,7 @@ def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = 
 
 
 def idle_noise(reference: Reference) -> IdleNoise:
-    """Describe the noise of an idle record (Eq. 6 and Fig. 8).
-
-    Parameters
-    ----------
-    reference
-        From `read_idle`: readings at rest, evenly sampled.
-
-    Returns
-    -------
-    IdleNoise
-        Offset and random part apart, spectrum, lines and Allan deviation.
+    """Describe the noise of an idle record from `read_idle` (Eq. 6 and Fig. 8).
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Spread of the gains when dimensions are drawn within their tolerances."""
+"""How the gains spread with dimensions within their tolerances: drawn, and expanded to second order."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,9 +8,16 @@ from jaxtyping import Array
 
 from fits.io._errors import DataError
 from fits.machining._design import Design
-from fits.machining._gains import gain_model, gains_of_many, gradient, inputs_of, once_per_function, twin
-from fits.machining._second_order import SecondOrder, second_order
-from fits.machining._tolerances import Distribution, check, copula_root, covariance, from_normal, tolerances
+from fits.machining._gains import gain_model, gains_of_many, gradient, hessian, inputs_of, once_per_function, twin
+from fits.machining._tolerances import (
+    Distribution,
+    check,
+    copula_root,
+    covariance,
+    excess_fourth_moment,
+    from_normal,
+    tolerances,
+)
 from microid import AXES, MOTIONS, Axis
 
 # One compiled function serves all calls; the last piece is filled up.
@@ -22,19 +29,99 @@ _AGREE, _STANDARD_ERRORS = 0.02, 3.0
 
 
 @dataclass(frozen=True)
-class AxisSpread:
-    """How the gain of an axis spreads, in its unit.
+class SecondOrder:
+    """Spread of the gain of an axis as a quadratic function of the errors of the `k` dimensions that it depends on.
 
     Attributes
     ----------
-    axis, unit
-        Which, and the unit of its gain: `um/um` or `rad/um`; per um of free elongation with an imposed voltage.
+    unit
+        Of the gain: `um/um` or `rad/um`; per um of free elongation with `voltage`.
+    gain, gradient, hessian
+        At the nominal dimensions, and derivatives per mm or rad, shapes `(k,)` and `(k, k)`.
+    first_order_sd, mean_shift
+        Standard deviation from the gradient alone, and mean less the gain at the nominal dimensions.
+    pairs
+        What each pair adds to the variance at second order, shape `(k, k)`; the sum of all counts, and two equal
+        halves of a pair stand at either side of the diagonal.
+    """
+
+    axis: Axis
+    unit: str
+    distribution: Distribution
+    voltage: bool
+    names: tuple[str, ...]
+    gain: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+    first_order_sd: float
+    mean_shift: float
+    pairs: np.ndarray
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation at second order."""
+        return float(np.sqrt(max(0.0, self.first_order_sd**2 + self.pairs.sum())))
+
+    @property
+    def second_order_share(self) -> float:
+        """Part of the variance that the gradient does not give."""
+        return float(self.pairs.sum() / (self.first_order_sd**2 + self.pairs.sum()))
+
+
+def second_order(
+    design: Design, axis: Axis, distribution: Distribution = "normal", *, voltage: bool = False
+) -> SecondOrder:
+    r"""Expand the gain of an axis to second order in the dimensions' errors; see `monte_carlo` for the arguments.
+
+    With the covariance :math:`\Sigma`, gradient g and Hessian H, the mean shifts by :math:`\tfrac12 \mathrm{tr} H
+    \Sigma` and the variance is
+
+    .. math::
+
+        g^T \Sigma g + \tfrac12 \mathrm{tr} H \Sigma H \Sigma + \tfrac14 \sum_i H_{ii}^2 (\mu_{4i} - 3 \sigma_i^4)
+
+    for independent dimensions of any symmetric distribution with fourth moments :math:`\mu_4`, and for correlated
+    normal ones. Correlated dimensions that are not normal have joint fourth moments that this leaves out. Third
+    derivatives add to the variance at the same power of the tolerances unless the gradient vanishes; they are left
+    out, too.
+
+    Raises
+    ------
+    DataError
+        If there is no such axis or distribution, or a tolerance is as large as its dimension.
+    """
+    check(design, (axis,), distribution)
+    names = inputs_of(axis, voltage)
+    at = gain_model(design, voltage), twin(axis), names
+    value, slopes, bends = (np.asarray(found) for found in (*gradient(*at), hessian(*at)))
+    sigma = covariance(design, names, distribution)
+    bent = bends @ sigma
+    tails = np.diag(bends) ** 2 * excess_fourth_moment(distribution) * tolerances(design, names) ** 4 / 4
+    return SecondOrder(
+        axis=axis,
+        unit=f"{MOTIONS[axis].unit}/um",
+        distribution=distribution,
+        voltage=voltage,
+        names=names,
+        gain=float(value),
+        gradient=slopes,
+        hessian=bends,
+        first_order_sd=float(np.sqrt(slopes @ sigma @ slopes)),
+        mean_shift=float(np.trace(bent) / 2),
+        pairs=bent * bent.T / 2 + np.diag(tails),
+    )
+
+
+@dataclass(frozen=True)
+class AxisSpread:
+    """How the gain of an axis spreads, in um/um or rad/um; per um of free elongation with a fixed voltage.
+
+    Attributes
+    ----------
     nominal, mean, sd, skewness
         Gain at the nominal dimensions, and statistics of the draws.
-    sd_error
-        Standard error of `sd`, from the fourth moment.
-    quantiles
-        By percentage: 0.135, 2.5, 50, 97.5 and 99.865.
+    sd_error, quantiles
+        Standard error of `sd`, from the fourth moment; and quantiles by percentage: 0.135, 2.5, 50, 97.5 and 99.865.
     first_order_sd, second
         Standard deviation from the gradient, and the expansion to second order where `flagged`, else `None`.
     """
@@ -98,15 +185,11 @@ def monte_carlo(
     design
         Dimensions, tolerances and which of them go together. The correlation of those is that of the dimensions,
         whatever their distribution: a Gaussian copula joins them, and each keeps its own distribution.
-    samples
-        Number of stages drawn.
+    samples, seed
+        Number of stages drawn, from 1000 to 30 million, and the seed of the draws.
     distribution
         Of each dimension: `normal` with the tolerance as three standard deviations; `uniform` or `triangular` over
         the tolerance.
-    seed
-        Of the draws.
-    axes
-        Some of `AXES`.
     voltage
         Impose the voltage of the piezos instead of their elongation.
     progress
@@ -116,7 +199,7 @@ def monte_carlo(
     ------
     DataError
         If there is no such axis or distribution, a tolerance is as large as its dimension, or the number of samples
-        is not between 1000 and 30 million.
+        is out of bounds.
     """
     check(design, axes, distribution)
     if not _FEWEST_SAMPLES <= samples <= _MOST_SAMPLES:

@@ -63,16 +63,14 @@ class DimensionEffect:
 
 @dataclass(frozen=True)
 class AxisSensitivity:
-    """The sensitivities of one axis.
+    """The sensitivities of one axis, whose outputs are in `output_unit`: `um` or `urad`.
 
     Attributes
     ----------
-    axis, output_unit
-        Its name, and `um` or `urad`.
     gain
         Output per elongation of the piezo for small strokes, in `output_unit` per um.
     loaded_stroke_um, stroke
-        Elongation of the loaded piezo at the highest voltage (Eq. 14), and the output there, in `output_unit`.
+        Elongation of the loaded piezo at the highest voltage (Eq. 14), and the output there.
     dimensions
         The arguments of Eq. 5, largest relative change first.
     rss_pct, worst_case_pct
@@ -128,17 +126,10 @@ class SensitivityReport:
 
 
 def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> SensitivityReport:
-    """Differentiate the motion of a stage with respect to its dimensions.
+    """Differentiate the motion of a stage with respect to its dimensions, for all axes by default.
 
     The derivatives are those of the implicit motion functions (Eq. 4, with the inverse that the paper leaves out,
     erratum 6).
-
-    Parameters
-    ----------
-    design
-        Dimensions, tolerances and constants.
-    axes
-        Which; all by default.
 
     Raises
     ------
@@ -213,7 +204,12 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
     slopes = np.array([float(derived.slopes[name]) for name in names])
     changes = slopes * tolerance / gain
     exact = gains_at(design, axis, np.diag(tolerance)) / gain - 1
-    by_voltage = _by_voltage(design, derived.by_voltage)
+    imposed = derived.by_voltage
+    by_voltage = {
+        name: 100 * float(slope) * design.tolerance[name] / float(imposed.output)
+        for name, slope in imposed.dimensions.items()
+        if slope != 0
+    }
     refuse_infinite(
         axis, [*changes, *exact, *slopes, *by_voltage.values(), float(derived.stroke), gain if gain > 0 else math.nan]
     )
@@ -244,15 +240,5 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
         dimensions=tuple(sorted(effects, key=lambda effect: -abs(effect.relative_change_pct))),
         rss_pct=100 * math.sqrt(max(variance, 0.0)),
         worst_case_pct=100 * float(np.abs(changes).sum()),
-        voltage_change_pct=by_voltage,
+        voltage_change_pct=dict(sorted(by_voltage.items(), key=lambda item: -abs(item[1]))),
     )
-
-
-def _by_voltage(design: Design, found: m.Sensitivity) -> dict[str, float]:
-    """Relative changes in percent of all dimensions that have any, largest first."""
-    changes = {
-        name: 100 * float(slope) * design.tolerance[name] / float(found.output)
-        for name, slope in found.dimensions.items()
-        if slope != 0
-    }
-    return dict(sorted(changes.items(), key=lambda item: -abs(item[1])))

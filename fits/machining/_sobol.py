@@ -18,22 +18,16 @@ _FEWEST_SAMPLES, _MOST_SAMPLES = 256, 2**20
 
 @dataclass(frozen=True)
 class SobolIndices:
-    """What part of the variance of a gain comes from which dimension.
+    """What part of the variance of the gain of an axis comes from which of the `k` dimensions that it depends on.
 
     Attributes
     ----------
-    axis
-        Which.
-    names
-        Dimensions that the gain depends on, `k` of them.
     first, total
         Part that a dimension explains by itself, and part that would not be there without it: with all its
         interactions, shape `(k,)`.
     first_interval, total_interval
         Lower and upper end of confidence intervals by bootstrap, shape `(k, 2)`. Points that fill the space evenly
         err less than independent ones, so these are on the safe side.
-    confidence
-        Of the intervals.
     evaluations
         Number of stages evaluated.
     """
@@ -63,16 +57,12 @@ def sobol(
 
     Parameters
     ----------
-    design
-        Dimensions and tolerances.
+    design, distribution, seed, axes, voltage
+        See `monte_carlo`.
     samples
         A power of two; each costs two evaluations and one more per dimension.
-    distribution, seed, axes, voltage
-        See `monte_carlo`.
-    confidence
-        Of the intervals.
-    resamples
-        Of the bootstrap.
+    confidence, resamples
+        Of the intervals, and of the bootstrap that gives them.
 
     Raises
     ------
@@ -109,12 +99,9 @@ def outputs_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Evaluate a function of points in the unit cube, shape `(samples, count)`, where the indices need it.
 
-    Returns
-    -------
-    tuple
-        Outputs at two independent sets of points of a scrambled Sobol sequence, each of shape `(samples,)`, and at
-        the first with one coordinate after the other taken from the second, shape `(count, samples)`. The mean is
-        taken out.
+    Outputs at two independent sets of points of a scrambled Sobol sequence come back, each of shape `(samples,)`, and
+    at the first with one coordinate after the other taken from the second, shape `(count, samples)`; less the mean of
+    the first two.
     """
     first, second = np.hsplit(stats.qmc.Sobol(2 * count, seed=seed, bits=64).random(samples), 2)
     both = [function(first), function(second)]

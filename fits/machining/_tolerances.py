@@ -22,14 +22,10 @@ _NODES = 80
 
 
 def check(design: Design, axes: tuple[Axis, ...], distribution: str) -> None:
-    """Refuse what cannot be drawn.
+    """Refuse, in a `DataError`, what cannot be drawn; float64 must be on.
 
-    Raises
-    ------
-    DataError
-        If an axis or the distribution is unknown, an axis has no tolerances, or draws reach a dimension of zero.
-    RuntimeError
-        If float64 is off.
+    These are an axis or a distribution that is unknown, an axis without tolerances, and draws that reach a dimension
+    of zero.
     """
     require_float64("tolerances")
     if distribution not in _MOMENTS:

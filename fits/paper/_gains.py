@@ -17,11 +17,7 @@ INTERVAL_s = 1e-3
 UPPER_V = 120.0
 # Pair of poles and single pole of the loop in rad/s, and the filter of the derivative in s.
 _STEP = (86.0, 27.0, 1e-3)
-_TRACK = {
-    "HC+PID": (30.0, 30.0, 8e-3),
-    "HC+BP-PID": (30.0, 30.0, 8e-3),
-    "HC+CMAC-PID": (25.0, 25.0, 1e-2),
-}
+_TRACK = {"HC+PID": (30.0, 30.0, 8e-3), "HC+BP-PID": (30.0, 30.0, 8e-3), "HC+CMAC-PID": (25.0, 25.0, 1e-2)}
 # The network starts at the gains of the PID controller, and may take them this factor up and down.
 _SPAN, _NETWORK_RATE_per_um2, _NETWORK_um = 1.5, 1e-3, 20.0
 _LEVELS, _GENERALISATION, _TABLE_V = (64, 64), 32, 2.0
@@ -42,11 +38,8 @@ def placed_pid(mode: PaperMode, pair_rad_per_s: float, single_rad_per_s: float, 
 
     The loop's polynomial `s³ + (2 zeta w + g w² Kd) s² + w² (1 + g Kp) s + g w² Ki` becomes `(s + p)² (s + q)`, with
     p and q the places of the pair and of the single pole, but for the driver, the sampling and the filter of the
-    derivative, whose time constant is `filter_s`.
-
-    For a step, of which the feedforward already makes one, the weights of the reference are such that the answer is
-    that of `p² / (s + p)²`, which does not overshoot. Otherwise they are 1, and what moves slowly is followed without
-    lag.
+    derivative. For a step, of which the feedforward already makes one, the weights of the reference are such that the
+    answer is that of `p² / (s + p)²`, which does not overshoot; otherwise they are 1, for tracking without lag.
     """
     w, zeta, g = mode.natural_rad_per_s, mode.damping_ratio, mode.gain_um_per_V
     p, q = pair_rad_per_s, single_rad_per_s

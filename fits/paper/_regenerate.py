@@ -16,21 +16,20 @@ from fits.machining._design import paper_design
 from fits.machining._idle import idle_noise
 from fits.machining._sensitivity import sensitivities
 from fits.paper._gains import INTERVAL_s
-from fits.paper._loop import PaperRun
 from fits.paper._runs import (
     LEVELS,
     TRAINING_RUNS,
     Identified,
     LEAD_s,
+    PaperRun,
     PaperStand,
     compensated,
     identify,
     identify_modes,
 )
 from fits.paper._tables import AXIS_TITLES, PAPER, Measured, PaperResult, paper_json, paper_page, render
-from fits.plots._idle import plot_idle
+from fits.plots._machining import plot_idle, plot_sensitivity
 from fits.plots._paper import plot_inverse, plot_loop, plot_steps, plot_tracking
-from fits.plots._sensitivity import plot_sensitivity
 from fits.stats._metrics import errors, loop_width_pct
 from microid.control import step_metrics, tracking_errors
 
@@ -73,11 +72,17 @@ def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], 
         else:
             result.table4[name] = found
     progress("drawing")
-    result.figures = {"fig6": _loop_figures(identified), "fig9": _inverse_figures(identified, piezo)}
+    fits = [one.fit.runs[0] for one in identified]
+    loops_um = [compensated(one, piezo) for one in identified]
+    result.figures = {
+        "fig6": _of_loops("fig6", [(run.loop_measured_pct, run.in_sample) for run in fits]),
+        "fig9": _of_loops("fig9", [(loop_width_pct(um, end), errors(um, end)) for um, _, end in loops_um]),
+    }
+    loop, inverse = _draw_loops(identified[0], piezo, folder)
     pictures = [
-        ("Fig. 6: the hysteresis and its model", _draw_loop(identified[0], folder)),
+        ("Fig. 6: the hysteresis and its model", loop),
         *_draw_errors(idle, folder),
-        ("Fig. 9: the inverse model", _draw_inverse(identified[0], piezo, folder)),
+        ("Fig. 9: the inverse model", inverse),
         ("Fig. 10: a step by scheme", _draw_steps(steps, folder)),
         ("Fig. 11: tracking along X, Y", _draw_tracks({"X, Y": tracks["x"]}, folder / "fig11.png")),
         (
@@ -137,16 +142,6 @@ def _measured(
     return found
 
 
-def _loop_figures(identified: list[Identified]) -> dict[str, Measured]:
-    runs = [one.fit.runs[0] for one in identified]
-    return _of_loops("fig6", [(run.loop_measured_pct, run.in_sample) for run in runs])
-
-
-def _inverse_figures(identified: list[Identified], piezo: data_synth.PaperPiezo) -> dict[str, Measured]:
-    loops = [compensated(one, piezo) for one in identified]
-    return _of_loops("fig9", [(loop_width_pct(um, reached), errors(um, reached)) for um, _, reached in loops])
-
-
 def _of_loops(figure: str, found: list[tuple[float | None, Any]]) -> dict[str, Measured]:
     """Widths and errors of loops by seed, beside those of a figure of the paper."""
     rows = [(width or np.nan, off.e_max_pct, off.e_rms_pct) for width, off in found if off is not None]
@@ -154,19 +149,13 @@ def _of_loops(figure: str, found: list[tuple[float | None, Any]]) -> dict[str, M
     return {name: Measured(paper, values) for (name, paper), values in zip(said, np.array(rows).T, strict=True)}
 
 
-def _draw_loop(one: Identified, folder: Path) -> Path:
-    record, model_um = one.record, one.model_um()
-    assert record.displacement_um is not None
-    return plot_loop(record.voltage_V, record.displacement_um, model_um, folder / "fig6.png")
-
-
-def _draw_inverse(one: Identified, piezo: data_synth.PaperPiezo, folder: Path) -> Path:
-    record = one.record
-    assert record.displacement_um is not None
+def _draw_loops(one: Identified, piezo: data_synth.PaperPiezo, folder: Path) -> tuple[Path, Path]:
+    voltage_V, measured_um = one.record.voltage_V, one.record.displacement_um
+    assert measured_um is not None
+    fitted = plot_loop(voltage_V, measured_um, one.model_um(), folder / "fig6.png")
     # Up to the end of the second full loop.
-    end = 1 + int(np.flatnonzero(record.voltage_V == record.voltage_V.min())[2])
-    loop = record.voltage_V[:end], record.displacement_um[:end]
-    return plot_inverse(*loop, *compensated(one, piezo), folder / "fig9.png")
+    end = 1 + int(np.flatnonzero(voltage_V == voltage_V.min())[2])
+    return fitted, plot_inverse(voltage_V[:end], measured_um[:end], *compensated(one, piezo), folder / "fig9.png")
 
 
 def _draw_errors(rng: np.random.Generator, folder: Path) -> list[tuple[str, Path]]:

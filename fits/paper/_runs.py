@@ -1,14 +1,18 @@
 """What `microid paper` does on the bench of `data_synth`: identification, feedforward, and all runs of its tables."""
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 import data_synth
+from data_synth import PaperBench
 from fits.control._compensate import compensate
 from fits.control._compensate_stage import simulate_model
 from fits.io._atomic import write_csv
@@ -17,10 +21,10 @@ from fits.io._record import Record, Reference
 from fits.loop._fit import fit
 from fits.loop._result import FitResult
 from fits.paper._gains import INTERVAL_s, PaperMode, paper_controller, shown_reference
-from fits.paper._loop import PaperRun, run_feedback, stacked
 from fits.stage._frequency import estimate_response, read_multisine
 from fits.stage._modal_fit import fit_response
 from microid import Preisach, positive_saturation
+from microid.control import AbstractController
 
 LEVELS = 23
 # Loops are closed this long before a run begins, so that the noise they carry has found its level.
@@ -28,6 +32,74 @@ LEAD_s = 1.0
 # What a table learns from before a tracking run: two periods and a rest each.
 TRAINING_RUNS = 6
 _STEP_s = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class PaperRun:
+    """What happened on the benches, each of shape `(benches, n)` but for the reference, `(n,)`.
+
+    The displacement is the true one at the sample, and the command is held from there to the next.
+    """
+
+    reference_um: np.ndarray
+    displacement_um: np.ndarray
+    reading_um: np.ndarray
+    command_V: np.ndarray
+
+    def last(self, samples: int) -> "PaperRun":
+        runs = self.displacement_um, self.reading_um, self.command_V
+        return PaperRun(self.reference_um[-samples:], *(values[:, -samples:] for values in runs))
+
+
+@functools.cache
+def _compiled(controllers: Any, states: Any) -> Callable[..., Any]:
+    """One step of controllers and states of these structures, from and to their bare arrays.
+
+    Calls of compiled functions are many here, and modules take longer to take apart than a step takes.
+    """
+
+    @jax.jit
+    def advance(held: Any, before: Any, signals: Any) -> tuple[Any, Any]:
+        def one(held: Any, before: Any, signals: Any) -> tuple[Any, Any]:
+            controller = jax.tree.unflatten(controllers, held)
+            state, command = controller.step(jax.tree.unflatten(states, before), signals[0], signals[1], signals[2])
+            return jax.tree.leaves(state), command
+
+        return jax.vmap(one)(held, before, signals)
+
+    return advance
+
+
+def stacked(make: Callable[[int], AbstractController], count: int) -> AbstractController:
+    """Controllers that differ in their numbers only, as one whose arrays have a first axis more."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(make(k) for k in range(count)))
+
+
+def run_feedback(
+    controllers: AbstractController,
+    bench: PaperBench,
+    reference_um: np.ndarray,
+    feedforward_V: np.ndarray,
+    shown_um: np.ndarray | None = None,
+) -> PaperRun:
+    """Run closed loops on benches side by side; the controllers come from `stacked`.
+
+    The reference has shape `(n,)`; feedforward, and the reference as the controllers are shown it if that differs,
+    have shape `(benches, n)`.
+    """
+    shown = np.broadcast_to(reference_um, feedforward_V.shape) if shown_um is None else shown_um
+    states, form = jax.tree.flatten(eqx.filter_jit(eqx.filter_vmap(lambda one: one.init()))(controllers))
+    held, kind = jax.tree.flatten(controllers)
+    advance = _compiled(kind, form)
+    now = bench.reset()
+    visited, commands = [], []
+    for wanted, lead in zip(shown.T, feedforward_V.T, strict=True):
+        states, command = advance(held, states, np.stack([wanted, now[1], lead], axis=1))
+        visited.append(now)
+        commands.append(np.asarray(command))
+        now = bench.step(commands[-1])
+    displacement_um, reading_um = (np.stack(values, axis=1) for values in zip(*visited, strict=True))
+    return PaperRun(reference_um, displacement_um, reading_um, np.stack(commands, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +128,9 @@ class Identified:
         return found.voltage_V[1:]
 
 
+_at = eqx.filter_jit(lambda model, voltage_V, start: model(voltage_V, start))
+
+
 def identify(piezo: data_synth.PaperPiezo, seeds: list[np.random.Generator], folder: Path) -> list[Identified]:
     """Measure the piezo once per generator, through a CSV, and fit its hysteresis."""
     found = []
@@ -66,14 +141,10 @@ def identify(piezo: data_synth.PaperPiezo, seeds: list[np.random.Generator], fol
         result = fit([record], levels=LEVELS, holdout=0.0, initial="negative")
         assert record.displacement_um is not None
         slope = float(np.ptp(record.displacement_um) / np.ptp(record.voltage_V))
-        rest = _at_bias(result.model, jnp.asarray([data_synth.PAPER_BIAS_V]))
+        saturated = positive_saturation(result.model.density.lower_V, result.model.density.upper_V)
+        rest = _at(result.model, jnp.asarray([data_synth.PAPER_BIAS_V]), saturated)
         found.append(Identified(result, record, float(rest[0]), slope))
     return found
-
-
-@eqx.filter_jit
-def _at_bias(model: Preisach, voltage_V: Float[Array, " n"]) -> Float[Array, " n"]:
-    return model(voltage_V, positive_saturation(model.density.lower_V, model.density.upper_V))
 
 
 def identify_modes(
@@ -101,7 +172,7 @@ class PaperStand:
     modes: list[PaperMode]
 
     def bench(self, rng: np.random.Generator | None) -> data_synth.PaperBench:
-        """A bench per seed; without a generator, with a sensor that sees everything."""
+        """A bench per seed; without a generator, with an ideal sensor."""
         return data_synth.PaperBench(
             self.axis, self.piezo, rng=rng, benches=len(self.identified), interval_s=INTERVAL_s
         )

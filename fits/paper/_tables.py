@@ -19,7 +19,6 @@ TRACK_UNITS = {"e_max_pct": "e_max (%)", "e_rms_pct": "e_rms (%)"}
 
 
 def _rows(names: Iterable[str], rows: Mapping[str, Sequence[float]]) -> dict[str, dict[str, float]]:
-    """Figures by scheme and name."""
     return {scheme: dict(zip(names, row, strict=True)) for scheme, row in rows.items()}
 
 
@@ -97,7 +96,6 @@ class Measured:
         return self.median is None or round(self.median, 2) > self.paper
 
     def json(self) -> dict[str, float | bool | None]:
-        """The figure in JSON values."""
         figures = {"paper": self.paper, "ours": self.median, "spread": self.spread}
         return figures | {"below_sensor": self.below_sensor}
 
@@ -175,7 +173,6 @@ def paper_page(result: PaperResult, pictures: Sequence[tuple[str, str]]) -> str:
 
 
 def render(template: str, **values: Any) -> str:
-    """Fill a template of this folder."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(
         loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True

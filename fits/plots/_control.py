@@ -1,4 +1,4 @@
-"""Pictures of a closed loop: what happened in it, and how far it is from instability."""
+"""Pictures of a reference that is followed: feedforward as in the paper's Fig. 9, and closed loops."""
 
 import os
 from collections.abc import Sequence
@@ -7,9 +7,13 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from fits.control._compensate import Compensation
+from fits.control._compensate_stage import simulate_model
 from fits.control._tune_start import slope_array
+from fits.io._record import Record, Reference
 from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save
-from microid import AbstractController, ControlledRun, Stage, loop_gain
+from fits.stats._metrics import TWO_SIDED_95
+from microid import AbstractController, ControlledRun, Preisach, Stage, loop_gain
 
 _FREQUENCIES = 600
 _DECADES = 3.5
@@ -25,21 +29,9 @@ def plot_control(
 ) -> list[Path]:
     """Draw a run, and the loop gain and sensitivity of every plant.
 
-    Parameters
-    ----------
-    run
-        From `microid.simulate_loop`.
-    controller, delay
-        As they were given there.
-    plants
-        Stages that the controller is to work with, the one that was run first.
-    folder
-        Existing folder for `run.png` and `margins.png`; 200 dots per inch. The paths come back.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
+    The run is from `microid.simulate_loop`, the controller and its delay in samples as they were given there; the
+    first plant is the one that was run. `run.png` and `margins.png` are written into an existing folder, at 200 dots
+    per inch; a `DataError` says if they cannot be.
     """
     time_s = np.asarray(run.time_s)
     picture = figure(WIDE_in, 5.2)
@@ -77,3 +69,49 @@ def plot_control(
     label(peak, "frequency (Hz)", "sensitivity")
     legend(picture, (size,))
     return [*files, save(picture, Path(folder) / "margins.png")]
+
+
+def plot_compensation(
+    model: Preisach | Stage,
+    reference: Reference | Record,
+    compensation: Compensation,
+    displacement_sd_um: np.ndarray | None,
+    folder: str | os.PathLike[str],
+    *,
+    initial: str = "negative",
+) -> list[Path]:
+    """Draw the loop, the inverse loop, the compensated output against its reference, and the error.
+
+    The loop is that of the uncompensated stage: the model driven by the straight line through the compensating
+    voltage over its reference. The error is that of the model, with the band in which the stage is expected, by the
+    standard deviation of the displacement from `predict`, shape `(n,)`; without one no band is drawn.
+
+    Model, reference and initial memory are those that `compensate` was given. `compensation.png` is written into an
+    existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
+    """
+    wanted, voltage, reached = compensation.reference_um, compensation.voltage_V, compensation.displacement_um
+    # A voltage proportional to the reference, within the voltages used.
+    centred = wanted - wanted.mean()
+    gain = float(centred @ voltage) / (float(centred @ centred) or np.inf)
+    straight_V = np.clip(voltage.mean() + gain * centred, voltage.min(), voltage.max())
+    plain = simulate_model(model, Record(reference.time_s, straight_V, None, source=reference.source), initial)
+
+    picture = figure(WIDE_in, 4.8, gap=0.08)
+    (loop, inverse), (output, error) = picture.subplots(2, 2)
+    curve(loop, straight_V, plain, "without compensation", **MEASURED)
+    label(loop, "voltage (V)", "displacement (µm)", "loop")
+    curve(inverse, wanted, voltage, "with compensation", **MODEL)
+    label(inverse, "reference (µm)", "voltage (V)", "inverse loop")
+    curve(output, wanted, plain, **MEASURED)
+    curve(output, wanted, reached, **MODEL)
+    label(output, "reference (µm)", "displacement (µm)", "output")
+    off = reached - wanted
+    error.axhline(0.0, color=LIGHT, linewidth=0.6)
+    curve(error, reference.time_s, off, **MODEL)
+    if displacement_sd_um is not None:
+        half = TWO_SIDED_95 * displacement_sd_um
+        for side, name in ((-half, ""), (half, "95 % band of the model")):
+            curve(error, reference.time_s, off + side, name, color=DARK, linestyle=":", linewidth=0.7)
+    label(error, "time (s)", "error (µm)", "error")
+    legend(picture, (loop, inverse, error))
+    return [save(picture, Path(folder) / "compensation.png")]

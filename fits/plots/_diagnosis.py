@@ -17,7 +17,7 @@ from matplotlib.text import Text
 
 from fits.diagnosis._result import Diagnosis, Experiment, RunView
 from fits.plots._residual_views import VIEWS
-from fits.plots._style import figure, label, verbatim
+from fits.plots._style import figure, label, thinned, verbatim
 from microid.effects import card_of
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
@@ -75,19 +75,6 @@ def _svg(picture: Figure, prefix: str, words: str) -> str:
     return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(words)}"', 1).strip()
 
 
-def _envelope(values: np.ndarray, points: int) -> np.ndarray:
-    """Choose samples that look like all of them: the extremes of even stretches, and the ends; increasing indices."""
-    n = len(values)
-    if n <= points:
-        return np.arange(n)
-    chosen = [0, n - 1]
-    for stretch in np.array_split(np.arange(n), max(points // 2, 1)):
-        known = stretch[np.isfinite(values[stretch])]
-        if known.size:
-            chosen += [known[np.argmin(values[known])], known[np.argmax(values[known])]]
-    return np.unique(chosen)
-
-
 def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
     """Choose the runs with the largest residuals, in their order."""
     runs = [run for run in runs if run.time_s.size > 1]
@@ -114,7 +101,7 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
                 axes.axhspan(-band, band, color=NOISE, linewidth=0)
             curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if extended else [])
             for values, colour, line in curves:
-                keep = _envelope(values, points)
+                keep = thinned(values, points)
                 axes.plot(run.time_s[keep], per_um * values[keep], color=colour, linewidth=line)
             if np.isfinite(band):
                 # Over the curves, which else hide the band.
@@ -183,7 +170,7 @@ def program(ahead: Experiment) -> Picture | None:
     def draw(width_in: float) -> Figure:
         picture = figure(width_in, 2.0)
         axes = picture.subplots()
-        keep = _envelope(ahead.voltage_V, _POINTS // 2)
+        keep = thinned(ahead.voltage_V, _POINTS // 2)
         axes.plot(ahead.time_s[keep], ahead.voltage_V[keep], color=INK, linewidth=0.9)
         axes.set_xlim(ahead.time_s[0], ahead.time_s[-1])
         label(axes, "time (s)", "voltage (V)")

@@ -8,7 +8,6 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -20,6 +19,7 @@ from fits.plots._style import DARK, NARROW_in, WIDE_in, figure, label, save
 from microid import Preisach, Reversible
 
 _MESH = 361
+_surfaces = eqx.filter_jit(lambda model, alpha, beta: (model.density(alpha, beta), model.everett(alpha, beta)))
 _ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
 
 
@@ -33,22 +33,9 @@ def plot_fit(
 ) -> list[Path]:
     """Draw a fit: loops, density, Everett surface and, where something was held out, its prediction.
 
-    Parameters
-    ----------
-    result
-        From `fit`.
-    records, holdout, initial
-        What `fit` was given.
-    folder
-        Existing folder for `loops.png`, `density.png`, `everett.png` and `heldout.png`; 200 dots per inch. The paths
-        come back.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
-    ValueError
-        If the records are not those of the result.
+    Records, holdout and initial memory are those that `fit` was given; a ValueError says that they are not those of
+    the result. `loops.png`, `density.png`, `everett.png` and `heldout.png` are written into an existing folder, at
+    200 dots per inch; a `DataError` says if they cannot be.
     """
     fraction, aside = held_out(holdout, len(records), len(result.runs))
     range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
@@ -75,13 +62,6 @@ def _simulated(result: FitResult[Preisach], run: Run, report: RunReport) -> Draw
         predicted = np.where(run.known, predicted, simulate_run(model, replace(run, start=report.start)))
     sd_um = result.uncertainty.sd_um(result.model, run) if run.held_out.any() else np.zeros(len(predicted))
     return Drawn(run, report, predicted, sd_um, result.noise_um)
-
-
-@eqx.filter_jit
-def _surfaces(
-    model: Preisach, alpha_V: Float[Array, "m m"], beta_V: Float[Array, "m m"]
-) -> tuple[Float[Array, "m m"], Float[Array, "m m"]]:
-    return model.density(alpha_V, beta_V), model.everett(alpha_V, beta_V)
 
 
 def _over_half_plane(model: Preisach) -> tuple[np.ndarray, list[np.ma.MaskedArray]]:

@@ -17,6 +17,11 @@ _FEWEST_IN_MEAN = 4
 _FIRST = 3
 # A change of the voltage below this part of its range is none.
 _SMALLEST_MOVE = 1e-6
+# Whether a residual is that after the extension, and what takes it from a run.
+_RESIDUALS: tuple[tuple[bool, Callable[[RunView], np.ndarray]], ...] = (
+    (False, attrgetter("before_um")),
+    (True, attrgetter("after_um")),
+)
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,9 @@ def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, 
     x, y = x[known], y[known]
     if x.size < _FEWEST_IN_MEAN * 3 or np.ptp(x) == 0:
         raise ValueError("too few samples")
-    edges = np.linspace(x.min(), x.max(), _BINS + 1) if even else np.unique(np.quantile(x, np.linspace(0, 1, 37)))
+    edges = (
+        np.linspace(x.min(), x.max(), _BINS + 1) if even else np.unique(np.quantile(x, np.linspace(0, 1, _BINS + 1)))
+    )
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     rows = []
     for k in range(len(edges) - 1):
@@ -76,10 +83,8 @@ def _over(x: Callable[[RunView], np.ndarray], even: bool = True) -> Callable[[Se
     """Look at a residual against a variable of each sample."""
 
     def look(runs: Sequence[RunView], factor: float) -> list[Curve]:
-        along, before, after = (
-            _together(runs, of) for of in (x, lambda run: run.before_um, lambda run: run.after_um)
-        )
-        return [_binned(along, factor * before, False, even=even), _binned(along, factor * after, True, even=even)]
+        along = _together(runs, x)
+        return [_binned(along, factor * _together(runs, of), after, even=even) for after, of in _RESIDUALS]
 
     return look
 
@@ -88,8 +93,8 @@ def _over_voltage(runs: Sequence[RunView], factor: float) -> list[Curve]:
     x = _together(runs, lambda run: run.voltage_V)
     up = _together(runs, lambda run: _last_move(run)[0]) >= 0
     curves = []
-    for after in (False, True):
-        y = factor * _together(runs, lambda run, after=after: run.after_um if after else run.before_um)  # type: ignore[misc]
+    for after, of in _RESIDUALS:
+        y = factor * _together(runs, of)
         curves.append(_binned(x[up], y[up], after))
         if np.count_nonzero(~up) > _BINS:
             curves.append(_binned(x[~up], y[~up], after, downwards=True))
@@ -114,11 +119,8 @@ def _since_move(runs: Sequence[RunView], factor: float) -> list[Curve]:
     if np.count_nonzero(kept) < _BINS or since_s[kept].max() < 10 * since_s[kept].min():
         raise ValueError("the voltage never goes on for long")
     curves = []
-    for after in (False, True):
-        change_um = _together(
-            runs,
-            lambda run, after=after: _since_event(run, run.after_um if after else run.before_um),  # type: ignore[misc]
-        )
+    for after, of in _RESIDUALS:
+        change_um = np.concatenate([_since_event(run, of(run)) for run in runs])
         found = _binned(np.log10(since_s[kept]), factor * (direction * change_um)[kept], after)
         curves.append(Curve(10**found.x, found.y, after, found.low, found.high))
     return curves
@@ -137,10 +139,7 @@ def _over_time(runs: Sequence[RunView], factor: float) -> list[Curve]:
     if not runs:
         raise ValueError("no runs")
     longest = max(runs, key=lambda run: run.time_s[-1] - run.time_s[0] if run.time_s.size else 0.0)
-    return [
-        _binned(longest.time_s, factor * longest.before_um, False),
-        _binned(longest.time_s, factor * longest.after_um, True),
-    ]
+    return [_binned(longest.time_s, factor * of(longest), after) for after, of in _RESIDUALS]
 
 
 def _spectrum(runs: Sequence[RunView], factor: float) -> list[Curve]:
@@ -153,8 +152,8 @@ def _spectrum(runs: Sequence[RunView], factor: float) -> list[Curve]:
         raise ValueError("too few samples")
     rate_Hz = 1 / float(np.median(np.diff(finest.time_s)))
     curves = []
-    for after in (False, True):
-        values = factor * np.nan_to_num(finest.after_um if after else finest.before_um)
+    for after, of in _RESIDUALS:
+        values = factor * np.nan_to_num(of(finest))
         frequency_Hz, density = signal.welch(values, rate_Hz, nperseg=min(4096, values.size // 2))
         frequency_Hz, density = frequency_Hz[1:], density[1:]
         # Peaks are what is looked for, so that each even stretch of the logarithm shows its largest.

@@ -37,22 +37,10 @@ def plot_stage(
 ) -> list[Path]:
     """Draw the fit of a stage: frequency response, runs with their residuals, and the loop of the slowest run.
 
-    Parameters
-    ----------
-    result
-        From `fit_stage`.
-    records, holdout, initial
-        What `fit_stage` was given.
-    folder
-        Existing folder for `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
-        out) and `loop.png`; 200 dots per inch. The paths come back.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
-    ValueError
-        If the records are not those of the result.
+    Records, holdout and initial memory are those that `fit_stage` was given; a ValueError says that they are not
+    those of the result. `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
+    out) and `loop.png` are written into an existing folder, at 200 dots per inch; a `DataError` says if they cannot
+    be.
     """
     fraction, aside = held_out(holdout, len(records), len(result.runs))
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
@@ -90,7 +78,7 @@ def plot_stage(
 
 
 def _speed_per_s(record: Record) -> float:
-    """How fast a voltage moves, for its size."""
+    """Root mean square rate of a voltage over its range, per s."""
     rate = np.diff(record.voltage_V) / np.diff(record.time_s)
     return float(np.sqrt(np.mean(rate**2)) / np.ptp(record.voltage_V))
 
@@ -127,7 +115,7 @@ def _static_um(stage: Stage, record: Record, state: str, fraction: float) -> np.
 
 
 def _linear(stage: Stage, frequency_Hz: np.ndarray) -> np.ndarray:
-    """Response of all linear parts over that at rest, complex, shape `(f,)`."""
+    """Frequency response of all linear parts over their static gain, complex, shape `(f,)`."""
     out = np.ones(len(frequency_Hz), dtype=complex)
     for part in stage.parts:
         if isinstance(part, AbstractLinear):

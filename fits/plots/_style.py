@@ -55,17 +55,20 @@ def legend(picture: Figure, axes: Iterable[Axes]) -> None:
     picture.legend(curves.values(), curves.keys(), frameon=False, handlelength=1.8, **place)
 
 
-def thinned(values: np.ndarray) -> np.ndarray:
+def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
     """Choose samples that look like all, shape `(n,)`: the extremes of even stretches, and the ends.
 
-    Increasing indices come back, at most some thousands.
+    Increasing indices come back; of a stretch in which nothing is finite there are none.
     """
     n = len(values)
-    if n <= _POINTS:
+    if n <= points:
         return np.arange(n)
-    stretches = np.array_split(np.arange(n), _POINTS // 2)
-    extremes = [(s[np.argmin(values[s])], s[np.argmax(values[s])]) for s in stretches]
-    return np.unique(np.concatenate([np.ravel(extremes), [0, n - 1]]))
+    chosen = [0, n - 1]
+    for stretch in np.array_split(np.arange(n), max(points // 2, 1)):
+        known = stretch[np.isfinite(values[stretch])]
+        if known.size:
+            chosen += [known[np.argmin(values[known])], known[np.argmax(values[known])]]
+    return np.unique(chosen)
 
 
 def curve(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "", **style: Any) -> None:

@@ -4,49 +4,29 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
+from fits.control._compensate_stage import respond
 from fits.control._gains import printed_gains
 from fits.control._make import Loop, Made
 from fits.control._tune_result import Tuning
-from microid import (
-    ControlledRun,
-    Margins,
-    Stage,
-    Start,
-    step_metrics,
-    tracking_errors,
-)
+from fits.report._json import strict
+from microid import ControlledRun, StepMetrics, step_metrics, tracking_errors
 
 SCHEMA = "microid.control/1"
 
 
 def control_json(
-    loop: Loop,
-    made: Made,
-    run: ControlledRun,
-    about: Mapping[str, Any],
-    remarks: Sequence[str],
+    loop: Loop, made: Made, run: ControlledRun, about: Mapping[str, Any], remarks: Sequence[str]
 ) -> dict[str, Any]:
-    """Gather all that is told, as JSON values; what is infinite is None.
+    """Put a run of a loop with a controller into JSON values, `microid.control/1`; what is not finite is None.
 
-    Parameters
-    ----------
-    loop, made, run
-        What was closed, by which controller, and what came of it.
-    about
-        More to put in front.
-    remarks
-        What is known already; more may follow.
+    What it is `about` comes first, and more remarks may follow those that are known.
     """
     kept = slice(loop.skip, None)
     wanted, moved, command = (np.asarray(x) for x in (run.reference_um, run.displacement_um, run.command_V))
-    error = np.asarray(run.error_um)[kept]
-    rms = _rms(error)
+    rms = _rms(np.asarray(run.error_um)[kept])
     sensor = {"noise": loop.noise_um, "resolution": loop.resolution_um or 0.0}
     said = list(remarks)
     below = [f"{name}, {size:.3g} um" for name, size in sensor.items() if 0 < rms < size]
@@ -56,33 +36,32 @@ def control_json(
             f"{' and its '.join(below)}: a bench cannot show it in single readings"
         )
     every = loop.margins(made.controller)
-    return {
+    gains = printed_gains(made.controller, made.pid)
+    found: dict[str, Any] = {
         "schema": SCHEMA,
         **about,
         "samples": len(wanted),
         "interval_s": loop.ready.interval_s,
-        "gains": _gains(made),
+        "gains": {path: value.astype(float) for path, value in gains.items()},
         "tuning": None if made.tuning is None else _tuning(made.tuning),
-        "margins": _margins(every[0]),
-        "margins_worst": _worst(every),
+        "margins": every[0],
+        "margins_worst": {
+            "plants": len(every),
+            "stable": all(bool(one.stable) for one in every),
+            "gain_margin": min(float(one.gain_margin) for one in every),
+            "phase_margin_deg": min(float(one.phase_margin_deg) for one in every),
+            "sensitivity_peak": max(float(one.sensitivity_peak) for one in every),
+        },
         "tracking": _tracking(wanted[kept], moved[kept]),
         "without_feedback": _without(loop, wanted, kept),
         "step": _step(np.asarray(run.time_s), wanted, moved),
-        "command_min_V": _finite(command.min()),
-        "command_max_V": _finite(command.max()),
+        "command_min_V": command.min(),
+        "command_max_V": command.max(),
         "noise_um": loop.noise_um,
         "resolution_um": loop.resolution_um,
         "remarks": said,
     }
-
-
-def _gains(made: Made) -> dict[str, Any]:
-    values = printed_gains(made.controller, made.pid)
-    return {path: jax.tree.map(_finite, value.tolist()) for path, value in values.items()}
-
-
-def _finite(value: Any) -> float | None:
-    return float(value) if math.isfinite(float(value)) else None
+    return strict(found)
 
 
 def _rms(values: np.ndarray) -> float:
@@ -91,41 +70,22 @@ def _rms(values: np.ndarray) -> float:
     return largest * float(np.sqrt(np.mean((values / largest) ** 2))) if 0 < largest < math.inf else largest
 
 
-def _margins(found: Margins) -> dict[str, Any]:
-    numbers = {name: _finite(value) for name, value in vars(found).items() if name != "stable"}
-    return {"stable": bool(found.stable), **numbers}
-
-
-def _worst(every: Sequence[Margins]) -> dict[str, Any]:
-    return {
-        "plants": len(every),
-        "stable": all(bool(one.stable) for one in every),
-        "gain_margin": _finite(min(float(one.gain_margin) for one in every)),
-        "phase_margin_deg": _finite(min(float(one.phase_margin_deg) for one in every)),
-        "sensitivity_peak": _finite(max(float(one.sensitivity_peak) for one in every)),
-    }
-
-
 def _tuning(found: Tuning[Any]) -> dict[str, Any]:
     return {
         "converged": found.converged,
-        "cost_before_um": _finite(found.cost_before_um),
-        "cost_after_um": _finite(found.cost_after_um),
+        "cost_before_um": found.cost_before_um,
+        "cost_after_um": found.cost_after_um,
         "plants": len(found.plants),
-        "error_rms_um": [_finite(one.error_rms_um) for one in found.plants],
-        "overshoot_pct": [_finite(one.overshoot_pct) for one in found.plants],
+        "error_rms_um": [one.error_rms_um for one in found.plants],
+        "overshoot_pct": [one.overshoot_pct for one in found.plants],
     }
 
 
 def _tracking(wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any]:
     error = wanted_um - moved_um
     shares = tracking_errors(jnp.asarray(wanted_um), jnp.asarray(moved_um))
-    return {
-        "error_rms_um": _finite(_rms(error)),
-        "error_max_um": _finite(np.abs(error).max()),
-        "e_rms_pct": _finite(shares.e_rms_pct),
-        "e_max_pct": _finite(shares.e_max_pct),
-    }
+    sizes = {"error_rms_um": _rms(error), "error_max_um": np.abs(error).max()}
+    return {**sizes, "e_rms_pct": shares.e_rms_pct, "e_max_pct": shares.e_max_pct}
 
 
 def _without(loop: Loop, wanted_um: np.ndarray, kept: slice) -> dict[str, Any] | None:
@@ -133,33 +93,23 @@ def _without(loop: Loop, wanted_um: np.ndarray, kept: slice) -> dict[str, Any] |
     ready = loop.ready
     if ready.feedforward_V is None:
         return None
-    stage = loop.plants[0]
-    command = jnp.asarray(np.clip(ready.feedforward_V, *ready.limits_V))
-    moved = np.asarray(_respond(stage, jnp.asarray(ready.interval_s), command, ready.start))
+    command = np.clip(ready.feedforward_V, *ready.limits_V)
+    moved = respond(loop.plants[0], ready.interval_s, command, ready.start)
     return _tracking(wanted_um[kept], moved[kept])
 
 
-@eqx.filter_jit
-def _respond(
-    stage: Stage, interval_s: Float[Array, ""], voltage_V: Float[Array, " t"], start: Start
-) -> Float[Array, " t"]:
-    return stage(interval_s, voltage_V, start)
-
-
-def _step(time_s: np.ndarray, wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any] | None:
+def _step(time_s: np.ndarray, wanted_um: np.ndarray, moved_um: np.ndarray) -> StepMetrics | None:
     """Figures of Table 2, where the reference is one step."""
     turns = np.flatnonzero(np.diff(wanted_um))
     if len(turns) != 1:
         return None
     first = int(turns[0]) + 1
-    found = step_metrics(
-        jnp.asarray(time_s[first:]), jnp.asarray(moved_um[first:]), float(wanted_um[-1]), float(moved_um[first])
-    )
-    return {name: _finite(value) for name, value in vars(found).items()}
+    after = jnp.asarray(time_s[first:]), jnp.asarray(moved_um[first:])
+    return step_metrics(*after, float(wanted_um[-1]), float(moved_um[first]))
 
 
 def describe_control(summary: Mapping[str, Any]) -> str:
-    """The same in words, from `control_json`."""
+    """Put what `control_json` gives into lines of text."""
     tracking, worst = summary["tracking"], summary["margins_worst"]
     lines = [f"{summary['controller']}, {summary['samples']} samples of {summary['interval_s']:.6g} s"]
     for path, value in summary["gains"].items():

@@ -6,7 +6,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from fits.diagnosis._result import Diagnosis, EffectParameter, Experiment
+from fits.diagnosis._result import Diagnosis, Experiment
 from fits.io._version import written_by
 from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
 from fits.report import _words
@@ -20,6 +20,7 @@ from fits.report._words import (
     parameter_name,
     percent,
     plain,
+    shown_unit,
     sigmas,
 )
 
@@ -27,55 +28,62 @@ _KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexp
 
 
 def report_html(diagnosis: Diagnosis) -> str:
-    """Write a diagnosis as a page for people: on a screen, a phone or paper.
+    """Write a diagnosis as an HTML page for people, on a screen, a phone or paper, with style and pictures in it.
 
-    Parameters
-    ----------
-    diagnosis
-        From `diagnose`.
-
-    Returns
-    -------
-    str
-        HTML, with style and pictures in it. The same diagnosis gives the same text.
+    The same diagnosis gives the same text.
     """
     length, causes, ahead = Lengths(diagnosis), diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]
     sources = list(dict.fromkeys(run.source for run in diagnosis.runs if run.source))
     asked = [one for one in diagnosis.upper_bounds if not one.reason]
     asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
-    template = _environment().get_template("diagnosis.html")
-    return template.render(
-        diagnosis=diagnosis,
-        length=length,
-        ahead=ahead,
-        style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
-        kind=_KINDS[diagnosis.verdict],
-        sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
-        tiles=_tiles(diagnosis, length),
-        residuals=residuals(diagnosis, length.per_um, length.unit),
-        some_aside=any((~run.fitted).any() for run in diagnosis.runs),
-        left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
-        views=[fingerprint(diagnosis, name, k, length.per_um, length.unit) for k, name in enumerate(named)],
-        gained=_gained(diagnosis, length),
-        bars=_bars(diagnosis),
-        further=_further(diagnosis, length),
-        bounds=[
-            (plain(one.name).capitalize(), sigmas(one.z), percent(one.absorbed_fraction), length.bare(one.bound_um))
-            for one in asked
-        ],
-        tests=[
-            (plain(one.name).capitalize(), sigmas(one.statistic), chance(one.p), percent(one.share), one.sentence)
-            for one in diagnosis.tests
-        ],
-        program=None if ahead is None else program(ahead),
-        ahead_facts=() if ahead is None else _facts(ahead),
-        extremes=[
-            (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
-            for one in (ahead.extremes if ahead is not None else ())
-        ],
-        weakest=max((cause.p_family for cause in causes), default=math.nan),
-        written_by=written_by(),
+    gain = diagnosis.gain
+    driven = gain.feedforward_before_um, gain.feedforward_after_um
+    return (
+        _environment()
+        .get_template("diagnosis.html")
+        .render(
+            diagnosis=diagnosis,
+            length=length,
+            ahead=ahead,
+            style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
+            kind=_KINDS[diagnosis.verdict],
+            sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
+            tiles=_tiles(diagnosis, length),
+            residuals=residuals(diagnosis, length.per_um, length.unit),
+            some_aside=any((~run.fitted).any() for run in diagnosis.runs),
+            left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
+            views=[fingerprint(diagnosis, name, k, length.per_um, length.unit) for k, name in enumerate(named)],
+            gained=_gained(diagnosis, length),
+            bars=_bars(diagnosis),
+            further=[
+                *_arrow(
+                    "Largest error, before → after", gain.heldout_max_before_um, gain.heldout_max_after_um, length
+                ),
+                *_arrow("Error under feedforward, rms, before → after", *driven, length),
+            ],
+            bounds=[
+                (
+                    plain(one.name).capitalize(),
+                    sigmas(one.z),
+                    percent(one.absorbed_fraction),
+                    length.bare(one.bound_um),
+                )
+                for one in asked
+            ],
+            tests=[
+                (plain(one.name).capitalize(), sigmas(one.statistic), chance(one.p), percent(one.share), one.sentence)
+                for one in diagnosis.tests
+            ],
+            program=None if ahead is None else program(ahead),
+            ahead_facts=() if ahead is None else _facts(ahead),
+            extremes=[
+                (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
+                for one in (ahead.extremes if ahead is not None else ())
+            ],
+            weakest=max((cause.p_family for cause in causes), default=math.nan),
+            written_by=written_by(),
+        )
     )
 
 
@@ -92,18 +100,14 @@ def _environment() -> Environment:
     for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number"):
         made.filters[name] = getattr(_words, name)
     made.filters["without_dot"] = lambda text: text.rstrip(".")
-    made.filters["parameter_row"] = _parameter_row
+    made.filters["parameter_row"] = lambda one: (parameter_name(one), *estimate(one), shown_unit(one.unit) or "1")
     made.tests["finite"] = math.isfinite
     made.globals["SIGMA"] = SIGMA
     return made
 
 
-def _parameter_row(parameter: EffectParameter) -> tuple[str, ...]:
-    return (parameter_name(parameter), *estimate(parameter), _words.shown_unit(parameter.unit) or "1")
-
-
 def _tiles(diagnosis: Diagnosis, length: Lengths) -> list[tuple[str, str]]:
-    """The first numbers to be read."""
+    """Key figures at the top of the page, by name."""
     gain, tiles = diagnosis.gain, []
     if diagnosis.causes:
         first = diagnosis.causes[0]
@@ -123,15 +127,6 @@ def _arrow(name: str, before_um: float, after_um: float, length: Lengths) -> lis
     if not (math.isfinite(before_um) and math.isfinite(after_um)):
         return []
     return [(name, f"{length.bare(before_um)} → {length.bare(after_um)} {length.unit}")]
-
-
-def _further(diagnosis: Diagnosis, length: Lengths) -> list[tuple[str, str]]:
-    gain = diagnosis.gain
-    driven = gain.feedforward_before_um, gain.feedforward_after_um
-    return [
-        *_arrow("Largest error, before → after", gain.heldout_max_before_um, gain.heldout_max_after_um, length),
-        *_arrow("Error under feedforward, rms, before → after", *driven, length),
-    ]
 
 
 def _gained(diagnosis: Diagnosis, length: Lengths) -> str:
@@ -166,7 +161,7 @@ def _span(low: float, high: float, unit: str) -> str:
 
 
 def _facts(ahead: Experiment) -> list[tuple[str, Any]]:
-    """What the next experiment would tell apart, and by how much."""
+    """Figures of the next experiment, by name."""
     pairs = []
     if ahead.time_s.size > 1:
         pairs.append(("Duration", f"{number(float(ahead.time_s[-1] - ahead.time_s[0]))} s"))

@@ -1,9 +1,6 @@
 """A diagnosis as JSON, and the schema that it keeps to."""
 
 import json
-import math
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -11,6 +8,7 @@ import numpy as np
 
 from fits.diagnosis._result import SCHEMA, Diagnosis, Experiment, FoundCause, RunView
 from fits.io._version import written_by
+from fits.report._json import strict
 from fits.report._words import rms_um, verdict_sentence
 
 
@@ -22,22 +20,13 @@ def diagnosis_schema() -> dict[str, Any]:
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Turn a diagnosis into values that strict JSON can hold.
+    """Turn a diagnosis into values that strict JSON can hold, as `diagnosis_schema` describes them.
 
-    Parameters
-    ----------
-    diagnosis
-        From `diagnose`.
-
-    Returns
-    -------
-    dict
-        As `diagnosis_schema` describes it; a number that is not known is None. The samples of the runs and of the
-        next program are not in it.
+    A number that is not known is None. The samples of the runs and of the next program are left out.
     """
     ahead = diagnosis.next_experiment
     noise = ("false_alarm", "noise_um", "noise_source", "noise_samples")
-    found: dict[str, Any] = _strict(
+    found: dict[str, Any] = strict(
         {
             "schema": SCHEMA,
             "written_by": written_by(),
@@ -55,19 +44,6 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         }
     )
     return found
-
-
-def _strict(value: Any) -> Any:
-    """The same of what JSON has: a number that is not known is None."""
-    if is_dataclass(value):
-        return {each.name: _strict(getattr(value, each.name)) for each in fields(value)}
-    if isinstance(value, Mapping):
-        return {name: _strict(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_strict(each) for each in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    return value
 
 
 def _cause(cause: FoundCause) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The fit of a hysteresis or a stage in JSON values and in words."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from fits.io._limits import ranges_json
 from fits.loop._misfit import Misfit
 from fits.loop._result import FitResult, RunReport
+from fits.report._json import columns, strict
 from fits.stage._run import place_of_hysteresis
 from fits.stats._metrics import Errors
 from fits.stats._noise import WHITE
@@ -23,12 +24,9 @@ _OF_FITTED = ("noise_um", "correlation_samples", "substeps")
 
 
 def fit_report(result: FitResult[Any]) -> dict[str, Any]:
-    """Put what is known of a fit into JSON values.
+    """Put what is known of a fit into JSON values, which a model file keeps under `fit`.
 
-    Returns
-    -------
-    dict
-        What a model file keeps under `fit`. Errors and limits that do not exist are None.
+    Errors and limits that do not exist are None.
     """
     model = result.model
     law: Any = model
@@ -38,86 +36,42 @@ def fit_report(result: FitResult[Any]) -> dict[str, Any]:
         law = None if place is None else model.parts[place]
         named = zip(model.names, model.parts, strict=True)
         parts["parts"] = [{"name": name, "type": type(part).__name__} for name, part in named]
-    density = law.density if isinstance(law, Preisach) else None
-    report = {
+        known = {name: strict(getattr(result, name)) for name in ("parameters", "correlation", "unseen")}
+    else:
+        known = {name: getattr(result, name) for name in ("noise_um", "correlation_samples", "smoothness")}
+        known["trials"] = [dict(vars(trial)) for trial in result.trials]
+    grid = dict.fromkeys(("family", "levels", "lower_V", "upper_V"))
+    if isinstance(law, Preisach):
+        lower, upper = float(law.density.lower_V), float(law.density.upper_V)
+        grid = {"family": law.density.family, "levels": law.density.levels, "lower_V": lower, "upper_V": upper}
+    return {
         "status": result.status.name.lower(),
         **parts,
-        "family": None if density is None else density.family,
-        "levels": None if density is None else density.levels,
-        "lower_V": None if density is None else float(density.lower_V),
-        "upper_V": None if density is None else float(density.upper_V),
-        **(_of_stage(result) if isinstance(model, Stage) else _of_hysteresis(result)),
+        **grid,
+        **known,
+        "misfit": _misfit(result.misfit),
+        "discrepancy_um": float(result.uncertainty.discrepancy_um),
         "in_sample": _errors(result.in_sample),
         "held_out": _errors(result.held_out),
-        "runs": [_run(run) for run in result.runs],
+        "runs": [_run(run, _OF_FITTED if isinstance(model, Stage) else ()) for run in result.runs],
         "remarks": [remark for remark in result.remarks if remark not in result.unseen],
     }
-    if isinstance(model, Stage):
-        for entry, run in zip(report["runs"], result.runs, strict=True):
-            entry.update({key: getattr(run, key) for key in _OF_FITTED})
-    return report
-
-
-def _of_hysteresis(result: FitResult[Any]) -> dict[str, Any]:
-    return {
-        "noise_um": result.noise_um,
-        "correlation_samples": result.correlation_samples,
-        "discrepancy_um": float(result.uncertainty.discrepancy_um),
-        "smoothness": result.smoothness,
-        "trials": [{"levels": trial.levels, "error_um": trial.error_um} for trial in result.trials],
-        "misfit": _misfit(result.misfit),
-    }
-
-
-def _of_stage(result: FitResult[Any]) -> dict[str, Any]:
-    return {
-        "parameters": [
-            {
-                "name": parameter.name,
-                "unit": parameter.unit,
-                **{key: _finite(getattr(parameter, key)) for key in ("value", "sd", "lower", "upper")},
-            }
-            for parameter in result.parameters
-        ],
-        "correlation": [[_finite(value) for value in row] for row in np.asarray(result.correlation)],
-        "unseen": list(result.unseen),
-        "misfit": _misfit(result.misfit),
-        "discrepancy_um": float(result.uncertainty.discrepancy_um),
-    }
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _misfit(misfit: Misfit | None) -> dict[str, Any] | None:
     if misfit is None:
         return None
-    return {
-        "source": misfit.source,
-        "residual_um": misfit.residual_um,
-        "share_pct": misfit.share_pct,
-        "noise_um": misfit.noise_um,
-        "noise_shown_by": misfit.shown_by,
-        "times_noise": misfit.times_noise,
-        "far": misfit.far,
-    }
+    found = {**vars(misfit), "times_noise": misfit.times_noise, "far": misfit.far}
+    return {"noise_shown_by" if name == "shown_by" else name: value for name, value in found.items()}
 
 
 def _errors(errors: Errors | None) -> dict[str, Any] | None:
     if errors is None:
         return None
-    return {
-        "samples": errors.samples,
-        "rms_um": errors.rms_um,
-        "max_um": errors.max_um,
-        "range_um": errors.range_um,
-        "e_rms_pct": errors.e_rms_pct,
-        "e_max_pct": errors.e_max_pct,
-    }
+    return {**vars(errors), "e_rms_pct": errors.e_rms_pct, "e_max_pct": errors.e_max_pct}
 
 
-def _run(run: RunReport) -> dict[str, Any]:
+def _run(run: RunReport, more: Sequence[str]) -> dict[str, Any]:
     return {
         "source": run.source,
         "offset_um": run.offset_um,
@@ -128,6 +82,7 @@ def _run(run: RunReport) -> dict[str, Any]:
         "e_loop_measured_pct": run.loop_measured_pct,
         "e_loop_model_pct": run.loop_model_pct,
         "reached": ranges_json(run.reached),
+        **{key: getattr(run, key) for key in more},
     }
 
 
@@ -164,10 +119,9 @@ def _said_of_misfit(misfit: Mapping[str, Any] | None) -> list[str]:
     if misfit is None:
         return []
     figures = (
-        f"{misfit['residual_um']:.4g} um rms in {misfit['source']}, {misfit['share_pct']:.3g} % of its stroke and "
-        f"{misfit['times_noise']:.3g} times the sensor's noise ({misfit['noise_um']:.3g} um, by "
-        f"{misfit['noise_shown_by']})"
-    )
+        "{residual_um:.4g} um rms in {source}, {share_pct:.3g} % of its stroke and {times_noise:.3g} times the "
+        "sensor's noise ({noise_um:.3g} um, by {noise_shown_by})"
+    ).format(**misfit)
     if not misfit["far"]:
         return [f"left over      {figures}", ""]
     return [f"FAR FROM NOISE {figures}: the model misses something, and all below is no better than that", ""]
@@ -230,32 +184,19 @@ def _parameters(report: Mapping[str, Any]) -> list[str]:
     rows = [
         (
             one["name"],
-            f"{_value(one)} ± {_sd(one)}",
+            f"{_value(one)} ± {'unknown' if one['sd'] is None else format(one['sd'], '.2g')}",
             f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})",
-            one["unit"],
+            "" if one["unit"] == "1" else one["unit"],
         )
         for one in report["parameters"]
     ]
-    widths = [max((len(row[column]) for row in rows), default=0) for column in range(3)]
-    table = [
-        f"{name:{widths[0]}}  {value:{widths[1]}}  {interval:{widths[2]}}  {'' if unit == '1' else unit}".rstrip()
-        for name, value, interval, unit in rows
-    ]
+    lines = ["", *columns(rows)]
     names = [each["name"] for each in report["parameters"]]
-    pairs = [(i, j, report["correlation"][i][j]) for i, j in combinations(range(len(names)), 2)]
-    return [
-        "",
-        *table,
-        *(
-            f"correlated     {names[i]} and {names[j]}: {value:+.2f}"
-            for i, j, value in pairs
-            if value is not None and abs(value) > _WORTH_SAYING
-        ),
-    ]
-
-
-def _sd(parameter: Mapping[str, Any]) -> str:
-    return "unknown" if parameter["sd"] is None else f"{parameter['sd']:.2g}"
+    for i, j in combinations(range(len(names)), 2):
+        value = report["correlation"][i][j]
+        if value is not None and abs(value) > _WORTH_SAYING:
+            lines.append(f"correlated     {names[i]} and {names[j]}: {value:+.2f}")
+    return lines
 
 
 def _value(parameter: Mapping[str, Any], key: str = "value") -> str:

@@ -6,7 +6,8 @@ from typing import Any
 
 from fits.io._printable import plain
 from fits.machining._budget import AxisBudget, Budget
-from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport
+from fits.machining._sensitivity import AxisSensitivity, SensitivityReport
+from fits.report._json import columns
 
 _TOTALS = ("signed", "worst_case", "root_sum_square")
 
@@ -18,6 +19,10 @@ def sensitivity_json(report: SensitivityReport) -> dict[str, Any]:
 
 
 def _sensitivity_json(axis: AxisSensitivity) -> dict[str, Any]:
+    parameters = {effect.name: dataclasses.asdict(effect) for effect in axis.dimensions}
+    for values in parameters.values():
+        del values["name"]
+        values[f"output_change_{axis.output_unit}_per_10um"] = values.pop("output_change_per_10um")
     return {
         "gain": axis.gain,
         "gain_unit": axis.gain_unit,
@@ -25,26 +30,15 @@ def _sensitivity_json(axis: AxisSensitivity) -> dict[str, Any]:
         f"stroke_{axis.output_unit}": axis.stroke,
         "rss_pct": axis.rss_pct,
         "worst_case_pct": axis.worst_case_pct,
-        "parameters": {effect.name: _effect_json(effect, axis.output_unit) for effect in axis.dimensions},
+        "parameters": parameters,
         "fixed_voltage": {name: {"relative_change_pct": change} for name, change in axis.voltage_change_pct.items()},
     }
-
-
-def _effect_json(effect: DimensionEffect, output_unit: str) -> dict[str, Any]:
-    values = {key: value for key, value in dataclasses.asdict(effect).items() if key != "name"}
-    values[f"output_change_{output_unit}_per_10um"] = values.pop("output_change_per_10um")
-    return values
 
 
 def describe_sensitivity(report: SensitivityReport, voltage: bool = False) -> str:
     """Put sensitivities into tables, one for each axis or two that are alike, without a newline at the end.
 
-    Parameters
-    ----------
-    report
-        From `sensitivities`.
-    voltage
-        Whether to add the relative changes at a fixed voltage.
+    With `voltage`, the relative changes at a fixed voltage are added.
     """
     note = (
         "at plus one tolerance and a fixed elongation of the piezo; per 10 um of the dimension, at full stroke; "
@@ -73,7 +67,7 @@ def _table(axes: Sequence[AxisSensitivity], level: int, voltage: bool) -> list[s
     lines = [
         f"{title}: {axis.gain:.6g} {axis.gain_unit}, {axis.stroke:.5g} {unit} at {axis.loaded_stroke_um:.4g} um of "
         f"the loaded piezo, level {level}",
-        *_columns(rows),
+        *(f"  {row}" for row in columns(rows, ">")),
         f"  root sum of squares {axis.rss_pct:.2f} %, worst case {axis.worst_case_pct:.2f} %",
     ]
     if voltage:
@@ -128,10 +122,10 @@ def describe_budget(found: Budget) -> str:
         + (", zeroed at rest" if found.zeroed else " and its offset")
         + (f", at {found.arm_mm:g} mm from the axes of rotation" if found.arm_mm else ""),
         "",
-        *_columns([("", *parts), *map(_row, axes)]),
+        *(f"  {row}" for row in columns([("", *parts), *map(_row, axes)], ">")),
         "",
         "shares of the squares in rss:",
-        *_columns([("", "driving", "machining", "measuring"), *shares]),
+        *(f"  {row}" for row in columns([("", "driving", "machining", "measuring"), *shares], ">")),
         "",
         "driving: the largest of a full loop, with its sign; machining: worst case over the tolerances at a fixed "
         "elongation, and at a fixed voltage",
@@ -156,10 +150,3 @@ def _row(axis: AxisBudget) -> tuple[str, ...]:
         plain(axis.root_sum_square, 3),
         f"{100 * axis.root_sum_square / axis.stroke:.2f}",
     )
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align cells, the first of a row to the left and all others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    sides = ["<", *">" * (len(widths) - 1)]
-    return ["  " + "  ".join(f"{c:{s}{w}}" for c, s, w in zip(row, sides, widths, strict=True)) for row in rows]

@@ -20,12 +20,10 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def plain(name: str) -> str:
-    """Turn a name into words."""
     return name.replace("_", " ")
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:
-    """Join names as a sentence does."""
     words = [plain(name) for name in names]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}" if words else ""
 
@@ -93,7 +91,6 @@ def percent(share: float) -> str:
 
 
 def chance(p: float) -> str:
-    """Write a probability."""
     if not math.isfinite(p):
         return NONE
     if p < _SMALLEST_P:
@@ -150,7 +147,12 @@ def either(cause: FoundCause) -> str:
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """Say in plain sentences what is wrong, why, how sure that is, and how much better the extension predicts."""
     length = Lengths(diagnosis)
-    parts = [_found(diagnosis, length), *_told_apart(diagnosis), *_gained(diagnosis, length)]
+    unclear = [cause for cause in diagnosis.causes if cause.also_consistent]
+    apart = [
+        f"These records cannot tell {plain(cause.name)} from {listed(cause.also_consistent, 'or')}."
+        for cause in unclear
+    ]
+    parts = [_found(diagnosis, length), *apart, *_gained(diagnosis, length)]
     return " ".join(part for part in parts if part)
 
 
@@ -177,14 +179,6 @@ def _found(diagnosis: Diagnosis, length: Lengths) -> str:
         left = length(diagnosis.unexplained_rms_um)
         sentences.append(f"A reproducible error of {left}, root mean square, is left without an explanation.")
     return " ".join(sentences)
-
-
-def _told_apart(diagnosis: Diagnosis) -> list[str]:
-    return [
-        f"These records cannot tell {plain(cause.name)} from {listed(cause.also_consistent, 'or')}."
-        for cause in diagnosis.causes
-        if cause.also_consistent
-    ]
 
 
 def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:

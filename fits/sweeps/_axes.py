@@ -37,7 +37,7 @@ class Axis:
     second: float = 1.0
 
     def quantile(self, chance: FloatArray) -> FloatArray:
-        """Values at probabilities."""
+        """Values at cumulative probabilities."""
         if self.distribution == "normal":
             return np.asarray(self.first + self.second * ndtri(np.clip(chance, _TINY, 1 - _TINY)))
         if self.distribution == "log":
@@ -70,7 +70,6 @@ class Listed(AbstractGroup):
         return self.table.shape[1]
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
-        """Values at some places, shape `(axes, n)`."""
         return np.asarray(self.table[:, place])
 
 
@@ -101,7 +100,6 @@ class Drawn(AbstractGroup):
         return self.rows
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
-        """Values at some places, shape `(axes, n)`."""
         chance = np.empty((len(place), len(self.axes)))
         if self.method == "latin_hypercube":
             chance[:] = _hypercube(len(self.axes), self.rows, self.seed)[place]
@@ -129,17 +127,13 @@ def _hypercube(dimensions: int, rows: int, seed: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Plan:
-    """All rows: groups crossed with each other, of which the last runs fastest, for each of some repeats.
-
-    Repeats are rows there are by themselves, such as files.
-    """
+    """All rows: groups crossed with each other, the last running fastest, repeated for each source such as a file."""
 
     groups: tuple[AbstractGroup, ...]
     repeats: int = 1
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Of all groups."""
         return tuple(axis for group in self.groups for axis in group.axes)
 
     def __len__(self) -> int:
@@ -155,5 +149,5 @@ class Plan:
         return {axis.parameter: found[axis.parameter] for axis in self.axes}
 
     def repeat_of(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Which of the rows there are by themselves, shape `(n,)`."""
+        """Index of the source of each row, shape `(n,)`."""
         return rows // math.prod(len(group) for group in self.groups)

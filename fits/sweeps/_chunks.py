@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.sweeps._devices import device_count
 from fits.sweeps._spec import Sweep, outside
-from fits.sweeps._types import DONE, FAILED, Block, Output, Parameter, Rows
+from fits.sweeps._types import DONE, FAILED, Block, Output, Rows
 
 # A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
 # Rows that go one by one are slow ones, of which few are to be lost.
@@ -37,15 +37,12 @@ def bytes_per_row(sweep: Sweep) -> int:
 
 def swept_of(sweep: Sweep) -> tuple[Output, ...]:
     """The variables that hold the values of the axes."""
-    known = {parameter.name: parameter for parameter in sweep.facts.parameters}
-    return tuple(kept_as(known[axis.parameter], axis.relative) for axis in sweep.plan.axes)
-
-
-def kept_as(parameter: Parameter, relative: bool) -> Output:
-    """How the values of an axis are kept: numbers in their unit, or words."""
-    widest = max(map(len, parameter.words), default=0)
-    dtype = f"U{widest}" if widest else "f8"
-    return Output(parameter.name, "1" if relative else parameter.unit, "swept", dtype=dtype)
+    known, found = {parameter.name: parameter for parameter in sweep.facts.parameters}, []
+    for axis in sweep.plan.axes:
+        parameter = known[axis.parameter]
+        dtype = f"U{max(map(len, parameter.words))}" if parameter.words else "f8"
+        found.append(Output(parameter.name, "1" if axis.relative else parameter.unit, "swept", dtype=dtype))
+    return tuple(found)
 
 
 def source_of(sweep: Sweep) -> Output:
@@ -54,12 +51,10 @@ def source_of(sweep: Sweep) -> Output:
 
 
 def chunk_count(sweep: Sweep) -> int:
-    """How many chunks there are."""
     return -(-len(sweep.plan) // chunk_rows(sweep))
 
 
 def rows_of(sweep: Sweep, chunk: int) -> NDArray[np.int64]:
-    """Numbers of the rows of a chunk."""
     size = chunk_rows(sweep)
     return np.arange(chunk * size, min(len(sweep.plan), (chunk + 1) * size), dtype=np.int64)
 
@@ -70,7 +65,7 @@ def compute_chunk(sweep: Sweep, chunk: int, tell: Callable[[int], None] = lambda
     The rows have the swept values beside the outputs, and `status`; `tell` is called with the number that is added.
     """
     rows, facts = rows_of(sweep, chunk), sweep.facts
-    together = facts.block * (1 if facts.alone else device_count())
+    together = facts.block * (1 if facts.alone else jax.local_device_count())
     parts = []
     for first in range(0, len(rows), together):
         parts.append(_blocks(sweep, rows[first : first + together], together))

@@ -143,7 +143,6 @@ class _Workers:
         return usable
 
     def ban(self, address: str, reason: str) -> None:
-        """Give a worker nothing more."""
         if address not in self.banned:
             self.banned[address] = reason
             self._progress(f"refused: {reason}")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+import microid as m
 from fits.control._gains import GAINS, PID_SETTINGS
 from fits.control._make import strongest_Hz, with_defaults
 from fits.control._setup import setup
@@ -18,45 +19,32 @@ from fits.io._record import Reference
 from fits.io._typed import nearest
 from fits.sweeps._programs import Program
 from fits.sweeps._stages import memory_before, range_of
-from fits.sweeps._toml import number
-from fits.sweeps._types import FloatArray, Parameter, check_plain
-from microid import (
-    CONTROLLERS,
-    PID,
-    AbstractController,
-    ControlledPlant,
-    ControlTask,
-    SampledStage,
-    Setting,
-    Stage,
-    Start,
-    settings_of,
-)
+from fits.sweeps._types import FloatArray, Parameter, check_plain, number
 
-_LIMITS = (Setting("lower_V", "V", varies=False), Setting("upper_V", "V", varies=False))
+_LIMITS = (m.Setting("lower_V", "V", varies=False), m.Setting("upper_V", "V", varies=False))
 
 
 class Controllers(eqx.Module):
     """Controllers of one kind that differ in some numbers, whose names in the sweep begin with `controller.`.
 
     What is found by the stage or the reference is found for the nominal ones: those differ from row to row, and the
-    controller does not know of it. `numbers` are those of a row where they do not vary, without what the controller
-    finds by the nominal plant; that is None where it needs to find nothing. Readings are late by `delay` samples.
+    controller does not know of it. `numbers` are those that do not vary; the plant is None where nothing is to be
+    found by it. Readings are late by `delay` samples.
     """
 
-    kind: type[AbstractController] = eqx.field(static=True)
+    kind: type[m.AbstractController] = eqx.field(static=True)
     numbers: dict[str, Float[Array, ""]]
     interval_s: Float[Array, ""]
-    plant: ControlledPlant | None
+    plant: m.ControlledPlant | None
     delay: int = eqx.field(static=True)
 
-    def at(self, values: Mapping[str, Float[Array, ""]]) -> AbstractController:
+    def at(self, values: Mapping[str, Float[Array, ""]]) -> m.AbstractController:
         """The controller of a row, whose values come by the names of the sweep."""
         names = [setting.name for setting in self.kind.settings if setting.varies]
         varied = {name: values[f"controller.{name}"] for name in names if f"controller.{name}" in values}
         numbers: dict[str, Any] = dict.fromkeys(GAINS, 0.0) | self.numbers | varied
         fields = {name: numbers.pop(name) for name in (*PID_SETTINGS, "lower_V", "upper_V") if name in numbers}
-        return self.kind.of(PID(interval_s=self.interval_s, **fields), numbers, self.plant)
+        return self.kind.of(m.PID(interval_s=self.interval_s, **fields), numbers, self.plant)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What may vary, with its nominal value."""
@@ -65,29 +53,33 @@ class Controllers(eqx.Module):
         def nominal(name: str) -> float:
             return float(np.ravel(self.numbers[name] if name in self.numbers else getattr(found, name))[0])
 
-        varied = [setting for setting in settings_of(self.kind) if setting.varies]
+        varied = [setting for setting in m.settings_of(self.kind) if setting.varies]
         return tuple(_parameter(setting, nominal(setting.name), float(self.interval_s)) for setting in varied)
 
 
-def _parameter(setting: Setting, nominal: float, interval_s: float) -> Parameter:
+def _parameter(setting: m.Setting, nominal: float, interval_s: float) -> Parameter:
     name, upper = f"controller.{setting.name}", setting.upper / interval_s if setting.of_rate else setting.upper
     return Parameter(name, setting.unit, nominal, setting.lower, upper, whole=setting.whole)
 
 
-def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, reference: Program) -> Controllers:
+def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, reference: Program) -> Controllers:
     """Read the table `[controller]` of a sweep, for the nominal stage, its memory, and what it is to follow."""
     name = given.get("kind", "pid")
-    if not isinstance(name, str) or name not in CONTROLLERS:
+    if not isinstance(name, str) or name not in m.CONTROLLERS:
         raise DataError(
-            f"controller.kind: expected one of {', '.join(CONTROLLERS)}, found {shown(name)}; "
-            f"{nearest(str(name), [*CONTROLLERS])}"
+            f"controller.kind: expected one of {', '.join(m.CONTROLLERS)}, found {shown(name)}; "
+            f"{nearest(str(name), [*m.CONTROLLERS])}"
         )
-    kind = CONTROLLERS[name]
-    settings = {setting.name: setting for setting in (*settings_of(kind), *_LIMITS)}
+    kind = m.CONTROLLERS[name]
+    settings = {setting.name: setting for setting in (*m.settings_of(kind), *_LIMITS)}
     known = (*settings, "kind", "delay_samples")
     for key in given:
         if key not in known:
-            raise DataError(_unknown(key, name, known))
+            owners = [other for other, each in m.CONTROLLERS.items() if key in [one.name for one in each.settings]]
+            of = f", which is of {' and '.join(owners)}" if owners else ""
+            raise DataError(
+                f"controller.{key}: expected a known key of {name}, found {shown(key)}{of}; {nearest(key, known)}"
+            )
     delay = given.get("delay_samples", 0)
     if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= 100:
         raise DataError(f"controller.delay_samples: expected a number from 0 to 100, found {shown(delay)}.")
@@ -108,7 +100,7 @@ def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, refer
         kind,
         {each: jnp.asarray(value) for each, value in numbers.items()},
         jnp.asarray(reference.interval_s),
-        ControlledPlant(stage, slope_array(stage), delay) if left else None,
+        m.ControlledPlant(stage, slope_array(stage), delay) if left else None,
         delay,
     )
     try:
@@ -121,13 +113,7 @@ def read_controllers(given: Mapping[str, Any], stage: Stage, initial: str, refer
     return found
 
 
-def _unknown(key: str, name: str, known: tuple[str, ...]) -> str:
-    owners = [other for other, kind in CONTROLLERS.items() if key in [setting.name for setting in kind.settings]]
-    of = f", which is of {' and '.join(owners)}" if owners else ""
-    return f"controller.{key}: expected a known key of {name}, found {shown(key)}{of}; {nearest(key, known)}"
-
-
-def _check(setting: Setting, value: float, interval_s: float) -> None:
+def _check(setting: m.Setting, value: float, interval_s: float) -> None:
     """Refuse a number out of its bounds, varied or not."""
     place, parameter = f"controller.{setting.name}", _parameter(setting, value, interval_s)
     if setting.above and not value > setting.lower:
@@ -137,13 +123,13 @@ def _check(setting: Setting, value: float, interval_s: float) -> None:
     check_plain(parameter, np.array([value]), False, place)
 
 
-def _task(stage: Stage, initial: str, reference: Program) -> ControlTask:
+def _task(stage: m.Stage, initial: str, reference: Program) -> m.ControlTask:
     """What the controllers are made for, as `microid control` has it, with the nominal stage and reference."""
 
     def from_rest_um() -> FloatArray:
         # A step at the first sample is none by itself, but from where the stage stands before.
-        plant = SampledStage(stage, reference.interval_s)
-        return np.append(plant.init(Start(None, memory_before(stage, initial)))[1], reference.wanted())
+        plant = m.SampledStage(stage, reference.interval_s)
+        return np.append(plant.init(m.Start(None, memory_before(stage, initial)))[1], reference.wanted())
 
     def static_V() -> FloatArray:
         way_um = from_rest_um()
@@ -158,6 +144,6 @@ def _task(stage: Stage, initial: str, reference: Program) -> ControlTask:
             return nominal["frequency_Hz"]
         return None if reference.shape == "step" else strongest_Hz(reference.wanted(), reference.interval_s)
 
-    return ControlTask(
+    return m.ControlTask(
         stage, reference.interval_s, from_rest_um, static_V, lambda: steepest_slope(stage), frequency_Hz
     )

@@ -22,16 +22,6 @@ def block_rows(samples: int) -> int:
     return int(min(_LARGEST_BLOCK, 2 ** max(0, int(np.log2(max(fit, 1.0))))))
 
 
-def on_cpu() -> bool:
-    """Whether the devices are CPUs."""
-    return jax.default_backend() == "cpu"
-
-
-def device_count() -> int:
-    """Number of local devices."""
-    return jax.local_device_count()
-
-
 def place(rows: Any) -> Any:
     """Put arrays on the devices, a block of their first axis on each, or on one if they cannot share it evenly."""
     if _shares(rows) == 1:
@@ -41,12 +31,10 @@ def place(rows: Any) -> Any:
 
 
 def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Jit a function of rows. Where its rows are on several devices, each runs it for its own ones.
-
-    Nothing goes from device to device: each does for its block what it would do with that block alone.
+    """Compile a function of rows; where these are on several devices, each runs it for its own, with no exchange.
 
     `own` names the arguments whose arrays have the rows along their first axis, as all results have. Other arrays
-    belong to all rows. What the decorator makes takes arguments by place.
+    belong to all rows. Arguments are taken by place.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -78,12 +66,10 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
-    """Call a function for block after block on one CPU.
+    """Call a function for block after block on one CPU; arguments and results have the rows along their first axis.
 
-    For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads
-    of several CPU devices that factor many matrices at once wait for each other for ever.
-
-    The arguments have the rows of all blocks along their first axis, and so have the results.
+    For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads of
+    several CPU devices that factor many matrices at once wait for each other for ever.
     """
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         count = _shares(rows)
@@ -95,7 +81,8 @@ def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
 
 
 def _shares(rows: Any) -> int:
-    return 1 if any(len(leaf) % device_count() for leaf in jax.tree.leaves(rows)) else device_count()
+    count = jax.local_device_count()
+    return 1 if any(len(leaf) % count for leaf in jax.tree.leaves(rows)) else count
 
 
 def _mesh(rows: Any) -> Mesh | None:

@@ -20,8 +20,7 @@ from fits.io._table import open_table
 from fits.io._typed import check_keys, typed
 from fits.io._units import recognise
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._toml import in_a_file, number
-from fits.sweeps._types import Block, FloatArray, Parameter
+from fits.sweeps._types import Block, FloatArray, Parameter, in_a_file, number
 
 # Parameters of each shape beside offset and amplitude.
 SHAPES: dict[str, tuple[str, ...]] = {
@@ -45,11 +44,7 @@ class _Times(msgspec.Struct):
     samples: Annotated[int, Meta(ge=3, le=_SAMPLES, description=f"a number from 3 to {_SAMPLES:,}")] = 1000
     interval_s: Annotated[
         float,
-        Meta(
-            ge=SHORTEST_STEP_s,
-            le=_LONGEST_s,
-            description=f"a time from {SHORTEST_STEP_s:g} to {_LONGEST_s:g} s",
-        ),
+        Meta(ge=SHORTEST_STEP_s, le=_LONGEST_s, description=f"a time from {SHORTEST_STEP_s:g} to {_LONGEST_s:g} s"),
     ] = 1e-4
 
 
@@ -76,7 +71,6 @@ class Program:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """What may be varied."""
         lower = {"frequency_Hz": 0.0, "frequency_end_Hz": 0.0}
         upper = {"step_s": self.last_s}
         return tuple(
@@ -150,31 +144,22 @@ def _read_signal(path: Any, name: str, unit: str, load: Callable[[str], bytes]) 
     """The signal of a file, and its interval."""
     if not isinstance(path, str):
         raise DataError(f"{name}.file: expected the name of a CSV file, found {shown(path)}; give one.")
-    time_s, given = in_a_file(load(path), path, _read_voltage if unit == "V" else _read_displacement)
+    column = f"{'voltage' if unit == 'V' else 'displacement'}_{unit}"
+
+    def read(file: Path) -> tuple[FloatArray, FloatArray]:
+        # What is no record is refused before anything of it is shown.
+        if not any(map(recognise, open_table(file).names)):
+            raise DataError(
+                f"{file}: expected the columns time_s and {column}, found none that is known; name another."
+            )
+        record = read_csv(file, required=("time_s", column)) if unit == "V" else read_reference(file)
+        return record.time_s, getattr(record, column)
+
+    time_s, given = in_a_file(load(path), path, read)
     interval = np.diff(time_s)
     if np.ptp(interval) > _EVEN * np.mean(interval):
         raise DataError(f"{name}.file: {path} is not sampled evenly, which a sweep needs; resample it.")
     return given, float(np.mean(interval))
-
-
-def _needs(path: Path, *columns: str) -> None:
-    """Refuse a file that is no record before anything of it is shown."""
-    if not any(map(recognise, open_table(path).names)):
-        raise DataError(
-            f"{path}: expected the columns {' and '.join(columns)}, found none that is known; name another."
-        )
-
-
-def _read_voltage(path: Path) -> tuple[FloatArray, FloatArray]:
-    _needs(path, "time_s", "voltage_V")
-    record = read_csv(path, required=("time_s", "voltage_V"))
-    return record.time_s, record.voltage_V
-
-
-def _read_displacement(path: Path) -> tuple[FloatArray, FloatArray]:
-    _needs(path, "time_s", "displacement_um")
-    reference = read_reference(path)
-    return reference.time_s, reference.displacement_um
 
 
 def drive(program: Program, block: Block, values: Mapping[str, Array]) -> Float[Array, "n t"]:

@@ -14,8 +14,7 @@ from msgspec import Meta
 from fits.io._errors import DataError, shown
 from fits.io._typed import typed
 from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
-from fits.sweeps._toml import number
-from fits.sweeps._types import Parameter, check_plain, code_of
+from fits.sweeps._types import Parameter, check_plain, code_of, number
 
 _PREFIXES = {"k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
 _BASES = ("s", "V", "m", "Hz", "Pa", "rad")
@@ -52,21 +51,19 @@ class _Design(msgspec.Struct):
 
 
 def read_plan(
-    table: Mapping[str, Any],
-    parameters: Sequence[Parameter],
-    repeats: int,
-    seed: int,
-    load: Callable[[str], bytes],
+    table: Mapping[str, Any], parameters: Sequence[Parameter], repeats: int, seed: int, load: Callable[[str], bytes]
 ) -> Plan:
-    """Read `[[axis]]`, `[design]` and `[list]` of a sweep.
+    """Read `[[axis]]`, `[design]` and `[list]` of a sweep, whose rows are repeated for each of so many sources.
 
-    There are `repeats` rows by themselves; the seed is that of what is drawn, and `load` gives the content of a file.
-    A `DataError` says what is not as it should be.
+    The seed is that of random draws, and `load` gives the content of a file. A `DataError` says what is wrong.
     """
     known = {parameter.name: parameter for parameter in parameters}
     listed: dict[str, list[tuple[Axis, np.ndarray]]] = {}
     drawn: list[Axis] = []
-    for k, entry in enumerate(_tables(table, "axis")):
+    entries = table.get("axis", [])
+    if not isinstance(entries, list) or not all(isinstance(each, dict) for each in entries):
+        raise DataError("axis: expected tables [[axis]], found something else; double the brackets.")
+    for k, entry in enumerate(entries):
         axis, values = _axis(entry, f"axis[{k}]", known)
         if values is None:
             drawn.append(axis)
@@ -86,7 +83,10 @@ def read_plan(
         groups.append(_list(table["list"], known, load))
     design = table.get("design")
     if drawn:
-        groups.append(_drawn(design, drawn, seed))
+        if not isinstance(design, dict):
+            raise DataError("design: expected how axes without a count are drawn; add [design] with method and rows.")
+        how = typed(design, _Design, "design")
+        groups.append(Drawn(tuple(drawn), how.method, how.rows, seed))
     elif design is not None:
         raise DataError("design: expected axes to draw, found none; give axes low and high without a count.")
     names = [axis.parameter for group in groups for axis in group.axes]
@@ -99,13 +99,6 @@ def read_plan(
     if math.prod(len(group) for group in groups) * repeats > _MOST_ROWS:
         raise DataError("axis: these are more rows than can be counted; leave out some.")
     return plan
-
-
-def _tables(table: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
-    found = table.get(name, [])
-    if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
-        raise DataError(f"{name}: expected tables [[{name}]], found something else; double the brackets.")
-    return found
 
 
 def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) -> tuple[Axis, np.ndarray | None]:
@@ -214,13 +207,6 @@ def _split(unit: str) -> tuple[int, str]:
     """Power of ten of a unit's prefix, and the unit without it."""
     prefixed = unit[:1] in _PREFIXES and unit[1:] in _BASES
     return (_PREFIXES[unit[0]], unit[1:]) if prefixed else (0, unit)
-
-
-def _drawn(design: Any, axes: list[Axis], seed: int) -> Drawn:
-    if not isinstance(design, dict):
-        raise DataError("design: expected how axes without a count are drawn; add [design] with method and rows.")
-    found = typed(design, _Design, "design")
-    return Drawn(tuple(axes), found.method, found.rows, seed)
 
 
 def read_list(content: bytes, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:

@@ -43,7 +43,6 @@ class _Progress:
         self._began = self._told = time.monotonic()
 
     def __call__(self, rows: int) -> None:
-        """Count rows."""
         self._done, self._new = self._done + rows, self._new + rows
         now = time.monotonic()
         if now - self._told >= _EVERY_s or self._done == self._rows:
@@ -67,10 +66,8 @@ def run_sweep(
 
     Parameters
     ----------
-    sweep
-        From `read_sweep`.
-    out
-        Folder for the results.
+    sweep, out
+        From `read_sweep`, and the folder for the results.
     resume
         Go on with the sweep that is in the folder.
     cluster
@@ -81,8 +78,8 @@ def run_sweep(
     Raises
     ------
     DataError
-        If the folder, the disk or the cluster does not allow it; the sentence says what to do. Rows that fail do
-        not raise: they are kept with their reason.
+        If the folder, the disk or the cluster does not allow it. Rows that fail do not raise: they are kept with the
+        reason.
     RuntimeError
         If JAX computes in single precision.
     """
@@ -115,13 +112,8 @@ def run_sweep(
 
 
 def _computed(
-    sweep: Sweep,
-    chunks: list[int],
-    client: Any,
-    tell: Callable[[int], None],
-    progress: Callable[[str], None],
+    sweep: Sweep, chunks: list[int], client: Any, tell: Callable[[int], None], progress: Callable[[str], None]
 ) -> Iterator[tuple[int, Rows]]:
-    """Chunks as they come."""
     if client is None:
         for chunk in chunks:
             yield chunk, compute_chunk(sweep, chunk, tell)

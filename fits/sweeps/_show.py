@@ -17,22 +17,10 @@ SCHEMA = "microid.sweep.summary/1"
 
 
 def open_sweep(folder: str | os.PathLike[str]) -> Any:
-    """Open the results of a sweep, finished or not.
+    """Open the results of a sweep, finished or not, as an `xarray.Dataset` along `row`.
 
-    Parameters
-    ----------
-    folder
-        What the sweep was given by `--out`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Along `row`; swept parameters are coordinates. Rows that are not there yet are NaN with a status of 0.
-
-    Raises
-    ------
-    DataError
-        If the folder holds no sweep or a broken one, or xarray and zarr are not installed.
+    Swept parameters are coordinates. Rows that are not there yet are NaN with a status of 0. A `DataError` says that
+    the folder holds no sweep or a broken one, or that xarray and zarr are not installed.
     """
     about_of(folder)
     need("zarr")
@@ -44,7 +32,7 @@ def open_sweep(folder: str | os.PathLike[str]) -> Any:
 
 @contextmanager
 def readable(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn what decoders say of a broken file into one sentence."""
+    """Turn the errors of decoders of a broken file into a `DataError`."""
     try:
         yield
     except DataError:
@@ -119,11 +107,9 @@ def _best(data: Any, about: dict[str, Any], done: np.ndarray, by: str | None, la
     there = np.flatnonzero(done & np.isfinite(values))
     order = there[np.argsort(-values[there] if largest else values[there], kind="stable")[:5]]
     names = [*about["parameters"], by]
-    return [{"row": int(row)} | {name: _plain(data[name].values[row]) for name in names} for row in order]
-
-
-def _plain(value: Any) -> float | str:
-    return value if isinstance(value, str) else float(value)
+    rows = [{name: data[name].values[row] for name in names} for row in order]
+    plain = [{name: x if isinstance(x, str) else float(x) for name, x in row.items()} for row in rows]
+    return [{"row": int(row)} | values for row, values in zip(order, plain, strict=True)]
 
 
 def describe(summary: dict[str, Any]) -> str:

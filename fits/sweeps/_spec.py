@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -35,22 +35,9 @@ class _Run(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that can run.
+    """A sweep that can run: its TOML and where that is from, the files it names, its rows and what is done with each.
 
-    Attributes
-    ----------
-    text, name
-        The TOML, and where it is from.
-    inputs
-        Contents of the files it names.
-    kind, seed
-        As stated.
-    plan, job, facts
-        Its rows, and what is done with each.
-    memory_MB, chunk_rows
-        What a chunk may take, and the rows of one if they are stated.
-    folder
-        Where its sources are.
+    `memory_MB` is what a chunk may take, `chunk_rows` its rows if they are stated; sources are in `folder`.
     """
 
     text: str
@@ -105,44 +92,35 @@ def parse_sweep(text: str, name: str, load: Callable[[str], bytes], folder: Path
         return inputs[file]
 
     try:
-        return _sweep(table, text, name, inputs, kept, folder)
+        if table.get("schema") != SCHEMA:
+            raise DataError(f'schema: expected "{SCHEMA}", found {shown(table.get("schema"))}; give that.')
+        kind = table.get("kind")
+        if not isinstance(kind, str) or kind not in kinds.names():
+            raise DataError(f"kind: expected one of {', '.join(kinds.names())}, found {shown(kind)}; choose one.")
+        made_by = kinds.kind(kind)
+        tables = made_by.KEYS
+        check_keys(table, [*_COMMON, *tables], "")
+        for key in table:
+            if key in tables and key not in _NO_TABLES and not isinstance(table[key], dict):
+                raise DataError(
+                    f"{key}: expected a table, found {shown(table[key])}; write [{key}] and its keys below."
+                )
+        seed = table.get("seed", 0)
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+            raise DataError(f"seed: expected a whole number of 0 or more, found {shown(seed)}; correct it.")
+        options = typed(table.get("run", {}), _Run, "run")
+        chunk_rows = options.chunk_rows
+        job = made_by.make(Request(table, kept, folder))
+        facts = job.facts
+        plan = read_plan(table, facts.parameters, max(1, len(facts.sources)), seed, kept)
+        if chunk_rows is not None and chunk_rows % job.facts.block:
+            raise DataError(
+                f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, "
+                f"found {chunk_rows}; correct it, or leave it out."
+            )
+        return Sweep(text, name, inputs, kind, seed, plan, job, facts, options.memory_MB, chunk_rows, folder)
     except DataError as error:
         raise DataError(f"{name}: {error}") from None
-
-
-def _sweep(
-    table: Mapping[str, Any],
-    text: str,
-    name: str,
-    inputs: dict[str, bytes],
-    load: Callable[[str], bytes],
-    folder: Path | None,
-) -> Sweep:
-    if table.get("schema") != SCHEMA:
-        raise DataError(f'schema: expected "{SCHEMA}", found {shown(table.get("schema"))}; give that.')
-    kind = table.get("kind")
-    if not isinstance(kind, str) or kind not in kinds.names():
-        raise DataError(f"kind: expected one of {', '.join(kinds.names())}, found {shown(kind)}; choose one.")
-    made_by = kinds.kind(kind)
-    tables = made_by.KEYS
-    check_keys(table, [*_COMMON, *tables], "")
-    for key in table:
-        if key in tables and key not in _NO_TABLES and not isinstance(table[key], dict):
-            raise DataError(f"{key}: expected a table, found {shown(table[key])}; write [{key}] and its keys below.")
-    seed = table.get("seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise DataError(f"seed: expected a whole number of 0 or more, found {shown(seed)}; correct it.")
-    options = typed(table.get("run", {}), _Run, "run")
-    chunk_rows = options.chunk_rows
-    job = made_by.make(Request(table, load, folder))
-    facts = job.facts
-    plan = read_plan(table, facts.parameters, max(1, len(facts.sources)), seed, load)
-    if chunk_rows is not None and chunk_rows % job.facts.block:
-        raise DataError(
-            f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, found "
-            f"{chunk_rows}; correct it, or leave it out."
-        )
-    return Sweep(text, name, inputs, kind, seed, plan, job, facts, options.memory_MB, chunk_rows, folder)
 
 
 def _sum_of(path: Path) -> str:
@@ -156,7 +134,7 @@ def _sum_of(path: Path) -> str:
 
 
 def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Replace rows outside the bounds by something harmless, and say why they fail."""
+    """Replace values out of bounds by nominal ones, and give the reason for each row that fails."""
     reasons = [""] * len(next(iter(values.values()), np.zeros(0)))
     kept = dict(values)
     parameters = {parameter.name: parameter for parameter in sweep.facts.parameters}

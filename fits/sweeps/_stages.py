@@ -9,27 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+import microid as m
 from fits.control._tune import parameter_values
 from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
 from fits.sweeps._devices import by_rows
-from fits.sweeps._toml import in_a_file
-from fits.sweeps._types import Parameter, Request
-from microid import (
-    Driver,
-    GridDensity,
-    Mechanics,
-    Preisach,
-    Reversible,
-    Stage,
-    Staircase,
-    demagnetised,
-    negative_saturation,
-    node_areas,
-    parameter_table,
-    positive_saturation,
-    respond_all,
-)
+from fits.sweeps._types import Parameter, Request, in_a_file
 
 NOMINAL = "nominal"
 INITIAL = ("negative", "positive", "demagnetised")
@@ -39,57 +24,50 @@ _DENSITY_WIDTH = 0.2
 _EXTREMES = 16
 
 
-def nominal_stage() -> Stage:
+def nominal_stage() -> m.Stage:
     """A stage of common size: 0 to 120 V, 17 um, loops of some 15 %, 1 ms, 200 Hz and a damping ratio of 0.03."""
     lower, upper = (jnp.asarray(value) for value in _RANGE_V)
     i, j = np.tril_indices(_LEVELS)
-    density = np.exp(-(i - j) / (_LEVELS - 1) / _DENSITY_WIDTH) * node_areas(_LEVELS)[i, j]
-    grid = GridDensity(jnp.asarray(_LOOPS_um * density / density.sum()), lower, upper)
-    slope = Reversible(jnp.full(_LEVELS, _SLOPE_um_per_V), lower, upper)
-    return Stage.of(
-        driver=Driver(jnp.asarray(1e-3)),
-        hysteresis=Preisach(grid, slope, jnp.asarray(0.0)),
-        mechanics=Mechanics(jnp.asarray(200.0), jnp.asarray(0.03)),
+    density = np.exp(-(i - j) / (_LEVELS - 1) / _DENSITY_WIDTH) * m.node_areas(_LEVELS)[i, j]
+    grid = m.GridDensity(jnp.asarray(_LOOPS_um * density / density.sum()), lower, upper)
+    slope = m.Reversible(jnp.full(_LEVELS, _SLOPE_um_per_V), lower, upper)
+    return m.Stage.of(
+        driver=m.Driver(jnp.asarray(1e-3)),
+        hysteresis=m.Preisach(grid, slope, jnp.asarray(0.0)),
+        mechanics=m.Mechanics(jnp.asarray(200.0), jnp.asarray(0.03)),
     )
 
 
-def stage_from(text: bytes | None, name: str) -> Stage:
-    """Read a stage from the content of a model file, or make the nominal one where there is none."""
-    if text is None:
-        return nominal_stage()
-    model = in_a_file(text, name, load_model).model
-    if isinstance(model, Preisach):
-        return Stage.of(hysteresis=model)
-    if isinstance(model, Stage):
-        return model
-    raise DataError(f"{name}: expected a stage or a Preisach model, found a {type(model).__name__}; fit one first.")
-
-
-def requested_stage(request: Request) -> tuple[Stage, str]:
+def requested_stage(request: Request) -> tuple[m.Stage, str]:
     """The stage and the initial memory that a sweep names by `model` and `initial`."""
     name, initial = request.table.get("model", NOMINAL), request.table.get("initial", INITIAL[0])
     if not isinstance(name, str):
         raise DataError(f'model: expected "{NOMINAL}" or the name of a model file, found {shown(name)}; give one.')
     if initial not in INITIAL:
         raise DataError(f"initial: expected one of {', '.join(INITIAL)}, found {shown(initial)}; choose one.")
-    return stage_from(None if name == NOMINAL else request.load(name), name), initial
+    model = nominal_stage() if name == NOMINAL else in_a_file(request.load(name), name, load_model).model
+    if isinstance(model, m.Preisach):
+        return m.Stage.of(hysteresis=model), initial
+    if isinstance(model, m.Stage):
+        return model, initial
+    raise DataError(f"{name}: expected a stage or a Preisach model, found a {type(model).__name__}; fit one first.")
 
 
-def stage_parameters(stage: Stage) -> tuple[Parameter, ...]:
+def stage_parameters(stage: m.Stage) -> tuple[Parameter, ...]:
     """Everything about a stage that can be varied, by its name in the stage."""
     values, found = parameter_values(stage), []
-    for info in parameter_table(stage):
+    for info in m.parameter_table(stage):
         nominal, spec = float(values[info.path]) if info.shape == () else math.nan, info.spec
         found.append(Parameter(stage.named(info.path), spec.unit, nominal, spec.lower, spec.upper))
     return tuple(found)
 
 
-def varied(stage: Stage, values: Mapping[str, Float[Array, "..."]], relative: Sequence[str]) -> Stage:
+def varied(stage: m.Stage, values: Mapping[str, Float[Array, "..."]], relative: Sequence[str]) -> m.Stage:
     """Return a stage with other values of some parameters; those that are relative are multiplied by theirs.
 
     Values may have rows, if all arrays of the stage have an axis for them in front.
     """
-    names = {info.path: stage.named(info.path) for info in parameter_table(stage)}
+    names = {info.path: stage.named(info.path) for info in m.parameter_table(stage)}
 
     def changed(path: Any, leaf: Any) -> Any:
         name = names.get(jax.tree_util.keystr(path).lstrip("."), "")
@@ -98,39 +76,39 @@ def varied(stage: Stage, values: Mapping[str, Float[Array, "..."]], relative: Se
         factor = jnp.reshape(values[name], jnp.shape(values[name]) + (1,) * (leaf.ndim - jnp.ndim(values[name])))
         return leaf * factor if name in relative else jnp.asarray(values[name], leaf.dtype)
 
-    found: Stage = jax.tree_util.tree_map_with_path(changed, stage)
+    found: m.Stage = jax.tree_util.tree_map_with_path(changed, stage)
     return found
 
 
 @by_rows("voltage_V", "values")
 def respond(
-    stage: Stage,
+    stage: m.Stage,
     values: Mapping[str, Float[Array, " n"]],
     relative: tuple[str, ...],
     interval_s: Float[Array, ""],
     voltage_V: Float[Array, "n t"],
-    memory: Staircase | None,
+    memory: m.Staircase | None,
 ) -> Float[Array, "n t"]:
     """Respond to commands, each row at rest under its first sample."""
     rows = jax.tree.map(lambda leaf: leaf[None], stage)
-    return respond_all(varied(rows, values, relative), interval_s, voltage_V, memory)
+    return m.respond_all(varied(rows, values, relative), interval_s, voltage_V, memory)
 
 
-def range_of(stage: Stage) -> tuple[float, float] | None:
+def range_of(stage: m.Stage) -> tuple[float, float] | None:
     """Range of the hysteresis in V, None where there is none."""
     for part in stage.parts:
-        if isinstance(part, Preisach):
+        if isinstance(part, m.Preisach):
             return float(part.density.lower_V), float(part.density.upper_V)
     return None
 
 
-def memory_before(stage: Stage, initial: str) -> Staircase | None:
+def memory_before(stage: m.Stage, initial: str) -> m.Staircase | None:
     """Memory of the hysteresis before a row, None where the stage has none of Preisach's."""
     limits = range_of(stage)
     if limits is None:
         return None
     if initial == "negative":
-        return negative_saturation(limits[0], 1)
+        return m.negative_saturation(limits[0], 1)
     if initial == "positive":
-        return positive_saturation(*limits, 2)
-    return demagnetised(*limits, size=_EXTREMES)
+        return m.positive_saturation(*limits, 2)
+    return m.demagnetised(*limits, size=_EXTREMES)

@@ -55,7 +55,6 @@ class Store:
     """The folder of one sweep, held by one process at a time."""
 
     def __init__(self, sweep: Sweep, folder: Path):
-        """Take a sweep and its folder, which `opened` has checked."""
         self.sweep, self.folder = sweep, folder
         self._group: Any = None
 
@@ -165,7 +164,6 @@ class Store:
                 flush(path)
 
     def read(self, chunk: int) -> dict[str, np.ndarray]:
-        """Read all variables of a chunk."""
         rows, group = rows_of(self.sweep, chunk), self._open()
         return {
             variable.name: np.asarray(group[variable.name][int(rows[0]) : int(rows[-1]) + 1])
@@ -182,7 +180,6 @@ class Store:
             return False
 
     def noted(self, chunk: int) -> bool:
-        """Whether a chunk is in the ledger."""
         return (self.folder / LEDGER / f"{chunk:08d}.json").exists()
 
     def _sum(self, arrays: dict[str, np.ndarray]) -> str:
@@ -295,7 +292,7 @@ def _locked(folder: Path, out: str) -> Iterator[None]:
 
 @contextmanager
 def _sentences(folder: Path) -> Iterator[None]:
-    """Turn what a disk complains of into one sentence."""
+    """Turn an OSError of the disk into a `DataError`."""
     try:
         yield
     except OSError as error:

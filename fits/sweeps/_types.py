@@ -1,7 +1,9 @@
-"""What a sweep is made of: parameters that go in, outputs that come out, and the job between them."""
+"""What a sweep is made of: numbers and files of its TOML, parameters, outputs, and the job between them."""
 
 import abc
 import math
+import os
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +19,8 @@ FloatArray = NDArray[np.float64]
 SCHEMA = "microid.sweep/1"
 PENDING, DONE, FAILED = 0, 1, 2
 STATUS_WORDS = ("pending", "done", "failed")
+# Squares and products of what is larger overflow.
+_LARGEST = 1e30
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,6 @@ class Parameter:
 
     @property
     def range_words(self) -> str:
-        """Its bounds and unit in words."""
         unit = "" if self.unit == "1" else f" {self.unit}"
         return f"{self.lower:g} to {self.upper:g}{unit}"
 
@@ -87,7 +90,6 @@ class Output:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one row."""
         return tuple(length for _, length in self.dims)
 
     @property
@@ -120,10 +122,9 @@ class Rows:
 class Facts:
     """What is known of a job before it runs: all that may be varied, and all that comes out.
 
-    So many rows as there are in a block are computed together by one device. A row's numbers may depend on its place
-    in the block, and on nothing else of the rows beside it; rows that go `alone` are on one device whatever the
-    number of devices. Sources are names of the rows there are by themselves, such as files; without them only the
-    axes make rows. Coordinates are values along the outputs' own axes: name to axis, unit and values.
+    A block of rows is computed together by one device. A row's numbers may depend on its place in the block, and on
+    nothing else of the rows beside it; rows that go `alone` are on one device. Sources, such as files, are rows by
+    themselves. Coordinates are values along the outputs' own axes: name to axis, unit and values.
     """
 
     parameters: tuple[Parameter, ...]
@@ -182,3 +183,27 @@ class AbstractJob(abc.ABC):
     @abc.abstractmethod
     def compute(self, block: Block) -> Rows:
         """Compute one block on each device."""
+
+
+def number(found: Any, place: str) -> float:
+    """A finite number, or a `DataError` that begins with its place."""
+    try:
+        value = float(found) if isinstance(found, int | float) and not isinstance(found, bool) else math.nan
+    except OverflowError:
+        value = math.inf
+    if not math.isfinite(value):
+        raise DataError(f"{place}: expected a finite number, found {shown(found)}; give one without quotes.")
+    if abs(value) > _LARGEST or 0 < abs(value) < 1 / _LARGEST:
+        raise DataError(f"{place}: expected 0, or {1 / _LARGEST:g} to {_LARGEST:g} in size, found {value:g}.")
+    return value
+
+
+def in_a_file(content: bytes, name: str, read: Callable[[Path], Any]) -> Any:
+    """Read content by a function that reads files; its errors name the file as the sweep does."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / os.path.basename(name)
+        path.write_bytes(content)
+        try:
+            return read(path)
+        except DataError as error:
+            raise DataError(str(error).replace(str(path), name)) from None

@@ -1,6 +1,7 @@
 """The job `control`: a stage in closed loop with a controller, and its figures of merit."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -14,15 +15,7 @@ from fits.sweeps._devices import block_rows, by_rows, in_turn, place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, stage_parameters, varied
 from fits.sweeps._types import AbstractJob, Block, Facts, Output, Request, Rows
-from microid import (
-    AbstractLinear,
-    Preisach,
-    Stage,
-    Start,
-    margins,
-    simulate_loop,
-    step_metrics,
-)
+from microid import AbstractLinear, Preisach, Stage, Start, margins, simulate_loop, step_metrics
 
 KEYS = ("model", "initial", "reference", "controller")
 _OUTPUTS = (
@@ -51,29 +44,30 @@ _STILL_um = 1e-9
 _FINE = 8
 
 
+@dataclass(frozen=True, eq=False)
 class ControlJob(AbstractJob):
-    """Closed loops of a stage."""
+    """Closed loops of a stage, with what they follow and how the stage stands before each row."""
 
-    def __init__(self, stage: Stage, controllers: Controllers, reference: Program, initial: str):
-        """Take the loop and what it follows, and the memory before each row."""
-        self._stage, self._controllers, self._reference = stage, controllers, reference
-        self._start = Start(None, memory_before(stage, initial))
+    stage: Stage
+    controllers: Controllers
+    reference: Program
+    start: Start
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
-        parameters = (*self._controllers.parameters(), *stage_parameters(self._stage), *self._reference.parameters)
-        outputs = (*_OUTPUTS, *_STEP) if self._reference.shape == "step" else _OUTPUTS
-        return Facts(parameters, outputs, block_rows(self._reference.samples))
+        parameters = (*self.controllers.parameters(), *stage_parameters(self.stage), *self.reference.parameters)
+        outputs = (*_OUTPUTS, *_STEP) if self.reference.shape == "step" else _OUTPUTS
+        return Facts(parameters, outputs, block_rows(self.reference.samples))
 
     def compute(self, block: Block) -> Rows:
         """Run a block of loops on each device; see `AbstractJob.compute`."""
-        values, step = place(block.values), self._reference.shape == "step"
-        wanted = drive(self._reference, block, values)
-        found = _control(self._stage, self._controllers, values, block.relative, wanted, self._start, step)
+        values, step = place(block.values), self.reference.shape == "step"
+        wanted = drive(self.reference, block, values)
+        found = _control(self.stage, self.controllers, values, block.relative, wanted, self.start, step)
         outputs = {name: np.asarray(value) for name, value in found.items()}
         outputs["pole_radius"] = in_turn(
-            lambda rows, values: _radius(self._stage, self._controllers, rows, values, block.relative),
+            lambda rows, values: _radius(self.stage, self.controllers, rows, values, block.relative),
             block.rows,
             block.values,
         )
@@ -97,7 +91,7 @@ def make(request: Request) -> ControlJob:
     stage, initial = requested_stage(request)
     reference = read_program(request.table.get("reference", {"shape": "step"}), "reference", "um", request.load)
     controllers = read_controllers(request.table.get("controller", {}), stage, initial, reference)
-    return ControlJob(stage, controllers, reference, initial)
+    return ControlJob(stage, controllers, reference, Start(None, memory_before(stage, initial)))
 
 
 @by_rows("wanted", "values")

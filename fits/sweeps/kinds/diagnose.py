@@ -1,5 +1,6 @@
 """The job `diagnose`: what a fitted stage gets wrong in each of many records, one by one."""
 
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import msgspec
@@ -34,29 +35,30 @@ class _Options(msgspec.Struct):
     initial: Initial = None
 
 
+@dataclass(frozen=True, eq=False)
 class DiagnoseJob(AbstractJob):
-    """Diagnoses of records."""
+    """Diagnoses of records, with the options of `fits.diagnose` and the memory before each record."""
 
-    def __init__(self, records: Files | Simulated, options: _Options, initial: str):
-        """Take the records, the options of `fits.diagnose`, and the memory before each record."""
-        self._records, self._options, self._initial = records, options, initial
+    records: Files | Simulated
+    options: _Options
+    initial: str
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
         options = (
-            Parameter("diagnose.false_alarm", "1", self._options.false_alarm, 1e-6, 0.5),
-            Parameter("diagnose.holdout", "1", self._options.holdout, 0.0, 0.9),
-            choice("diagnose.initial", INITIAL_STATES, self._initial),
+            Parameter("diagnose.false_alarm", "1", self.options.false_alarm, 1e-6, 0.5),
+            Parameter("diagnose.holdout", "1", self.options.holdout, 0.0, 0.9),
+            choice("diagnose.initial", INITIAL_STATES, self.initial),
         )
-        return Facts((*self._records.parameters, *options), _OUTPUTS, 1, self._records.sources, alone=True)
+        return Facts((*self.records.parameters, *options), _OUTPUTS, 1, self.records.sources, alone=True)
 
     def compute(self, block: Block) -> Rows:
         """Diagnose one record; see `AbstractJob.compute`."""
-        alarm = block.numbers("diagnose.false_alarm", self._options.false_alarm).tolist()
-        holdout = block.numbers("diagnose.holdout", self._options.holdout).tolist()
-        initial = block.words("diagnose.initial", INITIAL_STATES, self._initial)
-        rows = zip(self._records.records(block), alarm, holdout, initial, strict=True)
+        alarm = block.numbers("diagnose.false_alarm", self.options.false_alarm).tolist()
+        holdout = block.numbers("diagnose.holdout", self.options.holdout).tolist()
+        initial = block.words("diagnose.initial", INITIAL_STATES, self.initial)
+        rows = zip(self.records.records(block), alarm, holdout, initial, strict=True)
         found = [_diagnosed(*options, block.seed) for options in rows]
         return Rows.one_by_one(_OUTPUTS, found)
 

@@ -1,7 +1,9 @@
 """The job `fit`: loop fits of many records, in one batch or one by one."""
 
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
@@ -18,7 +20,7 @@ from fits.loop._prior import roughness
 from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES, initial_state, known_samples
 from fits.stats._metrics import errors
-from fits.sweeps._devices import in_turn, on_cpu, place
+from fits.sweeps._devices import in_turn, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
@@ -54,46 +56,50 @@ class _Options(msgspec.Struct):
     smoothness: Annotated[float, Meta(ge=1e-12, le=1e6, description="a weight from 1e-12 to 1e6")] = 0.01
 
 
+@dataclass(frozen=True, eq=False)
 class FitJob(AbstractJob):
-    """Fits of a Preisach operator."""
+    """Fits of a Preisach operator: records, options of all rows, and the memory before each, of `INITIAL_STATES`."""
 
-    def __init__(self, records: Files | Simulated, options: _Options, initial: str):
-        """Take the records, the options of all rows, and the memory before each record, one of `INITIAL_STATES`."""
-        self._records, self._options, self._initial = records, options, initial
-        self._batch = options.method == "batch"
+    records: Files | Simulated
+    options: _Options
+    initial: str
+
+    @property
+    def _batch(self) -> bool:
+        return self.options.method == "batch"
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
         outputs = list(_OUTPUTS)
-        if self._options.weights:
-            size = len(_packed(self._options.levels or 0)[0])
+        if self.options.weights:
+            size = len(_packed(self.options.levels or 0)[0])
             outputs.append(Output("weights_um", "um", "weights of Eq. 9, packed row by row", (("weight", size),)))
-        levels = float(self._options.levels or _DEFAULT_LEVELS)
+        levels = float(self.options.levels or _DEFAULT_LEVELS)
         parameters: tuple[Parameter, ...] = (
-            *self._records.parameters,
-            Parameter("fit.holdout", "1", self._options.holdout, 0.0, 0.9),
-            choice("fit.initial", INITIAL_STATES, self._initial),
+            *self.records.parameters,
+            Parameter("fit.holdout", "1", self.options.holdout, 0.0, 0.9),
+            choice("fit.initial", INITIAL_STATES, self.initial),
         )
-        if not self._options.weights:
+        if not self.options.weights:
             # Rows of other levels have other weights.
             parameters += (Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),)
         if self._batch:
-            parameters += (Parameter("fit.smoothness", "1", self._options.smoothness, 1e-12, 1e6),)
+            parameters += (Parameter("fit.smoothness", "1", self.options.smoothness, 1e-12, 1e6),)
         block = _BLOCK if self._batch else 1
-        return Facts(parameters, tuple(outputs), block, self._records.sources, alone=not self._batch)
+        return Facts(parameters, tuple(outputs), block, self.records.sources, alone=not self._batch)
 
     def compute(self, block: Block) -> Rows:
         """Fit the records of some blocks; see `AbstractJob.compute`."""
-        records, holdout = self._records.records(block), block.numbers("fit.holdout", self._options.holdout)
-        initial = block.words("fit.initial", INITIAL_STATES, self._initial)
+        records, holdout = self.records.records(block), block.numbers("fit.holdout", self.options.holdout)
+        initial = block.words("fit.initial", INITIAL_STATES, self.initial)
         if self._batch:
-            levels = block.numbers("fit.levels", self._options.levels or _DEFAULT_LEVELS).astype(int)
+            levels = block.numbers("fit.levels", self.options.levels or _DEFAULT_LEVELS).astype(int)
             return self._together(
-                records, holdout, initial, levels, block.numbers("fit.smoothness", self._options.smoothness)
+                records, holdout, initial, levels, block.numbers("fit.smoothness", self.options.smoothness)
             )
         swept = block.values.get("fit.levels")
-        numbers = [self._options.levels] * len(records) if swept is None else swept.astype(int).tolist()
+        numbers = [self.options.levels] * len(records) if swept is None else swept.astype(int).tolist()
         found = [_alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
         return Rows.one_by_one(self.facts.outputs, found)
 
@@ -105,7 +111,7 @@ class FitJob(AbstractJob):
         levels: NDArray[np.int64],
         smoothness: FloatArray,
     ) -> Rows:
-        count, samples = len(records), self._options.samples
+        count, samples = len(records), self.options.samples
         voltage, displacement = np.zeros((count, samples)), np.zeros((count, samples))
         fitted, known = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
         limits, extremes, used = np.tile([0.0, 1.0], (count, 1)), np.zeros((count, _PLACES)), np.ones(count, "i4")
@@ -130,21 +136,19 @@ class FitJob(AbstractJob):
         # The whole block on each number of levels there is in it, of which every row takes its own: what is found
         # for a row depends on its place in the block, and not on what the rows beside it ask for.
         found = {number: _fitted(number, rows) for number in np.unique(levels).tolist()}
-        names = [name for name in found[int(levels[0])] if name != "weights_um" or self._options.weights]
-        outputs = {name: np.array([found[n][name][k] for k, n in enumerate(levels.tolist())]) for name in names}
-        predicted, success = outputs.pop("predicted_um"), outputs.pop("success")
-        for start_name, samples_of in (("", fitted > 0), ("heldout_", known & (fitted == 0))):
-            figures = [_errors(displacement[k], predicted[k], samples_of[k], known[k]) for k in range(count)]
-            outputs[f"{start_name}e_rms_pct"] = np.array([each[0] for each in figures])
-            outputs[f"{start_name}e_max_pct"] = np.array([each[1] for each in figures])
-        for k in range(count):
-            if not reasons[k] and not (success[k] and np.isfinite(outputs["e_rms_pct"][k])):
-                reasons[k] = "the regression did not converge"
-        return Rows(outputs, tuple(reasons))
+        each: list[dict[str, Any] | str] = []
+        for k, number in enumerate(levels.tolist()):
+            row = {name: value[k] for name, value in found[number].items()}
+            for start_name, chosen in (("", fitted[k] > 0), ("heldout_", known[k] & (fitted[k] == 0))):
+                figures = _errors(displacement[k], row["predicted_um"], chosen, known[k])
+                row |= {f"{start_name}e_rms_pct": figures[0], f"{start_name}e_max_pct": figures[1]}
+            converged = row["success"] and np.isfinite(row["e_rms_pct"])
+            each.append(reasons[k] or (row if converged else "the regression did not converge"))
+        return Rows.one_by_one(self.facts.outputs, each)
 
     def _why_not(self, record: Record) -> str:
-        if len(record) > self._options.samples:
-            return f"the record has {len(record)} samples; raise fit.samples, which is {self._options.samples}"
+        if len(record) > self.options.samples:
+            return f"the record has {len(record)} samples; raise fit.samples, which is {self.options.samples}"
         if record.displacement_um is None or np.ptp(record.displacement_um) == 0 or np.ptp(record.voltage_V) == 0:
             return "nothing moves in the record"
         return ""
@@ -181,7 +185,7 @@ def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[An
         fits: BatchFit = fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
         return fits
 
-    found = in_turn(regress, *rows) if on_cpu() else regress(*map(place, rows))
+    found = in_turn(regress, *rows) if jax.default_backend() == "cpu" else regress(*map(place, rows))
     packed = _packed(levels)
     weights = np.asarray(found.columns_um)[:, : len(packed[0])] * node_areas(levels)[packed]
     return {

@@ -1,6 +1,7 @@
 """The job `sensitivity`: gains, strokes and resonances of a stage of other dimensions, and what its tolerances do."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Annotated, TypeVar
 
@@ -14,18 +15,15 @@ from msgspec import Meta
 import microid as m
 from fits.io._errors import DataError, shown
 from fits.io._typed import typed
-from fits.machining._design import Design, paper_design
+from fits.machining._design import LARGEST_ANGLE_RAD, Design, paper_design
 from fits.machining._design_file import read_design
 from fits.machining._sensitivity import SHORT_um
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._toml import in_a_file
-from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows
+from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows, in_a_file
 
 _Tree = TypeVar("_Tree", m.Geometry, m.Actuation)
 KEYS = ("stage", "sensitivity")
 _BLOCK = 256
-# Beyond it a bridge has no inclination left.
-_LARGEST_ANGLE_RAD = 1.5
 
 
 class _Options(msgspec.Struct):
@@ -37,18 +35,18 @@ class _Options(msgspec.Struct):
     )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class SensitivityJob(AbstractJob):
-    """Axes of a stage as its dimensions vary."""
+    """Some axes of a stage as its dimensions vary."""
 
-    def __init__(self, design: Design, axes: tuple[m.Axis, ...]):
-        """Take a design and the axes that are looked at."""
-        self._design, self._axes = design, axes
+    design: Design
+    axes: tuple[m.Axis, ...]
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
         outputs = []
-        for axis in self._axes:
+        for axis in self.axes:
             unit = m.MOTIONS[axis].unit
             outputs += [
                 Output(f"{axis}_gain_{unit}_per_um", f"{unit}/um", f"{axis} per elongation of the piezo"),
@@ -56,32 +54,20 @@ class SensitivityJob(AbstractJob):
                 Output(f"{axis}_resonance_Hz", "Hz", f"first resonance of {axis}"),
                 Output(f"{axis}_spread_pct", "%", f"root sum of squares of what the tolerances do to {axis}"),
             ]
-        return Facts(_parameters(self._design), tuple(outputs), _BLOCK)
+        return Facts(_parameters(self.design), tuple(outputs), _BLOCK)
 
     def compute(self, block: Block) -> Rows:
         """Evaluate a block of stages on each device; see `AbstractJob.compute`."""
-        design = self._design
-        outputs: dict[str, np.ndarray] = {}
-        values = place(block.values)
-        for axis in self._axes:
+        design, values = self.design, place(block.values)
+        material = jnp.asarray(design.youngs_modulus_GPa), jnp.asarray(design.guides)
+        stage, known = (design.geometry, design.actuation, material), [output.name for output in self.facts.outputs]
+        found: list[np.ndarray] = []
+        for axis in self.axes:
             names = m.MOTIONS[axis].dimensions
             tolerance = jnp.asarray([design.tolerance[name] for name in names])
             together = jnp.asarray(design.correlation(names))
-            nominal = jnp.asarray(design.youngs_modulus_GPa), jnp.asarray(design.guides)
-            found = _evaluate(
-                design.geometry,
-                design.actuation,
-                nominal,
-                values,
-                tolerance,
-                together,
-                block.relative,
-                axis,
-                design.level,
-            )
-            unit = m.MOTIONS[axis].unit
-            ends = (f"gain_{unit}_per_um", f"stroke_{unit}", "resonance_Hz", "spread_pct")
-            outputs |= {f"{axis}_{end}": np.asarray(value) for end, value in zip(ends, found, strict=True)}
+            found += _evaluate(*stage, values, tolerance, together, block.relative, axis, design.level)
+        outputs = {name: np.asarray(value) for name, value in zip(known, found, strict=True)}
         good = np.all([np.isfinite(value) for value in outputs.values()], axis=0)
         reasons = tuple("" if each else "no finite number comes out: such a stage cannot be built" for each in good)
         return Rows(outputs, reasons)
@@ -99,11 +85,9 @@ def make(request: Request) -> SensitivityJob:
 
 def _parameters(design: Design) -> tuple[Parameter, ...]:
     found = []
-    for name, dimension in m.DIMENSIONS.items():
-        upper = _LARGEST_ANGLE_RAD if dimension.unit == "rad" else np.inf
-        found.append(
-            Parameter(f"geometry.{dimension.field}", dimension.unit, float(design.geometry[name]), 1e-9, float(upper))
-        )
+    for name, each in m.DIMENSIONS.items():
+        upper = LARGEST_ANGLE_RAD if each.unit == "rad" else math.inf
+        found.append(Parameter(f"geometry.{each.field}", each.unit, float(design.geometry[name]), 1e-9, upper))
     for info in m.parameter_table(design.actuation):
         value = float(getattr(design.actuation, info.path))
         found.append(Parameter(f"actuation.{info.path}", info.spec.unit, value, 1e-9))

@@ -1,5 +1,6 @@
 """The job `simulate`: the response of a stage to a program, and figures that sum it up."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import jax
@@ -38,43 +39,45 @@ class _Options(msgspec.Struct):
     from_s: Annotated[float, Meta(ge=0, description="a time within the program")] = 0.0
 
 
+@dataclass(frozen=True, eq=False)
 class SimulateJob(AbstractJob):
-    """Simulations of a stage."""
+    """Simulations of a stage under a voltage, from a memory before each row.
 
-    def __init__(self, stage: Stage, program: Program, initial: str, from_s: float = 0.0, every: int = 0):
-        """Take a stage, its voltage, and its memory before each row.
+    Figures count from `from_s` on; traces are kept at every so many samples, not at all if that is 0.
+    """
 
-        Figures count from `from_s` on; traces are kept at every so many samples, not at all if that is 0.
-        """
-        self._stage, self._program = stage, program
-        self._memory = memory_before(stage, initial)
-        self._first, self._every = round(from_s / program.interval_s), every
+    stage: Stage
+    program: Program
+    initial: str
+    from_s: float = 0.0
+    every: int = 0
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
-        samples = self._program.samples
+        samples = self.program.samples
         outputs = list(_OUTPUTS)
         coordinates: dict[str, tuple[str, str, FloatArray]] = {}
-        if self._every:
-            time_s = np.arange(0, samples, self._every) * self._program.interval_s
+        if self.every:
+            time_s = np.arange(0, samples, self.every) * self.program.interval_s
             outputs += [
                 Output("displacement_um", "um", "displacement at times", (("time", len(time_s)),)),
                 Output("voltage_V", "V", "command at times", (("time", len(time_s)),)),
             ]
             coordinates["time_s"] = ("time", "s", np.asarray(time_s, dtype=np.float64))
-        parameters = (*stage_parameters(self._stage), *self._program.parameters)
+        parameters = (*stage_parameters(self.stage), *self.program.parameters)
         return Facts(parameters, tuple(outputs), block_rows(samples), coordinates=coordinates)
 
     def compute(self, block: Block) -> Rows:
         """Simulate a block on each device; see `AbstractJob.compute`."""
         # In programs of their own: compiled as one, XLA computes much of it several times.
-        values, interval_s = place(block.values), jnp.asarray(self._program.interval_s)
-        voltage = drive(self._program, block, values)
-        displacement = respond(self._stage, values, block.relative, interval_s, voltage, self._memory)
-        found = _sum_up(voltage, displacement, self._first)
-        if self._every:
-            found |= {"displacement_um": displacement[:, :: self._every], "voltage_V": voltage[:, :: self._every]}
+        values, interval_s = place(block.values), jnp.asarray(self.program.interval_s)
+        memory, first = memory_before(self.stage, self.initial), round(self.from_s / self.program.interval_s)
+        voltage = drive(self.program, block, values)
+        displacement = respond(self.stage, values, block.relative, interval_s, voltage, memory)
+        found = _sum_up(voltage, displacement, first)
+        if self.every:
+            found |= {"displacement_um": displacement[:, :: self.every], "voltage_V": voltage[:, :: self.every]}
         outputs = {name: np.asarray(value) for name, value in found.items()}
         fine = np.isfinite(outputs["displacement_rms_um"])
         reasons = tuple("" if good else "the displacement is not finite" for good in fine)

@@ -1,4 +1,4 @@
-"""Pictures of what machining errors do: tornado plots, and the curves of the paper's Fig. 7."""
+"""Pictures of machining errors (Fig. 7 of the paper), of measuring errors (its Fig. 8), and of error budgets."""
 
 import os
 import re
@@ -16,10 +16,13 @@ from scipy.optimize import isotonic_regression
 
 import microid as m
 from fits.io._printable import plain
+from fits.io._record import Reference
+from fits.machining._budget import Budget
 from fits.machining._claims import Claim, paper_claims
 from fits.machining._design import Design, lever_mm, paper_design
+from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at
-from fits.plots._style import DARK, LIGHT, WIDE_in, figure, label, legend, save
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save, verbatim
 
 AXIS_SIGNS: dict[m.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamma": r"$\gamma$"}
 UNIT_SIGNS = {"um": "µm", "urad": "µrad"}
@@ -37,6 +40,8 @@ _DIMENSION = re.compile(rf"\b(?:{'|'.join({name for motion in m.MOTIONS.values()
 # A thin line from a label to its curve; without `patchA` it would end at the frame of the label.
 _LEADER: dict[str, Any] = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.4, "patchA": None}
 _LEADER |= {"shrinkA": 1.5, "shrinkB": 0, "relpos": (0, 0.5)}
+_PARTS = {"driving": "0.3", "machining": "0.65", "measuring": "0.95"}
+_MOST_LINES = 5
 
 
 @dataclass(frozen=True)
@@ -54,34 +59,22 @@ class _Panel:
 def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os.PathLike[str]) -> list[Path]:
     """Draw which dimensions matter, and the output error over the machining error of each (Fig. 7).
 
-    Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel.
-
-    Parameters
-    ----------
-    design, report
-        What `sensitivities` was given, and what it found.
-    folder
-        Existing folder for `tornado.png` and `machining_error.png`; 200 dots per inch.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
+    Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel. The
+    report is that of the design, from `sensitivities`. `tornado.png` and `machining_error.png` are written into an
+    existing folder, at 200 dots per inch; a `DataError` says if they cannot be.
     """
-    panels = _panels(design, report)
-    claims = paper_claims(design) if _is_the_papers(design) else ()
-    return [
-        save(_tornado(panels), Path(folder) / "tornado.png"),
-        save(_machining_error(design, panels, claims), Path(folder) / "machining_error.png"),
-    ]
-
-
-def _panels(design: Design, report: SensitivityReport) -> list[_Panel]:
     panels = []
     for axes in report.alike():
         title = ", ".join(AXIS_SIGNS.get(each.axis, each.axis) for each in axes)
         panels.append(_Panel(axes[0], title, _curves(design, axes[0].axis)))
-    return panels
+    paper = paper_design()
+    same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
+    same = same and design.guides == paper.guides and design.tolerance == paper.tolerance
+    claims = paper_claims(design) if same else ()
+    return [
+        save(_tornado(panels), Path(folder) / "tornado.png"),
+        save(_machining_error(design, panels, claims), Path(folder) / "machining_error.png"),
+    ]
 
 
 def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
@@ -91,12 +84,6 @@ def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
     gains = gains_at(design, axis, errors).reshape(len(names), _STEPS)
     nominal = gains[0, _STEPS // 2]
     return {name: gains[i] / nominal - 1 for i, name in enumerate(names)}
-
-
-def _is_the_papers(design: Design) -> bool:
-    paper = paper_design()
-    same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
-    return same and design.guides == paper.guides and design.tolerance == paper.tolerance
 
 
 def _tornado(panels: Sequence[_Panel]) -> Figure:
@@ -241,3 +228,101 @@ def symbol(name: str) -> str:
 
 def _tolerance(effect: DimensionEffect) -> str:
     return f"{1e3 * effect.tolerance:.3g} {'mrad' if effect.unit == 'rad' else 'µm'}"
+
+
+def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
+    """Draw the parts of the worst case of each axis in percent of its stroke, and the root sum of squares.
+
+    `budget.png` is written into an existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
+    """
+    axes = list(found.axes.values())
+    places = range(len(axes))
+    picture = figure(WIDE_in, 0.9 + 0.34 * len(axes))
+    bars = picture.subplots()
+    ends = [0.0] * len(axes)
+    parts = [(abs(axis.driving), axis.machining_worst_case, axis.measuring or 0.0) for axis in axes]
+    for (part, color), sizes in zip(_PARTS.items(), zip(*parts, strict=True), strict=True):
+        widths = [100 * size / axis.stroke for size, axis in zip(sizes, axes, strict=True)]
+        bars.barh(places, widths, 0.62, ends, color=color, edgecolor=DARK, linewidth=0.4, label=f"{part}, largest")
+        ends = [end + width for end, width in zip(ends, widths, strict=True)]
+    squares = [100 * axis.root_sum_square / axis.stroke for axis in axes]
+    mark: dict[str, Any] = {"markersize": 4, "color": "1.0", "markeredgecolor": "0.0", "markeredgewidth": 0.8}
+    bars.plot(squares, places, "D", label="root sum of squares of all", **mark)
+    for place, axis in enumerate(axes):
+        unit = UNIT_SIGNS[axis.output_unit]
+        words = f"{plain(axis.worst_case, 3)} {unit} of {plain(axis.stroke)} {unit}"
+        words += "" if axis.measuring is not None else ", sensor unknown"
+        bars.annotate(words, (ends[place], place), (4, 0), textcoords="offset points", va="center", fontsize=7)
+    bars.set_xlim(0, 1.35 * max(ends))
+    bars.set_ylim(len(axes) - 0.4, -0.6)
+    bars.set_yticks(places, [AXIS_SIGNS.get(axis.axis, axis.axis) for axis in axes])
+    bars.tick_params(axis="y", length=0)
+    label(bars, x="error (% of the stroke)")
+    legend(picture, [bars])
+    return [save(picture, Path(folder) / "budget.png")]
+
+
+def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[str]) -> list[Path]:
+    """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
+
+    The noise is that of the record, from `idle_noise`. `idle.png` is written into an existing folder, at 200 dots per
+    inch; a `DataError` says if it cannot be.
+    """
+    picture = figure(WIDE_in, 4.8, gap=0.08)
+    grid = picture.add_gridspec(2, 8)
+    readings = picture.add_subplot(grid[0, :7])
+    histogram = picture.add_subplot(grid[0, 7], sharey=readings)
+    spectrum, allan = picture.add_subplot(grid[1, :4]), picture.add_subplot(grid[1, 4:])
+    _draw_readings(readings, histogram, reference, noise)
+    _draw_spectrum(spectrum, noise)
+    _draw_allan(allan, noise)
+    legend(picture, (readings,))
+    return [save(picture, Path(folder) / "idle.png")]
+
+
+def _draw_readings(axes: Axes, margin: Axes, reference: Reference, noise: IdleNoise) -> None:
+    values, half = reference.displacement_um, noise.error_um()
+    curve(axes, reference.time_s, values, "readings", **MEASURED | {"linewidth": 0.4})
+    for more, style, name in ((-half, ":", ""), (0.0, "-", "offset"), (half, ":", "offset ± measuring error")):
+        for each in (axes, margin):
+            each.axhline(noise.mean_um + more, color=DARK, linestyle=style, linewidth=0.8, label=name)
+    label(axes, "time (s)", "displacement (µm)", verbatim(reference.source) or "readings")
+    margin.hist(values, _edges(noise, values), orientation="horizontal", color=LIGHT)
+    margin.tick_params(labelleft=False)
+    margin.set_xticks([])
+    label(margin, "count")
+
+
+def _edges(noise: IdleNoise, values: np.ndarray) -> list[float]:
+    """Bins of the histogram: of whole quanta where readings have one, so that no bin is empty by construction."""
+    low, high = float(values.min()), float(values.max())
+    width = (high - low) / min(40.0, np.sqrt(len(values)))
+    if noise.resolution_um is None:
+        return np.arange(low, high + width, width).tolist()
+    width = noise.resolution_um * np.ceil(width / noise.resolution_um)
+    return np.arange(low - noise.resolution_um / 2, high + width, width).tolist()
+
+
+def _draw_spectrum(axes: Axes, noise: IdleNoise) -> None:
+    density = noise.asd_um_per_rtHz
+    curve(axes, noise.frequency_Hz, density, **MODEL)
+    axes.set(xscale="log", yscale="log")
+    at_Hz = [line.frequency_Hz for line in noise.lines[:_MOST_LINES]]
+    if at_Hz:
+        tops = [float(density[np.argmin(np.abs(noise.frequency_Hz - each))]) for each in at_Hz]
+        axes.plot(at_Hz, tops, "v", color=DARK, markersize=3.5)
+        for x, y in zip(at_Hz, tops, strict=True):
+            axes.annotate(f"{x:.4g} Hz", (x, y), (3, 1), textcoords="offset points", fontsize=6)
+    label(axes, "frequency (Hz)", "amplitude density (µm/√Hz)", "spectrum")
+
+
+def _draw_allan(axes: Axes, noise: IdleNoise) -> None:
+    time_s, deviation, sd = noise.averaging_s, noise.adev_um, noise.adev_sd_um
+    axes.loglog(time_s, deviation, **MODEL | {"linewidth": 1.0})
+    seen = deviation > 0
+    low = np.maximum(deviation - sd, 0.1 * deviation)
+    axes.fill_between(time_s[seen], low[seen], (deviation + sd)[seen], color=LIGHT, linewidth=0)
+    axes.plot(time_s, deviation[0] * np.sqrt(time_s[0] / time_s), ":", color=DARK, linewidth=0.8, label="white noise")
+    axes.plot(noise.bias_instability_s, noise.bias_instability_um, "o", color=DARK, markersize=3, label="minimum")
+    axes.legend(frameon=False)
+    label(axes, "averaging time (s)", "Allan deviation (µm)", "Allan deviation")
