@@ -49,18 +49,23 @@ class GridTrial:
 
 
 def choose_grid(
-    runs: Sequence[Run], levels: int | None, progress: Callable[[str], None], finest: int = LADDER[-1]
+    runs: Sequence[Run],
+    levels: int | None,
+    progress: Callable[[str], None],
+    finest: int = LADDER[-1],
+    alone: bool = False,
 ) -> tuple[float, GridTrial, list[LevelTrial]]:
     """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
 
-    Returns the stroke in um, the unit of the columns, the grid that is kept, and all trials. A `DataError` where
-    there is no loop to fit, a `FitError` where a solver fails.
+    A hysteresis that is fitted `alone` may be rougher than the evidence has it; beside what lags or creeps it would
+    take that in. Returns the stroke in um, the unit of the columns, the grid that is kept, and all trials. A
+    `DataError` where there is no loop to fit, a `FitError` where a solver fails.
     """
     stroke = max(_stroke(run) for run in runs)
 
     def trial(n: int, hyper: Hyper) -> GridTrial:
         progress(f"{n} levels")
-        return try_grid(gather(grid_of(runs, n), runs), runs, stroke, hyper, levels is None)
+        return try_grid(gather(grid_of(runs, n), runs), runs, stroke, hyper, levels is None, alone)
 
     digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
     tried, trials = _resolve(trial, levels, finest, _ROUNDED * digit / 12**0.5)
@@ -94,7 +99,9 @@ def _resolve(
     return best, trials
 
 
-def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compare: bool) -> GridTrial:
+def try_grid(
+    data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compare: bool, alone: bool = False
+) -> GridTrial:
     grid = data.grid
     correlation = 1.0
     solution = solve_grid(data, stroke, correlation, hyper)
@@ -105,7 +112,7 @@ def try_grid(data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compa
     found = correlation_samples(left)
     if found > WHITE:
         correlation = found
-        relaxation = relaxation_of(runs, stroke, correlation, hyper)
+        relaxation = relaxation_of(runs, stroke, correlation, hyper) if alone else 0.0
         solution = solve_grid(data, stroke, correlation, hyper, relaxation)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)

@@ -94,7 +94,7 @@ def fit(
     runs = [prepare(record) for record in records]
     if loss == "huber":
         runs = weigh_robustly(runs, progress)
-    stroke, tried, trials = choose_grid(runs, levels, progress)
+    stroke, tried, trials = choose_grid(runs, levels, progress, alone=True)
     remarks = [*_remarks(runs), *(warning for record in aside for warning in record.warnings)]
     if family == "grid":
         found = grid_estimate(tried.data, tried.solution, stroke, tried.correlation, tried.discrepancy_um)
