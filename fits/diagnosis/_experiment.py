@@ -136,7 +136,7 @@ def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, .
             Hypothesis(
                 (*best.laws[:at], rival.refit.laws[-1], *best.laws[at + 1 :]),
                 (*best.x[:at], rival.refit.x[-1], *best.x[at + 1 :]),
-                (*best.covariances[:at], _covariances(rival.refit)[-1], *best.covariances[at + 1 :]),
+                (*best.covariances[:at], _last_covariance(rival.refit), *best.covariances[at + 1 :]),
             )
             for rival in rivals
             # Another cause may have turned out to be the rival.
@@ -166,6 +166,12 @@ def _covariances(model: Refit) -> tuple[np.ndarray, ...]:
     whole, stops = model.covariance(), np.cumsum([law.size for law in model.laws])
     blocks = [slice(stop - law.size, stop) for law, stop in zip(model.laws, stops, strict=True)]
     return tuple(whole[block, block] for block in blocks)
+
+
+def _last_covariance(model: Refit) -> np.ndarray:
+    """The same of the last effect alone: those before it may only have followed along their tangent."""
+    size = model.laws[-1].size
+    return model.covariance()[-size:, -size:]
 
 
 def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) -> tuple[np.ndarray, float]:
