@@ -1,6 +1,7 @@
 """Strict numerics for every test, and randomness that prints itself."""
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -16,14 +17,21 @@ from hypothesis import settings
 
 # For notebooks and commands that tests start: threads of several processes wait for each other in a busy loop.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Tests compile much and compute little: what LLVM does to make code fast is not worth its time here.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
+# Tests compile much and compute little: what makes code fast is not worth its time here. Without the fusion emitters
+# most programs compile in half the time, but wrongly if nothing is fused (`xla_disable_hlo_passes=fusion`).
+QUICK = ("backend_optimization_level=0", "cpu_parallel_codegen_split_count=1", "cpu_use_fusion_emitters=false")
+os.environ.setdefault("XLA_FLAGS", " ".join(f"--xla_{flag}" for flag in QUICK))
 # What one process has compiled the others, and the commands and notebooks they start, take from here.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="microid-tests-")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+# JAX itself has read the environment by now.
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+jax.config.update(
+    "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
+)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -32,6 +40,39 @@ mpl.use("Agg")
 settings.register_profile("fixed", derandomize=True)
 if os.environ.get("MICROID_SEED") != "fresh":
     settings.load_profile("fixed")
+# Tracing makes many objects and few cycles.
+gc.set_threshold(100_000, 50, 100)
+
+# Files that take longest: were one of them the last to begin, one worker would wait for the other.
+LONGEST = (
+    "test_hidden_effect",
+    "test_fit_stage",
+    "test_fit_stage_checks",
+    "test_plugins",
+    "test_sweep_controllers",
+    "test_cli_stage",
+    "test_fit",
+    "test_cli_control",
+    "test_diagnosis_foreign",
+    "test_diagnosis_tangent",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep the order below, where xdist would begin with the files of most tests."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let the longest files begin first, so that both workers end together."""
+    place = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))
+
+
+def pytest_collection_finish() -> None:
+    """Look no more for garbage among what was imported and collected."""
+    gc.freeze()
 
 
 # Every compiled function maps some memory, of which a process on Linux may have 65530 pieces. Beyond that it crashes.

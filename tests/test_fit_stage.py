@@ -219,7 +219,13 @@ def test_runs_of_different_rigs_are_refused(rig):
         fits.fit_stage([rig.records["slow"], other], levels=8, initial="negative", holdout=0.0)
 
 
-@pytest.mark.parametrize("tau", [4e-3, 1e-4], ids=["slow driver", "driver faster than a sample"])
+@pytest.mark.parametrize(
+    "tau",
+    [
+        pytest.param(4e-3, id="slow driver", marks=pytest.mark.study),
+        pytest.param(1e-4, id="driver faster than a sample"),
+    ],
+)
 def test_a_command_held_in_steps_is_fitted(tau, seed):
     """Slow loops lag by what a slow driver takes, and whole samples see nothing of a quick one."""
     text = SCENARIO.format(tau=tau, frequency=120.0, damping=0.05).replace("[plant]", '[plant]\nhold = "zero"')

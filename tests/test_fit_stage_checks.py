@@ -145,7 +145,8 @@ def test_a_run_beyond_its_resonance_alone_is_refused_in_true_words(rng, others):
         assert abs(float(re.search(r"most near ([\d.]+) Hz", str(refusal.value))[1]) - 732) < 50
 
 
-def test_a_lag_without_a_resonance_is_fitted_as_one(rng):
+@pytest.mark.study
+def test_a_lag_beside_what_relaxes_is_fitted_as_one(rng):
     result = fits.fit_stage([triangles(rng, 40.0), triangles(rng, 100.0)], levels=LEVELS)
     assert "show a lag, but no resonance" in said(result, "mechanics was left out")
     assert [parameter.name for parameter in result.parameters] == ["driver.time_constant_s"]

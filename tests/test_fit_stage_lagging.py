@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from _wrong_records import said
 from scipy import signal
 
 import fits
@@ -37,6 +38,8 @@ def triangle(rng, frequency_Hz, periods, noise_um=2e-4):
 def test_a_lag_is_found_whatever_came_before(rng, frequencies_Hz, periods):
     records = [triangle(rng, *each) for each in zip(frequencies_Hz, periods, strict=True)]
     result = fits.fit_stage(records, levels=24)
+    assert "show a lag, but no resonance" in said(result, "mechanics was left out")
+    assert [parameter.name for parameter in result.parameters] == ["driver.time_constant_s"]
     # The rest of a per cent is structure finer than the grid: the least of the plays moves after 0.5 V.
     assert result["driver.time_constant_s"].value == pytest.approx(LAG_s, rel=0.01)
     assert result.held_out.e_rms_pct < 0.02

@@ -53,6 +53,21 @@ def copy(tmp_path_factory):
     return folder
 
 
+# Commands one after another, in one process that imports once.
+COMMANDS = """
+import json, sys
+from click.testing import CliRunner
+from fits.cli._main import cli
+for arguments in json.loads(sys.argv[1]):
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 0, (arguments, done.output)
+"""
+
+
+def commands(folder, *each):
+    python(folder, "-c", COMMANDS, json.dumps(each))
+
+
 def python(folder, *arguments, code=0):
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
@@ -72,11 +87,10 @@ def test_a_command_is_one_file(copy):
 
 
 def test_a_density_is_one_file_and_is_saved_and_read(copy):
-    python(copy, "-m", "fits", "synth", "quickstart", "--out", "data")
     fit = ["fit", "data/train.csv", "--family", "flat", "--starts", "1", "--levels", "8", "--out", "flat.json"]
-    python(copy, "-m", "fits", *fit)
+    simulate = ["simulate", "flat.json", "data/heldout.csv", "--out", "out.csv"]
+    commands(copy, ["synth", "quickstart", "--out", "data"], fit, simulate)
     assert "FlatDensity" in (copy / "flat.json").read_text()
-    python(copy, "-m", "fits", "simulate", "flat.json", "data/heldout.csv", "--out", "out.csv")
     assert (copy / "out.csv").read_text().startswith("time_s,voltage_V,displacement_um")
 
 
@@ -104,16 +118,16 @@ def test_a_column_is_one_file_and_an_effect_uses_it(copy):
     python(copy, "-c", save)
     rows = "time_s,voltage_V,{}\n0,0,30\n1,8,40\n2,4,50\n"
     # Of its own name, converted; of a name that its file recognises; chosen by the user.
-    for header, columns, factor in (
-        ("humidity_permille", "", 0.1),
-        ("hum_lab", "", 1.0),
-        ("rh", "humidity_pct=rh[permille]", 0.1),
-    ):
-        (copy / "damp.csv").write_text(rows.format(header))
-        python(
-            copy, "-m", "fits", "simulate", "swelling.json", "damp.csv", "--columns", columns, "--out", "swollen.csv"
-        )
-        found = [float(line.split(",")[2]) for line in (copy / "swollen.csv").read_text().splitlines()[1:]]
+    given = (("humidity_permille", "", 0.1), ("hum_lab", "", 1.0), ("rh", "humidity_pct=rh[permille]", 0.1))
+    for header, _, _ in given:
+        (copy / f"{header}.csv").write_text(rows.format(header))
+    simulate = [
+        ["simulate", "swelling.json", f"{header}.csv", "--columns", columns, "--out", f"{header}_swollen.csv"]
+        for header, columns, _ in given
+    ]
+    commands(copy, *simulate)
+    for header, _, factor in given:
+        found = [float(line.split(",")[2]) for line in (copy / f"{header}_swollen.csv").read_text().splitlines()[1:]]
         # The spring, 0.25 um/V and 1 um, times 1 + 0.5 per percent beyond the first reading.
         damp = [factor * more for more in (0, 10, 20)]
         expected = [(1 + 0.5 * each) * um for each, um in zip(damp, (1, 3, 2), strict=True)]
