@@ -17,7 +17,6 @@ import fits
 import microid as m
 from fits.cli._main import cli
 from fits.loop._design import Grid
-from fits.machining import _budget
 
 NAMES = {
     "x": ["l1", "t1", "la1", "alpha1", "l2", "t2", "l3"],
@@ -25,12 +24,6 @@ NAMES = {
 }
 UNIT = {"x": 1.0, "gamma": 1e6}
 CELLS = 1500
-
-
-@pytest.fixture(autouse=True)
-def _fused(monkeypatch):
-    """Compile the loop with fusions: without them XLA gets it wrong under the flags of `conftest.py`."""
-    monkeypatch.setattr(_budget, "_loop", eqx.filter_jit(_budget._loop.__wrapped__))
 
 
 @pytest.fixture
