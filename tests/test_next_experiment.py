@@ -161,7 +161,9 @@ def by_least_squares(made, true, other, time_s, voltage_V):
     """The difference of two changes off all that can follow, of both runs as one dense regression."""
     again = Record(time_s, voltage_V, np.zeros(len(time_s)))
     both = [made.bench.prepared[0].run.record, again]
-    runs = tuple(prepare_run(one, made.baseline.range_V, "unknown", 0.0, 1) for one in both)
+    # The new one begins at an end of the range.
+    settings = made.baseline.range_V, "unknown", 0.0, 1
+    runs = tuple(prepare_run(one, *settings, estimated=k == 0) for k, one in enumerate(both))
     baseline = replace(made.baseline, runs=runs, coarse=runs, fine=runs)
     bench, regression = Bench(baseline), regress(baseline)
     noise = made.projector.noise[0].innovation_um

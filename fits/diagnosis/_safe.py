@@ -13,6 +13,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._select import Selection
 from fits.io._limits import Extreme, Ranges, allowed, beyond, compared, joined
 from fits.io._record import Record
+from fits.loop._run import known_samples
 from fits.stage._motion import motion, reached_by
 from microid import Stage
 
@@ -113,7 +114,8 @@ def guard_of(
     """
     baseline = ready.baseline
     records = [run.record for run in baseline.runs]
-    known = [run.known for run in baseline.runs]
+    # What an unknown past adds is no property of the rig.
+    known = [run.known & known_samples(run.record.voltage_V, *baseline.range_V) for run in baseline.runs]
     states = ["unknown"] * len(records)
     reached, offsets_um = reached_by(baseline.stage, records, baseline.range_V, states, known)
     limits = allowed({**reached, "voltage": baseline.range_V}, stated, margin)
