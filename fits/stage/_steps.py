@@ -32,6 +32,8 @@ _EVEN = 1.0
 _LAG = 3.0
 # Parts of the sampling interval below which a driver has no time constant, and from which it may find one again.
 _VANISHED, _RESTARTED = 1e-2, 0.3
+# Samples of a run, as a part of those fitted, that are not worth another fit where an unknown past reaches them.
+_HARDLY_ANY = 0.01
 
 
 @dataclass(frozen=True)
@@ -82,13 +84,15 @@ class Plan:
         return replace(self, records=tuple(map(without_impulses, self.records)))
 
     def behind(self, solved: Solved) -> "Plan | None":
-        """The same without what an unknown past reaches behind the lag that was found; None where that is nothing.
+        """The same without what an unknown past reaches behind the lag that was found; None where that is hardly any.
 
         The hysteresis is driven by what lags the command: it turns later, and short of the command's ends.
         """
+        if self.estimated:
+            return None
         settled = [settled_samples(solved.stage, *each) for each in zip(solved.runs, self.states, strict=True)]
-        lost = [run.fitted & ~own for run, own in zip(solved.runs, settled, strict=True)]
-        if not any(one.any() for one in lost):
+        lost = [np.sum(run.fitted & ~own) / run.fitted.sum() for run, own in zip(solved.runs, settled, strict=True)]
+        if max(lost) < _HARDLY_ANY:
             return None
         return replace(self, settled=tuple(settled))
 
