@@ -4,6 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fits import Record
+from fits.diagnosis._baseline import has_known_loop
 from fits.loop._past import past_columns
 
 LEVELS = 120
@@ -61,3 +63,16 @@ def test_relays_not_yet_swept_add_what_the_columns_span(rng, way):
     assert np.std(difference) > 0.01
     # What is left is the relays' own coarseness, and what a sum of two functions misses.
     assert np.std(left) < 0.05 * np.std(difference)
+
+
+def test_a_past_is_estimated_where_a_loop_is_left_beside_it():
+    once = np.r_[np.linspace(0, 1, 100), np.linspace(1, 0, 100)]
+
+    def known(voltage, holdout=0.0):
+        return has_known_loop([Record(np.arange(len(voltage)) * 1.0, voltage, voltage)], (0.0, 1.0), holdout)
+
+    assert not known(once)
+    assert known(np.r_[once, once, once])
+    assert not known(np.r_[once, once, once], holdout=0.6)
+    # A slow return within the range is no whole loop.
+    assert not known(np.r_[once, 0.4 * once])

@@ -136,19 +136,22 @@ def fit_baseline(
     voltages = [record.voltage_V for record in (*records, *aside)]
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     remarks: tuple[str, ...] = ()
+    past = has_known_loop(records, range_V, holdout)
     try:
         stage = default_stage(hold) if hold != "first" else None
-        found = solve_stage(records, stage, None, holdout, initial, "squares", progress, _FINEST, accept_best=True)
+        found = solve_stage(
+            records, stage, None, holdout, initial, "squares", progress, _FINEST, accept_best=True, estimated=past
+        )
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
-        return _static(records, aside, range_V, holdout, initial, remarks, progress)
+        return _static(records, aside, range_V, holdout, initial, past, remarks, progress)
     solved, chain, stroke_um = found.solved, found.solved.problem.chain, found.solved.problem.stroke_um
     prior = prior_precision(chain, solved.hyper, stroke_um)
     stride = solved.runs[0].stride
 
     def prepared(many: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
-        held = _prepared(aside, range_V, initial, 0.0, many, hold, estimated=False)
-        return _prepared(records, range_V, initial, holdout, many, hold), held
+        held = _prepared(aside, range_V, initial, 0.0, many, False, hold)
+        return _prepared(records, range_V, initial, holdout, many, past, hold), held
 
     # What a step starts is over soon, and slow runs sample it sparsely.
     many = _FINE_STEPS if hold == "zero" else _FINE
@@ -162,6 +165,21 @@ def fit_baseline(
         dynamic=True,
         remarks=solved.problem.remarks,
     )
+
+
+def has_known_loop(records: Sequence[Record], range_V: tuple[float, float], holdout: float) -> bool:
+    """Whether the fitted samples go up and down through the range where no unknown past reaches them.
+
+    Otherwise nothing would be left beside it.
+    """
+    up_V = down_V = 0.0
+    for record in records:
+        voltage = record.voltage_V
+        swept = (np.maximum.accumulate(voltage) >= voltage.max()) & (np.minimum.accumulate(voltage) <= voltage.min())
+        swept[len(record) - round(holdout * len(record)) :] = False
+        moves_V = np.diff(voltage)[swept[1:]]
+        up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
+    return min(up_V, down_V) >= range_V[1] - range_V[0]
 
 
 def _with_paths(records: Sequence[Record], aside: Sequence[Record]) -> tuple[Sequence[Record], Sequence[Record]]:
@@ -182,8 +200,8 @@ def _prepared(
     initial: str,
     holdout: float,
     stride: int,
+    estimated: bool,
     hold: Hold = "first",
-    estimated: bool = True,
 ) -> tuple[Run, ...]:
     settings = range_V, initial, holdout, stride
     return tuple(prepare_run(record, *settings, hold=hold, estimated=estimated) for record in records)
@@ -205,19 +223,19 @@ def _static(
     range_V: tuple[float, float],
     holdout: float,
     initial: str,
+    past: bool,
     remarks: tuple[str, ...],
     progress: Callable[[str], None],
 ) -> Baseline:
-    loops = list(_prepared(records, range_V, initial, holdout, 1))
-    stroke, tried, _ = choose_grid(loops, None, progress, _FINEST)
+    ready, held = (
+        _prepared(records, range_V, initial, holdout, 1, past),
+        _prepared(aside, range_V, initial, 0.0, 1, False),
+    )
+    stroke, tried, _ = choose_grid(list(ready), None, progress, _FINEST)
     grid = tried.data.grid
     columns = np.asarray(tried.solution.columns) * stroke
     stage = Stage.of(hysteresis=grid.model(columns, np.zeros(())))
     chain = Chain(Fixed(stage), 0, grid)  # type: ignore[arg-type]
     prior = np.asarray(roughness(grid.levels).precision(tried.solution.hyper)) / stroke**2
-    ready, held = (
-        _prepared(records, range_V, initial, holdout, 1),
-        _prepared(aside, range_V, initial, 0.0, 1, estimated=False),
-    )
     same = (ready, held) * 4
     return Baseline(chain, np.zeros(0), columns, prior, stroke, range_V, *same, dynamic=False, remarks=remarks)

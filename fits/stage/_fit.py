@@ -156,11 +156,12 @@ def solve_stage(
     progress: Callable[[str], None],
     finest: int = LADDER[-1],
     accept_best: bool = False,
+    estimated: bool = False,
 ) -> Solution:
     """Fit a stage, on a grid of at most the finest levels; see `fit_stage`.
 
-    `accept_best`, for those who go on from there, takes the best place for an answer where the fit does not become
-    stationary, and estimates an unknown past beside the rest.
+    `accept_best` takes the best place for an answer where the fit does not become stationary. What an unknown past
+    adds may be `estimated` beside the rest.
     """
     fraction, _, range_V = check_fit(records, holdout, loss)
     for record in records:
@@ -178,7 +179,7 @@ def solve_stage(
     plan = Plan(
         *(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold),
         accept_best=accept_best,
-        estimated=accept_best,
+        estimated=estimated,
     )
     found = _refined(plan, start_problem(plan, stage, levels, finest))
     settled = plan.behind(found.solved)
