@@ -131,8 +131,10 @@ def conclude(
     extension = extend_stage(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
     weak = max((cause.z for cause in kept), default=0.0) < _WEAK_Z
-    parts = extension.compared[: len(baseline.runs)], extension.compared[len(baseline.runs) :]
-    if kept and (misfit.share < _EXPLAINED_SHARE or any(predicts_worse(part, weak) for part in parts)):
+    # Of what one run had of its own other runs show nothing.
+    repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
+    seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
+    if kept and (misfit.share < _EXPLAINED_SHARE or predicts_worse(seen, weak)):
         suspects = ", ".join(cause.name for cause in kept)
         why = "predicts what was held out worse"
         if misfit.share < _EXPLAINED_SHARE:
