@@ -16,7 +16,7 @@ from fits.stage._motion import Prepared, pass_signal, prepare, programs, signals
 from microid import AbstractEffect, Coordinates, ParameterInfo, Sensor, Signal, Stage
 
 # Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
-_LONG, _MANY = 20_000, 500
+_LONG, _MANY = 20_000, 400
 # Part of a period of the resonance between samples, beyond which a run does not resolve it.
 _PERIOD = 0.25
 # Periods of a line in a record, as its samples show it, below which it is a drift as well.
