@@ -129,7 +129,9 @@ class Named:
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
 def test_a_request_to_end_during_an_import_ends_in_a_sentence(tmp_path, sent):
     (tmp_path / "imported.py").write_text(IMPORTED)
-    program = "from fits.cli._common import heed_signals; heed_signals(); import imported"
+    # What is started in the background ignores Ctrl-C.
+    heeded = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = f"{heeded}; from fits.cli._common import heed_signals; heed_signals(); import imported"
     process = begin("-c", program, cwd=tmp_path, env={"SENT": str(int(sent))})
     _, stderr = process.communicate()
     assert process.returncode == 128 + sent

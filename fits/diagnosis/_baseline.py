@@ -22,6 +22,8 @@ from fits.stage._solve import prior_precision
 from fits.stats._noise import rough_noise_um
 from microid import AbstractEffect, Hold, Mechanics, Stage, extend, host
 
+# A voltage has been at an end once it comes this close, as a part of the range.
+_NEAR = 0.01
 # What a finer grid would follow has a prior of its own in the projection.
 _FINEST = 32
 # Steps between samples in which effects are simulated, at most.
@@ -174,12 +176,13 @@ def has_known_loop(records: Sequence[Record], range_V: tuple[float, float], hold
     """
     up_V = down_V = 0.0
     for record in records:
-        voltage = record.voltage_V
-        swept = (np.maximum.accumulate(voltage) >= voltage.max()) & (np.minimum.accumulate(voltage) <= voltage.min())
+        voltage, near = record.voltage_V, _NEAR * (range_V[1] - range_V[0])
+        highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
+        swept = (highest >= voltage.max() - near) & (lowest <= voltage.min() + near)
         swept[len(record) - round(holdout * len(record)) :] = False
         moves_V = np.diff(voltage)[swept[1:]]
         up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
-    return min(up_V, down_V) >= range_V[1] - range_V[0]
+    return min(up_V, down_V) >= (1 - 2 * _NEAR) * (range_V[1] - range_V[0])
 
 
 def _with_paths(records: Sequence[Record], aside: Sequence[Record]) -> tuple[Sequence[Record], Sequence[Record]]:

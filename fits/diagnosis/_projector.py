@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
@@ -135,9 +136,17 @@ class Projector:
         columns = self.regression.baseline.chain.size
         return answer[columns : self.regression.size], answer[:columns]
 
+    @cached_property
+    def _spread(self) -> np.ndarray:
+        """Root of the covariance, in the order of its eigenvalues: that of pivots is up to rounding."""
+        value, vector = np.linalg.eigh(self._gram)
+        shown = value > _SHOWN / 10 * value[-1]
+        return np.asarray(vector[:, shown] / np.sqrt(value[shown]))
+
     def draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Steps of coordinates and columns to another baseline that the runs allow, drawn by their covariance."""
-        answer = (self._inverse @ rng.standard_normal(self._inverse.shape[1])) / self._scale
+        spread = self._spread
+        answer = (spread @ rng.standard_normal(spread.shape[1])) / self._scale
         columns = self.regression.baseline.chain.size
         return answer[columns : self.regression.size], answer[:columns]
 
