@@ -163,6 +163,10 @@ class Stage(eqx.Module):
         """Return a stage that divides every interval into so many steps."""
         return type(self)(self.parts, self.names, self.hold, substeps, self.frozen)
 
+    def with_hold(self, hold: Hold) -> Self:
+        """Return a stage whose command runs in another way between its samples."""
+        return type(self)(self.parts, self.names, hold, self.substeps, self.frozen)
+
     def __getitem__(self, name: str) -> AbstractPart:
         return self.parts[self._place(name)]
 

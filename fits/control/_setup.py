@@ -41,7 +41,7 @@ class Setup:
 
 def held(stage: Stage) -> Stage:
     """The same stage under a zero-order hold of its command."""
-    return Stage(stage.parts, stage.names, "zero", stage.substeps, stage.frozen)
+    return stage.with_hold("zero")
 
 
 def setup(

@@ -18,7 +18,7 @@ from fits.loop._run import Run, prepare_run
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
-from fits.stage._solve import prior_precision
+from fits.stage._solve import Problem, prior_precision
 from fits.stats._noise import rough_noise_um
 from microid import AbstractEffect, Hold, Mechanics, Stage, extend, host
 
@@ -72,6 +72,7 @@ class Baseline:
     fine_aside: tuple[Run, ...]
     dynamic: bool
     remarks: tuple[str, ...]
+    problem: Problem | None = None
     skewed: bool = False
     blurred: bool = False
 
@@ -103,11 +104,6 @@ def simulate(stage: Stage, run: Run) -> np.ndarray:
     return np.asarray(values)[:: run.samples.stride][: len(run.record)]
 
 
-def along_curves(run: Run) -> Run:
-    """The same run, its command along curves between the samples."""
-    return replace(run, hold="smooth")
-
-
 def with_effects(stage: Stage, effects: Sequence[AbstractEffect]) -> Stage:
     """Put effects into a stage, those that act on a part around that part."""
     for effect in effects:
@@ -124,10 +120,11 @@ def fit_baseline(
     initial: str,
     progress: Callable[[str], None],
     hold: Hold = "first",
+    onward: Problem | None = None,
 ) -> Baseline:
     """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
 
-    `hold` says how the command runs between samples, as in `Stage`.
+    `hold` says how the command runs between samples, as in `Stage`; the fit goes `onward` from one that was made.
 
     Raises
     ------
@@ -140,10 +137,10 @@ def fit_baseline(
     remarks: tuple[str, ...] = ()
     past = has_known_loop(records, range_V, holdout)
     try:
-        stage = default_stage(hold) if hold != "first" else None
-        found = solve_stage(
-            records, stage, None, holdout, initial, "squares", progress, _FINEST, accept_best=True, estimated=past
-        )
+        stage = default_stage(hold) if onward is None else onward.held(hold).stage
+        settings = records, stage, None, holdout, initial, "squares", progress, _FINEST
+        near = None if onward is None else onward.held(hold)
+        found = solve_stage(*settings, accept_best=True, estimated=past, onward=near)
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)
         return _static(records, aside, range_V, holdout, initial, past, remarks, progress)
@@ -166,6 +163,7 @@ def fit_baseline(
         tuple(map(partial(_with_enough_steps, solved.stage), held, finest_held)),
         dynamic=True,
         remarks=solved.problem.remarks,
+        problem=solved.onward,
     )
 
 

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fits.diagnosis._baseline import Baseline, along_curves, fit_baseline, simulate
+from fits.diagnosis._baseline import Baseline, fit_baseline, simulate
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness
@@ -15,7 +15,8 @@ from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
 from fits.io._record import Record
-from microid import EFFECTS, Hold, Scales, Stage
+from fits.stage._solve import Problem
+from microid import EFFECTS, Hold, Scales
 
 # Curves, steps or a delay that lower the sum of squares by less than this, in noise variances, are not looked into.
 _LATE = 25.0
@@ -31,8 +32,6 @@ _SKEWED = (
     "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
 )
-# Part of the difference between curves and lines that must be there for it to be looked into.
-_NOTICEABLE = 0.2
 HOLDS: tuple[Hold, ...] = ("first", "smooth", "zero")
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
@@ -111,43 +110,54 @@ class _Fit:
     def probed(self) -> tuple[list[Probe], list[tuple[str, str]]]:
         return _probed(self.bench, self.scales)
 
-    def remaining(self) -> float:
-        """Sum of squares that is left."""
-        left = self.projector.off(self.projector.residual)
-        return float(left @ left)
+    @cached_property
+    def left(self) -> np.ndarray:
+        """What the stage leaves, whitened and joined."""
+        return self.projector.off(self.projector.residual)
 
-    def late(self) -> tuple[float, float]:
-        """Decrease of that by a delay, and the delay in s."""
-        left = self.projector.off(self.projector.residual)
+    def late(self, left: np.ndarray | None = None) -> tuple[float, float]:
+        """Decrease of that, or of what is `left` otherwise, by a delay, and the delay in s."""
+        left = self.left if left is None else left
         form = next(form for form in EFFECTS if form.delay)
-        probes = list(probes_of(self.bench, form, self.scales))
-        scores = score(self.projector, probes, left)
+        scores = score(self.projector, list(probes_of(self.bench, form, self.scales)), left)
         if not scores:
             return 0.0, 0.0
         best = max(scores, key=lambda one: one.drop)
         return best.drop, float(best.coefficients[0] * getattr(best.probe.effects[0], form.delay))
 
-    def delay_drop(self) -> float:
+    def delay_drop(self, left: np.ndarray | None = None) -> float:
         """The same decrease, if that is a delay and no lead."""
-        drop, late_s = self.late()
+        drop, late_s = self.late(left)
         return drop if late_s > 0 else 0.0
 
-    def curve_drop(self) -> float:
-        """Decrease of that by a command along curves, as far as the stage's answer to it is in proportion."""
+    def left_under(self, hold: Hold) -> np.ndarray:
+        """What is left with the command in another way between samples, the stage following along its tangent."""
         baseline = self.regression.baseline
-        curved = [along_curves(run) for run in baseline.finest]
-        stage = baseline.stage
-        smooth = Stage(stage.parts, stage.names, "smooth", 1, stage.frozen)
-        pairs = zip(curved, baseline.finest, strict=True)
-        change = [simulate(smooth, curve) - simulate(stage, line) for curve, line in pairs]
-        column, left = (self.projector.off(one) for one in (self.projector.join(change), self.projector.residual))
-        size = float(column @ column)
-        along = float(column @ left)
-        return along**2 / size if size > 0 and _NOTICEABLE * size < along else 0.0
+        here, there = baseline.stage, baseline.stage.with_hold(hold)
+        change = [simulate(there, replace(run, hold=hold)) - simulate(here, run) for run in baseline.finest]
+        return self.projector.off(self.projector.residual - self.projector.join(change))
 
-    def largest_z(self) -> float:
-        """Evidence of the effect that has most."""
-        scores = score(self.projector, self.probed[0], self.projector.off(self.projector.residual))
+    def prefers(self, hold: Hold) -> float:
+        """Evidence for another command between samples, as a decrease of the sum of squares; 0 where there is none.
+
+        Curves must leave less than lines beyond chance, and beside the best effect, too. Steps must explain what a
+        delay behind lines does.
+        """
+        late = self.delay_drop() if hold == "zero" else np.inf
+        if late <= _LATE:
+            return 0.0
+        left = self.left_under(hold)
+        gained = float(self.left @ self.left - left @ left)
+        if hold == "zero":
+            as_well = gained > _AS_WELL * late or gained - late + self.delay_drop(left) > _BETTER * late
+            return late if as_well else 0.0
+        if gained <= _LATE:
+            return 0.0
+        return gained if gained + self.largest_z(left) ** 2 > self.largest_z() ** 2 else 0.0
+
+    def largest_z(self, left: np.ndarray | None = None) -> float:
+        """Evidence of the effect that has most, in what is `left`."""
+        scores = score(self.projector, self.probed[0], self.left if left is None else left)
         return max((one.z for one in scores), default=0.0)
 
 
@@ -158,14 +168,14 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, ONE_WAY)
 
-    def fitted(hold: Hold) -> _Fit:
-        regression = regress(fit_baseline(records, reading.aside, fraction, initial, progress, hold))
+    def fitted(hold: Hold, onward: Problem | None = None) -> _Fit:
+        settings = reading.aside, fraction, initial, progress, hold
+        regression = regress(fit_baseline(records, *settings, onward))
         faults = find_faults(regression)
         if not faults.repaired:
             return _Fit(regression, faults)
         progress("fitting the plain stage again, without single bad samples")
-        clean = faults.clean(records)
-        regression = regress(fit_baseline(clean, reading.aside, fraction, initial, progress, hold))
+        regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem))
         found = find_faults(regression)
         return _Fit(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
 
@@ -178,17 +188,15 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
         if hold != "first":
             if not here.regression.baseline.dynamic:
                 break
-            drop = here.curve_drop() if hold == "smooth" else here.delay_drop()
-            if drop <= _LATE:
+            drop = here.prefers(hold)
+            if not drop:
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
-            drop_programs(records)
-            other = fitted(hold)
-            drop_programs(records)
-            if not (_runs_along_curves(here, other) if hold == "smooth" else _is_held_in_steps(here, other, drop)):
-                continue
             doubted = doubted or drop < here.largest_z() ** 2
-            here, said = other, (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
+            drop_programs(records)
+            here = fitted(hold, here.regression.baseline.problem)
+            drop_programs(records)
+            said = (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
         if drop > max(_LATE, (_ABOUT * here.largest_z()) ** 2) and late_s < _SKEW * here.scales.interval_s:
@@ -209,22 +217,6 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     drop_programs(records)
     projector = Projector(regression, faults.noise, rough)
     return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped), doubted)
-
-
-def _runs_along_curves(lines: _Fit, curves: _Fit) -> bool:
-    """Whether a command along curves leaves less than one in lines, beyond chance and beside the best effect, too."""
-    # With the same noise, they compare.
-    same = _Fit(curves.regression, lines.faults)
-    beside = (lines.remaining() - lines.largest_z() ** 2) - (same.remaining() - same.largest_z() ** 2)
-    return lines.remaining() - same.remaining() > _LATE and beside > 0
-
-
-def _is_held_in_steps(lines: _Fit, steps: _Fit, late: float) -> bool:
-    """Whether a command held in steps explains what a delay, behind lines, takes so much off."""
-    # With the same noise, they compare: by themselves, and with a delay beside each.
-    same = _Fit(steps.regression, lines.faults)
-    gained = lines.remaining() - same.remaining()
-    return gained > _AS_WELL * late or gained - late + same.delay_drop() > _BETTER * late
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:

@@ -28,8 +28,9 @@ from microid import (
 
 # Records are filled up to a power of two, so that those of like length share what was compiled.
 _SHORTEST = 1024
-# Intervals that differ by less than this from their mean, as a fraction of it, count as even.
-_EVEN = 1e-6
+# Instants that differ by less than this part of the interval from those of an even clock were taken by one: the time
+# was rounded when it was written.
+_EVEN = 1e-3
 # Extremes that a memory may hold: filtered multisines nest deeply.
 _EXTREMES = 512
 # A hundred arrays of so many values are 8 GB.
@@ -179,7 +180,7 @@ class Run:
         step = (time_s[-1] - time_s[0]) / (n - 1)
         share = np.arange((n + pad[1] - 1) * stride + 1) / stride
         voltage = jnp.asarray(np.pad(record.voltage_V, pad, mode="edge"))
-        if np.max(np.abs(np.diff(time_s) - step)) <= _EVEN * step:
+        if np.max(np.abs(time_s - time_s[0] - step * np.arange(n))) <= _EVEN * step:
             time: Any = np.asarray(step / stride)
         else:
             longer = np.concatenate([time_s, time_s[-1] + step * np.arange(1, pad[1] + 1)])

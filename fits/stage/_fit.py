@@ -157,11 +157,12 @@ def solve_stage(
     finest: int = LADDER[-1],
     accept_best: bool = False,
     estimated: bool = False,
+    onward: Problem | None = None,
 ) -> Solution:
     """Fit a stage, on a grid of at most the finest levels; see `fit_stage`.
 
     `accept_best` takes the best place for an answer where the fit does not become stationary. What an unknown past
-    adds may be `estimated` beside the rest.
+    adds may be `estimated` beside the rest. The fit goes `onward` from another one, or begins where the runs say.
     """
     fraction, _, range_V = check_fit(records, holdout, loss)
     for record in records:
@@ -181,7 +182,7 @@ def solve_stage(
         accept_best=accept_best,
         estimated=estimated,
     )
-    found = _refined(plan, start_problem(plan, stage, levels, finest))
+    found = _refined(plan, start_problem(plan, stage, levels, finest) if onward is None else onward)
     settled = plan.behind(found.solved)
     if settled is None:
         return found

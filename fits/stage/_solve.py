@@ -19,7 +19,7 @@ from fits.loop._run import Run
 from fits.stage._moments import Chain, RunSums, run_sums, split_moments
 from fits.stage._run import residual_of
 from fits.stats._noise import correlation_samples, huber_weight
-from microid import Stage
+from microid import Hold, Stage
 
 _ROUNDS, _ROUGH = 40, 12
 # Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
@@ -107,6 +107,12 @@ class Problem:
         """Begin at a stage, and at columns of the grid of its hysteresis."""
         chain = Chain.of(stage, grid)
         return cls(stage, chain, np.asarray(chain.coordinates.of(stage)), columns_um, hyper, stroke_um)
+
+    def held(self, hold: Hold) -> "Problem":
+        """The same with the command held in another way between samples."""
+        stage = self.chain.stage(jnp.asarray(self.z), jnp.asarray(self.columns_um)).with_hold(hold)
+        chain = Chain.of(stage, self.chain.grid)
+        return replace(self, stage=stage, chain=chain, z=np.asarray(chain.coordinates.of(stage)))
 
 
 @dataclass(frozen=True)
