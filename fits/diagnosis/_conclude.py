@@ -19,7 +19,9 @@ from fits.diagnosis._extension import (
 from fits.diagnosis._findings import bounds, causes_of
 from fits.diagnosis._noise import SPIKE, Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._protocol import held_gain, with_held_gain
+from fits.diagnosis._refit import nothing, refit
 from fits.diagnosis._residual_tests import (
     Cycles,
     cycles,
@@ -34,6 +36,7 @@ from fits.diagnosis._select import Selection
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from fits.loop._run import known_samples
+from fits.stats._noise import Noise
 from microid.effects import card_of
 
 # Causes that explain less than this part of what is reproducible are not named: the true ones are not in the library.
@@ -122,10 +125,13 @@ def conclude(
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
     baseline = ready.baseline
-    noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in found.projector.noise])))
+    beside = find_faults(found.projector.regression, found.model.change_um) if found.causes else ready.faults
+    # What there is to be explained is all that the sensor does not make, the model's discrepancy, too.
+    told = _in_noise(found, beside.noise)
+    noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in beside.noise])))
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
     rounded = ready.faults.quantum_um**2 / 12 > _ROUNDED * noise_um**2
-    misfit, repeated = _misfit(ready, found, rounded)
+    misfit, repeated = _misfit(ready, told, rounded)
     rest_noise, left_over = misfit.rest_noise, misfit.is_left_over
     progress(Step.EXTENSION)
     extension = extend_stage(ready, found, found.model if found.causes else None)
@@ -153,7 +159,7 @@ def conclude(
             f"what is left repeats itself every {repeated.period_um:.3g} um of the position, as the error of an "
             "interferometer or an encoder does"
         )
-    faults = ready.faults if not kept else _faults_beside(ready, found, extension.compared)
+    faults = _standing(ready.faults, beside, extension.compared) if kept else ready.faults
     named = name_faults(faults, cyclic)
     causes = causes_of(kept, model, found.projector, found.bench, misfit.total, named, ready.faults)
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
@@ -165,13 +171,13 @@ def conclude(
             "no program of this length that stays within the limits tells the class apart; allow a longer one, or "
             "wider limits where the rig has them"
         )
-    unlike, bursts = irregular(found.first, found.plain.residual)
+    unlike, bursts = irregular(told.first, told.plain.residual)
     # Faults of samples and noise explain nothing that is reproducible, but a narrow band may look as if it were.
     in_band = any(card_of(one.name).statistic == "band" and one.share_of_misfit > _BAND for one in causes)
     if bursts and not kept and not rounded:
         remarks.append("what is left comes in bursts that no effect of the library makes")
         in_band, left_over = False, True
-        excess = found.plain.cost / max(found.first.count - found.first.freedom, 1.0) - 1
+        excess = told.plain.cost / max(told.first.count - told.first.freedom, 1.0) - 1
         rest_noise = max(rest_noise, max(excess, 0.0) ** 0.5)
     unexplained = left_over and not kept and not in_band
     compared = extension.compared
@@ -194,7 +200,7 @@ def conclude(
         causes=causes,
         unexplained_rms_um=rest_noise * noise_um if left_over else 0.0,
         upper_bounds=bounds(found, ready, found.left if kept else found.scores, likely),
-        tests=(*_tests(ready, found), *unlike),
+        tests=(*_tests(ready, told), *unlike),
         gain=gain,
         next_experiment=ahead,
         remarks=tuple(remarks),
@@ -211,6 +217,15 @@ def conclude(
             ],
         },
     )
+
+
+def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
+    """What was found, in units of other noise."""
+    first, now = (Projector(one.regression, noise, one.roughness) for one in (found.first, found.projector))
+    plain = nothing(found.bench, first)
+    model = refit(found.bench, now, found.model.laws, found.model.x, 2) if found.causes else plain
+    explained = max(plain.cost - model.cost, 0.0)
+    return replace(found, first=first, projector=now, plain=plain, model=model, explained=explained)
 
 
 def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, Cycles]:
@@ -256,16 +271,13 @@ def _gain(
     return gain, sorted({effect.name for effect in extension.effects if effect.per_run and len(baseline.runs) > 1})
 
 
-def _faults_beside(ready: Prepared, found: Selection, compared: Sequence[Compared]) -> Faults:
-    """Faults of samples and noise, as they are beside the causes, which may explain what looked like a bad sample."""
-    now = find_faults(found.projector.regression, found.model.change_um)
-    standing = tuple(
+def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared]) -> Faults:
+    """Faults of samples and noise beside the causes, which may explain what looked like a bad sample."""
+    spikes = tuple(
         bad & (np.abs(one.after_um + height_um) > SPIKE * noise.total_um)
-        for bad, height_um, one, noise in zip(
-            ready.faults.spikes, ready.faults.heights_um, compared, now.noise, strict=False
-        )
+        for bad, height_um, one, noise in zip(faults.spikes, faults.heights_um, compared, beside.noise, strict=False)
     )
-    return replace(now, spikes=standing, heights_um=ready.faults.heights_um)
+    return replace(beside, spikes=spikes, heights_um=faults.heights_um)
 
 
 def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from fits.diagnosis._baseline import Baseline, simulate
 from fits.diagnosis._effects import Bench, scaled
 from fits.diagnosis._noise import find_faults
-from fits.diagnosis._projector import Projector, learn_roughness, smoothed
+from fits.diagnosis._projector import Projector, learn_roughness, smoothed, with_discrepancy
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
 
@@ -182,11 +182,18 @@ def keep_density_positive(bench: Bench, projector: Projector, model: Refit, fine
     return bench, projector, model
 
 
-def relearn_noise(first: Projector, projector: Projector, model: Refit) -> Projector | None:
-    """The projector without causes, with noise and smoothness as they are beside them, where either was misjudged."""
-    found = find_faults(projector.regression, model.change_um).noise
+def relearn_noise(
+    first: Projector, projector: Projector, model: Refit, candidates: Sequence[Sequence[np.ndarray]]
+) -> Projector | None:
+    """The projector without causes, with noise and smoothness as they are beside them, where either was misjudged.
+
+    Noise is that of the sensor and what neither the causes nor any of the `candidates` explain.
+    """
+    sensor = find_faults(projector.regression, model.change_um).noise
+    beside = Projector(projector.regression, sensor, projector.roughness)
+    found = with_discrepancy(beside, candidates, model.change_um)
     less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
-    noise = tuple(found) if any(less) else projector.noise
+    noise = found if any(less) else projector.noise
     beside = smoothed(Projector(projector.regression, noise, projector.roughness), model.change_um)
     is_smoother = _prior_precision(beside) > _SMOOTHER * _prior_precision(first)
     if not is_smoother:

@@ -9,7 +9,7 @@ import numpy as np
 from fits.diagnosis._baseline import Baseline, fit_baseline, simulate
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
-from fits.diagnosis._projector import Projector, learn_roughness
+from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
 from fits.diagnosis._protocol import held_gain
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
@@ -211,11 +211,13 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
         probes = [one for one in probes if one.form.held]
     baseline = replace(regression.baseline, remarks=(*regression.baseline.remarks, *said))
     progress(Step.ROUGHNESS)
-    rough = learn_roughness(here.projector, [column for probe in probes for column in probe.signatures])
+    candidates = [column for probe in probes for column in probe.signatures]
+    rough = learn_roughness(here.projector, candidates)
     # What is large and has been used makes room.
     del here
     drop_programs(records)
     projector = Projector(regression, faults.noise, rough)
+    projector = Projector(regression, with_discrepancy(projector, candidates), rough)
     return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped), doubted)
 
 

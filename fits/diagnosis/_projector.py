@@ -17,7 +17,7 @@ from fits.loop._moments import Moments
 from fits.loop._prior import Hyper, Posterior, interpolation, maximise_evidence, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.stage._solve import prior_precision
-from fits.stats._noise import Noise
+from fits.stats._noise import Noise, learn_noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
 _ROUGHEST = 0.5
@@ -218,6 +218,12 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
     return q[:, np.abs(np.diagonal(r)) > _INDEPENDENT]
 
 
+def along_all(projector: Projector, candidates: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+    """Orthonormal columns, off the tangent, that span what candidates change in each run, shape `(rows, k)`."""
+    joined = [projector.join(candidate) for candidate in candidates]
+    return orthonormal(projector.off(np.stack(joined, axis=1))) if joined else np.zeros((len(projector.residual), 0))
+
+
 def learn_roughness(
     projector: Projector, candidates: Sequence[Sequence[np.ndarray]], change_um: Sequence[np.ndarray] | None = None
 ) -> tuple[float, ...]:
@@ -232,9 +238,8 @@ def learn_roughness(
     sizes = [kind.shape[1] for kind in joined]
     residual = projector.residual if change_um is None else projector.residual - projector.join(change_um)
     off = projector.off(np.concatenate([*joined, residual[:, None]], axis=1))
-    if candidates:
-        fixed, _ = qr(projector.off(np.stack([projector.join(c) for c in candidates], axis=1)), mode="economic")
-        off = off - fixed @ (fixed.T @ off)
+    fixed = along_all(projector, candidates)
+    off -= fixed @ (fixed.T @ off)
     columns, left = off[:, :-1], off[:, -1]
     gram, cross, energy = columns.T @ columns, columns.T @ left, float(left @ left)
     count = projector.count - projector.freedom - len(candidates)
@@ -254,6 +259,25 @@ def learn_roughness(
         if found.fun < best - 0.5:
             best, at = float(found.fun), found.x
     return tuple(float(min(np.exp(a), _ROUGHEST)) if a > -12 else 0.0 for a in at)
+
+
+def with_discrepancy(
+    projector: Projector, candidates: Sequence[Sequence[np.ndarray]], change_um: Sequence[np.ndarray] | None = None
+) -> tuple[Noise, ...]:
+    """Noise of each run together with model discrepancy: what neither the baseline nor any candidate explains.
+
+    That is an autoregression, no quieter than the noise of the projector; for `change_um` see `learn_roughness`.
+    """
+    residual = projector.residual if change_um is None else projector.residual - projector.join(change_um)
+    fixed = along_all(projector, candidates)
+    left = projector.off(residual)
+    left -= fixed @ (fixed.T @ left)
+    taken = np.sum(projector.orthonormal**2, axis=1) + np.sum(fixed**2, axis=1)
+    found = []
+    for noise, part, freedom in zip(projector.noise, projector.split(left), projector.split(taken), strict=True):
+        more = learn_noise(part, float(np.sum(freedom)))
+        found.append(noise.followed_by(more) if noise.spread is None and more.total_um > 1 else noise)
+    return tuple(found)
 
 
 def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector:

@@ -139,7 +139,8 @@ def select(
         bench, projector, model = beside
         # What took this cause's place, at its bound, is asked about once more.
         refused, refused_at_bound = refused - refused_at_bound, set()
-        afresh = relearn_noise(first_projector, projector, model) if again else None
+        candidates = [column for probe in probes for column in probe.signatures]
+        afresh = relearn_noise(first_projector, projector, model, candidates) if again else None
         if afresh is not None:
             # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
             found = select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)

@@ -82,6 +82,11 @@ class Noise:
         """Samples that are worth one independent one."""
         return float((self.innovation_um / (1 - np.sum(self.past)) / self.total_um) ** 2)
 
+    def followed_by(self, other: "Noise") -> "Noise":
+        """The noise that is left as another one where it is whitened by this one."""
+        past = -np.convolve(np.r_[1.0, -self.past], np.r_[1.0, -other.past])[1:]
+        return Noise(self.innovation_um * other.innovation_um, past)
+
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Turn noise into independent numbers of variance one, along the first axis."""
         # SciPy filters no array without columns.
