@@ -1,5 +1,6 @@
 """From records to a diagnosis: what is wrong, why, and what is gained by adding it."""
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -13,6 +14,7 @@ from fits.diagnosis._experiment import Request
 from fits.diagnosis._prepare import HOLDS, Prepared, Reading, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis, Step
 from fits.diagnosis._select import Selection, select
+from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._errors import DataError
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import Record, refuse_repeats
@@ -21,8 +23,6 @@ from fits.io._record import Record, refuse_repeats
 _CHECK = 0.12
 # Mean square of the errors in what was held out, in noise variances, that no chance explains.
 _UNLIKE = 1.5
-# Evidence of a cause that is found there, in standard deviations: less does not make up for having nothing held out.
-_STRONG = 8.0
 _ALL = (
     "what was held out is predicted far worse than noise allows, and the causes show only there: it was used to find "
     "them, so that the gain is not measured on new data"
@@ -49,7 +49,8 @@ class _Question:
 
 
 def _not_in_lines(answer: _Answer) -> bool:
-    return answer.ready.doubted and not answer.found.model.is_noise(answer.found.projector)
+    thresholds = answer.ready.reading.thresholds
+    return answer.ready.doubted and not answer.found.model.is_noise(answer.found.projector, thresholds.chance_z)
 
 
 def _leaves_less(other: _Answer, answer: _Answer) -> bool:
@@ -60,11 +61,13 @@ def _held_out_is_unlike(answer: _Answer) -> bool:
     found, ready = answer.found, answer.ready
     if found.causes or ready.reading.aside:
         return False
-    return ready.projector.held_out_error(found.model.change_um) > _UNLIKE
+    error = ready.projector.held_out(found.model.change_um)
+    return len(error) > 0 and float(np.mean(error**2)) > _UNLIKE
 
 
 def _finds_a_cause(other: _Answer, _: _Answer) -> bool:
-    return max((cause.z for cause in other.found.causes), default=0.0) > _STRONG
+    strong = other.ready.reading.thresholds.strong_z
+    return max((cause.z for cause in other.found.causes), default=0.0) > strong
 
 
 def _questions() -> tuple[_Question, ...]:
@@ -96,6 +99,8 @@ def diagnose(
     limits: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     margin: float = MARGIN,
     seed: int = 0,
+    budget_s: float = 300.0,
+    thresholds: Thresholds = THRESHOLDS,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
     """Say what the simulation of a stage gets wrong, name the cause, extend the model and measure the gain.
@@ -124,6 +129,10 @@ def diagnose(
         By how much of its range a predicted quantity may go beyond what the records reached.
     seed
         Of the draws that calibrate the false alarms.
+    budget_s
+        Seconds after which nothing more is asked: the best answer so far is refined, and what was not asked is said.
+    thresholds
+        What else decides.
     progress
         Told what is being done, a sentence at a time.
 
@@ -155,17 +164,22 @@ def diagnose(
     if unknown or not margin >= 0:
         raise DataError(f"expected limits of {', '.join(UNITS)} and a margin of 0 or more; correct them")
     refuse_repeats([*records, *aside])
-    rng = np.random.default_rng(seed)
+    if not budget_s > 0:
+        raise DataError(f"the budget is {budget_s:g} s: give it a positive time")
+    rng, end_s = np.random.default_rng(seed), time.monotonic() + budget_s
+
+    def has_time() -> bool:
+        return time.monotonic() < end_s
 
     def answer(reading: Reading) -> _Answer:
         ready = prepare_diagnosis(reading, progress)
         progress(Step.SELECTION)
         stage = ready.bench, ready.projector, ready.probes
-        return _Answer(ready, select(*stage, false_alarm, rng, progress))
+        return _Answer(ready, select(*stage, false_alarm, rng, progress, thresholds, has_time))
 
-    best = answer(Reading(records, aside, fraction, initial))
+    best = answer(Reading(records, aside, fraction, initial, thresholds=thresholds))
     for question in _questions():
-        if not question.arises(best):
+        if not question.arises(best) or not has_time():
             continue
         progress(question.said)
         other = answer(replace(best.ready.reading, **question.changes))
@@ -173,5 +187,5 @@ def diagnose(
             baseline = other.ready.baseline
             said = (*baseline.remarks, question.remark) if question.remark else baseline.remarks
             best = replace(other, ready=replace(other.ready, baseline=replace(baseline, remarks=said)))
-    request = Request(duration_s, limits, margin)
+    request = Request(duration_s, limits, margin) if has_time() else None
     return conclude(best.ready, best.found, [*records, *aside], false_alarm, progress, request)

@@ -12,6 +12,7 @@ from fits.diagnosis._noise import find_faults
 from fits.diagnosis._projector import Projector, learn_roughness, smoothed, with_discrepancy
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
+from fits.diagnosis._score import improvement_z
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _LARGEST_DIFFERENCE = 1.0
@@ -122,8 +123,8 @@ def relearn_smoothness(bench: Bench, projector: Projector, model: Refit) -> Stat
         # What the causes leave is no roughness.
         return bench, projector, model
     moved = fit_jointly(Bench(afresh.regression.baseline), afresh, model)
-    before, after = (at.bare.held_out_error(one.change_um) for at, one in ((projector, model), moved[1:]))
-    return (bench, projector, model) if after > before else moved
+    before, after = (at.held_out(one.change_um) for at, one in ((projector, model), moved[1:]))
+    return (bench, projector, model) if improvement_z(before, after) < 0 else moved
 
 
 def refine_steps(bench: Bench, projector: Projector, model: Refit) -> tuple[Refit, bool]:

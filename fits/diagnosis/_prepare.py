@@ -14,12 +14,11 @@ from fits.diagnosis._protocol import held_gain
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
+from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
 from fits.stage._solve import Problem
 from microid import EFFECTS, Hold, Scales
 
-# Curves, steps or a delay that lower the sum of squares by less than this, in noise variances, are not looked into.
-_LATE = 25.0
 # A command held in steps explains a delay of half a sample where it lowers the sum of squares by this part as much.
 _AS_WELL = 0.97
 # Or where, beside a delay of its own, it lowers it by this part more.
@@ -59,7 +58,8 @@ class Reading:
     """How the records are read.
 
     The last `fraction` of each of the `records` is held out, and all of `aside`. `initial` is the memory before each
-    run. `holds` are the ways in which the command may run between samples, of which lines are the first.
+    run. `holds` are the ways in which the command may run between samples, of which lines are the first, and
+    `thresholds` decide.
     """
 
     records: Sequence[Record]
@@ -67,6 +67,7 @@ class Reading:
     fraction: float
     initial: str
     holds: Sequence[Hold] = HOLDS
+    thresholds: Thresholds = THRESHOLDS
 
 
 @dataclass(frozen=True)
@@ -137,21 +138,21 @@ class _Fit:
         change = [simulate(there, replace(run, hold=hold)) - simulate(here, run) for run in baseline.finest]
         return self.projector.off(self.projector.residual - self.projector.join(change))
 
-    def prefers(self, hold: Hold) -> float:
-        """Evidence for another command between samples, as a decrease of the sum of squares; 0 where there is none.
+    def prefers(self, hold: Hold, least: float) -> float:
+        """Evidence for another command between samples, a decrease of the sum of squares of `least`; 0 for none.
 
         Curves must leave less than lines beyond chance, and beside the best effect, too. Steps must explain what a
         delay behind lines does.
         """
         late = self.delay_drop() if hold == "zero" else np.inf
-        if late <= _LATE:
+        if late <= least:
             return 0.0
         left = self.left_under(hold)
         gained = float(self.left @ self.left - left @ left)
         if hold == "zero":
             as_well = gained > _AS_WELL * late or gained - late + self.delay_drop(left) > _BETTER * late
             return late if as_well else 0.0
-        if gained <= _LATE:
+        if gained <= least:
             return 0.0
         return gained if gained + self.largest_z(left) ** 2 > self.largest_z() ** 2 else 0.0
 
@@ -165,6 +166,7 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     """Fit the plain stage, learn the noise, and simulate every probe of every effect."""
     records, initial, fraction = reading.records, reading.initial, reading.fraction
     said: tuple[str, ...] = ()
+    least = reading.thresholds.other_hold_z**2
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, ONE_WAY)
 
@@ -188,7 +190,7 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
         if hold != "first":
             if not here.regression.baseline.dynamic:
                 break
-            drop = here.prefers(hold)
+            drop = here.prefers(hold, least)
             if not drop:
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
@@ -199,7 +201,7 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
             said = (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
-        if drop > max(_LATE, (_ABOUT * here.largest_z()) ** 2) and late_s < _SKEW * here.scales.interval_s:
+        if drop > max(least, (_ABOUT * here.largest_z()) ** 2) and late_s < _SKEW * here.scales.interval_s:
             here = _Fit(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
     if here.faults.jitter_s > 0:

@@ -76,7 +76,7 @@ class Projector:
         self.residual = self.join(regression.residuals)
         self.residual[self.count : self.count + grid] = -root @ regression.baseline.columns_um
 
-    @property
+    @cached_property
     def bare(self) -> "Projector":
         """The same without roughness of the density beyond its grid."""
         return Projector(self.regression, self.noise) if any(self.roughness) else self
@@ -154,22 +154,21 @@ class Projector:
         along = self.orthonormal.T @ joined if self._matrix is None else self._inverse.T @ (self._matrix.T @ joined)
         return (self._inverse @ along) / self._scale
 
-    def held_out_error(self, change_um: Sequence[np.ndarray]) -> float:
-        """Mean square of the errors in what is held out of the runs, in noise variances, under effects.
+    def held_out(self, change_um: Sequence[np.ndarray]) -> np.ndarray:
+        """Errors in what is held out of the runs, in noise, one after the other, under effects; shape `(n,)`.
 
-        The baseline and the runs' nuisance parameters follow what was fitted. NaN where nothing is held out.
+        The baseline, without roughness beyond its grid, and the runs' nuisance parameters follow what was fitted.
         """
-        regression = self.regression
-        step, columns = self.step(self.residual - self.join(change_um))
-        square = count = 0.0
+        bare, regression = self.bare, self.regression
+        step, columns = bare.step(bare.residual - bare.join(change_um))
+        found = []
         for k, run in enumerate(regression.baseline.runs):
             left = regression.residuals[k] - change_um[k] - regression.rows[k] @ np.concatenate([columns, step])
             nuisance, mask, held = regression.nuisance[k], self.masks[k], run.held_out
             if held.any():
                 left = left - nuisance @ np.linalg.lstsq(nuisance[mask], left[mask], rcond=None)[0]
-                square += float(np.sum(left[held] ** 2)) / self.noise[k].total_um ** 2
-                count += float(held.sum())
-        return square / count if count else float("nan")
+                found.append(left[held] / self.noise[k].total_um)
+        return np.concatenate(found) if found else np.zeros(0)
 
     def move(self, joined: np.ndarray) -> Baseline:
         """The baseline moved so that it follows a joined signal best, with columns that stay non-negative.

@@ -15,10 +15,8 @@ from fits.io.columns.temperature import TEMPERATURE
 from microid import AbstractEffect
 
 _STEP = 1e-3
-# Standard deviations that a strength must be away from zero.
-_DETERMINED = 3.0
-# Standard deviations by which a sum of squares of noise varies.
-_CHANCE = 3.0
+# Standard deviations up to which a strength may be larger than it was found.
+_LARGEST_Z = 3.0
 # Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
 _ROUNDS, _FARTHEST, _LEAST_GAIN = 12, 3.0, 0.1
 # Factor by which that is shortened where it was too far.
@@ -94,12 +92,12 @@ class Refit:
         scaled = plain * wider * wider[:, None] if robust else plain
         return np.where(seen[:, None] & seen, scaled, np.diag(np.where(seen, 0.0, _UNKNOWN_VARIANCE)))
 
-    def is_noise(self, projector: Projector) -> bool:
-        """Whether what is left is no more than noise."""
-        return self.cost < projector.count - projector.freedom + _CHANCE * (2 * projector.count) ** 0.5
+    def is_noise(self, projector: Projector, chance_z: float) -> bool:
+        """Whether what is left is no more than noise, within so many standard deviations."""
+        return self.cost < projector.count - projector.freedom + chance_z * (2 * projector.count) ** 0.5
 
-    def determined(self, marginally: bool = True, alone: bool = False) -> bool:
-        """Whether the data determine the strength of the last effect, in some run at least, within its bounds.
+    def determined(self, least_z: float, marginally: bool = True, alone: bool = False) -> bool:
+        """Whether the strength of the last effect is so far from zero, in some run at least, and within its bounds.
 
         Marginally, whatever its other coordinates are, as its time constant, or else beside them as they were found:
         where an effect is weak, the records may show no more than that it is there. At its bound it counts only where
@@ -116,7 +114,7 @@ class Refit:
         covariance = beside.covariance(robust=False)[before:, before:]
         runs = range(len(law.maps) if law.each.any() else 1)
         strengths = [_strength(law, x, run, varied, covariance) for run in runs]
-        return any(bool(np.any(np.abs(here) > _DETERMINED * sd)) for here, sd in strengths)
+        return any(bool(np.any(np.abs(here) > least_z * sd)) for here, sd in strengths)
 
     def possible(self, bench: Bench) -> bool:
         """Whether what went on in the last effect before the runs is no more than moves of the rig leave behind."""
@@ -130,7 +128,7 @@ class Refit:
         covariance = self.covariance(robust=False)[before:, before:]
         for run in range(len(law.maps)):
             here, sd = _strength(law, x, run, np.arange(law.size), covariance)
-            most = _FARTHER * spans[law.form.moved] * float(np.max(np.abs(here) + _DETERMINED * sd))
+            most = _FARTHER * spans[law.form.moved] * float(np.max(np.abs(here) + _LARGEST_Z * sd))
             effect = law.effect(x, run)
             if any(float(np.max(np.abs(getattr(effect, name)))) > most for name in law.form.history):
                 return False

@@ -211,6 +211,17 @@ def _robust_z(along: np.ndarray, residual: np.ndarray) -> float:
     return float(along @ along / max(float(np.linalg.norm(blocks)), 1e-300)) if np.any(along) else 0.0
 
 
+def improvement_z(before: np.ndarray, after: np.ndarray) -> float:
+    """Standard deviations by which errors of shape `(n,)` became smaller; samples in blocks err alike.
+
+    0 where there are none.
+    """
+    if not len(before):
+        return 0.0
+    blocks = np.add.reduceat(before**2 - after**2, np.arange(0, len(before), BLOCK))
+    return float(np.sum(blocks) / max(float(np.linalg.norm(blocks - np.mean(blocks))), 1e-300))
+
+
 def _most(probe: Probe) -> float:
     """The largest multiple of its signatures that means anything."""
     return _LARGEST if probe.effects[0].finite else np.inf

@@ -1,4 +1,4 @@
-"""Which effects the records need: forward selection with refits, and a backward check."""
+"""Which effects the records need: a search over sets of causes, with refits, and a backward check."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -6,26 +6,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._comparison import (
-    SAME,
     WORTH,
     Rival,
-    choose_cause,
     compare_rivals,
+    confusable_z,
     indistinguishable,
     model_error,
 )
 from fits.diagnosis._effects import Bench
-from fits.diagnosis._joint_fit import fit_jointly, is_smoothness_confirmed, refine, relearn_noise
+from fits.diagnosis._joint_fit import State, is_smoothness_confirmed, refine, relearn_noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
-from fits.diagnosis._score import Family, Probe, Scored, best_of, rescore, score
+from fits.diagnosis._score import Family, Probe, Scored, rescore, score
+from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from microid import EFFECTS
 from microid.effects import card_of
 
-# Causes that are sought, at most, and laws in all, as some causes come several times.
-_MOST_CAUSES, _MOST_LAWS = 4, 8
+# Laws at most, as some causes come several times, and sets of causes that are followed at a time.
+_MOST_LAWS, _BEAM = 8, 3
 # Part of what a cause explains by itself that must be left of it once all is fitted together.
 _LEFT_JOINTLY = 0.3
+_ONCE = {form.name for form in EFFECTS if not form.repeats}
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,13 @@ class Cause:
 
 @dataclass(frozen=True)
 class Selection:
-    """What forward selection found: the `causes` in that order, and the `model` with all of them fitted together.
+    """What the search found: the `causes` in the order of their evidence, and the `model` with all of them.
 
     `plain` is the baseline without them. `scores` are those of all probes at the baseline, `left` those beside the
     causes, and `family` gives the chance of the largest. `bench` and `projector` are of the baseline as it is beside
     the causes, `first` of the one without them. `explained` is what the causes take off the sum of squares beside a
     baseline that may do all that it may without them; `finest` says whether they were simulated with many steps in
-    the end.
+    the end, and `stopped` that there was no time to ask for more.
     """
 
     causes: tuple[Cause, ...]
@@ -66,12 +67,65 @@ class Selection:
     first: Projector
     explained: float = 0.0
     finest: bool = False
+    stopped: bool = False
 
     @property
     def left_um(self) -> float:
         """Root mean square of what baseline and causes leave."""
         noise_um2 = float(np.mean([noise.total_um**2 for noise in self.projector.noise]))
         return (noise_um2 * self.model.cost / max(self.projector.count - self.projector.freedom, 1.0)) ** 0.5
+
+
+@dataclass(frozen=True)
+class Search:
+    """What every set of causes is judged by."""
+
+    probes: tuple[Probe, ...]
+    plain: Refit
+    false_alarm: float
+    rng: np.random.Generator
+    progress: Callable[[str], None]
+    thresholds: Thresholds
+    has_time: Callable[[], bool]
+
+    @property
+    def candidates(self) -> list[tuple[np.ndarray, ...]]:
+        """The signatures of all effects."""
+        return [column for probe in self.probes for column in probe.signatures]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A set of causes, and baseline and causes fitted to each other; `left` are the scores beside them."""
+
+    causes: tuple[Cause, ...]
+    bench: Bench
+    projector: Projector
+    model: Refit
+    left: tuple[Scored, ...]
+    family: Family
+
+    @classmethod
+    def of(cls, causes: Sequence[Cause], state: State, search: Search) -> "Explanation":
+        """Ask for all effects beside these causes."""
+        bench, projector, model = state
+        left = rescore(score(projector, search.probes, model.residual), model.basis(), model.residual)
+        return cls(tuple(causes), bench, projector, model, left, Family(left, search.rng))
+
+    @property
+    def state(self) -> State:
+        """Baseline and causes."""
+        return self.bench, self.projector, self.model
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the causes, in the order in which they were found, each once."""
+        return tuple(dict.fromkeys(cause.name for cause in self.causes))
+
+    @property
+    def criterion(self) -> float:
+        """Bayesian information criterion: the smaller, the better."""
+        return self.model.criterion(self.projector.count)
 
 
 def select(
@@ -81,88 +135,138 @@ def select(
     false_alarm: float,
     rng: np.random.Generator,
     progress: Callable[[str], None],
+    thresholds: Thresholds = THRESHOLDS,
+    has_time: Callable[[], bool] = lambda: True,
     again: int = 2,
 ) -> Selection:
-    """Add effects one at a time until chance explains the rest, take out what became unnecessary, and refine.
+    """Add causes one at a time until chance explains the rest, take out what became unnecessary, and refine.
 
-    Where a cause passed for noise before, selection begins again beside less noise, so often at most.
+    Sets of causes that explain about as much are followed side by side (beam search), as of two causes the first may
+    hide behind an effect that follows part of each; the smallest information criterion decides. Where a cause passed
+    for noise before, the search begins again beside less noise, so often at most.
     """
-    plain = model = nothing(bench, projector)
-    first_bench, first_projector = bench, projector
-    scores = left = score(projector, probes, plain.residual)
-    family = Family(scores, rng)
-    causes: list[Cause] = []
-    refused: set[str] = set()
-    refused_at_bound: set[str] = set()
-    once = {form.name for form in EFFECTS if not form.repeats}
-    while len({cause.name for cause in causes}) < _MOST_CAUSES and len(causes) < _MOST_LAWS:
-        taken = {cause.name for cause in causes}
-        # Models of effects are not exact: what one leaves may look like another, above all like its confusions.
-        whole = max(plain.cost - model.cost, 0.0)
-        independent = sum(cause.drop for cause in causes if card_of(cause.name).independent)
-        explained = max(whole - independent, 0.0) ** 0.5
-        bars = {
-            one.form: (whole**0.5 if one.form.independent else explained) * model_error(one, taken) for one in left
-        }
-        open_ = [one for one in left if one.name not in (taken & once) | refused and one.z > bars[one.form]]
-        if not open_:
+    plain = nothing(bench, projector)
+    search = Search(tuple(probes), plain, false_alarm, rng, progress, thresholds, has_time)
+    start = Explanation.of((), (bench, projector, plain), search)
+    beam, ends = [start], []
+    while beam:
+        grown: dict[frozenset[str], Explanation] = {}
+        for one in beam:
+            more = _grown(one, search)
+            if not more:
+                ends.append(one)
+            for other in more:
+                key = frozenset(other.names)
+                if key not in grown or other.criterion < grown[key].criterion:
+                    grown[key] = other
+        order = sorted(grown.values(), key=lambda one: one.criterion)
+        if order and again and not beam[0].causes:
+            afresh = relearn_noise(projector, order[0].projector, order[0].model, search.candidates)
+            if afresh is not None:
+                # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
+                settings = probes, false_alarm, rng, progress, thresholds, has_time
+                found = select(bench, afresh, *settings, again - 1)
+                if found.causes and is_smoothness_confirmed(found.projector, found.model):
+                    return found
+        reach = confusable_z(plain.cost - order[0].model.cost, thresholds) ** 2 if order else 0.0
+        beam = [one for one in order if one.criterion < order[0].criterion + reach][:_BEAM]
+    best = min(ends, key=lambda one: one.criterion)
+    return _refined(_without_outdone(best, ends, thresholds, plain), start, search)
+
+
+def _grown(one: Explanation, search: Search) -> list[Explanation]:
+    """The same with one more cause: with each of those that explain about as much."""
+    thresholds, false_alarm = search.thresholds, search.false_alarm
+    bench, projector, model = one.state
+    taken, refused = set(one.names), set[str]()
+    # Models of effects are not exact: what one leaves may look like another, above all like its confusions.
+    whole = max(search.plain.cost - model.cost, 0.0)
+    independent = sum(cause.drop for cause in one.causes if card_of(cause.name).independent)
+    explained = max(whole - independent, 0.0) ** 0.5
+    bars = {
+        scored.form: (whole**0.5 if scored.form.independent else explained) * model_error(scored, taken, thresholds)
+        for scored in one.left
+    }
+    # Noise that was read too low makes chance look like evidence: what is left says how low at most.
+    sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
+    while len(one.names) < thresholds.most_causes and len(one.causes) < _MOST_LAWS and search.has_time():
+        closed = (taken & _ONCE) | refused
+        open_ = [s for s in one.left if s.name not in closed and s.z > bars[s.form]]
+        top = max((s.z for s in open_), default=0.0)
+        if not open_ or one.family.p(top / sigma) >= false_alarm:
             break
-        top = max(one.z for one in open_)
-        # Noise that was read too low makes chance look like evidence: what is left says how low at most.
-        sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
-        if family.p(top / sigma) >= false_alarm:
-            break
-        progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
-        fitted = compare_rivals(bench, projector, model, open_, explained, _MOST_LAWS - len(causes))
-        if not fitted:
-            refused |= {one.name for one in open_ if one.z > WORTH * top}
-            continue
-        first, beside = choose_cause(bench, projector, probes, model, fitted, best_of(open_), taken & once)
-        drop = model.cost - first.refit.cost
-        rivals = indistinguishable(first, fitted, max(drop, 0.0), beside[-1].is_noise(beside[1]))
-        universal = next((rival for rival in rivals if rival.form.universal and not first.form.universal), None)
-        if universal is not None and not any(run.held_out.any() for run in bench.baseline.runs):
-            # Of effects that these records cannot tell apart, and nothing else can, the one that every rig has.
-            rivals = (replace(first, apart=universal.apart), *(rival for rival in rivals if rival is not universal))
-            first, beside = universal, fit_jointly(bench, projector, universal.refit)
-        alone = beside[-1].is_noise(beside[1]) and not model.is_noise(projector)
-        if not beside[-1].determined(False, alone) or model.cost - beside[-1].cost < _LEFT_JOINTLY * drop:
-            # Its strength is not determined, or what it explains is lost where all is fitted together.
-            refused.add(first.name)
-            refused_at_bound |= {first.name} if beside[-1].laws[-1].at_bound(beside[-1].x[-1]) else set()
-            continue
-        z = max(drop, 0.0) ** 0.5
-        if family.p(z / sigma) >= false_alarm or z <= bars[first.form]:
-            # It explains less than its score promised.
-            refused.add(first.name)
-            continue
-        bench, projector, model = beside
-        # What took this cause's place, at its bound, is asked about once more.
-        refused, refused_at_bound = refused - refused_at_bound, set()
-        candidates = [column for probe in probes for column in probe.signatures]
-        afresh = relearn_noise(first_projector, projector, model, candidates) if again else None
-        if afresh is not None:
-            # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
-            found = select(first_bench, afresh, probes, false_alarm, rng, progress, again - 1)
-            if found.causes and is_smoothness_confirmed(found.projector, found.model):
-                return found
-            again = 0
-        new = len(model.laws) - len(causes)
-        causes += [Cause(first.name, z, family.p(z), rivals, drop / new)] * new
-        left = rescore(score(projector, probes, model.residual), model.basis(), model.residual)
-        family = Family(left, rng)
-    causes, model = _backward(bench, projector, causes, model)
+        search.progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
+        fitted = compare_rivals(bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds)
+        refused |= {s.name for s in open_ if s.z >= WORTH * top} if not fitted else set()
+        found = []
+        for rival in [rival for rival in fitted if rival.end is not None]:
+            refused.add(rival.name)
+            end, drop = rival.end, model.cost - rival.refit.cost
+            assert end is not None
+            is_noise = end[-1].is_noise(end[1], thresholds.chance_z)
+            alone = is_noise and not model.is_noise(projector, thresholds.chance_z)
+            if not end[-1].determined(thresholds.determined_z, False, alone):
+                continue
+            # What it explains is lost where all is fitted together, or it explains less than its score promised.
+            z = max(drop, 0.0) ** 0.5
+            if model.cost - end[-1].cost < _LEFT_JOINTLY * drop or z <= bars[rival.form]:
+                continue
+            if one.family.p(z / sigma) >= false_alarm:
+                continue
+            rivals = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
+            new = len(end[-1].laws) - len(one.causes)
+            causes = [Cause(rival.name, z, one.family.p(z), rivals, drop / new)] * new
+            found.append(Explanation.of((*one.causes, *causes), end, search))
+        if found:
+            return _that_every_rig_has(found, bench)
+    return []
+
+
+def _that_every_rig_has(found: list[Explanation], bench: Bench) -> list[Explanation]:
+    """Of explanations that these records cannot tell apart, and nothing else can, the one that every rig has."""
+    if any(run.held_out.any() for run in bench.baseline.runs):
+        return found
+    rivals = {rival.name for rival in found[0].causes[-1].rivals}
+    first = [one for one in found if one.causes[-1].name in rivals and card_of(one.causes[-1].name).universal]
+    return first[:1] if first and not card_of(found[0].causes[-1].name).universal else found
+
+
+def _without_outdone(
+    best: Explanation, ends: Sequence[Explanation], thresholds: Thresholds, plain: Refit
+) -> Explanation:
+    """The best without rivals of its causes that explain less in the end, whatever was put beside them."""
+    apart = confusable_z(plain.cost - best.model.cost, thresholds) ** 2
+    causes = []
+    for at, cause in enumerate(best.causes):
+        outdone = set()
+        for rival in cause.rivals:
+            instead = {*(other.name for other in best.causes[:at]), rival.name}
+            theirs = [
+                end.criterion for end in ends if end is not best and {c.name for c in end.causes[: at + 1]} == instead
+            ]
+            if theirs and min(theirs) > best.criterion + apart:
+                outdone.add(rival.name)
+        causes.append(replace(cause, rivals=tuple(rival for rival in cause.rivals if rival.name not in outdone)))
+    return replace(best, causes=tuple(causes))
+
+
+def _refined(best: Explanation, start: Explanation, search: Search) -> Selection:
+    """The best with what became unnecessary taken out, and fitted as well as the records allow."""
+    plain, tie = start.model, search.thresholds.tie
+    causes, model = _backward(best.bench, best.projector, list(best.causes), best.model, tie)
     explained = plain.cost - model.cost
-    bench, projector, model, finest = refine(bench, projector, model)
+    bench, projector, model, finest = refine(best.bench, best.projector, model)
     # One may have become unnecessary since.
-    causes, model = _backward(bench, projector, causes, model)
+    causes, model = _backward(bench, projector, causes, model, tie)
     # In the end the density is smoother and nowhere negative, which costs something by itself.
     explained = max(explained, plain.cost - model.cost, 0.0)
-    at = bench, projector, first_projector
-    return Selection(tuple(causes), model, plain, scores, left, family, *at, explained, finest)
+    scored, at = (start.left, best.left, best.family), (bench, projector, start.projector)
+    return Selection(tuple(causes), model, plain, *scored, *at, explained, finest, not search.has_time())
 
 
-def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Refit) -> tuple[list[Cause], Refit]:
+def _backward(
+    bench: Bench, projector: Projector, causes: list[Cause], model: Refit, tie: float
+) -> tuple[list[Cause], Refit]:
     """Take out what later additions made unnecessary."""
     while len(causes) > 1:
         trials = []
@@ -171,7 +275,7 @@ def _backward(bench: Bench, projector: Projector, causes: list[Cause], model: Re
             without = refit(bench, projector, laws, [x for i, x in enumerate(model.x) if i != k], 3)
             trials.append((without.criterion(projector.count), k, without))
         criterion, k, without = min(trials, key=lambda t: t[0])
-        if criterion > model.criterion(projector.count) + SAME:
+        if criterion > model.criterion(projector.count) + tie:
             break
         causes = [cause for i, cause in enumerate(causes) if i != k]
         model = without
