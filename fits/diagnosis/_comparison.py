@@ -16,8 +16,8 @@ from microid import EFFECTS, AbstractEffect
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.
 _LEADERS, _FORMS, _NEAREST = 5, 2, 3
-# Scores below this share of the best are not worth a fit, nor another of the baseline what leaves more than the best by
-# this share of what that explains.
+# Scores below this share of the best are not worth a fit. The baseline is not fitted again beside what leaves more than
+# the best by this share of what that explains.
 WORTH, _NEAR = 0.25, 0.1
 
 
@@ -67,9 +67,8 @@ def compare_rivals(
             found = relocate(bench, projector, refit_beside(bench, projector, model, one), len(model.laws))
             if not all(np.all(np.isfinite(change)) for change in found.change_um):
                 continue
-            alone = found.is_noise(projector, thresholds.chance_z) and not model.is_noise(
-                projector, thresholds.chance_z
-            )
+            chance_z = thresholds.chance_z
+            alone = found.is_noise(projector, chance_z) and not model.is_noise(projector, chance_z)
             if not (found.determined(thresholds.determined_z, False, alone) and has_occurred(bench, found)):
                 continue
             better = improvement_z(before, projector.held_out(found.change_um))

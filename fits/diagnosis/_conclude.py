@@ -116,11 +116,12 @@ def conclude(
     records: Sequence[Record],
     false_alarm: float,
     progress: Callable[[str], None],
-    request: Request,
+    request: Request | None,
 ) -> Diagnosis:
     """Decide on the verdict, extend the stage, measure the gain, and say what else is to be said.
 
-    `records` are those whose warnings are passed on; for `false_alarm` and `request` see `diagnose`.
+    `records` are those whose warnings are passed on; for `false_alarm` and `request` see `diagnose`. No experiment is
+    suggested where there is no request.
     """
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
@@ -165,8 +166,13 @@ def conclude(
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)
         remarks.append(held.sentence)
-    ahead = suggest(ready, found, causes, request, progress)
-    if ahead is None and any(cause.also_consistent for cause in causes):
+    ahead = None if request is None else suggest(ready, found, causes, request, progress)
+    if request is None or found.stopped:
+        remarks.append(
+            "the time was over: what else may be there was not asked to the end, nor the next experiment; give it a "
+            "larger budget"
+        )
+    elif ahead is None and any(cause.also_consistent for cause in causes):
         remarks.append(
             "no program of this length that stays within the limits tells the class apart; allow a longer one, or "
             "wider limits where the rig has them"
