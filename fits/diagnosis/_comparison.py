@@ -16,8 +16,8 @@ from microid import EFFECTS, AbstractEffect
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.
 _LEADERS, _FORMS, _NEAREST = 5, 2, 3
-# Scores below this share of the best are not worth a fit. The baseline is not fitted again beside an effect that leaves
-# more than the best by this share of what that explains.
+# Scores below this share of the best are not worth a fit. The baseline is not fitted again beside an effect that
+# leaves more than the best by this share of what that explains.
 WORTH, _NEAR = 0.25, 0.1
 
 
