@@ -211,7 +211,7 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     creep, drift = fitted(made, "creep"), fitted(made, "thermal_drift")
     plain = select(made.bench, made.projector, made.probes, 0.01, np.random.default_rng(seed), lambda _: None)
     count = made.projector.count
-    rival = Rival("thermal_drift", drift, drift.criterion(count), 0.0, drift.cost)
+    rival = Rival("thermal_drift", drift, drift.criterion(count), drift.cost)
     ambiguous = replace(plain, causes=(Cause("creep", 9.0, 1e-9, (rival,), 81.0),), model=creep)
     told = []
     experiment = suggest(made, ambiguous, (found_cause("creep", "thermal_drift"),), Request(), told.append)

@@ -17,7 +17,7 @@ from fits.diagnosis._extension import (
     predicts_worse,
 )
 from fits.diagnosis._findings import bounds, causes_of
-from fits.diagnosis._noise import SPIKE, Faults, find_faults, name_faults
+from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._protocol import held_gain, with_held_gain
@@ -33,34 +33,15 @@ from fits.diagnosis._residual_tests import (
 )
 from fits.diagnosis._result import Diagnosis, Gain, RunView, Step, Test
 from fits.diagnosis._select import Selection
+from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from fits.loop._run import known_samples
 from fits.stats._noise import Noise
 from microid.effects import card_of
 
-# Causes that explain less than this part of what is reproducible are not named: the true ones are not in the library.
-_EXPLAINED_SHARE = 0.65
-# Causes that explain less than this part have nothing to do with it.
-_UNRELATED_SHARE = 0.3
-# Standard deviations by which a sum of squares exceeds its mean by chance.
-_SPREAD = 3.0
-# What is left counts as unexplained where its root mean square is above this part of the noise.
-_REST_NOISE = 0.3
-# It must be less probable than this by chance, too.
-_CHANCE = 1e-6
-# A narrow band that is more than this part of the misfit is what is seen in every way of looking.
-_BAND = 0.75
-# A residual repeats itself with the position where the evidence of a period, in e-folds of chance, is above this.
-_CYCLIC_EVIDENCE = 50.0
-# The period must explain this part of what is left, too.
-_CYCLIC_SHARE = 0.3
 # Part of the stroke below which a change of the feedforward is rounding.
 _MET = 1e-9
-# Part of the noise variance from which on it is that of rounding.
-_ROUNDED = 0.5
-# Causes with less evidence than this, in standard deviations, may get it from what else is not simulated.
-_WEAK_Z = 8.0
 
 
 @dataclass(frozen=True)
@@ -74,11 +55,12 @@ class Misfit:
     rest: float
     freedom: int
     count: int
+    thresholds: Thresholds = THRESHOLDS
 
     @property
     def total(self) -> float:
         """What there is to be explained: the rest as far as it is beyond chance."""
-        beyond = self.rest - self.freedom - _SPREAD * (2 * self.freedom) ** 0.5
+        beyond = self.rest - self.freedom - self.thresholds.chance_z * (2 * self.freedom) ** 0.5
         return max(self.explained + max(beyond, 0.0), 1e-300)
 
     @property
@@ -99,7 +81,8 @@ class Misfit:
     @property
     def is_left_over(self) -> bool:
         """Whether the rest is of a size that matters, and no chance."""
-        return self.rest_noise > _REST_NOISE and bool(stats.chi2.sf(self.rest, self.freedom) < _CHANCE)
+        improbable = bool(stats.chi2.sf(self.rest, self.freedom) < self.thresholds.rest_chance)
+        return improbable and self.rest_noise > self.thresholds.rest_noise
 
     def unnamed(self, weak: bool) -> tuple[float, bool]:
         """Root mean square of what is left in noise, and whether that counts, where none of the causes is named.
@@ -107,7 +90,7 @@ class Misfit:
         What is beyond chance counts, however small it is, unless nearly all of the rest is of another kind.
         """
         rest = (max(self.explained + self.excess, 0.0) / self.count) ** 0.5
-        return rest, rest > _REST_NOISE or not (weak or self.share < _UNRELATED_SHARE)
+        return rest, rest > self.thresholds.rest_noise or not (weak or self.share < self.thresholds.minor_share)
 
 
 def conclude(
@@ -125,26 +108,28 @@ def conclude(
     """
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
-    baseline = ready.baseline
-    beside = find_faults(found.projector.regression, found.model.change_um) if found.causes else ready.faults
+    baseline, thresholds = ready.baseline, ready.reading.thresholds
+    beside = (
+        find_faults(found.projector.regression, found.model.change_um, thresholds) if found.causes else ready.faults
+    )
     # What there is to be explained is all that the sensor does not make, the model's discrepancy, too.
     told = _in_noise(found, beside.noise)
     noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in beside.noise])))
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
-    rounded = ready.faults.quantum_um**2 / 12 > _ROUNDED * noise_um**2
+    rounded = ready.faults.quantum_um**2 / 12 > thresholds.minor_share * noise_um**2
     misfit, repeated = _misfit(ready, told, rounded)
     rest_noise, left_over = misfit.rest_noise, misfit.is_left_over
     progress(Step.EXTENSION)
     extension = extend_stage(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
-    weak = max((cause.z for cause in kept), default=0.0) < _WEAK_Z
+    weak = max((cause.z for cause in kept), default=0.0) < thresholds.strong_z
     # Of what one run had of its own other runs show nothing.
     repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
-    if kept and (misfit.share < _EXPLAINED_SHARE or predicts_worse(seen, weak)):
+    if kept and (misfit.share < thresholds.explained_share or predicts_worse(seen, thresholds.worse_z)):
         suspects = ", ".join(cause.name for cause in kept)
         why = "predicts what was held out worse"
-        if misfit.share < _EXPLAINED_SHARE:
+        if misfit.share < thresholds.explained_share:
             why = f"explains only {misfit.share:.0%} of what is left"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
         model, kept = found.plain, ()
@@ -152,16 +137,16 @@ def conclude(
         extension = extend_stage(ready, found, None)
     cyclic = (
         not rounded
-        and repeated.z > _CYCLIC_EVIDENCE
-        and repeated.drop > _CYCLIC_SHARE * max(misfit.excess, repeated.drop)
+        and repeated.z > thresholds.cycles
+        and repeated.drop > thresholds.minor_share * max(misfit.excess, repeated.drop)
     )
     if cyclic:
         remarks.append(
             f"what is left repeats itself every {repeated.period_um:.3g} um of the position, as the error of an "
             "interferometer or an encoder does"
         )
-    faults = _standing(ready.faults, beside, extension.compared) if kept else ready.faults
-    named = name_faults(faults, cyclic)
+    faults = _standing(ready.faults, beside, extension.compared, thresholds.spike_z) if kept else ready.faults
+    named = name_faults(faults, cyclic, thresholds)
     causes = causes_of(kept, model, found.projector, found.bench, misfit.total, named, ready.faults)
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)
@@ -177,9 +162,11 @@ def conclude(
             "no program of this length that stays within the limits tells the class apart; allow a longer one, or "
             "wider limits where the rig has them"
         )
-    unlike, bursts = irregular(told.first, told.plain.residual)
+    unlike, bursts = irregular(told.first, told.plain.residual, thresholds)
     # Faults of samples and noise explain nothing that is reproducible, but a narrow band may look as if it were.
-    in_band = any(card_of(one.name).statistic == "band" and one.share_of_misfit > _BAND for one in causes)
+    in_band = any(
+        card_of(one.name).statistic == "band" and one.share_of_misfit > thresholds.explained_share for one in causes
+    )
     if bursts and not kept and not rounded:
         remarks.append("what is left comes in bursts that no effect of the library makes")
         in_band, left_over = False, True
@@ -240,7 +227,7 @@ def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, C
     rest, freedom = explain_together(found.projector, found.model.basis(), found.model.residual, regressors)
     repeated = cycles(found.projector, found.model.residual, ready.bench.plain)
     rest = max(rest, 0.0 if rounded else repeated.drop)
-    return Misfit(found.explained, rest, freedom, found.first.count), repeated
+    return Misfit(found.explained, rest, freedom, found.first.count, ready.reading.thresholds), repeated
 
 
 def _tests(ready: Prepared, found: Selection) -> tuple[Test, ...]:
@@ -277,10 +264,10 @@ def _gain(
     return gain, sorted({effect.name for effect in extension.effects if effect.per_run and len(baseline.runs) > 1})
 
 
-def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared]) -> Faults:
+def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared], spike_z: float) -> Faults:
     """Faults of samples and noise beside the causes, which may explain what looked like a bad sample."""
     spikes = tuple(
-        bad & (np.abs(one.after_um + height_um) > SPIKE * noise.total_um)
+        bad & (np.abs(one.after_um + height_um) > spike_z * noise.total_um)
         for bad, height_um, one, noise in zip(faults.spikes, faults.heights_um, compared, beside.noise, strict=False)
     )
     return replace(beside, spikes=spikes, heights_um=faults.heights_um)

@@ -14,8 +14,9 @@ from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
-from fits.diagnosis._score import BLOCK
+from fits.diagnosis._score import improvement_z
 from fits.diagnosis._select import Selection
+from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop._run import Run
 from fits.stage._motion import signals
 from fits.stage._run import project_out
@@ -23,11 +24,6 @@ from microid import AbstractEffect, Stage
 
 _BLOCKS = 24
 _ROUNDS = 6
-# Relative spread of strengths that are the same in all runs.
-_SAME_IN_ALL_RUNS = 0.3
-# What was held out must not be predicted so many times worse, in squares, nor worse by so many standard deviations:
-# by causes with weak evidence, and by others.
-_MOST_WORSE, _WEAK_Z, _STRONG_Z = 1.1, 1.5, 3.0
 
 
 @dataclass(frozen=True)
@@ -63,15 +59,18 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Exte
     # What followed along the tangent is put into the stage itself.
     beside = found.projector
     regression = regress(beside.move(beside.residual - beside.join(model.change_um)), ())
-    effects = shared_effects(model, len(baseline.runs))
+    effects = shared_effects(model, len(baseline.runs), ready.reading.thresholds.minor_share)
     steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))
     stage = with_effects(regression.baseline.stage, effects).with_substeps(steps)
     compared = _compare(ready, Bench(regression.baseline), model, regression, effects, found.finest)
     return Extension(stage, compared, tuple(effects))
 
 
-def shared_effects(model: Refit, runs: int) -> list[AbstractEffect]:
-    """The effects as a model holds them: strengths that every run has by their mean, and others not at all."""
+def shared_effects(model: Refit, runs: int, spread: float = THRESHOLDS.minor_share) -> list[AbstractEffect]:
+    """The effects as a model holds them: strengths that every run has by their mean, and others not at all.
+
+    Every run has one whose relative `spread` is no larger.
+    """
     found = []
     for law, x in zip(model.laws, model.x, strict=True):
         # What went on before one run says nothing of the next.
@@ -81,17 +80,17 @@ def shared_effects(model: Refit, runs: int) -> list[AbstractEffect]:
             # What happened at one instant does not happen again.
             found.append(replace(each[0], **{name: 0 * getattr(each[0], name) for name in law.form.strength}))
         elif law.form.per_run and law.each.any():
-            found.append(replace(each[0], **{name: _common(each, name) for name in law.form.strength}))
+            found.append(replace(each[0], **{name: _common(each, name, spread) for name in law.form.strength}))
         else:
             found.append(each[0])
     return found
 
 
-def _common(each: Sequence[AbstractEffect], name: str) -> Float[Array, "..."]:
+def _common(each: Sequence[AbstractEffect], name: str, spread: float) -> Float[Array, "..."]:
     values = jnp.stack([getattr(effect, name) for effect in each])
     mean = jnp.mean(values, axis=0)
     # What one run had says nothing of the next.
-    return jnp.where(jnp.std(values, axis=0) < _SAME_IN_ALL_RUNS * jnp.abs(mean), mean, 0.0)
+    return jnp.where(jnp.std(values, axis=0) < spread * jnp.abs(mean), mean, 0.0)
 
 
 def _compare(
@@ -134,18 +133,16 @@ def left_of(run: Run, nuisance: np.ndarray, response_um: np.ndarray, using: np.n
 _without = eqx.filter_jit(project_out)
 
 
-def predicts_worse(compared: Sequence[Compared], weak: bool) -> bool:
-    """Whether the extended stage predicts what was held out worse than the plain one does."""
+def predicts_worse(compared: Sequence[Compared], worse_z: float) -> bool:
+    """Whether the extended stage predicts what was held out worse, by so many standard deviations."""
     held = [one for one in compared if one.held_out.any()]
     if not held:
         return False
     before, after = (
-        np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)]) ** 2
+        np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)])
         for pick in ([one.before_um for one in held], [one.after_um for one in held])
     )
-    sums = np.add.reduceat(after - before, np.arange(0, len(before), BLOCK))
-    least = (_WEAK_Z if weak else _STRONG_Z) * np.linalg.norm(sums - np.mean(sums))
-    return bool(np.sum(after) > _MOST_WORSE * np.sum(before) or np.sum(sums) > least)
+    return improvement_z(before, after) < -worse_z
 
 
 def gain_of(compared: Sequence[Compared], noise_um: float, source: str) -> Gain:

@@ -13,6 +13,7 @@ from fits.diagnosis._projector import Projector, learn_roughness, smoothed, with
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
 from fits.diagnosis._score import improvement_z
+from fits.diagnosis._thresholds import Thresholds
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _LARGEST_DIFFERENCE = 1.0
@@ -184,13 +185,17 @@ def keep_density_positive(bench: Bench, projector: Projector, model: Refit, fine
 
 
 def relearn_noise(
-    first: Projector, projector: Projector, model: Refit, candidates: Sequence[Sequence[np.ndarray]]
+    first: Projector,
+    projector: Projector,
+    model: Refit,
+    candidates: Sequence[Sequence[np.ndarray]],
+    thresholds: Thresholds,
 ) -> Projector | None:
     """The projector without causes, with noise and smoothness as they are beside them, where either was misjudged.
 
     Noise is that of the sensor and what neither the causes nor any of the `candidates` explain.
     """
-    sensor = find_faults(projector.regression, model.change_um).noise
+    sensor = find_faults(projector.regression, model.change_um, thresholds).noise
     beside = Projector(projector.regression, sensor, projector.roughness)
     found = with_discrepancy(beside, candidates, model.change_um)
     less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]

@@ -8,43 +8,28 @@ from scipy.ndimage import median_filter, rank_filter
 
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
+from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
 from fits.loop._run import Run
-from fits.stats._noise import Noise, idle_stretches, learn_noise, quantum_um, rough_noise_um
+from fits.stats._noise import Noise, idle_stretches, learn_noise, quantum_um, rough_noise_um, stretches
 from fits.stats._noise_spectrum import DRIFT, Band, MAINS_Hz, band_of
 from microid.effects import Statistic
 
 # So many samples at rest are enough to read the noise from.
 _IDLE = 150
-# Lag-one correlation of idle noise, in standard deviations, above which it counts as coloured.
-_COLOURED = 4.0
-# Standard deviations by which estimates of one noise may differ from run to run.
-_SAME_NOISE_Z = 4.0
 # Lines of mains are looked for in stretches of at least so many samples.
 _LONG = 60
-# They count where no more than this part of the variance is left without them.
-_LEFT_WITHOUT_LINES = 0.7
 # Lines drift out of step with their frequency after so many s.
 _STEADY_s = 1.5
-# A sample is a spike beyond so many standard deviations.
-SPIKE = 7.0
 # At most so many spikes stand together, and the other samples up to so far away are much smaller.
 _MOST_TOGETHER, _COMPARED_SAMPLES = 3, 16
 # A command that moves, or turns, by more than these parts of its range within so many samples may cause what looks
 # like a spike.
 _MOVED_SHARE, _TURNED_SHARE, _SAMPLES_AROUND = 0.02, 0.004, 6
-# There a spike is larger than this multiple of the quantile at which nearly all samples lie.
-_OUTLYING, _NEARLY_ALL = 4.0, 0.98
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
 # Jitter beside rounding has at least so many times its variance.
 _ROUNDING = 10.0
-# The jitter is at most what is found and so many standard errors.
-_MOST_JITTER_Z = 4.0
-# A last digit or jitter counts above this part of the noise variance.
-_LEAST_VARIANCE_SHARE = 0.3
-# Evidence of jitter and of a narrow band, in standard deviations.
-_JITTER_Z, _BAND_Z = 8.0, 8.0
 # A band is one of a resonance from this quality on; what is broader wanders, or jumps.
 _NARROW = 1.5
 # E-folds after which a motion has settled.
@@ -59,7 +44,7 @@ class Floor:
     idle: int
 
 
-def floor_of(run: Run, residual_um: np.ndarray, settling_s: float) -> Floor:
+def floor_of(run: Run, residual_um: np.ndarray, settling_s: float, thresholds: Thresholds = THRESHOLDS) -> Floor:
     """Read the noise of a run off its idle stretches, or off the fastest changes of the residual.
 
     A stretch is idle once the stage has settled, which takes it `settling_s`.
@@ -73,7 +58,7 @@ def floor_of(run: Run, residual_um: np.ndarray, settling_s: float) -> Floor:
         pieces.append(piece - np.polyval(np.polyfit(time, piece, order), time))
     count = sum(len(piece) for piece in pieces)
     if count >= _IDLE:
-        pieces = _without_mains(pieces, 1 / run.rate_Hz)
+        pieces = _without_mains(pieces, 1 / run.rate_Hz, 1 - thresholds.minor_share)
         count = sum(len(piece) for piece in pieces)
         joined = np.concatenate(pieces)
         if (rough_um := rough_noise_um(joined)) > 0:
@@ -81,7 +66,7 @@ def floor_of(run: Run, residual_um: np.ndarray, settling_s: float) -> Floor:
         freedom = 4.0 * len(pieces)
         level = float(np.std(joined)) * (len(joined) / max(len(joined) - freedom, 1)) ** 0.5
         correlation = float(np.mean(joined[1:] * joined[:-1]) / max(np.mean(joined**2), 1e-300))
-        if abs(correlation) * len(joined) ** 0.5 > _COLOURED and level > 0:
+        if abs(correlation) * len(joined) ** 0.5 > thresholds.apart_z and level > 0:
             return Floor(learn_noise(joined, freedom), len(joined))
         if level > 0:
             return Floor(Noise(level, np.zeros(0)), len(joined))
@@ -89,7 +74,7 @@ def floor_of(run: Run, residual_um: np.ndarray, settling_s: float) -> Floor:
     return Floor(Noise(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um))), np.zeros(0)), 0)
 
 
-def pooled(floors: Sequence[Floor]) -> list[Floor]:
+def pooled(floors: Sequence[Floor], same_z: float = THRESHOLDS.apart_z) -> list[Floor]:
     """Floors of one sensor: white noise that was read off idle stretches, and is the same in all runs by chance."""
     white = [floor for floor in floors if floor.idle and len(floor.noise.past) == 0]
     if len(white) < 2:
@@ -97,7 +82,7 @@ def pooled(floors: Sequence[Floor]) -> list[Floor]:
     counts = np.array([floor.idle for floor in white])
     levels = np.array([floor.noise.innovation_um for floor in white])
     level = float(np.sqrt(np.average(levels**2, weights=counts)))
-    if np.any(np.abs(levels / level - 1) > _SAME_NOISE_Z / np.sqrt(2 * counts)):
+    if np.any(np.abs(levels / level - 1) > same_z / np.sqrt(2 * counts)):
         return list(floors)
     return [
         replace(one, noise=Noise(level, np.zeros(0))) if any(one is other for other in white) else one
@@ -105,7 +90,7 @@ def pooled(floors: Sequence[Floor]) -> list[Floor]:
     ]
 
 
-def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarray]:
+def _without_mains(pieces: list[np.ndarray], interval_s: float, most_left: float) -> list[np.ndarray]:
     """Take the lines of mains out of stretches, where they are most of what is there: hum is a cause, not noise."""
     most = max(round(_STEADY_s / interval_s), _LONG)
     long = [
@@ -114,7 +99,7 @@ def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarr
     if sum(len(piece) for piece in long) < _IDLE:
         return pieces
     before = sum(float(piece @ piece) for piece in long)
-    best, found = _LEFT_WITHOUT_LINES * before, pieces
+    best, found = most_left * before, pieces
     for mains in MAINS_Hz:
         for frequency in mains * (1 + np.linspace(-DRIFT, DRIFT, 9)):
             left = []
@@ -128,12 +113,14 @@ def _without_mains(pieces: list[np.ndarray], interval_s: float) -> list[np.ndarr
     return found
 
 
-def spikes(run: Run, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarray:
+def spikes(
+    run: Run, residual_um: np.ndarray, least_um: float = 0.0, spike_z: float = THRESHOLDS.spike_z
+) -> np.ndarray:
     """Samples that stand alone, far off their neighbours, where the command gives no reason; shape `(n,)`."""
     off = residual_um - median_filter(residual_um, 7, mode="nearest")
     spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")
     spread = np.maximum(spread, 1.4826 * float(np.median(np.abs(off))))
-    far = np.abs(off) > np.maximum(SPIKE * spread, least_um + 1e-300)
+    far = np.abs(off) > np.maximum(spike_z * spread, least_um + 1e-300)
     # What rings has neighbours as large; what is alone has none, or one of its kind by chance.
     size = np.abs(off)
     # In two dimensions: in one, SciPy 1.17 takes a footprint with a gap for one without.
@@ -144,9 +131,12 @@ def spikes(run: Run, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarr
     turned = np.abs(np.diff(change, append=change[-1])) > _TURNED_SHARE * float(np.ptp(voltage))
     moved = (np.abs(change) > _MOVED_SHARE * float(np.ptp(voltage))) | turned
     near = np.convolve(moved, np.ones(2 * _SAMPLES_AROUND + 1), mode="same") > 0.5
-    # Where it may, others do so, too.
-    usual = float(np.quantile(size[near], _NEARLY_ALL)) if near.any() else 0.0
-    far &= ~near | (size > _OUTLYING * usual)
+    # Where it may, others do so, too: at most of the places, that is.
+    width = 2 * _SAMPLES_AROUND + 1
+    places = [slice(k, min(k + width, stop)) for first, stop in stretches(near) for k in range(first, stop, width)]
+    largest = np.array([size[place].max() for place in places]) if places else np.zeros(1)
+    usual = float(np.median(largest))
+    far &= ~near | (size > usual + spike_z * 1.4826 * float(np.median(np.abs(largest - usual))))
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
         if stop - first > _MOST_TOGETHER:
@@ -154,7 +144,9 @@ def spikes(run: Run, residual_um: np.ndarray, least_um: float = 0.0) -> np.ndarr
     return far
 
 
-def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float = 0.0) -> tuple[float, float, float]:
+def jitter_s(
+    residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float = 0.0, apart_z: float = THRESHOLDS.apart_z
+) -> tuple[float, float, float]:
     """Jitter of the instants of sampling, its evidence in standard deviations, and the most that it may be.
 
     Noise that grows with the speed, from sample to sample: the variance of the residual about its neighbours is
@@ -173,7 +165,7 @@ def jitter_s(residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float
         return 0.0, 0.0, float("inf")
     # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
     error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
-    most = float((max(more + _MOST_JITTER_Z * error, 0.0) / faster) ** 0.5)
+    most = float((max(more + apart_z * error, 0.0) / faster) ** 0.5)
     # Rounding is less where nothing moves, and there its median is not that of normal noise.
     if more <= _ROUNDING * least_um**2:
         return 0.0, 0.0, most
@@ -216,7 +208,9 @@ class Faults:
         return out
 
 
-def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None = None) -> Faults:
+def find_faults(
+    regression: Regression, change_um: Sequence[np.ndarray] | None = None, thresholds: Thresholds = THRESHOLDS
+) -> Faults:
     """Look at what a fitted plain stage leaves of each run, sample by sample.
 
     Where effects are known, `change_um` is what they change in each run, shape `(n,)`, and is taken off before.
@@ -244,23 +238,23 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
         mask = run.fitted
         free = np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
         left = moved - nuisance @ free
-        bad = spikes(run, left, 2 * quantum)
+        bad = spikes(run, left, 2 * quantum, thresholds.spike_z)
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)
         heights.append(np.where(bad, left - smooth, 0.0))
-        floors.append(floor_of(run, smooth, settling_s))
+        floors.append(floor_of(run, smooth, settling_s, thresholds))
         rate = np.gradient(run.displacement_um - left, run.record.time_s)
-        size, z, most = jitter_s(smooth[mask], rate[mask], least)
+        size, z, most = jitter_s(smooth[mask], rate[mask], least, thresholds.apart_z)
         jitters.append((z, size, np.abs(rate), most))
         interval = float(np.median(np.diff(run.record.time_s)))
         bands.append(band_of(smooth[mask], interval, run.record.voltage_V[mask]))
-    floors = pooled(floors)
+    floors = pooled(floors, thresholds.apart_z)
     idle = [floor.idle > 0 for floor in floors]
     noise = [one.noise if one.noise.total_um > least else Noise(least, np.zeros(0)) for one in floors]
     z, size, _, _ = max(jitters, key=lambda j: j[0])
     # One recorder took all runs: what only one of them shows is something else.
     z = z if size / 2 < min(most for _, _, _, most in jitters) else 0.0
-    if z > _JITTER_Z:
+    if z > thresholds.strong_z:
         noise = [
             replace(n, spread=np.sqrt(1 + (size * rate / n.innovation_um) ** 2))
             for n, (_, _, rate, _) in zip(noise, jitters, strict=True)
@@ -274,7 +268,7 @@ def find_faults(regression: Regression, change_um: Sequence[np.ndarray] | None =
         if not any(idle)
         else "idle stretches where there are any, and the fastest changes of the residual elsewhere"
     )
-    size = size if z > _JITTER_Z else 0.0
+    size = size if z > thresholds.strong_z else 0.0
     made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
     return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
 
@@ -289,7 +283,7 @@ class Fault:
     variance_um2: float
 
 
-def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
+def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLDS) -> list[Fault]:
     """Which of them explain enough of what is left; what repeats itself with the position (`cyclic`) is no jitter."""
     found = []
     total = float(np.mean([n.total_um**2 for n in faults.noise]))
@@ -302,7 +296,7 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
         known = ("fraction", share, count**0.5 / samples, "1"), ("size_um", size, size / (2 * count) ** 0.5, "um")
         found.append(Fault("spikes", z, known, share * size**2))
     step = faults.quantum_um
-    if step**2 / 12 > _LEAST_VARIANCE_SHARE * total:
+    if step**2 / 12 > thresholds.minor_share * total:
         z = (samples * step**2 / 12 / total) ** 0.5
         found.append(Fault("rounding", z, (("step_um", step, 1e-6 * step, "um"),), step**2 / 12))
     if faults.jitter_s > 0 and not cyclic:
@@ -310,8 +304,8 @@ def name_faults(faults: Faults, cyclic: bool) -> list[Fault]:
         jitter = Fault("jitter", faults.jitter_z, (("jitter_s", faults.jitter_s, sd, "s"),), faults.jitter_um**2)
         found.append(jitter)
     band = faults.band
-    narrow = band.z > _BAND_Z and band.quality > _NARROW
-    if narrow and band.size_um**2 > _LEAST_VARIANCE_SHARE / 3 * total and not band.mains:
+    narrow = band.z > thresholds.strong_z and band.quality > _NARROW
+    if narrow and band.size_um**2 > thresholds.minor_share / 3 * total and not band.mains:
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"
         size_of_band = "amplitude_um", band.size_um, band.sd_um, "um"
         found.append(Fault("band", band.z, (size_of_band, middle), band.size_um**2))

@@ -19,10 +19,6 @@ from fits.io._record import Record
 from fits.stage._solve import Problem
 from microid import EFFECTS, Hold, Scales
 
-# A command held in steps explains a delay of half a sample where it lowers the sum of squares by this part as much.
-_AS_WELL = 0.97
-# Or where, beside a delay of its own, it lowers it by this part more.
-_BETTER = 0.03
 # A delay below this part of the sampling interval is no effect, but one of each run's own.
 _SKEW = 0.04
 # It must have at least this part of the evidence of the strongest effect.
@@ -138,19 +134,20 @@ class _Fit:
         change = [simulate(there, replace(run, hold=hold)) - simulate(here, run) for run in baseline.finest]
         return self.projector.off(self.projector.residual - self.projector.join(change))
 
-    def prefers(self, hold: Hold, least: float) -> float:
-        """Evidence for another command between samples, a decrease of the sum of squares of `least`; 0 for none.
+    def prefers(self, hold: Hold, thresholds: Thresholds) -> float:
+        """Evidence for another command between samples, as a decrease of the sum of squares; 0 for none.
 
         Curves must leave less than lines beyond chance, and beside the best effect, too. Steps must explain what a
         delay behind lines does.
         """
+        least, off = thresholds.other_hold_z**2, thresholds.model_error
         late = self.delay_drop() if hold == "zero" else np.inf
         if late <= least:
             return 0.0
         left = self.left_under(hold)
         gained = float(self.left @ self.left - left @ left)
         if hold == "zero":
-            as_well = gained > _AS_WELL * late or gained - late + self.delay_drop(left) > _BETTER * late
+            as_well = gained > (1 - off) * late or gained - late + self.delay_drop(left) > off * late
             return late if as_well else 0.0
         if gained <= least:
             return 0.0
@@ -166,19 +163,18 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     """Fit the plain stage, learn the noise, and simulate every probe of every effect."""
     records, initial, fraction = reading.records, reading.initial, reading.fraction
     said: tuple[str, ...] = ()
-    least = reading.thresholds.other_hold_z**2
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, ONE_WAY)
 
     def fitted(hold: Hold, onward: Problem | None = None) -> _Fit:
         settings = reading.aside, fraction, initial, progress, hold
         regression = regress(fit_baseline(records, *settings, onward))
-        faults = find_faults(regression)
+        faults = find_faults(regression, None, reading.thresholds)
         if not faults.repaired:
             return _Fit(regression, faults)
         progress("fitting the plain stage again, without single bad samples")
         regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem))
-        found = find_faults(regression)
+        found = find_faults(regression, None, reading.thresholds)
         return _Fit(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
 
     progress(Step.BASELINE)
@@ -190,7 +186,7 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
         if hold != "first":
             if not here.regression.baseline.dynamic:
                 break
-            drop = here.prefers(hold, least)
+            drop = here.prefers(hold, reading.thresholds)
             if not drop:
                 continue
             progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
@@ -201,7 +197,10 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
             said = (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
-        if drop > max(least, (_ABOUT * here.largest_z()) ** 2) and late_s < _SKEW * here.scales.interval_s:
+        if (
+            drop > max(reading.thresholds.other_hold_z**2, (_ABOUT * here.largest_z()) ** 2)
+            and late_s < _SKEW * here.scales.interval_s
+        ):
             here = _Fit(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
     if here.faults.jitter_s > 0:

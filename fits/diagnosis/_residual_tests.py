@@ -9,6 +9,7 @@ from scipy import stats
 
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._result import Test
+from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import Run
 from fits.stats._noise import learn_noise
@@ -30,9 +31,6 @@ _SENTENCES = {
 }
 # Lags of neighbours, stretches of a run, and samples that a stretch needs at least.
 _LAGS, _STRETCHES, _FEWEST_IN_STRETCH = 20, 24, 20
-# Bursts: so much more spread of the stretches' sizes than chance, about their mean, and so heavy tails of what is new
-# in every sample (excess kurtosis).
-_SPREAD, _HEAVY = 0.4, 1.5
 # Evidence is counted up to so many standard deviations.
 _LARGEST_Z = 37.0
 
@@ -211,7 +209,9 @@ def cycles(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.nda
     return Cycles(span_um / float(counts[best]), float(-logs), drops[best])
 
 
-def irregular(projector: Projector, residual: np.ndarray) -> tuple[tuple[Test, ...], bool]:
+def irregular(
+    projector: Projector, residual: np.ndarray, thresholds: Thresholds = THRESHOLDS
+) -> tuple[tuple[Test, ...], bool]:
     """Test a residual, whitened and joined, run by run; and say whether it comes in bursts.
 
     Neighbours are compared with white noise (Ljung and Box), sizes of stretches with one another (Brown and Forsythe)
@@ -235,8 +235,9 @@ def irregular(projector: Projector, residual: np.ndarray) -> tuple[tuple[Test, .
         even[k] = stats.f.logsf(stats.f_oneway(*pieces).statistic, _STRETCHES - 1, len(size) - _STRETCHES)
         heavy = float(stats.kurtosis(new))
         tails[k] = stats.norm.logsf(stats.kurtosistest(new).statistic) if heavy > 0 else 0.0
-        stretches = np.array([np.sqrt(np.mean(piece**2)) for piece in np.array_split(part, _STRETCHES)])
-        bursts |= bool(heavy > _HEAVY and stretches.std() > _SPREAD * stretches.mean())
+        sizes = np.array([np.sqrt(np.mean(piece**2)) for piece in np.array_split(part, _STRETCHES)])
+        spread = float(sizes.std() / sizes.mean())
+        bursts |= heavy > thresholds.burst_kurtosis and spread > thresholds.burst_spread
     asked = (
         ("whiteness", "neighbouring residuals agree", white),
         ("evenness", "the residual is larger in some stretches of a run than in others", even),

@@ -24,8 +24,6 @@ from microid.effects import card_of
 
 # Laws at most, as some causes come several times, and sets of causes that are followed at a time.
 _MOST_LAWS, _BEAM = 8, 3
-# Part of what a cause explains by itself that must be left of it once all is fitted together.
-_LEFT_JOINTLY = 0.3
 _ONCE = {form.name for form in EFFECTS if not form.repeats}
 
 
@@ -161,7 +159,7 @@ def select(
                     grown[key] = other
         order = sorted(grown.values(), key=lambda one: one.criterion)
         if order and again and not beam[0].causes:
-            afresh = relearn_noise(projector, order[0].projector, order[0].model, search.candidates)
+            afresh = relearn_noise(projector, order[0].projector, order[0].model, search.candidates, thresholds)
             if afresh is not None:
                 # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
                 settings = probes, false_alarm, rng, progress, thresholds, has_time
@@ -209,7 +207,7 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
                 continue
             # What it explains is lost where all is fitted together, or it explains less than its score promised.
             z = max(drop, 0.0) ** 0.5
-            if model.cost - end[-1].cost < _LEFT_JOINTLY * drop or z <= bars[rival.form]:
+            if model.cost - end[-1].cost < thresholds.minor_share * drop or z <= bars[rival.form]:
                 continue
             if one.family.p(z / sigma) >= false_alarm:
                 continue
