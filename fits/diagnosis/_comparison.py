@@ -18,7 +18,7 @@ from microid import EFFECTS, AbstractEffect
 _LEADERS, _FORMS, _NEAREST = 5, 2, 3
 # Scores below this share of the best are not worth a fit. The baseline is not fitted again beside an effect that
 # leaves more than the best by this share of what that explains.
-WORTH, _NEAR = 0.25, 0.1
+WORTH, _NEAR = 0.4, 0.1
 
 
 @dataclass(frozen=True)

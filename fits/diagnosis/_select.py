@@ -23,7 +23,7 @@ from microid import EFFECTS
 from microid.effects import card_of
 
 # Laws at most, as some causes come several times, and sets of causes that are followed at a time.
-_MOST_LAWS, _BEAM = 8, 3
+_MOST_LAWS, _BEAM = 8, 2
 _ONCE = {form.name for form in EFFECTS if not form.repeats}
 
 
