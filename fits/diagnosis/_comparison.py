@@ -16,9 +16,9 @@ from microid import EFFECTS, AbstractEffect
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.
 _LEADERS, _FORMS, _NEAREST = 5, 2, 3
-# Scores below this share of the best are not worth a fit. The baseline is not fitted again beside an effect that
-# leaves more than the best by this share of what that explains.
-WORTH, _NEAR = 0.4, 0.1
+# Scores below this share of the best are not worth a fit. The instant of an effect is not searched for, and the
+# baseline not fitted again beside it, where it leaves more than the best by these shares of what that explains.
+WORTH, _PROMISING, _NEAR = 0.4, 0.5, 0.1
 
 
 @dataclass(frozen=True)
@@ -51,34 +51,48 @@ def compare_rivals(
     and not to another. What predicts held-out data worse is left out, and what does not stand out of the rest of the
     misfit unless it predicts better.
     """
-    best = best_of(scores)
-    top = max(one.z for one in scores)
-    names = [name for name, one in best.items() if one.z > WORTH * top][:_LEADERS]
-    before = projector.held_out(model.change_um)
+    before, first = projector.held_out(model.change_um), len(model.laws)
+    fits = [(one, refit_beside(bench, projector, model, one)) for one in _leaders(scores)]
+    least = min(found.cost for _, found in fits)
     fitted: dict[str, Refit] = {}
-    for name in names:
-        scored = sorted((one for one in scores if one.name == name), key=lambda s: -s.z)
-        tried: dict[type, int] = {}
-        for one in scored:
-            form = one.form
-            if tried.get(form, 0) >= (1 if form.strength else _FORMS) or one.z < WORTH * scored[0].z:
-                continue
-            tried[form] = tried.get(form, 0) + 1
-            found = relocate(bench, projector, refit_beside(bench, projector, model, one), len(model.laws))
-            if not all(np.all(np.isfinite(change)) for change in found.change_um):
-                continue
-            chance_z = thresholds.chance_z
-            alone = found.is_noise(projector, chance_z) and not model.is_noise(projector, chance_z)
-            if not (found.determined(thresholds.determined_z, False, alone) and has_occurred(bench, found)):
-                continue
-            better = improvement_z(before, projector.held_out(found.change_um))
-            if better < (-thresholds.worse_z if one.robust_z > thresholds.determined_z else 0.0):
-                continue
-            found = _add_occurrences(bench, projector, found, scored, len(model.laws) + laws, thresholds)
-            if name not in fitted or found.criterion(projector.count) < fitted[name].criterion(projector.count):
-                fitted[name] = found
+    for one, found in fits:
+        scored = [other for other in scores if other.name == one.name]
+        if found.cost - least < _PROMISING * (model.cost - least):
+            found = relocate(bench, projector, found, first)
+        if not (_is_possible(bench, projector, model, found, thresholds) and has_occurred(bench, found)):
+            continue
+        better = improvement_z(before, projector.held_out(found.change_um))
+        if better < (-thresholds.worse_z if one.robust_z > thresholds.determined_z else 0.0):
+            continue
+        found = _add_occurrences(bench, projector, found, scored, first + laws, thresholds)
+        if one.name not in fitted or found.criterion(projector.count) < fitted[one.name].criterion(projector.count):
+            fitted[one.name] = found
     rivals = [Rival(name, one, one.criterion(projector.count), one.cost) for name, one in fitted.items()]
     return _ranked(bench, projector, rivals, model.cost, thresholds)
+
+
+def _leaders(scores: Sequence[Scored]) -> list[Scored]:
+    """The best of those that explain most: of each effect the best of each form, or several without a strength."""
+    best = best_of(scores)
+    top = max(one.z for one in scores)
+    found = []
+    for name in [name for name, one in best.items() if one.z > WORTH * top][:_LEADERS]:
+        tried: dict[type, int] = {}
+        for one in sorted((one for one in scores if one.name == name), key=lambda s: -s.z):
+            most = 1 if one.form.strength else _FORMS
+            if tried.get(one.form, 0) < most and one.z >= WORTH * best[name].z:
+                tried[one.form] = tried.get(one.form, 0) + 1
+                found.append(one)
+    return found
+
+
+def _is_possible(bench: Bench, projector: Projector, model: Refit, found: Refit, thresholds: Thresholds) -> bool:
+    """Whether an effect beside a model is of a strength that the records determine."""
+    if not all(np.all(np.isfinite(change)) for change in found.change_um):
+        return False
+    chance_z = thresholds.chance_z
+    alone = found.is_noise(projector, chance_z) and not model.is_noise(projector, chance_z)
+    return found.determined(thresholds.determined_z, False, alone)
 
 
 def _add_occurrences(

@@ -22,8 +22,9 @@ from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from microid import EFFECTS
 from microid.effects import card_of
 
-# Laws at most, as some causes come several times, and sets of causes that are followed at a time.
-_MOST_LAWS, _BEAM = 8, 2
+# Laws at most, as some causes come several times, sets of causes that are followed at a time, and rounds in which
+# others are fitted where none of the leaders holds.
+_MOST_LAWS, _BEAM, _TRIES = 8, 2, 3
 _ONCE = {form.name for form in EFFECTS if not form.repeats}
 
 
@@ -187,11 +188,12 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
     }
     # Noise that was read too low makes chance look like evidence: what is left says how low at most.
     sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
-    while len(one.names) < thresholds.most_causes and len(one.causes) < _MOST_LAWS and search.has_time():
+    room = len(one.names) < thresholds.most_causes and len(one.causes) < _MOST_LAWS
+    for _ in range(_TRIES if room else 0):
         closed = (taken & _ONCE) | refused
         open_ = [s for s in one.left if s.name not in closed and s.z > bars[s.form]]
         top = max((s.z for s in open_), default=0.0)
-        if not open_ or one.family.p(top / sigma) >= false_alarm:
+        if not open_ or one.family.p(top / sigma) >= false_alarm or not search.has_time():
             break
         search.progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
         fitted = compare_rivals(bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds)
