@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from fits.control._tune_start import UltimatePoint, relay_start, steepest_slope, ultimate_point
     from fits.diagnosis._diagnose import diagnose
     from fits.diagnosis._result import Bound, Diagnosis, EffectParameter, Experiment, FoundCause, Gain
+    from fits.diagnosis._thresholds import Thresholds
     from fits.io._errors import DataError
     from fits.io._read_csv import read_csv, read_reference, read_runs
     from fits.io._record import Record, Reference

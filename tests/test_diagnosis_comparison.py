@@ -182,6 +182,15 @@ def test_hum_raises_no_bar_for_what_the_command_makes(rng):
     assert found.causes[1].z < THRESHOLDS.model_error * found.causes[0].z
 
 
+def test_no_cause_is_sought_once_the_time_is_over(rng):
+    case = made(rng, lambda bench, _: [one + 0.1 * np.gradient(one) for one in bench.plain])
+    probes = asked(case, "transport_delay")
+    found = select(case.bench, case.projector, probes, 0.01, rng, lambda _: None, has_time=lambda: False)
+    assert found.causes == ()
+    assert found.stopped
+    assert max(one.z for one in found.scores) > 20
+
+
 def test_a_density_is_smooth_again_beside_the_cause(rng, monkeypatch):
     delay_s = float(rng.uniform(2e-4, 4e-4))
 

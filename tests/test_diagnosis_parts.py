@@ -15,7 +15,7 @@ from fits import Record
 from fits.diagnosis import _effects
 from fits.diagnosis._effects import drop_programs
 from fits.diagnosis._noise import floor_of, jitter_s, spikes
-from fits.diagnosis._projector import Projector, learn_roughness
+from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
 from fits.diagnosis._score import Family, Probe, evidence, score
 from fits.stage._motion import pass_signal
 from fits.stats._noise import Noise, learn_noise, quantum_um
@@ -140,6 +140,33 @@ def test_roughness_is_learnt_only_where_it_is(rng):
     reg.residuals = tuple(r + kind @ bend for r, kind in zip(reg.residuals, reg.finer[0], strict=True))
     first, _ = learn_roughness(Projector(reg, noise), [])
     assert 0.15 < first <= 0.5
+
+
+def test_discrepancy_is_what_no_candidate_explains(rng):
+    reg = regression(rng)
+    noise = [Noise(1.0, WHITE), Noise(1.0, WHITE)]
+    candidate = [5 * np.sin(np.arange(len(r)) / 7) for r in reg.residuals]
+    reg.residuals = tuple(r + 3 * own for r, own in zip(reg.residuals, candidate, strict=True))
+    # Alone it is unexplained; as a candidate it is an effect, and what is left is the sensor's noise.
+    alone, explained = (with_discrepancy(Projector(reg, noise), some) for some in ([], [candidate]))
+    assert min(one.total_um for one in alone) > 5
+    assert max(one.total_um for one in explained) < 1.2
+    # What changes it is taken off before.
+    change = [3 * own for own in candidate]
+    assert max(one.total_um for one in with_discrepancy(Projector(reg, noise), [], change)) < 1.2
+    # It is never less than the noise, and as coloured as it is.
+    more = [lfilter([1.0], [1.0, -0.9], 2 * rng.standard_normal(len(r))) for r in reg.residuals]
+    reg.residuals = tuple(rng.standard_normal(len(one)) + one for one in more)
+    coloured = with_discrepancy(Projector(reg, noise), [])
+    for found, one in zip(coloured, more, strict=True):
+        assert found.total_um == pytest.approx(np.hypot(np.std(one), 1.0), rel=0.3)
+        assert found.correlation_samples > 3
+
+
+def test_noise_behind_noise_is_whitened_by_both(rng):
+    first, second = Noise(0.5, np.array([0.6])), Noise(3.0, np.array([-0.3, 0.2]))
+    values = rng.standard_normal(500)
+    np.testing.assert_allclose(first.followed_by(second).whiten(values), second.whiten(first.whiten(values)))
 
 
 def run_of(voltage_V, displacement_um, rate_Hz=1000.0):
