@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 
 import click
 
+from fits.cli import _late as late
 from fits.io._errors import DataError
 from fits.io._file_set import discard_all
 from fits.io._printable import printable
@@ -172,9 +173,7 @@ def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], Non
 
 def print_result(given: Given, content: Any, lines: Iterable[str]) -> None:
     """Print a result: as JSON where that is asked for, else in lines."""
-    from fits.io._atomic import finite_json
-
-    click.echo(finite_json(content) if given.as_json else "\n".join(lines))
+    click.echo(late.finite_json(content) if given.as_json else "\n".join(lines))
 
 
 def paths_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
@@ -209,9 +208,7 @@ def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:
 
 def length_mm(option: str, text: str, units: Sequence[str], example: str) -> float:
     """Read a length with one of some units, such as `0.02mm`, in mm."""
-    from fits.io._quantity import Quantity
-
-    length = Quantity("length", "mm", {"mm": 0, "um": -3, "µm": -3, "μm": -3, "m": 3})
+    length = late.Quantity("length", "mm", {"mm": 0, "um": -3, "µm": -3, "μm": -3, "m": 3})
     found = _LENGTH.fullmatch(text)
     try:
         number = float(found[1]) if found and found[2] in units else 0.0

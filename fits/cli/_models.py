@@ -3,42 +3,40 @@
 import math
 from collections.abc import Sequence
 
+from fits.cli import _late as late
 from fits.io._errors import DataError
-from fits.io._limits import Ranges, allowed, parse_limits
-from fits.io._record import Record
-from fits.loop._uncertainty import Prediction
-from fits.stage._model_file import ModelFile
-from fits.stage._uncertainty import predict
-from microid import Preisach, Stage
 
 
-def stage_or_preisach(path: str, loaded: ModelFile) -> Preisach | Stage:
+def stage_or_preisach(path: str, loaded: "late.ModelFile") -> "late.Preisach | late.Stage":
     """Return the stage or the hysteresis that a model file holds; a `DataError` where it holds neither."""
-    if isinstance(loaded.model, Preisach | Stage):
+    if isinstance(loaded.model, late.Preisach | late.Stage):
         return loaded.model
     raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
 
 
-def predicted_by(path: str, loaded: ModelFile, program: Record, initial: str) -> Prediction:
+def hysteresis(model: "late.Preisach | late.Stage") -> "late.Preisach":
+    """The hysteresis of a model, as slow voltages see it."""
+    return late.static_equivalent(model) if isinstance(model, late.Stage) else model
+
+
+def predicted_by(path: str, loaded: "late.ModelFile", program: "late.Record", initial: str) -> "late.Prediction":
     """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
     model = stage_or_preisach(path, loaded)
-    if loaded.uncertainty is None and isinstance(model, Preisach):
+    if loaded.uncertainty is None and isinstance(model, late.Preisach):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
-    return predict(model, loaded.uncertainty, program, initial)
+    return late.predict(model, loaded.uncertainty, program, initial)
 
 
 def parse_rig_limits(
     volts: str | None, limit: Sequence[str], margin: float
-) -> tuple[tuple[float, float] | None, Ranges]:
+) -> tuple[tuple[float, float] | None, dict[str, tuple[float, float]]]:
     """Read `--limits`, `--limit` and `--margin`: the range of the command in V, and what else is stated."""
-    stated = parse_limits(limit)
-    allowed({}, stated, margin)
+    stated = late.parse_limits(limit)
+    late.allowed({}, stated, margin)
     both = parse_limits_V(volts)
-    if "voltage" not in stated:
-        return both, stated
-    if both is not None:
+    if "voltage" in stated and both is not None:
         raise DataError("--limit voltage: --limits states that already; leave one of them out.")
-    return stated["voltage"], stated
+    return both or stated.get("voltage"), stated
 
 
 def parse_limits_V(text: str | None) -> tuple[float, float] | None:

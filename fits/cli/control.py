@@ -1,15 +1,15 @@
 """The command `microid control`: its options, and the work."""
 
-from __future__ import annotations
-
 import importlib.util
 import pkgutil
 from pathlib import Path
 
 import click
 
+from fits.cli import _late as late
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences, paths_in, progress_to_stderr, refuse_overwriting
+from fits.cli._models import parse_rig_limits, stage_or_preisach
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -100,25 +100,6 @@ def control(given: Given) -> None:
     """
     import numpy as np
 
-    from fits.cli._models import parse_rig_limits, stage_or_preisach
-    from fits.control._gains import read_gains
-    from fits.control._make import Loop, Maker
-    from fits.control._setup import held, setup
-    from fits.control._tune_problem import Goal
-    from fits.control._tune_result import passed_limits
-    from fits.io._atomic import finite_json, write_csv
-    from fits.io._jax_setup import start_jax
-    from fits.io._limits import check_command, joined, reached_in
-    from fits.io._read_csv import read_reference
-    from fits.io._record import Record
-    from fits.io._units import parse_columns
-    from fits.loop._result import FitError
-    from fits.report._control import control_json, describe_control
-    from fits.stage._model_file import load_model
-    from fits.stage._motion import predicted_ranges
-    from fits.stage._uncertainty import draw_plants
-    from microid import CONTROLLERS, Stage
-
     for name, least in _LEAST.items():
         value = getattr(given, name)
         if value is not None and not least <= value <= _LARGEST:
@@ -130,8 +111,8 @@ def control(given: Given) -> None:
             raise DataError(f"{_option(name)}: expected {allowed}, found {step:g}; leave it out for none.")
     stated = {_option(name): getattr(given, name) for name in _LIMITS}
     volts, allowed_here = parse_rig_limits(given.limits, given.limit, given.margin)
-    start_jax()
-    tuned_to = [name for name, each in CONTROLLERS.items() if "frequency_Hz" in each.own]
+    late.start_jax()
+    tuned_to = [name for name, each in late.CONTROLLERS.items() if "frequency_Hz" in each.own]
     if given.frequency and given.controller not in tuned_to:
         raise DataError(
             f"--frequency: expected --controller {' or '.join(tuned_to)} with it, found {given.controller}; leave it "
@@ -139,16 +120,16 @@ def control(given: Given) -> None:
         )
     refuse_overwriting(given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])])
     progress = progress_to_stderr(given.quiet)
-    known_gains = None if given.gains is None else read_gains(given.gains)
-    loaded = load_model(given.model)
+    known_gains = None if given.gains is None else late.read_gains(given.gains)
+    loaded = late.load_model(given.model)
     known = loaded.uncertainty is not None
     plant = stage_or_preisach(given.model, loaded)
-    wanted = read_reference(given.reference, parse_columns(given.columns))
+    wanted = late.read_reference(given.reference, late.parse_columns(given.columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with file_set() as files:
         unfinished, drawings = files.file(given.out), files.folder(given.plots)
         try:
-            ready = setup(plant, wanted, given.feedforward, initial=given.initial, limits_V=volts)
+            ready = late.setup(plant, wanted, given.feedforward, initial=given.initial, limits_V=volts)
         except DataError as error:
             if not error.of_model:
                 raise
@@ -158,17 +139,17 @@ def control(given: Given) -> None:
             longest = f"the reference's {wanted.time_s[-1]:g} s"
             raise DataError(f"--skip: expected less than {longest}, found {given.skip:g} s.")
         count = given.plants or (_PLANTS if known else 1)
-        nominal = held(plant) if isinstance(plant, Stage) else plant
-        stages = draw_plants(nominal, loaded.uncertainty, count, seed=given.seed)
+        nominal = late.held(plant) if isinstance(plant, late.Stage) else plant
+        stages = [late.held(one) for one in late.draw_plants(nominal, loaded.uncertainty, count, seed=given.seed)]
         limits_of = {field: bound for name, field in _LIMITS.items() if (bound := getattr(given, name)) is not None}
-        goal = Goal(given.effort, given.rate, **limits_of)
+        goal = late.Goal(given.effort, given.rate, **limits_of)
         rng = np.random.default_rng(given.seed)
-        loop = Loop(ready, [held(one) for one in stages], given.noise, given.delay, given.resolution, skipped)
+        loop = late.Loop(ready, stages, given.noise, given.delay, given.resolution, skipped)
         noise = rng.normal(0, given.noise, len(wanted)) if given.noise else None
-        tune = Maker(loop, goal, given.starts, given.seed, noise, progress)
+        tune = late.Maker(loop, goal, given.starts, given.seed, noise, progress)
         try:
             made = tune.make(given.controller, known_gains, given.frequency)
-        except FitError as error:
+        except late.FitError as error:
             raise DataError(f"{given.model}: {error}.") from error
         every = loop.margins(made.controller)
         if not all(bool(one.stable) for one in every):
@@ -183,12 +164,12 @@ def control(given: Given) -> None:
         runs, run = played[:asked], played[0]
         if not all(np.all(np.isfinite(one.error_um)) for one in played):
             raise DataError(f"{given.model}: the loop is unstable, its displacement has no bounds; lower --gains.")
-        passed = passed_limits(goal, every, runs)
+        passed = late.passed_limits(goal, every, runs)
         in_motion = bool({"velocity", "acceleration", "current"} & set(allowed_here))
-        predicted = joined(
-            predicted_ranges(
+        predicted = late.joined(
+            late.predicted_ranges(
                 one,
-                Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source),
+                late.Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source),
                 np.asarray(ran.displacement_um),
                 given.initial,
                 in_motion,
@@ -196,22 +177,19 @@ def control(given: Given) -> None:
             for one, ran in zip(loop.plants, played, strict=True)
         )
         # Sensor noise alone makes a loop's command jump from sample to sample.
-        said = check_command(
-            wanted.source, predicted, reached_in(loaded.report), allowed_here, given.margin, spared=("slew",)
+        said = late.check_command(
+            wanted.source, predicted, late.reached_in(loaded.report), allowed_here, given.margin, spared=("slew",)
         )
         more = [*made.remarks, *said, *_judged(passed, stated, given.controller, known_gains is not None)]
         names = ("time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um")
         table = {name: np.asarray(getattr(run, name)) for name in names}
-        write_csv(unfinished, table | {"time_s": wanted.time_s})
-        drawn: list[Path] = []
-        if drawings is not None:
-            from fits.plots._control import plot_control
-
-            drawn = plot_control(run, made.controller, loop.plants, drawings, delay=given.delay)
+        late.write_csv(unfinished, table | {"time_s": wanted.time_s})
+        to_draw = run, made.controller, loop.plants
+        drawn = [] if drawings is None else late.plot_control(*to_draw, drawings, delay=given.delay)
         about = {"controller": given.controller, "out": given.out, "plots": paths_in(given.plots, drawn)}
         # Before the file is in its place: what cannot be told is not left behind either.
-        summary = control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
-        told = finite_json(summary) if given.as_json else describe_control(summary)
+        summary = late.control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
+        told = late.finite_json(summary) if given.as_json else late.describe_control(summary)
     click.echo(told)
 
 
@@ -221,15 +199,13 @@ def _option(name: str) -> str:
 
 def _judged(passed: dict[str, str], stated: dict[str, float | None], kind: str, given: bool) -> list[str]:
     """What is said of limits that are passed; those that were asked for are not."""
-    from microid import CONTROLLERS
-
     remarks = []
     for option, words in passed.items():
         if stated[option] is None:
             remarks.append(f"a limit that tuning keeps by default is passed: {words} ({option})")
         elif given:
             raise DataError(f"{option}: {words}; choose other --gains, or leave them out to have them tuned.")
-        elif CONTROLLERS[kind].learns:
+        elif late.CONTROLLERS[kind].learns:
             raise DataError(f"{option}: {words} while {kind} learns; relax it, or choose pid.")
         else:
             # Tuning kept it under the noise it heard.

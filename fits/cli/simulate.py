@@ -2,8 +2,10 @@
 
 import click
 
+from fits.cli import _late as late
 from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences, print_result, refuse_overwriting
+from fits.cli._models import predicted_by
 
 
 @click.command()
@@ -22,22 +24,15 @@ def simulate(given: Given) -> None:
     """
     import numpy as np
 
-    from fits.cli._models import predicted_by
-    from fits.io._atomic import write_csv
-    from fits.io._jax_setup import start_jax
-    from fits.io._read_csv import read_csv
-    from fits.io._units import parse_columns
-    from fits.stage._model_file import load_model
-
-    start_jax()
+    late.start_jax()
     refuse_overwriting(given.out, [given.model, given.program])
-    loaded = load_model(given.model)
-    record = read_csv(given.program, parse_columns(given.columns), required=("time_s", "voltage_V"))
+    loaded = late.load_model(given.model)
+    record = late.read_csv(given.program, late.parse_columns(given.columns), required=("time_s", "voltage_V"))
     prediction = predicted_by(given.model, loaded, record, given.initial)
     displacement_um, sd_um = prediction.displacement_um, prediction.displacement_sd_um
     known = loaded.uncertainty is not None
     table = {"time_s": record.time_s, "voltage_V": record.voltage_V, "displacement_um": displacement_um}
-    write_csv(given.out, table | ({"displacement_sd_um": sd_um} if known else {}))
+    late.write_csv(given.out, table | ({"displacement_sd_um": sd_um} if known else {}))
     summary = {
         "out": given.out,
         "samples": len(record),
