@@ -25,11 +25,7 @@ from fits.io._errors import DataError
 from fits.io._file_set import discard_all
 from fits.io._printable import printable
 
-# Signals that ask the command to end.
-_SIGNALS = ("SIGTERM", "SIGHUP", "SIGINT")
 NOTHING_LEFT = "no unfinished file was left"
-_AGAIN_s = 0.05
-_DEFAULT_HOLDOUT = 0.2
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*([a-zµμ]+)\s*")
 
 
@@ -54,7 +50,7 @@ def heed_signals() -> None:
         except Stopped as end:
             leave(end)
 
-    for name in _SIGNALS:
+    for name in ("SIGTERM", "SIGHUP", "SIGINT"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, stop)
@@ -83,7 +79,7 @@ def _again(lost: Any) -> None:
         sys.__unraisablehook__(lost)
         return
     number = stop.number if isinstance(stop, Terminated) else signal.SIGINT
-    timer = threading.Timer(_AGAIN_s, os.kill, (os.getpid(), number))
+    timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
     timer.daemon = True
     timer.start()
 
@@ -91,9 +87,9 @@ def _again(lost: Any) -> None:
 def stopped(stop: KeyboardInterrupt, what: str) -> NoReturn:
     """Say that the command was stopped, and what is left, and end with the status that shells have for it."""
     discard_all()
-    by_signal = isinstance(stop, Terminated)
-    click.echo(f"{'Terminated' if by_signal else 'Interrupted'}: {what}.", err=True)
-    raise Stopped(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))
+    said, number = ("Terminated", stop.number) if isinstance(stop, Terminated) else ("Interrupted", signal.SIGINT)
+    click.echo(f"{said}: {what}.", err=True)
+    raise Stopped(128 + number)
 
 
 def system_refuses(error: OSError) -> NoReturn:
@@ -189,14 +185,12 @@ def with_paths(words: str, places: Iterable[tuple[str, str | None]]) -> str:
 
 def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:
     """Tell a fraction from files."""
+    if not given:
+        return 0.2, []
     numbers = []
     for text in given:
-        try:
+        with contextlib.suppress(ValueError):
             numbers.append(float(text))
-        except ValueError:
-            continue
-    if not given:
-        return _DEFAULT_HOLDOUT, []
     if not numbers:
         return 0.0, list(given)
     if len(given) > 1:
@@ -209,11 +203,10 @@ def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:
 def length_mm(option: str, text: str, units: Sequence[str], example: str) -> float:
     """Read a length with one of some units, such as `0.02mm`, in mm."""
     length = late.Quantity("length", "mm", {"mm": 0, "um": -3, "µm": -3, "μm": -3, "m": 3})
-    found = _LENGTH.fullmatch(text)
-    try:
-        number = float(found[1]) if found and found[2] in units else 0.0
-    except ValueError:
-        number = 0.0
+    found, number = _LENGTH.fullmatch(text), 0.0
+    if found and found[2] in units:
+        with contextlib.suppress(ValueError):
+            number = float(found[1])
     if not (found and 0 < number < float("inf")):
         raise DataError(
             f"{option}: expected a length above 0 with its unit, found '{text}'; write one such as {example}."
@@ -232,9 +225,5 @@ def refuse_clashes(places: dict[str, str | None]) -> None:
     """Refuse to write where is read, or twice to one place."""
     seen: dict[str, str] = {}
     for option, place in places.items():
-        if place is None:
-            continue
-        real = os.path.realpath(place)
-        if real in seen:
-            raise DataError(f"{option}: {place} would overwrite the file of {seen[real]}; choose another name.")
-        seen[real] = option
+        if place is not None and (first := seen.setdefault(os.path.realpath(place), option)) != option:
+            raise DataError(f"{option}: {place} would overwrite the file of {first}; choose another name.")

@@ -13,7 +13,6 @@ from fits.cli._models import parse_rig_limits, stage_or_preisach
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
-_PLANTS = 4
 # Finer steps, of um or V, are none.
 _FINEST, _LARGEST = 1e-9, 1e9
 # Fields of the goal by the options that state them.
@@ -107,8 +106,8 @@ def control(given: Given) -> None:
     for name in ("resolution", "resolution_voltage"):
         step = getattr(given, name)
         if step is not None and not _FINEST <= step <= _LARGEST:
-            allowed = f"{_FINEST:g} to {_LARGEST:g}"
-            raise DataError(f"{_option(name)}: expected {allowed}, found {step:g}; leave it out for none.")
+            steps = f"{_FINEST:g} to {_LARGEST:g}, found {step:g}"
+            raise DataError(f"{_option(name)}: expected {steps}; leave it out for none.")
     stated = {_option(name): getattr(given, name) for name in _LIMITS}
     volts, allowed_here = parse_rig_limits(given.limits, given.limit, given.margin)
     late.start_jax()
@@ -122,7 +121,6 @@ def control(given: Given) -> None:
     progress = progress_to_stderr(given.quiet)
     known_gains = None if given.gains is None else late.read_gains(given.gains)
     loaded = late.load_model(given.model)
-    known = loaded.uncertainty is not None
     plant = stage_or_preisach(given.model, loaded)
     wanted = late.read_reference(given.reference, late.parse_columns(given.columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
@@ -138,7 +136,7 @@ def control(given: Given) -> None:
         if skipped > len(wanted) - 2:
             longest = f"the reference's {wanted.time_s[-1]:g} s"
             raise DataError(f"--skip: expected less than {longest}, found {given.skip:g} s.")
-        count = given.plants or (_PLANTS if known else 1)
+        count = given.plants or (1 if loaded.uncertainty is None else 4)
         nominal = late.held(plant) if isinstance(plant, late.Stage) else plant
         stages = [late.held(one) for one in late.draw_plants(nominal, loaded.uncertainty, count, seed=given.seed)]
         limits_of = {field: bound for name, field in _LIMITS.items() if (bound := getattr(given, name)) is not None}
@@ -159,27 +157,20 @@ def control(given: Given) -> None:
             )
         progress("run")
         heard = rng.normal(0, given.noise, len(wanted)) if given.noise else None
-        asked = 1 if given.overshoot is None else len(loop.plants)
         played = [loop.run(made.controller, heard, given.resolution_voltage, k) for k in range(len(loop.plants))]
-        runs, run = played[:asked], played[0]
+        run = played[0]
         if not all(np.all(np.isfinite(one.error_um)) for one in played):
             raise DataError(f"{given.model}: the loop is unstable, its displacement has no bounds; lower --gains.")
-        passed = late.passed_limits(goal, every, runs)
+        passed = late.passed_limits(goal, every, played[:1] if given.overshoot is None else played)
         in_motion = bool({"velocity", "acceleration", "current"} & set(allowed_here))
-        predicted = late.joined(
-            late.predicted_ranges(
-                one,
-                late.Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source),
-                np.asarray(ran.displacement_um),
-                given.initial,
-                in_motion,
-            )
-            for one, ran in zip(loop.plants, played, strict=True)
-        )
+        predicted = []
+        for one, ran in zip(loop.plants, played, strict=True):
+            program = late.Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source)
+            moved_um = np.asarray(ran.displacement_um)
+            predicted.append(late.predicted_ranges(one, program, moved_um, given.initial, in_motion))
         # Sensor noise alone makes a loop's command jump from sample to sample.
-        said = late.check_command(
-            wanted.source, predicted, late.reached_in(loaded.report), allowed_here, given.margin, spared=("slew",)
-        )
+        limits = late.reached_in(loaded.report), allowed_here, given.margin
+        said = late.check_command(wanted.source, late.joined(predicted), *limits, spared=("slew",))
         more = [*made.remarks, *said, *_judged(passed, stated, given.controller, known_gains is not None)]
         names = ("time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um")
         table = {name: np.asarray(getattr(run, name)) for name in names}

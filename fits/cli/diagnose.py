@@ -23,7 +23,7 @@ from fits.io._file_set import file_set, usable_folder
 
 _REPORT, _JSON, _BASELINE, _EXTENDED = "report.html", "diagnosis.json", "baseline.json", "extended.json"
 _PROGRAM = "next_experiment.csv"
-_LONGEST_s, _WIDEST = 1e5, 10.0
+_LONGEST_s = 1e5
 
 
 @click.command()
@@ -52,12 +52,9 @@ def diagnose(given: Given) -> None:
         raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {given.false_alarm:g}.")
     if given.duration is not None and not 0 < given.duration <= _LONGEST_s:
         raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {given.duration:g}.")
-    if not 0 <= given.margin <= _WIDEST:
-        raise DataError(
-            f"--margin: expected a share of the ranges reached, 0 to {_WIDEST:g}, found {given.margin:g}."
-        )
-    limits = late.parse_limits(given.limit)
-    mapping = late.parse_columns(given.columns)
+    if not 0 <= given.margin <= 10:
+        raise DataError(f"--margin: expected a share of the ranges reached, 0 to 10, found {given.margin:g}.")
+    limits, mapping = late.parse_limits(given.limit), late.parse_columns(given.columns)
     fraction, files = fraction_or_files(given.holdout)
     for name in (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM):
         refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])

@@ -7,8 +7,6 @@ from fits.cli import _options as options
 from fits.cli._common import Given, in_sentences, print_result
 from fits.cli._models import hysteresis, parse_limits_V, stage_or_preisach
 
-_STATIC_ONLY = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
-
 
 @click.command()
 @options.model
@@ -29,5 +27,6 @@ def export(given: Given) -> None:
     made = late.export_c(hysteresis(stage), given.out, given.name, size=given.memory, limits_V=limits_V)
     files = [str(file) for file in made]
     # The inverse of mechanics needs the samples to come, which a controller does not have.
-    remarks = [_STATIC_ONLY] if isinstance(stage, late.Stage) else []
+    static = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
+    remarks = [static] if isinstance(stage, late.Stage) else []
     print_result(given, {"files": files, "remarks": remarks}, [*(f"Note: {remark}" for remark in remarks), *files])

@@ -11,9 +11,6 @@ import jax
 
 from fits.io._errors import DataError
 
-# Functions that compile faster than this are not worth a file.
-_KEPT_S = 0.3
-
 
 def start_jax() -> None:
     """Configure JAX before any computation; a `DataError` if others can write to the folder MICROID_CACHE names."""
@@ -21,7 +18,8 @@ def start_jax() -> None:
     folder = _cache_folder()
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", _KEPT_S)
+        # Functions that compile faster than this are not worth a file.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 

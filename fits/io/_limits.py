@@ -31,8 +31,6 @@ of the voltage at the piezo, C dU/dt, and records of voltage and displacement do
 # By how much of its range a predicted quantity may go beyond what the records reached.
 MARGIN = 0.02
 
-# What the command is, as against what it makes the rig do; a margin is for predictions.
-_COMMANDED = ("voltage", "slew")
 # These have a sign that means something; of the others the size is limited.
 _TWO_SIDED = ("voltage", "displacement")
 _PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "n": 1e-9}
@@ -120,20 +118,16 @@ def measured_ranges(record: Record, offset_um: float = 0.0) -> Ranges:
 
 def reached_in(report: Mapping[str, Any]) -> Ranges:
     """What the runs of a model reached, by its file's `fit`, displacements as in the first run; or nothing."""
-    listed = report.get("runs")
-    runs = (
-        [run for run in listed if isinstance(run, Mapping) and run.get("reached")] if isinstance(listed, list) else []
-    )
-    stated = [run.get("offset_um") for run in runs]
-    offsets_um = [float(offset) if isinstance(offset, int | float) else 0.0 for offset in stated]
-    found = []
-    for run, offset_um in zip(runs, offsets_um, strict=True):
-        ranges = ranges_of_json(run["reached"])
-        shift_um = offsets_um[0] - offset_um
-        if "displacement" in ranges:
-            low, high = ranges["displacement"]
-            ranges["displacement"] = low + shift_um, high + shift_um
-        found.append(ranges)
+    listed, found, first_um = report.get("runs"), [], None
+    for run in listed if isinstance(listed, list) else ():
+        if isinstance(run, Mapping) and run.get("reached"):
+            ranges, offset = ranges_of_json(run["reached"]), run.get("offset_um")
+            offset_um = float(offset) if isinstance(offset, int | float) else 0.0
+            first_um = offset_um if first_um is None else first_um
+            if "displacement" in ranges:
+                (low, high), shift_um = ranges["displacement"], first_um - offset_um
+                ranges["displacement"] = low + shift_um, high + shift_um
+            found.append(ranges)
     return joined(found)
 
 
@@ -164,8 +158,10 @@ def allowed(reached: AnyRanges, stated: AnyRanges, margin: float) -> Ranges:
             if name not in _TWO_SIDED:
                 high = max(abs(low), abs(high))
                 low = -high
-            more = 0.0 if name in _COMMANDED else margin * (high - low) * (1.0 if name in _TWO_SIDED else 0.5)
-            found[name] = low - more, high + more
+            if name not in ("voltage", "slew"):  # which are the command itself, and not predicted
+                more = margin * (high - low) * (1.0 if name in _TWO_SIDED else 0.5)
+                low, high = low - more, high + more
+            found[name] = low, high
     return found
 
 
@@ -193,9 +189,8 @@ def check_command(
     It follows the reference `source`; `predicted` is what it is, and makes the rig do. For `reached`, `stated` and
     `margin` see `allowed`. Of the quantities `spared` a remark is made instead, unless their limit is stated.
     """
-    unknown = [name for name in stated if name not in predicted]
-    if unknown:
-        raise DataError(f"--limit {unknown[0]}: nothing says how large it becomes here; leave it out.")
+    for name in (name for name in stated if name not in predicted):
+        raise DataError(f"--limit {name}: nothing says how large it becomes here; leave it out.")
     remarks = []
     if not reached:
         remarks.append(
@@ -211,12 +206,10 @@ def check_command(
                 f"{words}but --limit allows {limit:.4g} {one.unit}; slow it down, shrink it, or widen that."
             )
         words += f"where the runs that the model was fitted to reached {limit:.4g} {one.unit}"
-        if one.name in spared:
-            remarks.append(f"{words}; state what the rig stands with {stated_as(one)} to have it kept")
-            continue
-        raise DataError(
-            f"{words}; slow the reference down or shrink it, or state what the rig stands with {stated_as(one)}."
-        )
+        stated_so = f"state what the rig stands with {stated_as(one)}"
+        if one.name not in spared:
+            raise DataError(f"{words}; slow the reference down or shrink it, or {stated_so}.")
+        remarks.append(f"{words}; {stated_so} to have it kept")
     return remarks
 
 
