@@ -40,8 +40,8 @@ class Curve:
 class ResidualView:
     """A residual against one variable.
 
-    `look` makes curves from runs, with lengths times a factor; a `ValueError` where the runs do not allow it. `per`
-    follows the unit of the length. The first axis is `logarithmic`, or both are where it is a `spectrum`.
+    `look` makes curves from runs, with lengths times a factor; a `ValueError` where the runs, or none at all, do not
+    allow it. `per` follows the unit of the length. The first axis is `logarithmic`, or both are of a `spectrum`.
     """
 
     look: Callable[[Sequence[RunView], float], list[Curve]]
@@ -59,9 +59,8 @@ def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, 
     x, y = x[known], y[known]
     if x.size < _FEWEST_IN_MEAN * 3 or np.ptp(x) == 0:
         raise ValueError("too few samples")
-    edges = (
-        np.linspace(x.min(), x.max(), _BINS + 1) if even else np.unique(np.quantile(x, np.linspace(0, 1, _BINS + 1)))
-    )
+    steps = np.linspace(0, 1, _BINS + 1)
+    edges = np.linspace(x.min(), x.max(), _BINS + 1) if even else np.unique(np.quantile(x, steps))
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     rows = []
     for k in range(len(edges) - 1):
@@ -76,7 +75,7 @@ def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, 
 
 
 def _together(runs: Sequence[RunView], of: Callable[[RunView], np.ndarray]) -> np.ndarray:
-    return np.concatenate([np.ravel(of(run)) for run in runs]) if runs else np.empty(0)
+    return np.concatenate([np.ravel(of(run)) for run in runs])
 
 
 def _over(x: Callable[[RunView], np.ndarray], even: bool = True) -> Callable[[Sequence[RunView], float], list[Curve]]:
@@ -136,15 +135,11 @@ def _since_event(run: RunView, residual_um: np.ndarray) -> np.ndarray:
 
 
 def _over_time(runs: Sequence[RunView], factor: float) -> list[Curve]:
-    if not runs:
-        raise ValueError("no runs")
     longest = max(runs, key=lambda run: run.time_s[-1] - run.time_s[0] if run.time_s.size else 0.0)
     return [_binned(longest.time_s, factor * of(longest), after) for after, of in _RESIDUALS]
 
 
 def _spectrum(runs: Sequence[RunView], factor: float) -> list[Curve]:
-    if not runs:
-        raise ValueError("no runs")
     finest = max(
         runs, key=lambda run: run.time_s.size / (np.median(np.diff(run.time_s)) if run.time_s.size > 2 else 1)
     )

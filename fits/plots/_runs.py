@@ -18,9 +18,9 @@ from fits.plots._style import (
     NARROW_in,
     WIDE_in,
     curve,
-    figure,
     label,
     legend,
+    panels,
     thinned,
     verbatim,
 )
@@ -98,8 +98,8 @@ def over_time(runs: Sequence[Drawn], held_out_alone: bool = False) -> Figure:
 
 def _columns(runs: Sequence[Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
     """Two rows of axes, values above errors, with a column for each of the first runs."""
-    picture = figure(width_in, 3.6, gap=0.04)
-    axes = picture.subplots(2, min(len(runs), _MOST_RUNS), squeeze=False, sharex="col", height_ratios=(2, 1))
+    many = min(len(runs), _MOST_RUNS)
+    picture, axes = panels(width_in, 3.6, 2, many, 0.04, squeeze=False, sharex="col", height_ratios=(2, 1))
     label(axes[0, 0], "", "displacement (µm)")
     label(axes[1, 0], "", "error (µm)")
     return picture, axes
