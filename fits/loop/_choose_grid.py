@@ -17,24 +17,6 @@ from fits.stats._noise import WHITE, correlation_samples, huber_weight, quantum_
 
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
-# Refining goes on while it takes this fraction off the error of predicted blocks.
-_LEAST_GAIN = 0.005
-# From so many levels on more, by the square of their number.
-_COSTLY = 32
-# Errors up to so many times what a last digit rounds off are rounding.
-_ROUNDED = 1.2
-# Rounds after which the weights of outliers have settled.
-_REWEIGHED = 8
-# Correlation of displacement with voltage below which there is no loop.
-_CORRELATED = 0.3
-# Coherence from which on it follows all the same.
-_COHERENT = 0.2
-# Coherence of lines whose gain is trusted.
-_CLEAR = 0.3
-# Segments whose spectra are averaged: chance gives a coherence of 1 / 16.
-_SEGMENTS = 16
-# Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
-_LEADING = 0.5
 
 
 @dataclass(frozen=True)
@@ -68,7 +50,7 @@ def choose_grid(
         return try_grid(gather(grid_of(runs, n), runs), runs, stroke, hyper, levels is None, alone)
 
     digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
-    tried, trials = _resolve(trial, levels, finest, _ROUNDED * digit / 12**0.5)
+    tried, trials = _resolve(trial, levels, finest, 1.2 * digit / 12**0.5)
     return stroke, tried, trials
 
 
@@ -92,7 +74,7 @@ def _resolve(
             break
         trials.append(LevelTrial(n, finer.error_um))
         # A fit takes eight times as long for twice the levels, and must be worth it.
-        pays = finer.error_um < (1 - _LEAST_GAIN * max(1.0, n / _COSTLY) ** 2) * best.error_um
+        pays = finer.error_um < (1 - 0.005 * max(1.0, n / 32) ** 2) * best.error_um
         best = finer if finer.error_um <= best.error_um else best
         if not pays:
             break
@@ -124,7 +106,7 @@ def _stroke(run: Run) -> float:
     if np.ptp(displacement) == 0 or np.ptp(voltage) == 0:
         raise DataError(f"{run.record.source}: nothing moves in the samples to be fitted; hold out less")
     together = float(np.corrcoef(voltage, displacement)[0, 1])
-    if abs(together) < _CORRELATED:
+    if abs(together) < 0.3:
         _refuse_ringing(run)
         raise DataError(
             f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so "
@@ -135,7 +117,8 @@ def _stroke(run: Run) -> float:
             f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
             "change the sign of one of the two columns"
         )
-    if _leads(voltage, displacement) > _LEADING:
+    # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
+    if _leads(voltage, displacement) > 0.5:
         raise DataError(
             f"{run.record.source}: the displacement runs ahead of the voltage round its loops, where a piezo stays "
             "behind: the two columns are exchanged; correct the header, or name them the other way with --columns"
@@ -149,14 +132,14 @@ def _refuse_ringing(run: Run) -> None:
     piece = slice(which[0], which[-1] + 1)
     voltage, displacement = run.record.voltage_V[piece], run.displacement_um[piece]
     rate_Hz = float(1 / np.median(np.diff(run.record.time_s[piece])))
-    settings: dict[str, Any] = {"fs": rate_Hz, "nperseg": max(len(voltage) // _SEGMENTS, 16)}
+    settings: dict[str, Any] = {"fs": rate_Hz, "nperseg": max(len(voltage) // 16, 16)}
     frequency, cross = signal.csd(voltage, displacement, **settings)
     power, out = (signal.welch(one, **settings)[1] for one in (voltage, displacement))
     shared = np.abs(cross) ** 2 / (power * out + 1e-300)
     follows = float(np.average(shared, weights=power))
-    if follows < _COHERENT:
+    if follows < 0.2:
         return
-    clear = (shared > min(_CLEAR, follows)) & (power > np.median(power))
+    clear = (shared > min(0.3, follows)) & (power > np.median(power))
     gain = np.where(clear, np.abs(cross) / (power + 1e-300), 0.0)
     raise DataError(
         f"{run.record.source}: the displacement follows the voltage (coherence {follows:.2f}), but not at once, and "
@@ -178,7 +161,7 @@ def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list
     progress("weighing outliers")
     stroke = max(_stroke(run) for run in runs)
     grid, hyper = grid_of(runs, LADDER[0]), Hyper.start()
-    for _ in range(_REWEIGHED):
+    for _ in range(8):  # outliers have settled by then
         solution = solve_grid(gather(grid, runs), stroke, 1.0, hyper)
         hyper = solution.hyper
         model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))

@@ -27,9 +27,6 @@ from microid import FAMILIES, Preisach, Staircase
 
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
-# Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
-_EDGE = 0.02
-_MINOR = 0.01
 # Pairs of extremes that stand for the unknown history, and samples that are compared.
 _PAIRS = 6
 _SAMPLES = 1024
@@ -193,9 +190,9 @@ def _remarks(runs: list[Run]) -> list[str]:
                 "they were not used for the weights, and the initial state was estimated from them"
             )
     lower, upper = min(run.lower_V for run in runs), max(run.upper_V for run in runs)
-    edge = _EDGE * (upper - lower)
+    edge = 0.02 * (upper - lower)
     anchors = np.concatenate([run.path.anchor_V[run.fitted] for run in runs])
-    if np.mean((anchors > lower + edge) & (anchors < upper - edge)) < _MINOR:
+    if np.mean((anchors > lower + edge) & (anchors < upper - edge)) < 0.01:
         remarks.append(
             "the fitted samples hold no loop smaller than the full range: what the model says about smaller loops "
             "rests on the smoothness of the density alone and its band there is too narrow; "

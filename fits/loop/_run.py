@@ -26,22 +26,11 @@ from microid import (
     remember,
 )
 
-# Records are filled up to a power of two, so that those of like length share what was compiled.
-_SHORTEST = 1024
-# Instants that differ by less than this part of the interval from those of an even clock were taken by one: the time
-# was rounded when it was written.
-_EVEN = 1e-3
-# Extremes that a memory may hold: filtered multisines nest deeply.
-_EXTREMES = 512
 # A hundred arrays of so many values are 8 GB.
 _MOST_STEPS = 10_000_000
 # All records pass through the same compiled functions in pieces of this many samples.
 _PIECE = 8192
 _STAIRCASES = (64, 512, 4096)
-# A record has met an end of the range, or an extreme of its own, once it comes this close, as a fraction of the
-# range: the first of these that does not cost most of the samples, as peaks of a smooth command miss an end by a
-# little.
-_END_SHARES = (1e-3, 3e-3, 1e-2)
 # Samples that a run must leave to fit.
 _FEWEST = 50
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
@@ -176,11 +165,12 @@ class Run:
         record, stride = self.record, self.stride
         refuse_many_steps(record, stride)
         n, time_s = len(record), record.time_s
-        pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
+        pad = (0, max(1024, 1 << (n - 1).bit_length()) - n)
         step = (time_s[-1] - time_s[0]) / (n - 1)
         share = np.arange((n + pad[1] - 1) * stride + 1) / stride
         voltage = jnp.asarray(np.pad(record.voltage_V, pad, mode="edge"))
-        if np.max(np.abs(time_s - time_s[0] - step * np.arange(n))) <= _EVEN * step:
+        # So near to those of an even clock, instants were taken by one: the time was rounded when it was written.
+        if np.max(np.abs(time_s - time_s[0] - step * np.arange(n))) <= 1e-3 * step:
             time: Any = np.asarray(step / stride)
         else:
             longer = np.concatenate([time_s, time_s[-1] + step * np.arange(1, pad[1] + 1)])
@@ -192,7 +182,7 @@ class Run:
             voltage_V=refined(jnp.ones(()), voltage, stride, self.hold)[1],
             displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
             weight=jnp.asarray(np.pad(self.fit_weight, pad)),
-            start=Start(memory=resized(self.start, _EXTREMES)),
+            start=Start(memory=resized(self.start, 512)),  # filtered multisines nest deeply
             stride=stride,
             moving=self.moving,
             has_past=self.has_past,
@@ -285,7 +275,9 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
         return np.ones(len(voltage), dtype=bool)
     highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
     found: list[np.ndarray] = []
-    for share in _END_SHARES:
+    # How near to an end or an own extreme, as a fraction of the range, has met it: peaks of smooth commands miss ends
+    # by a little, and the first that does not cost most of the samples is taken.
+    for share in (1e-3, 3e-3, 1e-2):
         near = share * (upper_V - lower_V)
         saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
         own = near if found else 0.0

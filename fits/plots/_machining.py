@@ -32,7 +32,6 @@ from fits.plots._style import (
     figure,
     label,
     legend,
-    panels,
     save,
     verbatim,
 )
