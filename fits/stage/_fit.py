@@ -25,15 +25,6 @@ from fits.stats._metrics import TWO_SIDED_95
 from fits.stats._noise import WHITE
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
 
-# A coordinate, of the order of 1, that is known no better than this is hardly seen.
-_UNSEEN_SD = 0.5
-# A coordinate, which is scaled to be of the order of 1, that is known no better than this is not known.
-_UNKNOWN = 1.0
-# Entries of a direction below this share of its largest are left out of its name.
-_FAINT = 0.15
-# Exponents this close to 1 or -1 are taken for them.
-_WHOLE = 0.1
-
 
 def default_stage(hold: Hold = "first") -> Stage:
     """The stage of Section 3.1: driver, Preisach operator and mechanics, with all gain in the operator.
@@ -209,7 +200,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     names, value, slope = solved.parameters()
     ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * TWO_SIDED_95 * sd))) for sign in (-1, 1)]
     # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
-    width = np.where(sd > _UNSEEN_SD, np.abs(ends[1] - ends[0]) / (2 * TWO_SIDED_95), np.abs(slope) * sd)
+    width = np.where(sd > 0.5, np.abs(ends[1] - ends[0]) / (2 * TWO_SIDED_95), np.abs(slope) * sd)
     parameters = tuple(
         ParameterEstimate(name, unit, *map(float, figures))
         for (name, unit), *figures in zip(names, value, width, *ends, strict=True)
@@ -261,7 +252,7 @@ def unseen_directions(information: np.ndarray, names: Sequence[str], relative: n
     values, vectors = np.linalg.eigh(information)
     sentences = []
     for value, vector in zip(values, vectors.T, strict=True):
-        if value * _UNKNOWN**2 > 1:
+        if value > 1:  # coordinates are scaled to be of the order of 1
             break
         sentences.append(_sentence(vector * relative, names))
     return tuple(sentences)
@@ -271,13 +262,13 @@ def _sentence(direction: np.ndarray, names: Sequence[str]) -> str:
     # A parameter at its bound does not move with its coordinate.
     direction = np.where(np.isfinite(direction), direction, 0.0)
     size = np.abs(direction)
-    moved = [k for k in np.argsort(-size, kind="stable") if size[k] > _FAINT * size.max()]
+    moved = [k for k in np.argsort(-size, kind="stable") if size[k] > 0.15 * size.max()]
     if not moved:
         return f"some combination of {', '.join(names)} is not seen in these runs"
     if len(moved) == 1:
         return f"{names[moved[0]]} is not seen in these runs"
     exponents = direction[moved] / direction[moved[0]]
-    if len(moved) == 2 and abs(abs(exponents[1]) - 1) < _WHOLE:
+    if len(moved) == 2 and abs(abs(exponents[1]) - 1) < 0.1:
         one, other = names[moved[0]], names[moved[1]]
         # Along the direction one rises as the other falls, or with it: their product, or ratio, stays.
         joint = f"{one} * {other}" if exponents[1] < 0 else f"{one} / {other}"

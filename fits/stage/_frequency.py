@@ -12,10 +12,6 @@ from fits.io._errors import DataError
 from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._table import Table, open_table
 
-# A line is excited if the input reaches this share of its largest.
-_EXCITED = 0.01
-# Variances are averaged over this many neighbouring lines: few realizations alone make poor weights.
-_SMOOTH = 9
 _REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
 _MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"
 # What a unit is checked by, of each column.
@@ -65,7 +61,7 @@ class Multisine:
         u, y = (np.moveaxis(np.fft.rfft(x, axis=2), 2, 0) / samples for x in (self.voltage_V, self.displacement_um))
         size = np.sqrt(np.mean(np.abs(u) ** 2, axis=(1, 2, 3)))
         size[0] = 0
-        lines = np.flatnonzero(size > _EXCITED * np.max(size))
+        lines = np.flatnonzero(size > 0.01 * np.max(size))
         if not len(lines):
             raise DataError(
                 f"{self.source}: expected periodic voltages, found none that change; choose other columns."
@@ -183,8 +179,8 @@ def approximate(record: Multisine, u: NDArray[Any], y: NDArray[Any]) -> tuple[ND
 
 
 def smooth(variance: NDArray[Any]) -> NDArray[Any]:
-    """Mean over neighbouring lines, shape `(f, p)`."""
-    width = 2 * (min(_SMOOTH, len(variance) - 1 | 1) // 2) + 1
+    """Mean over nine neighbouring lines, shape `(f, p)`: few realizations alone make poor weights."""
+    width = 2 * (min(9, len(variance) - 1 | 1) // 2) + 1
     return convolve1d(variance, np.full(width, 1 / width), axis=0, mode="mirror")
 
 

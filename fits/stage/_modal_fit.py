@@ -22,12 +22,7 @@ from microid import Coordinates, HystereticModes, Modes, with_plays
 
 _M = TypeVar("_M", Modes, HystereticModes)
 _Band = tuple[float, float] | None
-# The rest of the way to the optimum, in standard deviations, that still counts as having arrived.
-_ARRIVED = 1e-2
-_STEPS = 500
 _GAINS = ("gain_um_per_V", "quadrature_um_per_V", "residual_um_per_V")
-# Peaks lower than this, in the logarithm of a singular value, may be noise.
-_PROMINENCE = 0.3
 _FEW_LINES = 5
 
 
@@ -226,7 +221,7 @@ def _solve(model: _M, spectra: _Spectra) -> tuple[_M, Any]:
     size = jnp.sqrt(jnp.sum(jax.jacfwd(residual)(start) ** 2, axis=(0, 1)))
     solver: Any = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-6)
     solution: Any = optx.least_squares(
-        lambda x, _: residual(start + x / size), solver, jnp.zeros_like(start), max_steps=_STEPS, throw=False
+        lambda x, _: residual(start + x / size), solver, jnp.zeros_like(start), max_steps=500, throw=False
     )
     found = coordinates(start + solution.value / size)
     return _with_gains(found, spectra.eliminated(found)[1], spectra.coupled), solution.result
@@ -259,7 +254,8 @@ def _fit(start: _M, spectra: _Spectra, known: bool) -> ModalFit[_M]:
             "fit fewer modes or a wider band."
         )
     misfit = float(np.linalg.norm(residual) / math.sqrt(len(residual) - len(left)))
-    if not np.linalg.norm(left) <= _ARRIVED * misfit * math.sqrt(len(left)) + 1e-6:
+    # The rest of the way to the optimum, in standard deviations.
+    if not np.linalg.norm(left) <= 1e-2 * misfit * math.sqrt(len(left)) + 1e-6:
         slow = result == RESULTS.nonlinear_max_steps_reached
         raise FitError(FitStatus.MAX_STEPS if slow else FitStatus.NOT_STATIONARY)
     inverse = np.linalg.inv(root) * (max(1.0, misfit) if known else misfit)
@@ -287,7 +283,7 @@ def _start(spectra: _Spectra, response: NDArray[Any], count: int) -> Modes:
     average = np.full(_FEW_LINES, 1 / _FEW_LINES)
     for curve in np.linalg.svd(response, compute_uv=False).T:
         level = convolve1d(np.log(np.maximum(curve, 1e-12 * np.max(np.abs(response)))), average, mode="nearest")
-        peaks, about = find_peaks(level, prominence=_PROMINENCE)
+        peaks, about = find_peaks(level, prominence=0.3)  # lower ones may be noise
         width = peak_widths(np.exp(2 * level), peaks)[0] * np.mean(np.diff(frequency))
         found += zip(about["prominences"], frequency[peaks], width / (2 * frequency[peaks]), strict=True)
     at: list[tuple[float, float]] = []

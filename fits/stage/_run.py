@@ -32,8 +32,6 @@ from microid import (
 
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
-# Where a lag has come this close, as a fraction of the range, it no longer knows from where.
-_FORGOTTEN = 1e-3
 
 
 def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
@@ -166,7 +164,7 @@ def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.
     rests_V = run.lower_V / run.gain, run.upper_V / run.gain
     low_V, high_V = (np.asarray(ahead(stage, place, run.samples, rest))[:: run.stride][:n] for rest in rests_V)
-    begun = int(np.argmax(np.abs(high_V - low_V) < _FORGOTTEN * (run.upper_V - run.lower_V)))
+    begun = int(np.argmax(np.abs(high_V - low_V) < 1e-3 * (run.upper_V - run.lower_V)))
     settled = np.arange(n) >= begun
     settled[begun:] = known_samples(low_V[begun:], run.lower_V, run.upper_V, initial)
     return settled if 2 * (settled & run.fitted).sum() > run.fitted.sum() else everything

@@ -22,12 +22,10 @@ from fits.stats._noise import correlation_samples, huber_weight
 from microid import Hold, Stage
 
 _ROUNDS, _ROUGH = 40, 12
-# Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
-_DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
+# What a step that fails multiplies Marquardt's damping by, and where it gives up.
+_FACTOR, _HIGHEST = 10.0, 1e6
 # A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
 _STATIONARY = 0.02
-# Variance of the noise below which, in squares of the stroke, all is rounding.
-_ROUNDING = 1e-20
 
 
 @dataclass(frozen=True)
@@ -184,7 +182,7 @@ def solve_chain(
     """
     chain, stroke_um = problem.chain, problem.stroke_um
     z, columns_um, hyper = problem.z, problem.columns_um, problem.hyper
-    damping = _DAMPING
+    damping = 1e-4
     counted: tuple[float, ...] = ()
     for number in range(_ROUGH if rough else _ROUNDS):
         runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
@@ -303,7 +301,7 @@ def _step(
         columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
         step = step - follow @ columns
         variance = float(jnp.exp(hyper.log_variance)) * stroke_um**2
-        if not variance > _ROUNDING * stroke_um**2:
+        if not variance > 1e-20 * stroke_um**2:  # all is rounding below
             # The search for the noise went astray.
             raise FitError(FitStatus.NONFINITE)
         prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)

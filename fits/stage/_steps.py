@@ -21,19 +21,8 @@ from fits.stage._start import measure_response, start_stages
 from fits.stage._uncertainty import Precision
 from microid import Driver, Hold, Mechanics, Preisach, Stage
 
-# Runs whose voltage moves less than this many times faster than that of the slowest are slow.
-_SLOW = 4.0
-# Intervals are divided until the error of the finite step moves no parameter by this many standard deviations.
-_BIAS = 0.15
-_FINEST = 16
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
 _EVEN = 1.0
-# Samples that a driver lags by where its search begins.
-_LAG = 3.0
-# Parts of the sampling interval below which a driver has no time constant, and from which it may find one again.
-_VANISHED, _RESTARTED = 1e-2, 0.3
-# Samples of a run, as a part of those fitted, that are not worth another fit where an unknown past reaches them.
-_HARDLY_ANY = 0.01
 
 
 @dataclass(frozen=True)
@@ -92,7 +81,7 @@ class Plan:
             return None
         settled = [settled_samples(solved.stage, *each) for each in zip(solved.runs, self.states, strict=True)]
         lost = [np.sum(run.fitted & ~own) / run.fitted.sum() for run, own in zip(solved.runs, settled, strict=True)]
-        if max(lost) < _HARDLY_ANY:
+        if max(lost) < 0.01:  # not worth another fit
             return None
         return replace(self, settled=tuple(settled))
 
@@ -105,7 +94,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     """Read a hysteresis off the slow runs and poles off the others."""
     plan, asked = plan.smoothed(), stage
     speed = [speed_Hz(record) for record in plan.records]
-    slow = [k for k, one in enumerate(speed) if one <= _SLOW * min(speed)]
+    slow = [k for k, one in enumerate(speed) if one <= 4.0 * min(speed)]
     fitted = free_grid(stage)
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
     runs = plan.runs(1)
@@ -172,7 +161,7 @@ def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence
     if len(drivers) != 1 or len(mechanics) != 1 or grid is None or problem.hyper is None:
         return None
     (name, old), (dropped, _) = drivers[0], mechanics[0]
-    simple = stage.without(dropped).swap(name, Driver(jnp.asarray(_LAG * plan.interval_s), old.gain))
+    simple = stage.without(dropped).swap(name, Driver(jnp.asarray(3.0 * plan.interval_s), old.gain))
     simpler = Problem.of(simple, grid, problem.columns_um, problem.hyper, problem.stroke_um)
     simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, dropped),))
     plan.progress("a lag without a resonance")
@@ -204,11 +193,12 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         sd = np.sqrt(np.diagonal(precision.covariance(influence)))
         off = [simulate_stage(stage, a) - simulate_stage(stage, b) for a, b in zip(runs, plan.runs(2), strict=True)]
         moved = [own @ (o - o[run.fitted].mean()) for own, o, run in zip(influence, off, runs, strict=True)]
-        # Halving the step takes three quarters of its error off, which falls with its square.
-        excess = float(np.max(np.abs(np.sum(moved, axis=0)) / sd)) / (0.75 * _BIAS)
+        # Halving the step takes three quarters of its error off, which falls with its square; it may move a parameter
+        # by 0.15 standard deviations.
+        excess = float(np.max(np.abs(np.sum(moved, axis=0)) / sd)) / (0.75 * 0.15)
         if excess <= 1:
             return solved, precision
-        stride = min(_FINEST, 2 ** math.ceil(math.log2(excess) / 2))
+        stride = min(16, 2 ** math.ceil(math.log2(excess) / 2))
         plan.progress(f"{stride} steps per sample")
         problem = replace(solved.onward, z=_restart_driver(plan, solved))
 
@@ -222,8 +212,8 @@ def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     stage = solved.stage
     changed = False
     for name, part in named_parts(stage, Driver):
-        if float(part.time_constant_s) < _VANISHED * plan.interval_s:
-            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_RESTARTED * plan.interval_s)))
+        if float(part.time_constant_s) < 1e-2 * plan.interval_s:
+            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(0.3 * plan.interval_s)))
             changed = True
     if plan.hold != "zero" or not changed:
         return solved.z

@@ -21,8 +21,6 @@ from microid import Preisach, Stage
 
 # Levels on which predictions are perturbed; finer ones move no displacement.
 _LEVELS = 16
-# Autocovariances are trusted up to so many correlation times.
-_LAGS = 6.0
 # Precision, in scaled coordinates, that stands in for none.
 NO_PRECISION = 1e-8
 
@@ -157,7 +155,7 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
     size = fft.next_fast_len(2 * n)
     auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[:n] / fitted.sum()
     correlation = correlation_samples([residual_um[fitted]])
-    lags = 0 if correlation <= WHITE else min(n - 1, int(np.ceil(_LAGS * correlation)))
+    lags = 0 if correlation <= WHITE else min(n - 1, int(np.ceil(6.0 * correlation)))
     window = np.zeros(n)
     window[: lags + 1] = 1 - np.arange(lags + 1) / (lags + 1)
     kernel = np.zeros(size)
