@@ -36,8 +36,6 @@ _TWO_SIDED = ("voltage", "displacement")
 _PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "n": 1e-9}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _RANGE = re.compile(rf"(?:({_NUMBER}):)?({_NUMBER})\s*([^\d\s.:].*)?")
-# Part of a limit by which rounding may exceed it.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class Extreme:
     def excess(self) -> float:
         """How far the worse side is beyond its limit; 0 or less where it is inside."""
         sizes = [abs(value) for value in (self.low, self.high, self.lowest, self.highest) if math.isfinite(value)]
-        return max(self.high - self.highest, self.lowest - self.low) - _ROUNDING * max(sizes, default=0.0)
+        return max(self.high - self.highest, self.lowest - self.low) - 1e-9 * max(sizes, default=0.0)
 
     def __str__(self) -> str:
         """As in `displacement 0.1 to 38.2 um (limits 0 to 40 um)`."""

@@ -11,8 +11,6 @@ _LARGEST, _LARGEST_BY_UNIT = 1e9, {"s": 1e11, "um^2/V^2": 1e18, "dB": 180.0}
 # What changes by less than so much, in V or um, was not measured.
 LEAST_CHANGE = 1e-9
 SHORTEST_STEP_s = 1e-12
-# Steps of fewer last digits than these are not even where the clock was.
-_DIGITS = 8
 # Further columns serve for little, and may hold anything that has a square and a cube.
 LARGEST_EXTRA = 1e30
 
@@ -38,7 +36,8 @@ def check_steps(table: Table, column: str, time_s: FloatArray) -> None:
     if not len(steps_s):
         return
     row = int(np.argmin(steps_s))
-    least_s = max(SHORTEST_STEP_s, _DIGITS * float(np.spacing(np.abs(time_s[[0, -1]]).max())))
+    # Steps of fewer last digits than these are not even where the clock was.
+    least_s = max(SHORTEST_STEP_s, 8 * float(np.spacing(np.abs(time_s[[0, -1]]).max())))
     if steps_s[row] < least_s:
         what = (
             f"expected time steps of at least {least_s:.3g} s, which is what double precision resolves here, found "

@@ -19,14 +19,6 @@ STROKE_PER_VOLT_MIN_um_per_V = 0.005
 STROKE_PER_VOLT_MAX_um_per_V = 50.0
 MIN_SAMPLES = 50
 
-_MAX_REVERSALS = 0.2  # share of the samples
-# Median swing between reversals, as a share of the voltage range. Larger swings are a commanded multisine or
-# noise drive; smaller ones are the last digit of a 14-bit converter, too small to matter.
-_WIGGLE_MIN, _WIGGLE_MAX = 1e-4, 0.05
-_GAP = 5.0  # in median time steps
-# So many equal readings, over so much of the voltage's range, are no peak: the sensor is at its end.
-_EQUAL_READINGS, _MOVED_SHARE = 8, 0.03
-
 
 def read_csv(
     path: str | os.PathLike[str],
@@ -168,7 +160,7 @@ class KnownColumns:
         median_s = float(np.median(steps_s))
         if np.quantile(steps_s, 0.95, method="lower") > 2.0 * median_s:
             return
-        gaps = np.flatnonzero(steps_s > _GAP * median_s)
+        gaps = np.flatnonzero(steps_s > 5.0 * median_s)
         if gaps.size:
             worst = int(np.argmax(steps_s))
             count = "a gap" if gaps.size == 1 else f"{gaps.size} gaps, the longest"
@@ -183,10 +175,12 @@ class KnownColumns:
         voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays.get("displacement_um")
         turns_V = _reversals(voltage_V)
         share = turns_V.size / voltage_V.size
-        if voltage_V.size < MIN_SAMPLES or share <= _MAX_REVERSALS:
+        if voltage_V.size < MIN_SAMPLES or share <= 0.2:
             return
         wiggle = float(np.median(np.abs(np.diff(turns_V)))) / float(np.ptp(voltage_V))
-        if not _WIGGLE_MIN < wiggle < _WIGGLE_MAX:
+        # Larger swings between reversals, as a share of the range, are a commanded multisine or noise drive; smaller
+        # ones are the last digit of a 14-bit converter, too small to matter.
+        if not 1e-4 < wiggle < 0.05:
             return
         place = self.place("voltage_V")
         if displacement_um is not None and _reversals(displacement_um).size < turns_V.size / 4:
@@ -221,15 +215,14 @@ class KnownColumns:
             )
 
     def saturated(self) -> Iterator[str]:
-        """Readings that stand at one end while the voltage moves on: the longest such stretch."""
+        """Eight readings or more that stand at one end while the voltage moves on by 3 % of its range, which no peak does."""
         voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays["displacement_um"]
-        enough_V = _MOVED_SHARE * float(np.ptp(voltage_V))
+        enough_V = 0.03 * float(np.ptp(voltage_V))
         for end, words in ((displacement_um.max(), "largest"), (displacement_um.min(), "smallest")):
-            stands = np.concatenate([[False], displacement_um == end, [False]])
-            edges = np.flatnonzero(np.diff(stands.astype(int)))
+            edges = np.flatnonzero(np.diff((displacement_um == end).astype(int), prepend=0, append=0))
             for first, stop in zip(edges[::2], edges[1::2], strict=True):
                 moved = float(np.ptp(voltage_V[first:stop]))
-                if stop - first >= _EQUAL_READINGS and moved > enough_V:
+                if stop - first >= 8 and moved > enough_V:
                     yield (
                         f"{self.place('displacement_um', int(first))}: {stop - first} readings in a row are the "
                         f"{words}, {end:.6g} um, while the voltage moves by {moved:.3g} V, so the sensor is at its "

@@ -17,8 +17,6 @@ MOST_CSV_BYTES = 512_000_000
 MOST_JSON_BYTES = 64_000_000
 MOST_TOML_BYTES = 1_000_000
 MOST_DEPTH = 32
-_PIECE = 1 << 20
-_LONGEST_PATH = 200
 _LARGEST_INTEGER = 2**63 - 1
 
 
@@ -121,7 +119,7 @@ def _check(value: Any, place: str, finite: bool, path: str = "", depth: int = 0)
             name = f"{path}[{key}]" if listed else f"{path}.{key}".lstrip(".")
             if wrong:
                 raise DataError(f"{place}: {shown(name)[1:-1]}: expected {wrong}; correct it.")
-            _check(item, place, finite, name[:_LONGEST_PATH], depth + 1)
+            _check(item, place, finite, name[:200], depth + 1)
 
 
 def _fault(item: Any, finite: bool) -> str:
@@ -140,7 +138,7 @@ def _fault(item: Any, finite: bool) -> str:
 
 def _bounded(file: Any, name: str, most: int) -> bytes:
     pieces, size = [], 0
-    while piece := file.read(_PIECE):
+    while piece := file.read(1 << 20):
         pieces.append(piece)
         size += len(piece)
         if size > most:

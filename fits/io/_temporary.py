@@ -17,10 +17,6 @@ import time
 from pathlib import Path
 
 _NAME = re.compile(r"\.microid-([0-9a-f]{8})-([0-9a-f]{8})-(\d{1,10})-(\d{1,20})-[0-9a-f]{16}(\..*)?", re.DOTALL)
-# Longer endings tell no format.
-_LONGEST_ENDING = 12
-# A process that is listed, but has ended.
-_ENDED = ("Z", "X", "x")
 # Folders that were looked through: once in a process is enough.
 _CLEANED: set[str] = set()
 
@@ -29,7 +25,7 @@ def temporary_name(ending: str = "") -> str:
     """Make a new name for this process's use, with an ending such as `.csv` by which a format is told."""
     host, boot = _machine()
     pid = os.getpid()
-    kept = ending if len(ending) <= _LONGEST_ENDING else ""
+    kept = ending if len(ending) <= 12 else ""  # longer ones tell no format
     return f".microid-{host}-{boot}-{pid}-{_started(pid) or 0}-{secrets.token_hex(8)}{kept}"
 
 
@@ -92,7 +88,7 @@ def _started(pid: int) -> int | None:
         with open(f"/proc/{pid}/stat", "rb") as file:
             # The second field is a name in brackets, which may hold anything.
             fields = file.read().decode("ascii", "replace").rpartition(")")[2].split()
-        return -1 if fields[0] in _ENDED else int(fields[19])
+        return -1 if fields[0] in ("Z", "X", "x") else int(fields[19])  # listed, but ended
     except (OSError, ValueError, IndexError):
         return None
 

@@ -26,13 +26,8 @@ BEFORE, AFTER = "#d55e00", "#0072b2"
 NOISE, ASIDE, INK = "#d9dde2", "#f4f1e4", "#22272e"
 # Width of the column and of a phone, in CSS pixels over 96.
 _WIDE_in, _NARROW_in = 7.3, 3.4
-_FONT_pt = 8.5
 # Points of all curves of one picture together.
 _POINTS = 5000
-# More runs than this make a page that nobody scrolls through.
-_MOST_RUNS = 6
-# Half-width of the band of the noise, in standard deviations.
-_BAND = 2.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +50,7 @@ def _svg(picture: Figure, prefix: str, words: str) -> str:
             spine.set_linewidth(0.6)
             spine.set_color(INK)
     for each in picture.findobj(Text):
-        each.set_fontsize(_FONT_pt)
+        each.set_fontsize(8.5)
         if each.get_color() in ("black", "k"):
             each.set_color(INK)
     out = StringIO()
@@ -73,10 +68,10 @@ def _svg(picture: Figure, prefix: str, words: str) -> str:
 
 
 def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
-    """Choose the runs with the largest residuals, in their order."""
+    """Choose the six runs with the largest residuals, in their order: nobody scrolls through more."""
     runs = [run for run in runs if run.time_s.size > 1]
     sizes = [np.nanmean(run.before_um**2) if np.isfinite(run.before_um).any() else 0.0 for run in runs]
-    keep = sorted(np.argsort(sizes)[::-1][:_MOST_RUNS])
+    keep = sorted(np.argsort(sizes)[::-1][:6])
     return [runs[k] for k in keep]
 
 
@@ -93,7 +88,7 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
         picture, grid = panels(width_in, height_in, len(runs), sharey=True, squeeze=False)
         for axes, run in zip(grid[:, 0], runs, strict=True):
             _set_aside(axes, run)
-            band = _BAND * diagnosis.noise_um * per_um
+            band = 2.0 * diagnosis.noise_um * per_um
             curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if extended else [])
             for values, colour, line in curves:
                 keep = thinned(values, points)

@@ -40,7 +40,7 @@ AXIS_SIGNS: dict[m.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamm
 UNIT_SIGNS = {"um": "µm", "urad": "µrad"}
 # Odd, so that the nominal dimensions are among the steps.
 _STEPS = 41
-_PANEL_in, _LINE_in = 2.3, 0.125
+_LINE_in = 0.125
 _SMALL_pt = 6
 _CHARACTERS = 64
 _DIMENSION = re.compile(rf"\b(?:{'|'.join({name for motion in m.MOTIONS.values() for name in motion.dimensions})})\b")
@@ -139,7 +139,7 @@ def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[
     lines = [_claim_lines(panel, claims) for panel in panels]
     heights = []
     for k in range(0, len(panels), columns):
-        heights += [_PANEL_in, _LINE_in * max(1, *map(len, lines[k : k + columns]))]
+        heights += [2.3, _LINE_in * max(1, *map(len, lines[k : k + columns]))]
     width_in = WIDE_in * (1 if columns > 1 else 0.55)
     picture = figure(width_in, sum(heights) + 0.55 * len(heights) / 2 + 0.25, gap=0.06)
     grid = picture.add_gridspec(len(heights), columns, height_ratios=heights)

@@ -13,10 +13,6 @@ from microid.effects import View
 _BINS = 36
 # Fewer samples than this make no mean.
 _FEWEST_IN_MEAN = 4
-# Samples whose mean is where a change begins: more would hide what happens meanwhile.
-_FIRST = 3
-# A change of the voltage below this part of its range is none.
-_SMALLEST_MOVE = 1e-6
 # Whether a residual is that after the extension, and what takes it from a run.
 _RESIDUALS: tuple[tuple[bool, Callable[[RunView], np.ndarray]], ...] = (
     (False, attrgetter("before_um")),
@@ -103,7 +99,7 @@ def _over_voltage(runs: Sequence[RunView], factor: float) -> list[Curve]:
 def _last_move(run: RunView) -> tuple[np.ndarray, np.ndarray]:
     """Direction of the last move of the voltage, and the sample at which it last started, stopped or turned."""
     step = np.diff(run.voltage_V, prepend=run.voltage_V[:1])
-    sign = np.sign(np.where(np.abs(step) > _SMALLEST_MOVE * (np.ptp(run.voltage_V) or 1.0), step, 0.0))
+    sign = np.sign(np.where(np.abs(step) > 1e-6 * (np.ptp(run.voltage_V) or 1.0), step, 0.0))  # less is none
     index = np.arange(sign.size)
     moved = np.maximum.accumulate(np.where(sign != 0, index, 0))
     changed = np.concatenate([[0.0], np.diff(sign)]) != 0
@@ -126,11 +122,11 @@ def _since_move(runs: Sequence[RunView], factor: float) -> list[Curve]:
 
 
 def _since_event(run: RunView, residual_um: np.ndarray) -> np.ndarray:
-    """Change of a residual since the voltage last started, stopped or turned."""
+    """Change of a residual since the voltage last started, stopped or turned: since the mean of three samples there."""
     begins = np.unique(_last_move(run)[1])
     out = np.array(residual_um, dtype=float)
     for begin, end in zip(begins, [*begins[1:], out.size], strict=True):
-        out[begin:end] -= np.mean(out[begin : min(begin + _FIRST, end)])
+        out[begin:end] -= np.mean(out[begin : min(begin + 3, end)])
     return out
 
 

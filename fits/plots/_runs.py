@@ -26,9 +26,6 @@ from fits.plots._style import (
 )
 from fits.stats._metrics import TWO_SIDED_95
 
-# Runs side by side in one picture.
-_MOST_RUNS = 3
-
 
 @dataclass(frozen=True)
 class Drawn:
@@ -98,7 +95,7 @@ def over_time(runs: Sequence[Drawn], held_out_alone: bool = False) -> Figure:
 
 def _columns(runs: Sequence[Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
     """Two rows of axes, values above errors, with a column for each of the first runs."""
-    many = min(len(runs), _MOST_RUNS)
+    many = min(len(runs), 3)
     picture, axes = panels(width_in, 3.6, 2, many, 0.04, squeeze=False, sharex="col", height_ratios=(2, 1))
     label(axes[0, 0], "", "displacement (µm)")
     label(axes[1, 0], "", "error (µm)")

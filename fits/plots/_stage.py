@@ -21,8 +21,8 @@ from fits.stage._run import gain_ahead, hysteresis_of, residual_of
 from fits.stage._start import MeasuredResponse, measure_response
 from microid import AbstractLinear, Preisach, Stage
 
-# Frequencies at which the model's response is drawn, and how far beyond the measured ones.
-_FREQUENCIES, _BEYOND = 600, 1.3
+# How far beyond the measured frequencies the model's response is drawn.
+_BEYOND = 1.3
 # Coherence from which a line counts as measured.
 _COHERENT = 0.8
 
@@ -126,7 +126,7 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
     low, high = float(measured.frequency_Hz.min()), _BEYOND * _highest_Hz(measured)
     shown = measured.frequency_Hz <= high
     measured = MeasuredResponse(measured.frequency_Hz[shown], measured.response[shown], measured.coherence[shown])
-    frequency = np.geomspace(low / _BEYOND, high, _FREQUENCIES)
+    frequency = np.geomspace(low / _BEYOND, high, 600)
     model = _linear(stage, frequency)
     phase = np.unwrap(np.angle(model))
     at_lines = _linear(stage, measured.frequency_Hz)

@@ -14,10 +14,6 @@ from fits.sweeps._store import about_of
 from fits.sweeps._types import DONE
 
 _CELLS = 12
-# Axes are logarithmic where values span more than this factor, and most lie near its lower end.
-_DECADE = 10.0
-# More lines than this do not show.
-_LINES = 400
 _HIGH_in = 2.6
 
 
@@ -57,7 +53,7 @@ def plot_sweep(folder: str | os.PathLike[str], out: Path, by: str | None = None)
 
 
 def _parallel(path: Path, rows: _Rows) -> Path:
-    every = max(1, -(-len(rows.values) // _LINES))
+    every = max(1, -(-len(rows.values) // 400))  # more lines do not show
     columns = np.stack([*rows.swept.values(), rows.values], axis=1)[::every]
     low, high = columns.min(axis=0), columns.max(axis=0)
     scaled = (columns - low) / np.where(high > low, high - low, 1)
@@ -98,7 +94,7 @@ def _heat(path: Path, rows: _Rows, pair: tuple[str, str]) -> Path:
 def _logarithmic(found: np.ndarray) -> bool:
     """Whether values lie evenly by their logarithms rather than by themselves."""
     low, middle, high = float(found.min()), float(np.median(np.unique(found))), float(found.max())
-    return low > 0 and high > _DECADE * low and middle < (low + high) / 3
+    return low > 0 and high > 10.0 * low and middle < (low + high) / 3
 
 
 def _edges(found: np.ndarray) -> np.ndarray:
