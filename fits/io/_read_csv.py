@@ -215,7 +215,7 @@ class KnownColumns:
             )
 
     def saturated(self) -> Iterator[str]:
-        """Eight readings or more that stand at one end while the voltage moves on by 3 % of its range, which no peak does."""
+        """Readings that stand at one end, eight or more, while the voltage moves by 3 % of its range: no peak does."""
         voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays["displacement_um"]
         enough_V = 0.03 * float(np.ptp(voltage_V))
         for end, words in ((displacement_um.max(), "largest"), (displacement_um.min(), "smallest")):

@@ -122,7 +122,7 @@ def _since_move(runs: Sequence[RunView], factor: float) -> list[Curve]:
 
 
 def _since_event(run: RunView, residual_um: np.ndarray) -> np.ndarray:
-    """Change of a residual since the voltage last started, stopped or turned: since the mean of three samples there."""
+    """Change of a residual since the voltage last started, stopped or turned: from the mean of three samples on."""
     begins = np.unique(_last_move(run)[1])
     out = np.array(residual_um, dtype=float)
     for begin, end in zip(begins, [*begins[1:], out.size], strict=True):
