@@ -29,7 +29,9 @@ def read_csv(
 
     The separator (comma, semicolon, tab), a decimal comma, the encoding (UTF-8, UTF-16 with a byte-order mark,
     Latin-1) and gzip are recognised; lines that begin with ``#`` or ``%`` and blank lines are skipped. Headers
-    such as ``voltage_mV`` are recognised by stem and suffix and converted to the canonical unit.
+    such as ``voltage_mV`` are recognised by stem and suffix and converted to the canonical unit: times are in s,
+    voltages in V and displacements in um, each of shape (n,), and all other numeric columns in `extra`. A `DataError`
+    says in one sentence with file, line and column what was expected and what to do.
 
     Parameters
     ----------
@@ -41,16 +43,6 @@ def read_csv(
     required
         Canonical columns that must be there. Time and voltage always are; without ``displacement_um`` the file is
         a voltage programme, which may be short and may hold the voltage.
-
-    Returns
-    -------
-    Record
-        Times in s, voltages in V and displacements in um, each of shape (n,); all other numeric columns in `extra`.
-
-    Raises
-    ------
-    DataError
-        One sentence with file, line and column, what was expected and what to do.
     """
     required = tuple(dict.fromkeys(("time_s", "voltage_V", *required)))
     read = KnownColumns.read(path, columns, required)
@@ -215,7 +207,7 @@ class KnownColumns:
             )
 
     def saturated(self) -> Iterator[str]:
-        """Readings that stand at one end, eight or more, while the voltage moves by 3 % of its range: no peak does."""
+        """Readings that stand at one end, eight or more, while the voltage moves by 3 % of its range: no peak."""
         voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays["displacement_um"]
         enough_V = 0.03 * float(np.ptp(voltage_V))
         for end, words in ((displacement_um.max(), "largest"), (displacement_um.min(), "smallest")):

@@ -50,6 +50,9 @@ def fit(
     The weights are found by a smooth, non-negative regression whose smoothness and noise level maximise the
     evidence; the resolution is raised until blocks of the record are no longer predicted better from the others.
 
+    A `DataError` says that the records cannot be fitted, or are not of one rig, a `FitError` that a solver failed,
+    and a `RuntimeError` that JAX computes in single precision.
+
     Parameters
     ----------
     records
@@ -66,18 +69,6 @@ def fit(
         Number of starts, and their seed, for families whose fit is not convex.
     progress
         Told what is being done, a sentence at a time.
-
-    Returns
-    -------
-    FitResult
-        Never the start: a fit that fails raises.
-
-    Raises
-    ------
-    DataError
-        If the records cannot be fitted, or are not of one rig.
-    FitError, RuntimeError
-        If a solver fails, or JAX computes in single precision.
     """
     fraction, aside, range_V = check_fit(records, holdout, loss)
     if family not in FAMILIES:

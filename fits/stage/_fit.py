@@ -62,6 +62,9 @@ def fit_stage(
     start from. Then all runs are fitted together: the hysteresis is a smooth non-negative regression as in `fit`,
     solved for exactly while the other parameters follow damped Gauss-Newton steps.
 
+    A `DataError` says that the records cannot be fitted, do not show the dynamics, or are not of one rig; other errors
+    are those of `fit`.
+
     Parameters
     ----------
     records
@@ -77,13 +80,6 @@ def fit_stage(
         that are held out, too; theirs is unknown where each fitted run has its own.
     holdout, loss, progress
         See `fit`, as for what is returned.
-
-    Raises
-    ------
-    DataError
-        If the records cannot be fitted, do not show the dynamics, or are not of one rig.
-    FitError, RuntimeError
-        If a solver fails, or JAX computes in single precision.
     """
     found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
     solved, runs = found.solved, found.solved.runs

@@ -30,17 +30,11 @@ _FEW_LINES = 5
 class ModalFit(Generic[_M]):
     """Fitted modes and how far to trust them.
 
-    Attributes
-    ----------
-    model, sd
-        The model, and standard deviations in its place; zero for what was not fitted.
-    covariance
-        Of the fitted parameters in the order of `parameter_table(model)`, in their units.
-    misfit
-        Residual over what noise and distortion explain, root mean square: 1 if the model is right. Where it is
-        larger, and where the variance is not known, standard deviations were multiplied by it.
-    band_Hz
-        First and last frequency that was fitted.
+    Standard deviations are in the places of a model, zero for what was not fitted; the `covariance` is that of the
+    fitted parameters in the order of `parameter_table(model)`, in their units. The `misfit` is the residual over what
+    noise and distortion explain, root mean square: 1 if the model is right. Where it is larger, and where the
+    variance is not known, standard deviations were multiplied by it. `band_Hz` has the first and last frequency that
+    was fitted.
     """
 
     model: _M
@@ -56,22 +50,11 @@ def fit_response(data: ResponseData, modes: int = 2, band_Hz: _Band = None, coup
     Starts at the peaks of the singular values (complex mode indicator function); where there are fewer than modes,
     where the least is explained. Gains are eliminated (variable projection, Kaufman's Jacobian).
 
-    Parameters
-    ----------
-    data
-        One input and output or several.
-    modes, coupled
-        Number of modes, of which one more than the band shows stands for the next one above it; and whether damping
-        may couple them, by `quadrature_um_per_V`, zero otherwise.
-    band_Hz
-        Lowest and highest frequency to fit; all by default.
+    Of the number of `modes` one more than the band shows stands for the next one above it; damping may couple them,
+    by `quadrature_um_per_V`, if `coupled`. `band_Hz` is the lowest and highest frequency to fit; all by default.
 
-    Raises
-    ------
-    DataError
-        If the band is too narrow for so many parameters, or leaves some of them open.
-    FitError
-        If the solver does not arrive at an optimum.
+    A `DataError` says that the band is too narrow for so many parameters, or leaves some of them open, and a
+    `FitError` that the solver does not arrive at an optimum.
     """
     band = _in_band(data.frequency_Hz, band_Hz, modes)
     frequency, gain = data.frequency_Hz[band], data.response_um_per_V[band]
@@ -100,15 +83,9 @@ def fit_hysteresis(
     Under known periodic voltages plays of given thresholds are known too, so they are inputs like the voltages, and
     displacements are linear in all gains; everything is fitted together as in `fit_response`, to each realization.
 
-    Parameters
-    ----------
-    record
-        More realizations than inputs: they tell how much of the spectra is distortion, which the weights are made of.
-    start, threshold_V
-        Modes to start from, usually of `fit_response`, and thresholds of the plays, shape `(K,)`, not zero, where a
-        play is the voltage itself.
-    band_Hz, coupled
-        See `fit_response`, as for what is raised.
+    The record needs more realizations than inputs: they tell how much of the spectra is distortion, which the weights
+    are made of. Modes to start from are usually of `fit_response`; the thresholds of the plays have shape `(K,)` and
+    are not zero, where a play is the voltage itself. For the others, and what is raised, see `fit_response`.
     """
     frequency, u, y = record.spectra()
     modes = start if isinstance(start, Modes) else start.model

@@ -125,12 +125,8 @@ def model_text(
 def load_model(path: str | os.PathLike[str]) -> ModelFile:
     """Read a model file that `save_model` wrote: every number is bit by bit what was written.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, is of another version, was changed after it was written, or makes no sense.
-    RuntimeError
-        If JAX computes in single precision.
+    A `DataError` says that the file cannot be read, is of another version, was changed after it was written, or makes
+    no sense, and a `RuntimeError` that JAX computes in single precision.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('model files hold float64: jax.config.update("jax_enable_x64", True)')

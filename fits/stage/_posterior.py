@@ -62,19 +62,9 @@ def sample_posterior(
 ) -> Draws:
     """Draw from the posterior of the parameters, flat in the solver's coordinates, the hysteresis as it was fitted.
 
-    Needs numpyro: `pip install -c constraints.txt ".[posterior]"`.
-
-    Parameters
-    ----------
-    result, records, holdout, initial
-        From `fit_stage`, where the sampler starts, and what was given there.
-    draws, warmup, seed
-        Number of draws, of steps to adapt before, and the seed of the sampler.
-
-    Raises
-    ------
-    DataError
-        If numpyro is not installed.
+    Needs numpyro: `pip install -c constraints.txt ".[posterior]"`; a `DataError` says that it is not installed. The
+    sampler starts from a result of `fit_stage`; records, holdout and initial memory are those that were given there.
+    `warmup` steps adapt it before the draws.
     """
     try:
         from numpyro.infer import MCMC, NUTS
@@ -108,13 +98,9 @@ def sample_posterior(
 class Profile:
     """Profile of one parameter.
 
-    Attributes
-    ----------
-    values, deviance
-        Where it was held, and twice the loss of log likelihood there, shape `(k,)`; a parabola where the standard
-        deviation says all.
-    lower, upper
-        Ends of the 95 % interval; the last value looked at where the deviance stays below its bound.
+    The `deviance` is twice the loss of log likelihood at the `values` where it was held, shape `(k,)` both: a
+    parabola where the standard deviation says all. `lower` and `upper` are the ends of the 95 % interval, or the last
+    value looked at where the deviance stays below its bound.
     """
 
     name: str
@@ -137,22 +123,11 @@ def profile_stage(
 ) -> Profile:
     """Hold one parameter of a fitted stage at several values and fit all others again.
 
-    Parameters
-    ----------
-    result, records, holdout, initial
-        From `fit_stage`, with the squares as loss, and what was given there.
-    name, points
-        Of the parameter, such as `mechanics.damping_ratio`, and number of values: evenly spread over seven standard
-        deviations, less where a bound comes before.
-    progress
-        Told what is being done.
+    The result is from `fit_stage`, with the squares as loss; records, holdout and initial memory are those that were
+    given there. The values of the parameter, such as `mechanics.damping_ratio`, are evenly spread over seven standard
+    deviations, less where a bound comes before. `progress` is told what is being done.
 
-    Raises
-    ------
-    DataError
-        If no such parameter was fitted.
-    FitError
-        If one of the fits fails.
+    A `DataError` says that no such parameter was fitted, a `FitError` that one of the fits failed.
     """
     names = [parameter.name for parameter in result.parameters]
     if name not in names or name.endswith("]"):

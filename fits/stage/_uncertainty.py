@@ -171,19 +171,12 @@ def predict(
 ) -> Prediction:
     """Predict the displacement of a voltage program, with its uncertainty.
 
-    Parameters
-    ----------
-    model, uncertainty
-        From a fit or a model file; without an uncertainty the standard deviations are NaN.
-    record, initial
-        The program, whose displacement, if any, is not looked at; and the memory before its first sample: `negative`,
-        `positive` or `demagnetised`.
+    Model and uncertainty are from a fit or a model file; without an uncertainty the standard deviations are NaN. The
+    displacement of the program, if any, is not looked at; the memory before its first sample is `negative`,
+    `positive` or `demagnetised`.
 
-    Raises
-    ------
-    DataError
-        If the voltage leaves the range that the model was fitted on, a stage has an effect of another column that the
-        program lacks, or the uncertainty is that of another kind of model.
+    A `DataError` says that the voltage leaves the range that the model was fitted on, that a stage has an effect of
+    another column, which the program lacks, or that the uncertainty is that of another kind of model.
     """
     if uncertainty is not None:
         return uncertainty.predict(model, record, initial)
@@ -196,23 +189,10 @@ def draw_plants(
 ) -> tuple[Stage, ...]:
     """Draw stages from the covariance of a fit.
 
-    Parameters
-    ----------
-    model, uncertainty
-        From a fit or a model file.
-    count, seed
-        How many stages in all, 1 or more, of which the first is the fitted one; and the seed of the draws.
-
-    Returns
-    -------
-    tuple of Stage
-        All of one structure; a hysteresis alone becomes a stage of one part. Weights and slopes that a draw would
-        make negative are zero. The model's own error (`discrepancy_um`) is not in them.
-
-    Raises
-    ------
-    DataError
-        If there is no uncertainty to draw from, or it is not that of the model.
+    Model and uncertainty are from a fit or a model file. Of `count` stages, 1 or more, the first is the fitted one.
+    All are of one structure; a hysteresis alone becomes a stage of one part. Weights and slopes that a draw would
+    make negative are zero. The model's own error (`discrepancy_um`) is not in them. A `DataError` says that there is
+    no uncertainty to draw from, or that it is not that of the model.
     """
     if count < 1:
         raise ValueError(f"count must be 1 or more, got {count}")
