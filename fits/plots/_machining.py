@@ -22,19 +22,7 @@ from fits.machining._claims import Claim, paper_claims
 from fits.machining._design import Design, lever_mm, paper_design
 from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import AxisSensitivity, SensitivityReport, gains_at
-from fits.plots._style import (
-    DARK,
-    LIGHT,
-    MEASURED,
-    MODEL,
-    WIDE_in,
-    curve,
-    figure,
-    label,
-    legend,
-    save,
-    verbatim,
-)
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save, verbatim
 
 AXIS_SIGNS: dict[m.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamma": r"$\gamma$"}
 UNIT_SIGNS = {"um": "µm", "urad": "µrad"}

@@ -62,8 +62,8 @@ def fit_stage(
     start from. Then all runs are fitted together: the hysteresis is a smooth non-negative regression as in `fit`,
     solved for exactly while the other parameters follow damped Gauss-Newton steps.
 
-    A `DataError` says that the records cannot be fitted, do not show the dynamics, or are not of one rig; other errors
-    are those of `fit`.
+    A `DataError` says that the records cannot be fitted, do not show the dynamics, or are not of one rig; other
+    errors are those of `fit`.
 
     Parameters
     ----------
