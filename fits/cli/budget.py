@@ -2,10 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, length_mm, paths_in, refuse_clashes, with_paths
-from fits.cli._models import hysteresis, stage_or_preisach
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -29,8 +28,8 @@ from fits.io._file_set import file_set
 @options.columns
 @options.json_file("table")
 @options.plots("a plot")
-@in_sentences
-def budget(given: Given) -> None:
+@common.in_sentences
+def budget(given: common.Given) -> None:
     """Add up what driving, machining and measuring do to each motion of a stage.
 
     The driving error is the hysteresis of MODEL.json, from `microid fit`, over its whole range; the machining error
@@ -41,8 +40,8 @@ def budget(given: Given) -> None:
     printed = given.json_file == "-"
     out = None if printed else given.json_file
     for what, path in {"STAGE.toml": given.stage, "MODEL.json": given.model, "IDLE.csv": given.idle}.items():
-        refuse_clashes({what: None if path == "paper" else path, "--json": out})
-    arm_mm = None if given.arm is None else length_mm("--arm", given.arm, ("mm", "m"), "50mm")
+        common.refuse_clashes({what: None if path == "paper" else path, "--json": out})
+    arm_mm = None if given.arm is None else common.length_mm("--arm", given.arm, ("mm", "m"), "50mm")
     if arm_mm is None and given.model_measures in late.AXES and late.MOTIONS[given.model_measures].unit == "rad":
         raise DataError(
             f"--model-measures {given.model_measures}: expected the arm at which a displacement is a rotation, found "
@@ -63,14 +62,14 @@ def budget(given: Given) -> None:
     if printed:
         click.echo(text)
         return
-    places = [("json", out), *(("plot", place) for place in paths_in(given.plots, drawn))]
-    click.echo(with_paths(late.describe_budget(found), places))
+    places = [("json", out), *(("plot", place) for place in common.paths_in(given.plots, drawn))]
+    click.echo(common.with_paths(late.describe_budget(found), places))
 
 
 def _law(path: str) -> "late.Preisach":
     """The hysteresis of a model file, as slow voltages see it."""
-    model = stage_or_preisach(path, late.load_model(path))
+    model = common.stage_or_preisach(path, late.load_model(path))
     try:
-        return hysteresis(model)
+        return common.hysteresis(model)
     except DataError as error:
         raise DataError(f"{path}: {error}" if error.of_model else str(error)) from error

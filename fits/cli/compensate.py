@@ -2,10 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, paths_in, print_result, refuse_overwriting
-from fits.cli._models import hysteresis, parse_rig_limits, predicted_by, stage_or_preisach
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -26,8 +25,8 @@ from fits.io._file_set import file_set
 @options.plots("a plot")
 @options.columns
 @options.json_output
-@in_sentences
-def compensate(given: Given) -> None:
+@common.in_sentences
+def compensate(given: common.Given) -> None:
     """Find the voltage that makes the stage follow a reference.
 
     REFERENCE.csv needs the columns time_s and displacement_um: what the sensor is to read, its offset included. The
@@ -35,11 +34,11 @@ def compensate(given: Given) -> None:
     """
     import numpy as np
 
-    refuse_overwriting(given.out, [given.model, given.reference])
-    volts, stated = parse_rig_limits(given.limits, given.limit, given.margin)
+    common.refuse_overwriting(given.out, [given.model, given.reference])
+    volts, stated = common.parse_rig_limits(given.limits, given.limit, given.margin)
     late.start_jax()
     loaded = late.load_model(given.model)
-    stage = stage_or_preisach(given.model, loaded)
+    stage = common.stage_or_preisach(given.model, loaded)
     if given.way == "dynamic" and isinstance(stage, late.Preisach):
         raise DataError(
             f"{given.model}: expected a model with mechanics for --dynamic, found a Preisach model, which has none; "
@@ -56,14 +55,14 @@ def compensate(given: Given) -> None:
         said = late.check_command(wanted.source, predicted, late.reached_in(loaded.report), stated, given.margin)
         sd_um = None
         if loaded.uncertainty is not None:
-            sd_um = predicted_by(given.model, loaded, program, given.initial).displacement_sd_um
+            sd_um = common.predicted_by(given.model, loaded, program, given.initial).displacement_sd_um
             late.refuse_nonfinite("displacement_sd_um", sd_um)
         to_draw = stage, wanted, found, sd_um
         drawn = [] if drawings is None else late.plot_compensation(*to_draw, drawings, initial=given.initial)
         table = {"time_s": wanted.time_s, "voltage_V": found.voltage_V, "displacement_um": found.displacement_um}
         late.write_csv(unfinished, table)
     off = np.abs(found.displacement_um - found.reference_um)
-    places = paths_in(given.plots, drawn)
+    places = common.paths_in(given.plots, drawn)
     remarks = [*wanted.warnings, *found.remarks, *said]
     summary = {
         "out": given.out,
@@ -72,7 +71,7 @@ def compensate(given: Given) -> None:
         "clipped": int(found.clipped.sum()),
         "voltage_min_V": float(found.voltage_V.min()),
         "voltage_max_V": float(found.voltage_V.max()),
-        "offset_um": float(hysteresis(stage).offset_um),
+        "offset_um": float(common.hysteresis(stage).offset_um),
         "error_max_um": float(off.max()),
         "error_max_within_reach_um": float(off[~found.clipped].max(initial=0.0)),
         "displacement_sd_median_um": None if sd_um is None else float(np.median(sd_um)),
@@ -91,4 +90,4 @@ def compensate(given: Given) -> None:
         lines.append(f"clipped        at {summary['clipped']} of the samples, off by at most {off.max():.3g} um")
     lines += [f"Note: {remark}" for remark in remarks]
     lines += [f"voltage        {given.out}", *(f"plot           {place}" for place in places)]
-    print_result(given, summary, lines)
+    common.print_result(given, summary, lines)

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, paths_in, progress_to_stderr, refuse_overwriting
-from fits.cli._models import parse_rig_limits, stage_or_preisach
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -88,8 +87,8 @@ def _names() -> list[str]:
 @options.columns
 @options.json_output
 @options.quiet
-@in_sentences
-def control(given: Given) -> None:
+@common.in_sentences
+def control(given: common.Given) -> None:
     """Tune a controller on a model, and run it along a reference.
 
     REFERENCE.csv needs the columns time_s, in even steps, and displacement_um: what the sensor is to read, its offset
@@ -109,7 +108,7 @@ def control(given: Given) -> None:
             steps = f"{_FINEST:g} to {_LARGEST:g}, found {step:g}"
             raise DataError(f"{_option(name)}: expected {steps}; leave it out for none.")
     stated = {_option(name): getattr(given, name) for name in _LIMITS}
-    volts, allowed_here = parse_rig_limits(given.limits, given.limit, given.margin)
+    volts, allowed_here = common.parse_rig_limits(given.limits, given.limit, given.margin)
     late.start_jax()
     tuned_to = [name for name, each in late.CONTROLLERS.items() if "frequency_Hz" in each.own]
     if given.frequency and given.controller not in tuned_to:
@@ -117,11 +116,13 @@ def control(given: Given) -> None:
             f"--frequency: expected --controller {' or '.join(tuned_to)} with it, found {given.controller}; leave it "
             "out."
         )
-    refuse_overwriting(given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])])
-    progress = progress_to_stderr(given.quiet)
+    common.refuse_overwriting(
+        given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])]
+    )
+    progress = common.progress_to_stderr(given.quiet)
     known_gains = None if given.gains is None else late.read_gains(given.gains)
     loaded = late.load_model(given.model)
-    plant = stage_or_preisach(given.model, loaded)
+    plant = common.stage_or_preisach(given.model, loaded)
     wanted = late.read_reference(given.reference, late.parse_columns(given.columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with file_set() as files:
@@ -177,7 +178,7 @@ def control(given: Given) -> None:
         late.write_csv(unfinished, table | {"time_s": wanted.time_s})
         to_draw = run, made.controller, loop.plants
         drawn = [] if drawings is None else late.plot_control(*to_draw, drawings, delay=given.delay)
-        about = {"controller": given.controller, "out": given.out, "plots": paths_in(given.plots, drawn)}
+        about = {"controller": given.controller, "out": given.out, "plots": common.paths_in(given.plots, drawn)}
         # Before the file is in its place: what cannot be told is not left behind either.
         summary = late.control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
         told = late.finite_json(summary) if given.as_json else late.describe_control(summary)

@@ -7,17 +7,9 @@ from typing import Any
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import (
-    Given,
-    bar_to_stderr,
-    fraction_or_files,
-    in_sentences,
-    paths_in,
-    print_result,
-    refuse_overwriting,
-)
 from fits.io._errors import DataError
 from fits.io._file_set import file_set, usable_folder
 
@@ -40,8 +32,8 @@ _LONGEST_s = 1e5
 @options.columns
 @options.json_output
 @options.quiet
-@in_sentences
-def diagnose(given: Given) -> None:
+@common.in_sentences
+def diagnose(given: common.Given) -> None:
     """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.
 
     Writes report.html, diagnosis.json, the plain and the extended stage, and the voltages of the next experiment.
@@ -55,13 +47,13 @@ def diagnose(given: Given) -> None:
     if not 0 <= given.margin <= 10:
         raise DataError(f"--margin: expected a share of the ranges reached, 0 to 10, found {given.margin:g}.")
     limits, mapping = late.parse_limits(given.limit), late.parse_columns(given.columns)
-    fraction, files = fraction_or_files(given.holdout)
+    fraction, files = common.fraction_or_files(given.holdout)
     for name in (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM):
-        refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
+        common.refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
     # Before the work, so that a place that cannot be written to is refused before the wait.
     usable_folder(given.out, "--out")
     late.start_jax()
-    progress = bar_to_stderr(given.quiet, tuple(late.Step))
+    progress = common.bar_to_stderr(given.quiet, tuple(late.Step))
     records = late.read_runs(given.runs, mapping)
     aside = [late.read_csv(file, mapping) for file in files]
     try:
@@ -80,7 +72,7 @@ def diagnose(given: Given) -> None:
     progress(late.Step.WRITING)
     content = late.diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)
-    print_result(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
+    common.print_result(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
 
 
 def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> list[str]:
@@ -117,7 +109,7 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
         else:
             # One of an earlier diagnosis would pass for this one's.
             files.absent(Path(out) / _PROGRAM)
-    return paths_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
+    return common.paths_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
 
 
 def _lines(diagnosis: "late.Diagnosis") -> list[str]:

@@ -2,10 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, print_result
-from fits.cli._models import hysteresis, parse_limits_V, stage_or_preisach
 
 
 @click.command()
@@ -15,18 +14,20 @@ from fits.cli._models import hysteresis, parse_limits_V, stage_or_preisach
 @click.option("--memory", type=int, default=128, show_default=True, help="Extremes remembered, two per nested loop.")
 @options.limits
 @options.json_output
-@in_sentences
-def export(given: Given) -> None:
+@common.in_sentences
+def export(given: common.Given) -> None:
     """Write a model and its inverse as C99 for a controller.
 
     The header and the source need no library and allocate nothing.
     """
     late.start_jax()
-    stage = stage_or_preisach(given.model, late.load_model(given.model))
-    limits_V = parse_limits_V(given.limits)
-    made = late.export_c(hysteresis(stage), given.out, given.name, size=given.memory, limits_V=limits_V)
+    stage = common.stage_or_preisach(given.model, late.load_model(given.model))
+    limits_V = common.parse_limits_V(given.limits)
+    made = late.export_c(common.hysteresis(stage), given.out, given.name, size=given.memory, limits_V=limits_V)
     files = [str(file) for file in made]
     # The inverse of mechanics needs the samples to come, which a controller does not have.
     static = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
     remarks = [static] if isinstance(stage, late.Stage) else []
-    print_result(given, {"files": files, "remarks": remarks}, [*(f"Note: {remark}" for remark in remarks), *files])
+    common.print_result(
+        given, {"files": files, "remarks": remarks}, [*(f"Note: {remark}" for remark in remarks), *files]
+    )

@@ -4,17 +4,9 @@ from typing import Any
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import (
-    Given,
-    fraction_or_files,
-    in_sentences,
-    paths_in,
-    print_result,
-    progress_to_stderr,
-    refuse_overwriting,
-)
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -59,8 +51,8 @@ _HOLDS: dict[str, "late.Hold"] = {"lines": "first", "steps": "zero", "curves": "
 @click.option("--seed", type=options.SEEDS, help="Seed of the starts (default 0).")
 @options.json_output
 @options.quiet
-@in_sentences
-def fit(given: Given) -> None:
+@common.in_sentences
+def fit(given: common.Given) -> None:
     """Fit Preisach weights to measured loops, or a whole stage to slow and fast runs.
 
     The files are runs of one rig, with the columns time_s, voltage_V and displacement_um. A stage needs a slow run
@@ -74,10 +66,10 @@ def fit(given: Given) -> None:
     else:
         estimate, draw, asked = late.fit, late.plot_fit, _for_loop(given)
     initial = list(given.initial) if len(given.initial) > 1 else (given.initial or ("unknown",))[0]
-    progress = progress_to_stderr(given.quiet)
+    progress = common.progress_to_stderr(given.quiet)
     mapping = late.parse_columns(given.columns)
-    fraction, files = fraction_or_files(given.holdout)
-    refuse_overwriting(given.out, [*given.runs, *files])
+    fraction, files = common.fraction_or_files(given.holdout)
+    common.refuse_overwriting(given.out, [*given.runs, *files])
     # Entered before the fit, so that a place that cannot be written to is refused before the wait.
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
@@ -93,12 +85,12 @@ def fit(given: Given) -> None:
             progress("drawing")
             drawn = draw(result, records, drawings, **same)
         unfinished.write_text(late.model_text(result.model, result.uncertainty, report), encoding="utf-8")
-    places = paths_in(given.plots, drawn)
+    places = common.paths_in(given.plots, drawn)
     lines = [late.describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)]
-    print_result(given, {"out": given.out, "plots": places, **report}, lines)
+    common.print_result(given, {"out": given.out, "plots": places, **report}, lines)
 
 
-def _for_loop(given: Given) -> dict[str, Any]:
+def _for_loop(given: common.Given) -> dict[str, Any]:
     """What `fit` is asked for, beside what `fit_stage` is too; what it cannot honour is refused."""
     if given.hold is not None:
         raise DataError(
@@ -111,7 +103,7 @@ def _for_loop(given: Given) -> dict[str, Any]:
     return {"family": given.family or "grid", "starts": given.starts or 8, "seed": given.seed or 0}
 
 
-def _for_stage(given: Given) -> dict[str, Any]:
+def _for_stage(given: common.Given) -> dict[str, Any]:
     """What `fit_stage` is asked for, beside what `fit` is too; what it cannot honour is refused."""
     if given.family not in (None, "grid"):
         raise DataError(

@@ -2,17 +2,17 @@
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, print_result
 from fits.io._errors import DataError
 
 
 @click.command()
 @options.model
 @options.json_output
-@in_sentences
-def info(given: Given) -> None:
+@common.in_sentences
+def info(given: common.Given) -> None:
     """Say what a model file holds."""
     late.start_jax()
     loaded = late.load_model(given.model)
@@ -28,7 +28,7 @@ def info(given: Given) -> None:
     if not given.as_json:
         lines += ["", _known_of_fit(given.model, loaded)]
     content = {"written_by": loaded.written_by, "model": kind, "parameters": parameters, "fit": loaded.report}
-    print_result(given, content, lines)
+    common.print_result(given, content, lines)
 
 
 def _known_of_fit(path: str, loaded: "late.ModelFile") -> str:

@@ -4,9 +4,9 @@ import dataclasses
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, length_mm, paths_in, refuse_clashes, with_paths
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -24,8 +24,8 @@ from fits.io._file_set import file_set
 @options.json_file("tables")
 @options.plots("plots")
 @click.option("--write-stage", metavar="FILE", help="TOML file of the stage to write, to change and come back with.")
-@in_sentences
-def sensitivity(given: Given) -> None:
+@common.in_sentences
+def sensitivity(given: common.Given) -> None:
     """Rank what machining errors of the dimensions do to each motion of a stage.
 
     STAGE.toml holds the dimensions with their tolerances; without it, the stage is the paper's, and the tables are
@@ -34,7 +34,7 @@ def sensitivity(given: Given) -> None:
     late.start_jax()
     printed = given.json_file == "-"
     out = None if printed else given.json_file
-    refuse_clashes({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
+    common.refuse_clashes({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
     design = _design(given.stage, given.tolerance, given.level)
     axes = tuple(name for name in late.AXES if given.axis in (name, "all"))
     with file_set() as files:
@@ -56,15 +56,19 @@ def sensitivity(given: Given) -> None:
     words = late.describe_sensitivity(report, given.voltage)
     if claims:
         words += f"\n\n{late.describe_claims(claims)}"
-    places = [("json", out), ("stage", given.write_stage), *(("plot", each) for each in paths_in(given.plots, drawn))]
-    click.echo(with_paths(words, places))
+    places = [
+        ("json", out),
+        ("stage", given.write_stage),
+        *(("plot", each) for each in common.paths_in(given.plots, drawn)),
+    ]
+    click.echo(common.with_paths(words, places))
 
 
 def _design(stage: str | None, tolerance: str | None, level: int | None) -> "late.Design":
     """The stage that is asked about."""
     design = late.paper_design() if stage in (None, "paper") else late.read_design(stage)
     if tolerance is not None:
-        size_mm = length_mm("--tolerance", tolerance, ("mm", "um", "µm", "μm"), "0.02mm or 20um")
+        size_mm = common.length_mm("--tolerance", tolerance, ("mm", "um", "µm", "μm"), "0.02mm or 20um")
         try:
             design = design.with_tolerance(size_mm)
         except DataError as error:

@@ -2,10 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, print_result, refuse_overwriting
-from fits.cli._models import predicted_by
 
 
 @click.command()
@@ -15,8 +14,8 @@ from fits.cli._models import predicted_by
 @options.initial("the program")
 @options.columns
 @options.json_output
-@in_sentences
-def simulate(given: Given) -> None:
+@common.in_sentences
+def simulate(given: common.Given) -> None:
     """Predict the displacement of a voltage program, with its standard deviation.
 
     PROGRAM.csv needs the columns time_s and voltage_V. The prediction has time_s, voltage_V, displacement_um and
@@ -25,10 +24,10 @@ def simulate(given: Given) -> None:
     import numpy as np
 
     late.start_jax()
-    refuse_overwriting(given.out, [given.model, given.program])
+    common.refuse_overwriting(given.out, [given.model, given.program])
     loaded = late.load_model(given.model)
     record = late.read_csv(given.program, late.parse_columns(given.columns), required=("time_s", "voltage_V"))
-    prediction = predicted_by(given.model, loaded, record, given.initial)
+    prediction = common.predicted_by(given.model, loaded, record, given.initial)
     displacement_um, sd_um = prediction.displacement_um, prediction.displacement_sd_um
     known = loaded.uncertainty is not None
     table = {"time_s": record.time_s, "voltage_V": record.voltage_V, "displacement_um": displacement_um}
@@ -50,4 +49,4 @@ def simulate(given: Given) -> None:
         *(f"Note: {remark}" for remark in record.warnings),
         f"prediction  {given.out}",
     ]
-    print_result(given, summary, lines)
+    common.print_result(given, summary, lines)

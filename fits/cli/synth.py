@@ -2,8 +2,8 @@
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, paths_in, print_result
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -30,8 +30,8 @@ def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) ->
     help="List the scenarios and exit.",
 )
 @options.json_output
-@in_sentences
-def synth(given: Given) -> None:
+@common.in_sentences
+def synth(given: common.Given) -> None:
     """Write example CSVs from a virtual test bench.
 
     SCENARIO is one of those that --list shows, or a .toml file.
@@ -48,5 +48,5 @@ def synth(given: Given) -> None:
         contents = data_synth.files(bench)
         for name, text in contents.items():
             (folder / name).write_bytes(text.encode())
-    files = paths_in(given.out, contents)
-    print_result(given, {"seed": bench.seed, "files": files}, [f"seed {bench.seed}", *files])
+    files = common.paths_in(given.out, contents)
+    common.print_result(given, {"seed": bench.seed, "files": files}, [f"seed {bench.seed}", *files])
