@@ -10,21 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+import microid as m
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import columns_beside
 from fits.loop._past import past_columns
-from microid import (
-    Hold,
-    Preisach,
-    Staircase,
-    Start,
-    demagnetised,
-    negative_saturation,
-    positive_saturation,
-    refined,
-    remember,
-)
 
 # A hundred arrays of so many values are 8 GB.
 _MOST_STEPS = 10_000_000
@@ -49,17 +39,17 @@ class Samples(eqx.Module):
     voltage_V: Float[Array, " m"]
     displacement_um: Float[Array, " n"]
     weight: Float[Array, " n"]
-    start: Start
+    start: m.Start
     stride: int = eqx.field(static=True)
     moving: bool = eqx.field(static=True)
     has_past: bool = eqx.field(static=True)
     beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
 
 
-def resized(start: Staircase, size: int) -> Staircase:
+def resized(start: m.Staircase, size: int) -> m.Staircase:
     """Give a memory room for so many extremes at least."""
     pad = jnp.full(max(0, size - start.extremes_V.shape[0]), start.extremes_V[0])
-    return Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
+    return m.Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
 
 
 def refuse_many_steps(record: Record, stride: int) -> None:
@@ -79,7 +69,7 @@ class Path:
     from the remembered extreme `anchor_V` and is `rising` or not, shape `(n,)`.
     """
 
-    pieces: tuple[tuple[Float[Array, " k"], Staircase], ...]
+    pieces: tuple[tuple[Float[Array, " k"], m.Staircase], ...]
     anchor_V: np.ndarray
     rising: np.ndarray
 
@@ -99,13 +89,13 @@ class Run:
     record: Record
     lower_V: float
     upper_V: float
-    start: Staircase
+    start: m.Staircase
     known: np.ndarray
     fitted: np.ndarray
     weight: np.ndarray | None = None
     gain: float = 1.0
     stride: int = 1
-    hold: Hold = "first"
+    hold: m.Hold = "first"
     moving: bool = False
     has_past: bool = False
 
@@ -179,10 +169,10 @@ class Run:
         beside = {name: np.interp(share, np.arange(n), v) for name, v in columns_beside(record).items()}
         return Samples(
             time_s=jnp.asarray(time),
-            voltage_V=refined(jnp.ones(()), voltage, stride, self.hold)[1],
+            voltage_V=m.refined(jnp.ones(()), voltage, stride, self.hold)[1],
             displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
             weight=jnp.asarray(np.pad(self.fit_weight, pad)),
-            start=Start(memory=resized(self.start, 512)),  # filtered multisines nest deeply
+            start=m.Start(memory=resized(self.start, 512)),  # filtered multisines nest deeply
             stride=stride,
             moving=self.moving,
             has_past=self.has_past,
@@ -211,7 +201,7 @@ def prepare_run(
     holdout: float,
     stride: int = 1,
     gain: float | None = 1.0,
-    hold: Hold = "first",
+    hold: m.Hold = "first",
     usable: np.ndarray | None = None,
     estimated: bool = False,
 ) -> Run:
@@ -250,17 +240,17 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
     return min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
 
 
-def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
+def initial_state(name: str, lower_V: float, upper_V: float) -> m.Staircase:
     """Make the memory before a record from its name, one of `INITIAL_STATES`; a `DataError` for another name.
 
     Negative saturation stands in for an unknown state, as the samples that would show the difference are not used.
     """
     if name in ("negative", "unknown"):
-        return negative_saturation(lower_V)
+        return m.negative_saturation(lower_V)
     if name == "positive":
-        return positive_saturation(lower_V, upper_V)
+        return m.positive_saturation(lower_V, upper_V)
     if name == "demagnetised":
-        return demagnetised(lower_V, upper_V)
+        return m.demagnetised(lower_V, upper_V)
     raise DataError(f"unknown initial state {name!r}: choose one of {', '.join(INITIAL_STATES)}")
 
 
@@ -288,19 +278,19 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
 
 @eqx.filter_jit
 def _remember(
-    voltage_V: Float[Array, " n"], start: Staircase
-) -> tuple[Float[Array, " n"], Bool[Array, " n"], Staircase]:
-    memory = remember(voltage_V, start)
+    voltage_V: Float[Array, " n"], start: m.Staircase
+) -> tuple[Float[Array, " n"], Bool[Array, " n"], m.Staircase]:
+    memory = m.remember(voltage_V, start)
     anchor = memory.path_V[memory.anchor]
     return anchor[memory.lead :], memory.rising[memory.lead :], memory.end()
 
 
 @eqx.filter_jit
-def _respond(model: Preisach, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
+def _respond(model: m.Preisach, voltage_V: Float[Array, " n"], start: m.Staircase) -> Float[Array, " n"]:
     return model(voltage_V, start)
 
 
-def simulate_run(model: Preisach, run: Run) -> np.ndarray:
+def simulate_run(model: m.Preisach, run: Run) -> np.ndarray:
     """Predict the displacement of a run by a hysteresis alone, in um, shape `(n,)`."""
     out = [_respond(model, voltage, start) for voltage, start in run.path.pieces]
     return np.concatenate(out)[: len(run.record)]
