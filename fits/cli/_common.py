@@ -1,7 +1,4 @@
-"""What the commands share: bad input and interruptions in sentences, places to read and write, and what is told.
-
-Of other packages only click is imported before a command runs, so that help does not wait for JAX.
-"""
+"""What the commands share: bad input and interruptions in sentences, places to read and write, and what is told."""
 
 import contextlib
 import errno
@@ -22,7 +19,7 @@ from typing import Any, NoReturn
 import click
 
 from fits.cli import _late as late
-from fits.io._errors import DataError
+from fits.io._errors import DataError, without_middle
 from fits.io._file_set import discard_all
 from fits.io._printable import printable
 
@@ -123,8 +120,10 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
             command(Given(**options))
         except KeyboardInterrupt as stop:
             stopped(stop, NOTHING_LEFT)
-        except DataError as error:
-            sentence = printable(" ".join(str(error).split()))
+        except (DataError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and not isinstance(error, late.FitError):
+                raise
+            sentence = printable(" ".join(without_middle(str(error)).split()))
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
             sys.exit(2)
         except OSError as error:
@@ -145,10 +144,9 @@ def progress_to_stderr(quiet: bool) -> Callable[[str], None]:
 
 
 def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], None]:
-    """Make what draws on stderr how far the work has come, a step for each stage that is announced.
+    """Make what draws on stderr how far the work has come: a step for each stage, which is announced by itself.
 
-    A stage is announced by itself; other sentences tell of details. On a terminal the bar stays in its line;
-    elsewhere each sentence has its own.
+    Other sentences tell of details. On a terminal the bar stays in its line; elsewhere each sentence has its own.
     """
     began, at = time.monotonic(), 0
 

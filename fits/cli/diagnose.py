@@ -56,19 +56,16 @@ def diagnose(given: common.Given) -> None:
     progress = common.bar_to_stderr(given.quiet, tuple(late.Step))
     records = late.read_runs(given.runs, mapping)
     aside = [late.read_csv(file, mapping) for file in files]
-    try:
-        diagnosis = late.diagnose(
-            records,
-            holdout=aside or fraction,
-            false_alarm=given.false_alarm,
-            duration_s=given.duration,
-            initial=given.initial,
-            limits=limits,
-            margin=given.margin,
-            progress=progress,
-        )
-    except late.FitError as error:
-        raise DataError(f"{error}.") from error
+    diagnosis = late.diagnose(
+        records,
+        holdout=aside or fraction,
+        false_alarm=given.false_alarm,
+        duration_s=given.duration,
+        initial=given.initial,
+        limits=limits,
+        margin=given.margin,
+        progress=progress,
+    )
     progress(late.Step.WRITING)
     content = late.diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)

@@ -76,10 +76,7 @@ def fit(given: common.Given) -> None:
         records = late.read_runs(given.runs, mapping)
         same = {"holdout": [late.read_csv(file, mapping) for file in files] or fraction, "initial": initial}
         asked |= {"levels": given.levels, "loss": given.loss or "squares", "progress": progress}
-        try:
-            result = estimate(records, **same, **asked)
-        except late.FitError as error:
-            raise DataError(f"{error}.") from error
+        result = estimate(records, **same, **asked)
         report, drawn = late.fit_report(result), []
         if drawings is not None:
             progress("drawing")

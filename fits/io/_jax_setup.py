@@ -26,8 +26,7 @@ def start_jax() -> None:
 def _cache_folder() -> Path | None:
     """Make the folder for compiled functions; None where there is none or it cannot be written to.
 
-    What is in it runs as the user's own code. One that others can write to is refused if it was asked for, else not
-    used.
+    What is in it runs as the user's own code: one that others can write to is refused if asked for, else not used.
     """
     stated = os.environ.get("MICROID_CACHE")
     if stated in ("", "0", "off"):

@@ -93,10 +93,7 @@ def read_runs(
 
 
 def read_reference(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> Reference:
-    """Read a displacement to follow, with the columns `time_s` and `displacement_um`; others are not looked at.
-
-    Arguments and errors are those of `read_csv`.
-    """
+    """Read a displacement to follow: columns `time_s` and `displacement_um`, arguments and errors as of `read_csv`."""
     read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), alone=True)
     with np.errstate(all="ignore"):
         warnings = tuple(read.odd_gaps())

@@ -65,8 +65,11 @@ def _stale(entry: os.DirEntry[str], host: str, boot: str, pid: str, start: str) 
         return False
     if boot != now:
         # Another container on this machine looks like another start of it, but has not written before this start.
-        began = _machine_started_s()
-        return began is not None and status.st_mtime < began
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            uptime_s = float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
+            # A clock that was set right meanwhile must not make a live file look old.
+            return status.st_mtime < time.time() - uptime_s - 60
+        return False
     return not _lives(int(pid), int(start))
 
 
@@ -96,29 +99,11 @@ def _started(pid: int) -> int | None:
 @functools.cache
 def _machine() -> tuple[str, str]:
     """Digests of this machine, and of its running since the last start, as far as processes see each other."""
-    host = [socket.gethostname(), *_contents("/etc/machine-id")]
-    boot = _contents("/proc/sys/kernel/random/boot_id")
+    host, boot = [socket.gethostname()], list[str]()
+    for parts, path in ((host, "/etc/machine-id"), (boot, "/proc/sys/kernel/random/boot_id")):
+        with contextlib.suppress(OSError):
+            parts.append(Path(path).read_text(encoding="ascii", errors="replace").strip())
     with contextlib.suppress(OSError):
         boot.append(os.readlink("/proc/self/ns/pid"))
-    return _digest(host), _digest(boot)
-
-
-def _digest(parts: list[str]) -> str:
-    return hashlib.sha256("\n".join(parts).encode("utf-8", "replace")).hexdigest()[:8]
-
-
-def _contents(path: str) -> list[str]:
-    try:
-        return [Path(path).read_text(encoding="ascii", errors="replace").strip()]
-    except OSError:
-        return []
-
-
-def _machine_started_s() -> float | None:
-    """When this machine was started, in s since 1970; None where it is not known."""
-    try:
-        uptime_s = float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
-    except (OSError, ValueError, IndexError):
-        return None
-    # A clock that was set right meanwhile must not make a live file look old.
-    return time.time() - uptime_s - 60
+    first, second = (hashlib.sha256("\n".join(parts).encode("utf-8", "replace")) for parts in (host, boot))
+    return first.hexdigest()[:8], second.hexdigest()[:8]

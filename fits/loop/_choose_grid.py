@@ -59,8 +59,7 @@ def _resolve(
 ) -> tuple[GridTrial, list[LevelTrial]]:
     """Refine until it no longer pays; of grids that predict alike the finest is kept.
 
-    What a last digit rounds off repeats itself with every loop, and a fine grid follows it from digit to digit: an
-    error that is no more than that is not worth refining.
+    What a last digit rounds off repeats itself with every loop, and a fine grid would follow it from digit to digit.
     """
     best = trial(levels or LADDER[0], Hyper.start())
     trials = [LevelTrial(best.data.grid.levels, best.error_um)]

@@ -86,8 +86,7 @@ def disagreements(
 ) -> list[str]:
     """Look for runs, and parts of runs, that a hysteresis explains one by one but not together: a sentence for each.
 
-    The residuals are those of all runs together. A `DataError` if the gains of two runs differ by so much that they
-    are not of one rig in one setting.
+    The residuals are those of all runs together. A `DataError` if gains of two runs differ too much for one rig.
     """
     if not any(one.far for one in left):
         return []

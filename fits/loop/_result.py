@@ -54,8 +54,7 @@ class LevelTrial:
 class ParameterEstimate:
     """One parameter of a stage, by part and field, such as `mechanics.natural_frequency_Hz`.
 
-    The noise counts as coloured as the residual is in the standard deviation and the ends of the 95 % interval, which
-    lies within the bounds.
+    Standard deviation and ends of the 95 % interval, within the bounds, count the noise as coloured as the residual.
     """
 
     name: str

@@ -92,8 +92,7 @@ def solve_shape(
 
     The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise is
     what this family leaves, which may be more than the grid's, in `hyper`. Returns the best of all starts, and
-    whether the two best ended at the same cost. A `FitError` if no start ends finite, or the best one is not
-    stationary.
+    whether the two best ended at the same cost. A `FitError` if no start ends finite, or the best is not stationary.
     """
     grid = data.grid
     moments = data.total.scaled(1.0, stroke_um)

@@ -30,8 +30,7 @@ class Prediction:
 class AbstractUncertainty(eqx.Module):
     """How sure the predictions of a fitted model are.
 
-    `discrepancy_um` is the standard deviation of the model's own error, as predicting parts of the record from others
-    shows it.
+    `discrepancy_um` is the standard deviation of the model's own error, as predicting parts of records shows it.
     """
 
     discrepancy_um: eqx.AbstractVar[Float[Array, ""]]

@@ -39,8 +39,7 @@ def plot_stage(
 
     Records, holdout and initial memory are those that `fit_stage` was given; a ValueError says that they are not
     those of the result. `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
-    out) and `loop.png` are written into an existing folder, at 200 dots per inch; a `DataError` says if they cannot
-    be.
+    out) and `loop.png` are written into an existing folder, at 200 dots per inch; a `DataError` if they cannot be.
     """
     fraction, aside = held_out(holdout, len(records), len(result.runs))
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)

@@ -19,10 +19,7 @@ _HIGH_in = 2.6
 
 @dataclass(frozen=True)
 class _Rows:
-    """Values of the swept parameters by name, of rows that are done, and of the output that is drawn.
-
-    Words are 0, 1, 2 and so on in `swept`, and are themselves in `words`.
-    """
+    """Swept parameters and the output that is drawn, of rows that are done; a word is its number in `words`."""
 
     swept: dict[str, np.ndarray]
     words: dict[str, np.ndarray]

@@ -28,10 +28,7 @@ _KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexp
 
 
 def report_html(diagnosis: Diagnosis) -> str:
-    """Write a diagnosis as an HTML page for people, on a screen, a phone or paper, with style and pictures in it.
-
-    The same diagnosis gives the same text.
-    """
+    """Write a diagnosis as an HTML page for screen, phone and paper, all in one; the same one gives the same text."""
     length, causes, ahead = Lengths(diagnosis), diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]
     sources = list(dict.fromkeys(run.source for run in diagnosis.runs if run.source))

@@ -20,10 +20,7 @@ _EQUAL = 1.1
 
 
 def fit_report(result: FitResult[Any]) -> dict[str, Any]:
-    """Put what is known of a fit into JSON values, which a model file keeps under `fit`.
-
-    Errors and limits that do not exist are None.
-    """
+    """Put what is known of a fit into JSON values, kept under `fit` in model files; what does not exist is None."""
     model = result.model
     law: Any = model
     parts: dict[str, Any] = {}

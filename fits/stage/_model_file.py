@@ -2,18 +2,12 @@
 
 A model file is one JSON object (UTF-8; no NaN or infinity) with six keys:
 
-`schema`
-    `"microid.model/1"`. Another number means another format.
-`sha256`
-    Of the object without this key, as `json.dumps(rest, sort_keys=True, separators=(",", ":"))` in ASCII.
-`written_by`
-    Name and version of the program.
-`model`
-    The model. Every part is an object whose `type` is the name of a class in `microid`, with one key per field.
-`uncertainty`
-    `fits.Uncertainty`, or for a whole stage `fits.StageUncertainty`, in the same form.
-`fit`
-    The report of the fit, as `microid fit --json` prints it.
+- `schema`: `"microid.model/1"`. Another number means another format.
+- `sha256`: of the object without this key, as `json.dumps(rest, sort_keys=True, separators=(",", ":"))` in ASCII.
+- `written_by`: name and version of the program.
+- `model`: every part is an object whose `type` is the name of a class in `microid`, with one key per field.
+- `uncertainty`: `fits.Uncertainty`, or for a whole stage `fits.StageUncertainty`, in the same form.
+- `fit`: the report of the fit, as `microid fit --json` prints it.
 
 A field that holds numbers is `{"unit": "um", "value": 1.5}`, where the value is one number or nested lists of them
 (float64, written with as many digits as reading it back exactly takes; another type is named by the key `dtype`). The
