@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fits.io._errors import DataError
-from fits.io._plausible import LARGEST_EXTRA, check_size, check_steps
+from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._quantity import FloatArray
 from fits.io._record import Record, Reference
 from fits.io._table import Problem, Table, open_table
@@ -69,11 +69,12 @@ def read_csv(
         "the column matters."
         for name, (line, found) in read.problems.items()
     ]
-    for name in [name for name, array in extra.items() if np.abs(array).max() > LARGEST_EXTRA]:
+    # Further columns serve for little, and may hold anything that has a square and a cube.
+    for name in [name for name, array in extra.items() if np.abs(array).max() > 1e30]:
         del extra[name]
         warnings.append(
-            f"{table.path}, column '{name}': dropped, because it holds numbers beyond {LARGEST_EXTRA:g}; correct "
-            "them if the column matters."
+            f"{table.path}, column '{name}': dropped, because it holds numbers beyond 1e+30; correct them if the "
+            "column matters."
         )
     with np.errstate(all="ignore"):  # absurd magnitudes overflow here, and then warn of nothing
         warnings += [*read.odd_gaps(), *read.odd_voltage()]
@@ -93,7 +94,7 @@ def read_runs(
 
 
 def read_reference(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> Reference:
-    """Read a displacement to follow: columns `time_s` and `displacement_um`, arguments and errors as of `read_csv`."""
+    """Read a displacement to follow: the columns `time_s` and `displacement_um`; see `read_csv` for all else."""
     read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), alone=True)
     with np.errstate(all="ignore"):
         warnings = tuple(read.odd_gaps())
@@ -246,7 +247,15 @@ class KnownColumns:
 def _check_time(table: Table, column: str, time_s: FloatArray) -> None:
     wrong = np.flatnonzero(time_s[1:] <= time_s[:-1])
     if wrong.size == 0:
-        check_steps(table, column, time_s)
+        # Steps of fewer last digits than eight are not even where the clock was.
+        least_s = max(SHORTEST_STEP_s, 8 * float(np.spacing(np.abs(time_s[[0, -1]]).max())))
+        steps_s = np.diff(time_s)
+        if steps_s.min(initial=np.inf) < least_s:
+            what = (
+                f"expected time steps of at least {least_s:.3g} s, which is what double precision resolves here, "
+                f"found {steps_s.min():.3g} s; begin at 0 s, or check the unit"
+            )
+            raise table.error(what, int(np.argmin(steps_s)) + 1, column)
         return
     row = int(wrong[0]) + 1
     before, now = float(time_s[row - 1]), float(time_s[row])

@@ -42,7 +42,7 @@ Problem = tuple[int, str]
 
 @dataclass(frozen=True)
 class Table:
-    r"""A CSV file whose header is read, without quotes and spaces, and whose body is text with lines ended by `\n`."""
+    r"""A CSV file whose header is read, without quotes and spaces, and whose body is text whose lines end in `\n`."""
 
     path: str
     names: tuple[str, ...]

@@ -15,16 +15,8 @@ from fits.io._table import Table, open_table
 _REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
 _MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"
 # What a unit is checked by, of each column.
-_UNITS = {
-    "frequency_Hz": "Hz",
-    _REAL: "um/V",
-    _IMAGINARY: "um/V",
-    _VARIANCE: "um^2/V^2",
-    _MAGNITUDE: "um/V",
-    _DECIBEL: "dB",
-    _DEGREES: "deg",
-    _RADIANS: "rad",
-}
+_UNITS = {"frequency_Hz": "Hz"} | dict.fromkeys((_REAL, _IMAGINARY, _MAGNITUDE), "um/V")
+_UNITS |= {_VARIANCE: "um^2/V^2", _DECIBEL: "dB", _DEGREES: "deg", _RADIANS: "rad"}
 
 
 @dataclass(frozen=True, eq=False)
