@@ -15,12 +15,8 @@ from fits.io._file_set import file_set
 # Finer steps, of um or V, are none.
 _FINEST, _LARGEST = 1e-9, 1e9
 # Fields of the goal by the options that state them.
-_LIMITS = {
-    "gain_margin": "gain_margin_min",
-    "phase_margin": "phase_margin_min_deg",
-    "peak": "sensitivity_peak_max",
-    "overshoot": "overshoot_max_pct",
-}
+_LIMITS = {"gain_margin": "gain_margin_min", "phase_margin": "phase_margin_min_deg"}
+_LIMITS |= {"peak": "sensitivity_peak_max", "overshoot": "overshoot_max_pct"}
 # The least that options may be.
 _LEAST = dict.fromkeys(("noise", "effort", "rate", "skip"), 0.0)
 _LEAST |= {"gain_margin": 1.0, "phase_margin": 1.0, "peak": 1.0, "overshoot": 0.0}

@@ -89,12 +89,8 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
             raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error
 
     # All are composed before the first is written.
-    texts = {
-        _REPORT: late.report_html(diagnosis),
-        _JSON: f"{late.finite_json(content)}\n",
-        _BASELINE: model("baseline"),
-        _EXTENDED: model("extended"),
-    }
+    texts = {_REPORT: late.report_html(diagnosis), _JSON: f"{late.finite_json(content)}\n"}
+    texts |= {_BASELINE: model("baseline"), _EXTENDED: model("extended")}
     ahead = diagnosis.next_experiment
     with file_set() as files:
         place = files.folder(out, "--out")

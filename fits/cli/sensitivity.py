@@ -56,11 +56,8 @@ def sensitivity(given: common.Given) -> None:
     words = late.describe_sensitivity(report, given.voltage)
     if claims:
         words += f"\n\n{late.describe_claims(claims)}"
-    places = [
-        ("json", out),
-        ("stage", given.write_stage),
-        *(("plot", each) for each in common.paths_in(given.plots, drawn)),
-    ]
+    plots = [("plot", place) for place in common.paths_in(given.plots, drawn)]
+    places = [("json", out), ("stage", given.write_stage), *plots]
     click.echo(common.with_paths(words, places))
 
 

@@ -8,7 +8,7 @@ from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
 
-def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+def _list(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted and not context.resilient_parsing:
         import data_synth
 
@@ -22,12 +22,7 @@ def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) ->
 @options.out_folder
 @click.option("--seed", type=click.IntRange(0, 2**64 - 1), help="Seed; the scenario's own by default.")
 @click.option(
-    "--list",
-    is_flag=True,
-    expose_value=False,
-    is_eager=True,
-    callback=_list_scenarios,
-    help="List the scenarios and exit.",
+    "--list", is_flag=True, expose_value=False, is_eager=True, callback=_list, help="List the scenarios and exit."
 )
 @options.json_output
 @common.in_sentences

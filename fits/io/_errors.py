@@ -1,7 +1,10 @@
-"""The one exception for bad input, and how its sentences quote what was found."""
+"""The one exception for bad input, how its sentences quote what was found, and what names a file."""
 
 import json
+import os
 from typing import Any
+
+AnyPath = str | os.PathLike[str]
 
 # What is quoted, and a whole sentence, are cut to so many characters; so many are kept at its end.
 _SHOWN, _SENTENCE, _END = 60, 1000, 400

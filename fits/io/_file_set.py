@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
 
-from fits.io._errors import DataError
+from fits.io._errors import AnyPath, DataError
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
 _DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 
 
-def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path]:
+def usable_folder(path: AnyPath, option: str) -> tuple[Path, Path]:
     """Refuse a folder that cannot be written to, or made; itself and the nearest one that exists come back."""
     shown = os.fspath(path)
     if not shown:
@@ -39,7 +39,7 @@ def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path
     return target, anchor
 
 
-def check_file(path: str | os.PathLike[str], shown: str | None = None) -> Path:
+def check_file(path: AnyPath, shown: str | None = None) -> Path:
     """Refuse what cannot become, or be replaced by, a regular file; its real path comes back."""
     shown = os.fspath(path) if shown is None else shown
     if not shown:
@@ -112,7 +112,7 @@ class FileSet:
         self._folders: list[_Folder] = []
         self._scraps: list[Path] = []
 
-    def file(self, path: str | os.PathLike[str]) -> Path:
+    def file(self, path: AnyPath) -> Path:
         """Give a temporary name, of the ending of `path`, for a file to write; a `DataError` if `path` cannot be."""
         target = check_file(path)
         if any(is_temporary(part) for part in target.parts):
@@ -124,15 +124,15 @@ class FileSet:
         self._files.append(_Move(staged, target, os.fspath(path)))
         return staged
 
-    def absent(self, path: str | os.PathLike[str]) -> None:
+    def absent(self, path: AnyPath) -> None:
         """Have no file at `path` in the end; a missing one is fine."""
         self._files.append(_Move(None, Path(os.path.realpath(path)), os.fspath(path)))
 
     @overload
-    def folder(self, path: str | os.PathLike[str], option: str = ...) -> Path: ...
+    def folder(self, path: AnyPath, option: str = ...) -> Path: ...
     @overload
-    def folder(self, path: str | os.PathLike[str] | None, option: str = ...) -> Path | None: ...
-    def folder(self, path: str | os.PathLike[str] | None, option: str = "--plots") -> Path | None:
+    def folder(self, path: AnyPath | None, option: str = ...) -> Path | None: ...
+    def folder(self, path: AnyPath | None, option: str = "--plots") -> Path | None:
         """Make a temporary folder, whose files go to the folder `path` that an option named; for None there is none.
 
         A `DataError` says that `path`, which is made if need be, cannot be written to, or is no folder.

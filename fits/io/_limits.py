@@ -17,14 +17,8 @@ from fits.io._record import Record
 Ranges = dict[str, tuple[float, float]]
 AnyRanges = Mapping[str, tuple[float, float]]
 
-UNITS = {
-    "voltage": "V",
-    "slew": "V/s",
-    "displacement": "um",
-    "velocity": "um/s",
-    "acceleration": "um/s^2",
-    "current": "A/F",
-}
+UNITS = {"voltage": "V", "slew": "V/s", "displacement": "um", "velocity": "um/s"}
+UNITS |= {"acceleration": "um/s^2", "current": "A/F"}
 """Quantities that are limited, and their units. The driver's current is stated per farad of the piezo: it is the slew
 of the voltage at the piezo, C dU/dt, and records of voltage and displacement do not tell C."""
 

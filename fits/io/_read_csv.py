@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fits.io._errors import DataError
+from fits.io._errors import AnyPath, DataError
 from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._quantity import FloatArray
 from fits.io._record import Record, Reference
@@ -21,7 +21,7 @@ MIN_SAMPLES = 50
 
 
 def read_csv(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     columns: Mapping[str, str] | None = None,
     required: Iterable[str] = ("time_s", "voltage_V", "displacement_um"),
 ) -> Record:
@@ -83,9 +83,7 @@ def read_csv(
     return Record(time_s, voltage_V, displacement_um, extra, os.path.basename(table.path), tuple(warnings))
 
 
-def read_runs(
-    paths: Iterable[str | os.PathLike[str]], columns: Mapping[str, str] | None = None
-) -> tuple[Record, ...]:
+def read_runs(paths: Iterable[AnyPath], columns: Mapping[str, str] | None = None) -> tuple[Record, ...]:
     """Read several files as several runs of one rig; arguments and errors are those of `read_csv`."""
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not paths:
@@ -93,7 +91,7 @@ def read_runs(
     return tuple(read_csv(path, columns) for path in paths)
 
 
-def read_reference(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> Reference:
+def read_reference(path: AnyPath, columns: Mapping[str, str] | None = None) -> Reference:
     """Read a displacement to follow: the columns `time_s` and `displacement_um`; see `read_csv` for all else."""
     read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), alone=True)
     with np.errstate(all="ignore"):
@@ -115,7 +113,7 @@ class KnownColumns:
     @classmethod
     def read(
         cls,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         columns: Mapping[str, str] | None,
         required: Sequence[str],
         more: Sequence[str] = (),

@@ -10,7 +10,7 @@ import tomllib
 import zlib
 from typing import Any
 
-from fits.io._errors import DataError, shown
+from fits.io._errors import AnyPath, DataError, shown
 
 # Each is many times what real files need, and fits in the memory of a small computer.
 MOST_CSV_BYTES = 512_000_000
@@ -20,7 +20,7 @@ MOST_DEPTH = 32
 _LARGEST_INTEGER = 2**63 - 1
 
 
-def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
+def read_bytes(path: AnyPath, what: str, most: int) -> bytes:
     """Read `what` is expected at a path, such as `a CSV file`; a `DataError` if it cannot be, or is too large."""
     name = os.fspath(path)
     try:
@@ -41,7 +41,7 @@ def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
         raise DataError(f"{name}: cannot be read ({reason}); check the name and the permissions.") from None
 
 
-def read_text(path: str | os.PathLike[str], what: str, most: int) -> str:
+def read_text(path: AnyPath, what: str, most: int) -> str:
     """Read a file of UTF-8 text, with or without a byte-order mark; arguments and errors as of `read_bytes`."""
     data = read_bytes(path, what, most)
     try:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fits.io._errors import DataError
+from fits.io._errors import AnyPath, DataError
 from fits.io._quantity import FloatArray
 from fits.io._read_file import MOST_CSV_BYTES, read_bytes, unpack
 
@@ -205,7 +205,7 @@ class Table:
         return data_error(self.path, what, line, column)
 
 
-def open_table(path: str | os.PathLike[str]) -> Table:
+def open_table(path: AnyPath) -> Table:
     """Read a file and its header; a `DataError` says that this is no readable text with a header of its own."""
     shown = os.fspath(path)
     data = read_bytes(shown, "a CSV file", MOST_CSV_BYTES)

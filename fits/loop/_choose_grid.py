@@ -12,7 +12,7 @@ from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, relaxat
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, LevelTrial
-from fits.loop._run import Run, simulate_run
+from fits.loop._run import Progress, Run, simulate_run
 from fits.stats._noise import WHITE, correlation_samples, huber_weight, quantum_um
 
 # Resolutions in steps of the square root of two.
@@ -31,11 +31,7 @@ class GridTrial:
 
 
 def choose_grid(
-    runs: Sequence[Run],
-    levels: int | None,
-    progress: Callable[[str], None],
-    finest: int = LADDER[-1],
-    alone: bool = False,
+    runs: Sequence[Run], levels: int | None, progress: Progress, finest: int = LADDER[-1], alone: bool = False
 ) -> tuple[float, GridTrial, list[LevelTrial]]:
     """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
 
@@ -155,7 +151,7 @@ def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:
     return float(parts.sum() / (np.abs(parts).sum() + 1e-300))
 
 
-def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list[Run]:
+def weigh_robustly(runs: Sequence[Run], progress: Progress) -> list[Run]:
     """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid."""
     progress("weighing outliers")
     stroke = max(_stroke(run) for run in runs)

@@ -1,6 +1,6 @@
 """From records to a fitted Preisach operator, and to what a rig must have been through before its record."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._prior import interpolation
 from fits.loop._result import FitResult, FitStatus, RunReport
-from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
+from fits.loop._run import Progress, Run, command_range_V, prepare_run, simulate_run
 from fits.loop._shapes import solve_shape
 from fits.loop._uncertainty import Uncertainty
 from fits.stats._noise import LOSSES, WHITE
@@ -43,7 +43,7 @@ def fit(
     loss: str = "squares",
     starts: int = 8,
     seed: int = 0,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> FitResult[Preisach]:
     """Fit a Preisach operator to measured voltage and displacement (Eq. 8-11).
 

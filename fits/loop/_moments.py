@@ -153,12 +153,8 @@ class Moments(eqx.Module):
 
     def scaled(self, count: Float[Array, ""] | float, unit_um: float) -> "Moments":
         """Measure displacement in `unit_um`, and count each sample as `count` independent ones."""
-        return Moments(
-            self.gram * count,
-            self.cross_um * (count / unit_um),
-            self.energy_um2 * (count / unit_um**2),
-            self.count * count,
-        )
+        cross_um, energy_um2 = self.cross_um * (count / unit_um), self.energy_um2 * (count / unit_um**2)
+        return Moments(self.gram * count, cross_um, energy_um2, self.count * count)
 
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Moments":
         """Keep only combinations of columns."""

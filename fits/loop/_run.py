@@ -1,6 +1,6 @@
 """A record made ready for fitting: which samples count, what it began from, and the arrays that models take."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,6 +23,8 @@ _PIECE = 8192
 _STAIRCASES = (64, 512, 4096)
 # Samples that a run must leave to fit.
 _FEWEST = 50
+# Told what is being done, a sentence at a time.
+Progress = Callable[[str], None]
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 
 

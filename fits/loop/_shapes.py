@@ -1,6 +1,6 @@
 """Fitting densities with few or tangled parameters: Powell's dogleg from several starts."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from fits.loop._grid import Estimate
 from fits.loop._moments import Data, square_root
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import Run, simulate_run
+from fits.loop._run import Progress, Run, simulate_run
 from fits.stats._noise import correlation_samples, shared_square
 from microid import FAMILIES, Coordinates, Preisach, Reversible
 
@@ -86,7 +86,7 @@ def solve_shape(
     hyper: Hyper,
     starts: int,
     key: PRNGKeyArray,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> tuple[Estimate, bool]:
     """Fit a family of `microid.FAMILIES` that is not linear in its parameters, on the moments of the record alone.
 
@@ -141,11 +141,8 @@ def solve_shape(
         off = [o - o.mean() for o in off]
         variance = sum(float(np.sum(o**2)) for o in off) / stroke_um**2 / max(count - determined, 1)
         correlation = correlation_samples(off)
-        problem = eqx.tree_at(
-            lambda p: (p.scale, p.precision),
-            problem,
-            (jnp.asarray((variance * correlation) ** -0.5), jnp.asarray(precision)),
-        )
+        weights = jnp.asarray((variance * correlation) ** -0.5), jnp.asarray(precision)
+        problem = eqx.tree_at(lambda p: (p.scale, p.precision), problem, weights)
         z, _ = _follow(problem, z)
         factor, known, distance = _laplace(problem, z)
         determined = float(known)

@@ -1,6 +1,5 @@
 """Pictures of a reference that is followed: feedforward as in the paper's Fig. 9, and closed loops."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from fits.control._compensate import Compensation
 from fits.control._compensate_stage import simulate_model
 from fits.control._tune_start import slope_array
+from fits.io._errors import AnyPath
 from fits.io._record import Record, Reference
 from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save
 from fits.stats._metrics import TWO_SIDED_95
@@ -17,12 +17,7 @@ from microid import AbstractController, ControlledRun, Preisach, Stage, loop_gai
 
 
 def plot_control(
-    run: ControlledRun,
-    controller: AbstractController,
-    plants: Sequence[Stage],
-    folder: str | os.PathLike[str],
-    *,
-    delay: int = 0,
+    run: ControlledRun, controller: AbstractController, plants: Sequence[Stage], folder: AnyPath, *, delay: int = 0
 ) -> list[Path]:
     """Draw a run, and the loop gain and sensitivity of every plant.
 
@@ -69,7 +64,7 @@ def plot_compensation(
     reference: Reference | Record,
     compensation: Compensation,
     displacement_sd_um: np.ndarray | None,
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     *,
     initial: str = "negative",
 ) -> list[Path]:

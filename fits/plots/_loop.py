@@ -1,6 +1,5 @@
 """Pictures of a fit, for print: columns of 90 mm or 180 mm, readable in grey."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fits.io._errors import AnyPath
 from fits.io._record import Record
 from fits.loop._result import FitResult, RunReport
 from fits.loop._run import Run, prepare_run, simulate_run
@@ -25,7 +25,7 @@ _ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
 def plot_fit(
     result: FitResult[Preisach],
     records: Sequence[Record],
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     *,
     holdout: float | Sequence[Record] = 0.2,
     initial: str = "unknown",

@@ -1,6 +1,5 @@
 """Pictures of machining errors (Fig. 7 of the paper), of measuring errors (its Fig. 8), and of error budgets."""
 
-import os
 import re
 import textwrap
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 import microid as m
+from fits.io._errors import AnyPath
 from fits.io._printable import plain
 from fits.io._record import Reference
 from fits.machining._budget import Budget
@@ -49,7 +49,7 @@ class _Panel:
     curves: dict[str, NDArray[np.float64]]
 
 
-def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os.PathLike[str]) -> list[Path]:
+def plot_sensitivity(design: Design, report: SensitivityReport, folder: AnyPath) -> list[Path]:
     """Draw which dimensions matter, and the output error over the machining error of each (Fig. 7).
 
     Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel. The
@@ -221,7 +221,7 @@ def symbol(name: str) -> str:
     return f"${stem}_{{{index}}}$" if index else f"${stem}$"
 
 
-def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
+def plot_budget(found: Budget, folder: AnyPath) -> list[Path]:
     """Draw the parts of the worst case of each axis in percent of its stroke, and the root sum of squares.
 
     `budget.png` is written into an existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
@@ -254,7 +254,7 @@ def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
     return [save(picture, Path(folder) / "budget.png")]
 
 
-def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[str]) -> list[Path]:
+def plot_idle(reference: Reference, noise: IdleNoise, folder: AnyPath) -> list[Path]:
     """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
 
     The noise is that of the record, from `idle_noise`. `idle.png` is written into an existing folder, at 200 dots per

@@ -1,6 +1,5 @@
 """Pictures of the fit of a stage: its frequency response, every run with its residual, and the slow loop."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from fits.control._compensate_stage import static_equivalent
+from fits.io._errors import AnyPath
 from fits.io._record import Record
 from fits.loop._result import FitResult
 from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
@@ -30,7 +30,7 @@ _COHERENT = 0.8
 def plot_stage(
     result: FitResult[Stage],
     records: Sequence[Record],
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     *,
     holdout: float | Sequence[Record] = 0.2,
     initial: str | Sequence[str] = "unknown",

@@ -2,12 +2,12 @@
 
 import itertools
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from fits.io._errors import AnyPath
 from fits.plots._style import WIDE_in, figure, label, save, verbatim
 from fits.sweeps._show import open_sweep, readable, summarise
 from fits.sweeps._store import about_of
@@ -27,7 +27,7 @@ class _Rows:
     values: np.ndarray
 
 
-def plot_sweep(folder: str | os.PathLike[str], out: Path, by: str | None = None) -> list[Path]:
+def plot_sweep(folder: AnyPath, out: Path, by: str | None = None) -> list[Path]:
     """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back."""
     names, data = about_of(folder)["parameters"], open_sweep(folder)
     with readable(folder):

@@ -1,6 +1,6 @@
 """From slow and fast records to a whole fitted stage, in the terms of its user."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
 from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate, RunReport
-from fits.loop._run import Run, prepare_run, refuse_many_steps
+from fits.loop._run import Progress, Run, prepare_run, refuse_many_steps
 from fits.stage._checks import check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simulate_stage
@@ -37,12 +37,8 @@ def default_stage(hold: Hold = "first") -> Stage:
         Reversible(jnp.ones(4), jnp.asarray(0.0), jnp.asarray(1.0)),
         jnp.asarray(0.0),
     )
-    stage = Stage.of(
-        hold=hold,
-        driver=Driver(jnp.asarray(1e-3)),
-        hysteresis=flat,
-        mechanics=Mechanics(jnp.asarray(100.0), jnp.asarray(0.1)),
-    )
+    mechanics = Mechanics(jnp.asarray(100.0), jnp.asarray(0.1))
+    stage = Stage.of(hold=hold, driver=Driver(jnp.asarray(1e-3)), hysteresis=flat, mechanics=mechanics)
     return stage.freeze("driver.gain", "mechanics.gain")
 
 
@@ -54,7 +50,7 @@ def fit_stage(
     holdout: float | Sequence[Record] = 0.2,
     initial: str | Sequence[str] = "unknown",
     loss: str = "squares",
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> FitResult[Stage]:
     """Fit driver, hysteresis and mechanics jointly to slow and fast runs of one rig.
 
@@ -140,7 +136,7 @@ def solve_stage(
     holdout: float | Sequence[Record],
     initial: str | Sequence[str],
     loss: str,
-    progress: Callable[[str], None],
+    progress: Progress,
     finest: int = LADDER[-1],
     accept_best: bool = False,
     estimated: bool = False,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from fits.io._errors import DataError
+from fits.io._errors import AnyPath, DataError
 from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._table import Table, open_table
 
@@ -92,7 +92,7 @@ class ResponseData:
                 )
 
 
-def read_multisine(path: str | os.PathLike[str]) -> Multisine:
+def read_multisine(path: AnyPath) -> Multisine:
     """Read `time_s, realization, period, u1_V, u2_V, ..., y1_um, y2_um, ...` from a CSV file.
 
     Rows are ordered by realization, then period, then time, which may start anew with each realization. A `DataError`
@@ -176,7 +176,7 @@ def smooth(variance: NDArray[Any]) -> NDArray[Any]:
     return convolve1d(variance, np.full(width, 1 / width), axis=0, mode="mirror")
 
 
-def read_response(path: str | os.PathLike[str]) -> ResponseData:
+def read_response(path: AnyPath) -> ResponseData:
     """Read a frequency response as an analyser writes it: a row per line, frequencies increasing.
 
     The columns are `frequency_Hz`, then `real_um_per_V` and `imag_um_per_V`, or a magnitude (`magnitude_um_per_V`, or

@@ -42,7 +42,7 @@ import equinox as eqx
 import jax
 
 from fits.io._atomic import atomic_write_text
-from fits.io._errors import DataError, shown
+from fits.io._errors import AnyPath, DataError, shown
 from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
 from fits.io._version import written_by
 from fits.loop._design import Grid
@@ -73,10 +73,7 @@ class ModelFile:
 
 
 def save_model(
-    path: str | os.PathLike[str],
-    model: eqx.Module,
-    uncertainty: Uncertainty | StageUncertainty | None,
-    report: Mapping[str, Any],
+    path: AnyPath, model: eqx.Module, uncertainty: Uncertainty | StageUncertainty | None, report: Mapping[str, Any]
 ) -> None:
     """Write a model file, whole or not at all; the same model gives the same bytes.
 
@@ -116,7 +113,7 @@ def model_text(
     return _pretty(content) + "\n"
 
 
-def load_model(path: str | os.PathLike[str]) -> ModelFile:
+def load_model(path: AnyPath) -> ModelFile:
     """Read a model file that `save_model` wrote: every number is bit by bit what was written.
 
     A `DataError` says that the file cannot be read, is of another version, was changed after it was written, or makes

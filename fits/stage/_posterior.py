@@ -1,6 +1,6 @@
 """For those who do not trust a standard deviation: draws from a posterior by NUTS, and the profile likelihood."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
-from fits.loop._run import Run, Samples
+from fits.loop._run import Progress, Run, Samples
 from fits.stage._moments import offsets_out
 from fits.stage._run import free_grid, nuisance_columns, prepare_again, project_out, residual_of, respond
 from fits.stage._solve import Problem, Solved, Weighing, prior_precision, solve_chain
@@ -79,12 +79,8 @@ def sample_posterior(
     ]
     coordinates = offsets_out(stage, True)
     data = coordinates, [run.samples for run in runs], precision
-    sampler = MCMC(
-        NUTS(potential_fn=eqx.Partial(_potential, data), dense_mass=True),
-        num_warmup=warmup,
-        num_samples=draws,
-        progress_bar=False,
-    )
+    kernel = NUTS(potential_fn=eqx.Partial(_potential, data), dense_mass=True)
+    sampler = MCMC(kernel, num_warmup=warmup, num_samples=draws, progress_bar=False)
     # The sampler's own arithmetic mixes precisions.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         sampler.run(jax.random.key(seed), init_params=coordinates.of(stage), extra_fields=("diverging",))
@@ -119,7 +115,7 @@ def profile_stage(
     points: int = 9,
     holdout: float = 0.2,
     initial: str = "unknown",
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> Profile:
     """Hold one parameter of a fitted stage at several values and fit all others again.
 

@@ -1,7 +1,7 @@
 """Fitting a whole stage: damped Gauss-Newton steps, the columns of the hysteresis solved for exactly in each."""
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
@@ -15,7 +15,7 @@ from fits.loop._grid import solve_grid
 from fits.loop._moments import Data, Moments
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import Run
+from fits.loop._run import Progress, Run
 from fits.stage._moments import Chain, RunSums, run_sums, split_moments
 from fits.stage._run import residual_of
 from fits.stats._noise import correlation_samples, huber_weight
@@ -166,7 +166,7 @@ def solve_chain(
     problem: Problem,
     runs: Sequence[Run],
     loss: str,
-    progress: Callable[[str], None],
+    progress: Progress,
     rough: bool = False,
     accept_best: bool = False,
 ) -> Solved:
@@ -185,7 +185,7 @@ def solve_chain(
     damping = 1e-4
     counted: tuple[float, ...] = ()
     for number in range(_ROUGH if rough else _ROUNDS):
-        runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
+        runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
@@ -195,9 +195,7 @@ def solve_chain(
         here = weights.cost_um2(runs, [one.residual_um for one in sums])
         while True:
             try:
-                step, columns, better, variance, distance = _step(
-                    chain, total, columns_um, hyper, weights, stroke_um, damping
-                )
+                found = _step(problem, total, columns_um, hyper, weights, damping)
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
@@ -206,7 +204,7 @@ def solve_chain(
                 if damping > _HIGHEST:
                     return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
                 continue
-            hyper = better
+            step, columns, hyper, variance, distance = found
             prior = prior_precision(chain, hyper, stroke_um)
             there = weights.cost_um2(runs, _residuals(chain, z + step, columns, runs))
             old = here / variance + columns_um @ prior @ columns_um
@@ -229,7 +227,7 @@ def solve_chain(
             counted = weighing.correlation
             continue
         if distance < _STATIONARY:
-            runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
+            runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
             return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
     if rough or accept_best:
         return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
@@ -258,15 +256,9 @@ def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
 
 
 def _gather(
-    problem: Problem,
-    z: np.ndarray,
-    columns_um: np.ndarray,
-    runs: Sequence[Run],
-    loss: str,
-    free: bool,
-    counted: tuple[float, ...],
+    problem: Problem, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[Run], loss: str, counted: Sequence[float]
 ) -> tuple[Sequence[Run], list[RunSums], Weighing]:
-    chain = problem.chain
+    chain, free = problem.chain, problem.hyper is not None
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
         # Outliers count linearly (Huber).
@@ -284,15 +276,10 @@ def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequen
 
 
 def _step(
-    chain: Chain,
-    total: Moments,
-    columns_um: np.ndarray,
-    hyper: Hyper | None,
-    weighing: Weighing,
-    stroke_um: float,
-    damping: float,
+    problem: Problem, total: Moments, columns_um: np.ndarray, hyper: Hyper | None, weighing: Weighing, damping: float
 ) -> tuple[np.ndarray, np.ndarray, Hyper | None, float, float]:
     """Change of coordinates, columns, their smoothness, noise variance in um^2, and standard deviations moved."""
+    chain, stroke_um = problem.chain, problem.stroke_um
     columns, variance, prior = columns_um, weighing.least_um**2, None
     size = 0 if hyper is None else chain.size
     reduced, step, follow = split_moments(total, size, damping)

@@ -1,7 +1,7 @@
 """The two halves of fitting a stage: a place to begin, read off the runs, and the joint fit from there."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid
 from fits.loop._misfit import without_impulses
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import Run, prepare_run, simulate_run
+from fits.loop._run import Progress, Run, prepare_run, simulate_run
 from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
 from fits.stage._moments import offsets_out
 from fits.stage._run import free_grid, hysteresis_of, named_parts, settled_samples, simulate_stage
@@ -37,7 +37,7 @@ class Plan:
     fraction: float
     range_V: tuple[float, float]
     loss: str
-    progress: Callable[[str], None]
+    progress: Progress
     gain: float | None
     hold: Hold
     accept_best: bool
