@@ -15,7 +15,7 @@ from fits.io._record import Record
 
 # Range of each quantity, by name: lowest and highest value.
 Ranges = dict[str, tuple[float, float]]
-AnyRanges = Mapping[str, tuple[float, float]]
+RangeMap = Mapping[str, tuple[float, float]]
 
 UNITS = {"voltage": "V", "slew": "V/s", "displacement": "um", "velocity": "um/s"}
 UNITS |= {"acceleration": "um/s^2", "current": "A/F"}
@@ -123,7 +123,7 @@ def reached_in(report: Mapping[str, Any]) -> Ranges:
     return joined(found)
 
 
-def joined(ranges: Iterable[AnyRanges]) -> Ranges:
+def joined(ranges: Iterable[RangeMap]) -> Ranges:
     """The smallest ranges that hold all of several."""
     found: Ranges = {}
     for one in ranges:
@@ -133,7 +133,7 @@ def joined(ranges: Iterable[AnyRanges]) -> Ranges:
     return found
 
 
-def allowed(reached: AnyRanges, stated: AnyRanges, margin: float) -> Ranges:
+def allowed(reached: RangeMap, stated: RangeMap, margin: float) -> Ranges:
     """Limits: what a user stated, or else what the records reached.
 
     Of what has no sign that matters, the larger size counts both ways. A predicted quantity may go by `margin` of its
@@ -157,7 +157,7 @@ def allowed(reached: AnyRanges, stated: AnyRanges, margin: float) -> Ranges:
     return found
 
 
-def compared(predicted: AnyRanges, limits: AnyRanges) -> tuple[Extreme, ...]:
+def compared(predicted: RangeMap, limits: RangeMap) -> tuple[Extreme, ...]:
     """What is predicted beside its limits, for all that is limited."""
     both = [name for name in UNITS if name in predicted and name in limits]
     return tuple(Extreme(name, *predicted[name], *limits[name]) for name in both)
@@ -169,12 +169,7 @@ def beyond(extremes: Iterable[Extreme]) -> tuple[Extreme, ...]:
 
 
 def check_command(
-    source: str,
-    predicted: AnyRanges,
-    reached: AnyRanges,
-    stated: AnyRanges,
-    margin: float,
-    spared: Collection[str] = (),
+    source: str, predicted: RangeMap, reached: RangeMap, stated: RangeMap, margin: float, spared: Collection[str] = ()
 ) -> list[str]:
     """Refuse, in a `DataError`, a command that leaves what the rig has shown; remarks come back.
 
@@ -224,7 +219,7 @@ def _below(value: float) -> str:
     return f"{-float(_above(-value)):.4g}"
 
 
-def ranges_json(ranges: AnyRanges) -> dict[str, list[float]]:
+def ranges_json(ranges: RangeMap) -> dict[str, list[float]]:
     """Ranges as a model file keeps them, each under its name with the unit, as in `velocity_um_per_s`."""
     return {_key(name): [float(low), float(high)] for name, (low, high) in ranges.items()}
 

@@ -27,12 +27,7 @@ _FEWEST_SAMPLES = 200
 
 
 def check_loops(
-    runs: Sequence[Run],
-    prepare: Callable[[Record], Run],
-    model: Preisach,
-    stroke_um: float,
-    hyper: Hyper,
-    robust: bool,
+    runs: list[Run], prepare: Callable[[Record], Run], model: Preisach, stroke_um: float, hyper: Hyper, robust: bool
 ) -> tuple[Misfit, list[str]]:
     """Say how far from noise a fitted hysteresis is, and what is wrong with its runs; errors of `disagreements`.
 

@@ -42,8 +42,8 @@ class ResidualView:
 
     look: Callable[[Sequence[RunView], float], list[Curve]]
     x_label: str
-    y_label: str
     caption: str
+    y_label: str = "residual"
     per: str = ""
     logarithmic: bool = False
     spectrum: bool = False
@@ -162,32 +162,28 @@ VIEWS: dict[View, ResidualView] = {
     "voltage": ResidualView(
         _over_voltage,
         "voltage (V)",
-        "residual",
         f"Solid while the voltage rises or last rose, dashed while it falls or last fell. {_BAND}",
     ),
-    "position": ResidualView(_over(attrgetter("measured_um")), "measured displacement (µm)", "residual", _BAND),
+    "position": ResidualView(_over(attrgetter("measured_um")), "measured displacement (µm)", _BAND),
     "velocity": ResidualView(
-        _over(lambda run: np.gradient(run.voltage_V, run.time_s), even=False),
-        "rate of the voltage (V/s)",
-        "residual",
-        _BAND,
+        _over(lambda run: np.gradient(run.voltage_V, run.time_s), even=False), "rate of the voltage (V/s)", _BAND
     ),
     "frequency": ResidualView(
         _spectrum,
         "frequency (Hz)",
-        "residual density",
         "Spectrum of the residual of the most finely sampled run; of each narrow band the largest value is drawn.",
+        "residual density",
         per="/√Hz",
         logarithmic=True,
         spectrum=True,
     ),
-    "time": ResidualView(_over_time, "time (s)", "residual", f"The longest run. {_BAND}"),
+    "time": ResidualView(_over_time, "time (s)", f"The longest run. {_BAND}"),
     "since_move": ResidualView(
         _since_move,
         "time since the last event (s)",
-        "change of the residual",
         "How the residual changes after the voltage starts, stops or turns; positive in the direction of the last "
         f"move. {_BAND}",
+        "change of the residual",
         logarithmic=True,
     ),
 }

@@ -112,11 +112,8 @@ def read_multisine(path: AnyPath) -> Multisine:
     starts = np.flatnonzero(np.append(True, np.any(np.diff(group) != 0, axis=0)))
     lengths, periods = np.diff(np.append(starts, group.shape[1])), len(np.unique(group[1]))
     order = np.lexsort(group[::-1, starts])
-    if (
-        len(set(lengths)) != 1
-        or np.any(order != np.arange(len(starts)))
-        or len(starts) != periods * len(np.unique(group[0]))
-    ):
+    whole = len(set(lengths)) == 1 and len(starts) == periods * len(np.unique(group[0]))
+    if not whole or np.any(order != np.arange(len(starts))):
         raise table.error(
             "expected every realization with the same periods of the same length, in order; cut or sort the rows",
             column="period",

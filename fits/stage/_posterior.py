@@ -155,7 +155,7 @@ def profile_stage(
     return Profile(name, at.unit, values, found, lower, upper)
 
 
-def _solved(stage: Stage, runs: Sequence[Run], hyper: Hyper | None, stroke_um: float) -> Solved:
+def _solved(stage: Stage, runs: list[Run], hyper: Hyper | None, stroke_um: float) -> Solved:
     """Fit what is free of a stage; a `ValueError` where nothing is."""
     fitted = free_grid(stage)
     if fitted is None:

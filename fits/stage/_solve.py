@@ -163,12 +163,7 @@ class Solved:
 
 
 def solve_chain(
-    problem: Problem,
-    runs: Sequence[Run],
-    loss: str,
-    progress: Progress,
-    rough: bool = False,
-    accept_best: bool = False,
+    problem: Problem, runs: list[Run], loss: str, progress: Progress, rough: bool = False, accept_best: bool = False
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
@@ -202,7 +197,7 @@ def solve_chain(
                 if damping > _HIGHEST and not (accept_best and number):
                     raise
                 if damping > _HIGHEST:
-                    return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
+                    return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
                 continue
             step, columns, hyper, variance, distance = found
             prior = prior_precision(chain, hyper, stroke_um)
@@ -228,13 +223,13 @@ def solve_chain(
             continue
         if distance < _STATIONARY:
             runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
-            return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
+            return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
     if rough or accept_best:
-        return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
+        return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
     raise FitError(FitStatus.MAX_STEPS)
 
 
-def try_chain(problem: Problem, runs: Sequence[Run], *settings: Any, **further: Any) -> Solved | None:
+def try_chain(problem: Problem, runs: list[Run], *settings: Any, **further: Any) -> Solved | None:
     """Fit as `solve_chain` does; None where that fails."""
     try:
         return solve_chain(problem, runs, *settings, **further)
@@ -256,8 +251,8 @@ def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
 
 
 def _gather(
-    problem: Problem, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[Run], loss: str, counted: Sequence[float]
-) -> tuple[Sequence[Run], list[RunSums], Weighing]:
+    problem: Problem, z: np.ndarray, columns_um: np.ndarray, runs: list[Run], loss: str, counted: Sequence[float]
+) -> tuple[list[Run], list[RunSums], Weighing]:
     chain, free = problem.chain, problem.hyper is not None
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)

@@ -68,10 +68,6 @@ class Plan:
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
         return prepare_run(record, *settings, usable, self.estimated)
 
-    def smoothed(self) -> "Plan":
-        """The same without readings that jump out and back, of which a start must not be read off."""
-        return replace(self, records=tuple(map(without_impulses, self.records)))
-
     def behind(self, solved: Solved) -> "Plan | None":
         """The same without what an unknown past reaches behind the lag that was found; None where that is hardly any.
 
@@ -92,7 +88,8 @@ class Plan:
 
 def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> Problem:
     """Read a hysteresis off the slow runs and poles off the others."""
-    plan, asked = plan.smoothed(), stage
+    # Readings that jump out and back are left out, as a start must not be read off them.
+    plan, asked = replace(plan, records=tuple(map(without_impulses, plan.records))), stage
     speed = [speed_Hz(record) for record in plan.records]
     slow = [k for k, one in enumerate(speed) if one <= 4.0 * min(speed)]
     fitted = free_grid(stage)
@@ -154,7 +151,7 @@ def _no_resonance(plan: Plan, name: str) -> str:
     )
 
 
-def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence[np.ndarray]) -> Problem | None:
+def _lagging(plan: Plan, problem: Problem, runs: list[Run], drives: Sequence[np.ndarray]) -> Problem | None:
     """Fit hysteresis and driver together, without mechanics; None where the driver's lag does not show."""
     stage, grid = problem.stage, problem.chain.grid
     drivers, mechanics = (named_parts(stage, kind) for kind in (Driver, Mechanics))
