@@ -112,9 +112,8 @@ def control(given: common.Given) -> None:
             f"--frequency: expected --controller {' or '.join(tuned_to)} with it, found {given.controller}; leave it "
             "out."
         )
-    common.refuse_overwriting(
-        given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])]
-    )
+    read = [given.model, given.reference, given.gains]
+    common.refuse_overwriting(given.out, [path for path in read if path is not None])
     progress = common.progress_to_stderr(given.quiet)
     known_gains = None if given.gains is None else late.read_gains(given.gains)
     loaded = late.load_model(given.model)

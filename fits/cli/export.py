@@ -28,6 +28,5 @@ def export(given: common.Given) -> None:
     # The inverse of mechanics needs the samples to come, which a controller does not have.
     static = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
     remarks = [static] if isinstance(stage, late.Stage) else []
-    common.print_result(
-        given, {"files": files, "remarks": remarks}, [*(f"Note: {remark}" for remark in remarks), *files]
-    )
+    lines = [*(f"Note: {remark}" for remark in remarks), *files]
+    common.print_result(given, {"files": files, "remarks": remarks}, lines)

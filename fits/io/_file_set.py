@@ -99,9 +99,8 @@ class _Folder:
 
     def refused(self, error: OSError) -> DataError:
         """Say that nothing can be put there."""
-        return DataError(
-            f"{self.shown}: files cannot be put there ({reason_of(error)}); choose another for {self.option}."
-        )
+        why = reason_of(error)
+        return DataError(f"{self.shown}: files cannot be put there ({why}); choose another for {self.option}.")
 
 
 class FileSet:

@@ -223,9 +223,8 @@ def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) ->
         voltage = np.pad(groups.voltage_V[piece].ravel(), (0, 4 * pad[1]), mode="edge")
         mix = np.pad(groups.mix[piece], (pad, (0, 0), (0, 0)))
         mixed, start = _regress(grid, table, jnp.asarray(voltage), start, jnp.asarray(mix))
-        beside = np.einsum("gij,gjk->gik", groups.mix[piece], past[piece]).reshape(
-            4 * len(past[piece]), past.shape[2]
-        )
+        shape = 4 * len(past[piece]), past.shape[2]
+        beside = np.einsum("gij,gjk->gik", groups.mix[piece], past[piece]).reshape(shape)
         rows = np.asarray(mixed)[: len(beside)]
         rows = np.concatenate([rows[:, :-1], beside, rows[:, -1:]], axis=1)
         for block in np.unique(groups.block[piece]):

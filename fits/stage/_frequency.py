@@ -43,9 +43,8 @@ class Multisine:
 
     def take(self, realizations: slice) -> "Multisine":
         """Some of the realizations, so that the others can be held out."""
-        return Multisine(
-            self.interval_s, self.voltage_V[realizations], self.displacement_um[realizations], self.source
-        )
+        u, y = self.voltage_V[realizations], self.displacement_um[realizations]
+        return Multisine(self.interval_s, u, y, self.source)
 
     def spectra(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
         """Excited lines in Hz, shape `(f,)`, and spectra of all periods, `(f, r, q, m)` and `(f, r, q, p)`."""
@@ -211,9 +210,8 @@ def read_response(path: AnyPath) -> ResponseData:
     else:
         size = 10 ** (first / 20) if magnitude == _DECIBEL else first
         response = size * np.exp(1j * (np.deg2rad(second) if phase == _DEGREES else second))
-    return ResponseData(
-        values["frequency_Hz"], response[:, None, None], values[_VARIANCE][:, None, None] if known else None
-    )
+    variance = values[_VARIANCE][:, None, None] if known else None
+    return ResponseData(values["frequency_Hz"], response[:, None, None], variance)
 
 
 def _one_of(table: Table, *names: str) -> str:

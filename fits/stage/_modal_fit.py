@@ -248,9 +248,7 @@ def _fit(start: _M, spectra: _Spectra, known: bool) -> ModalFit[_M]:
 def _moved(coordinates: Coordinates[_M], z: Float[Array, " n"], by: Float[Array, " n"]) -> _M:
     """Change of the model per change of the coordinates, zero where nothing moves."""
     model, change = eqx.filter_jvp(coordinates, (z,), (by,))
-    return jax.tree_util.tree_map(
-        lambda value, moved: jnp.zeros_like(value) if moved is None else moved, model, change
-    )
+    return jax.tree.map(lambda value, moved: jnp.zeros_like(value) if moved is None else moved, model, change)
 
 
 def _start(spectra: _Spectra, response: NDArray[Any], count: int) -> Modes:

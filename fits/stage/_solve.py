@@ -257,9 +257,7 @@ def _gather(
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
         # Outliers count linearly (Huber).
-        runs = [
-            replace(run, weight=huber_weight(residual, run.fitted)) for run, residual in zip(runs, left, strict=True)
-        ]
+        runs = [replace(run, weight=huber_weight(one, run.fitted)) for run, one in zip(runs, left, strict=True)]
     sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
     weighing = Weighing.of(runs, [one.residual_um for one in sums], *counted)
     return runs, sums, replace(weighing, least_noise_share=problem.least_noise_share)

@@ -109,11 +109,9 @@ class Precision:
         autocovariances (the sandwich of Newey & West 1987), to which comes what is not known of the columns.
         """
         size, answer = self.chain.size, self.answer()
+        columns, rest = answer[:size], answer[size:]
         # What nothing is known of stays unknown, whatever the residual.
-        held = (
-            answer[:size].T @ self.prior[:size, :size] @ answer[:size]
-            + NO_PRECISION * answer[size:].T @ answer[size:]
-        )
+        held = columns.T @ self.prior[:size, :size] @ columns + NO_PRECISION * rest.T @ rest
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
             held = held + sandwich(own, np.sqrt(run.fit_weight) * one.residual_um, run.fitted)
         return held
