@@ -134,7 +134,7 @@ def _refuse_ringing(run: Run) -> None:
     follows = float(np.average(shared, weights=power))
     if follows < 0.2:
         return
-    clear = (shared > min(0.3, follows)) & (power > np.median(power))
+    clear = (shared > min(0.3, follows)) & (power > np.median(power))  # lines whose gain is trusted
     gain = np.where(clear, np.abs(cross) / (power + 1e-300), 0.0)
     raise DataError(
         f"{run.record.source}: the displacement follows the voltage (coherence {follows:.2f}), but not at once, and "

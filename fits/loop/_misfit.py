@@ -88,7 +88,7 @@ def sensor_noise_um(record: Record, residual_um: np.ndarray) -> tuple[float, str
         # What settles is no noise.
         pieces.append(piece - np.polyval(np.polyfit(time, piece, min(3, len(piece) // 12)), time))
     found = []
-    if sum(map(len, pieces)) >= 150:
+    if sum(map(len, pieces)) >= 150:  # samples at rest say what the noise is
         joined = np.concatenate(pieces)
         found.append((1.4826 * float(np.median(np.abs(joined))), f"{record.source} at rest"))
     words = f"the fastest changes in {record.source}"
@@ -191,7 +191,7 @@ def impulsive(residual_um: np.ndarray, digit_um: float = 0.0) -> np.ndarray:
     """Mark readings that are far off their neighbours, in last digits, too, shape `(n,)`."""
     off = _height(residual_um)
     spread = np.maximum(median_filter(off, 101, mode="nearest"), max(float(np.median(off)), digit_um))
-    far = off > 8.0 * 1.4826 * spread + 1e-300
+    far = off > 8.0 * 1.4826 * spread + 1e-300  # eight standard deviations
     # What rings, or turns back, goes on as fast as it came: its neighbours move about as far from sample to sample.
     steps = np.abs(np.diff(residual_um, append=residual_um[-1]))
     far &= off > 4.0 * median_filter(steps, 33, mode="nearest")

@@ -125,7 +125,7 @@ def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
         place = int(np.searchsorted(order, total * k / _PLACES))
         if min(order[place], total - order[place]) < _FEWEST_SAMPLES:
             continue
-        for _ in range(4):
+        for _ in range(4):  # each round moves the place to where it is best
             first, second = parts(place)
             if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST_SAMPLES:
                 break

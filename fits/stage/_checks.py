@@ -96,7 +96,7 @@ def refuse_unidentifiable(
     if len(unidentified) == len(poles) or not seen:
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
-        if noise[loudest] > 3.0 * min(noise):
+        if noise[loudest] > 3.0 * min(noise):  # it moves in ways that its samples do not show
             check_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
             what = (

@@ -182,7 +182,7 @@ def fit_without_delays(
         step = np.zeros(len(shifts))
         step[first] = more[first].delay_s
         # Where a parameter is at its bound, a line goes too far.
-        for _ in range(4):
+        for _ in range(4):  # halvings
             plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts + step)} ms")
             start = replace(start, z=found.z, columns_um=found.columns_um)
             again = _solved_with(plan, start, solved.runs[0].stride, shifts + step)

@@ -254,7 +254,7 @@ def _sentence(direction: np.ndarray, names: Sequence[str]) -> str:
     # A parameter at its bound does not move with its coordinate.
     direction = np.where(np.isfinite(direction), direction, 0.0)
     size = np.abs(direction)
-    moved = [k for k in np.argsort(-size, kind="stable") if size[k] > 0.15 * size.max()]
+    moved = [k for k in np.argsort(-size, kind="stable") if size[k] > 0.15 * size.max()]  # others are faint
     if not moved:
         return f"some combination of {', '.join(names)} is not seen in these runs"
     if len(moved) == 1:

@@ -91,7 +91,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     # Readings that jump out and back are left out, as a start must not be read off them.
     plan, asked = replace(plan, records=tuple(map(without_impulses, plan.records))), stage
     speed = [speed_Hz(record) for record in plan.records]
-    slow = [k for k, one in enumerate(speed) if one <= 4.0 * min(speed)]
+    slow = [k for k, one in enumerate(speed) if one <= 4.0 * min(speed)]  # all others are fast
     fitted = free_grid(stage)
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
     runs = plan.runs(1)

@@ -84,7 +84,7 @@ def _compare(power: FloatArray) -> tuple[FloatArray, FloatArray]:
     # Near 0 Hz and half the rate a lobe meets its own mirror image.
     reach = np.minimum(bins // 2, len(power) - 1 - _LOBE - bins)
     sides = np.clip((reach - _LOBE - 1) // _STRIDE + 1, 0, _SIDE)
-    sides[:20] = 0
+    sides[:20] = 0  # cycles within the record
     chance, floor = np.ones(len(power)), np.zeros(len(power))
     for side in range(1, _SIDE + 1):
         # The median of 2 * side powers is the side-th smallest; these many are left as each is passed.
@@ -204,7 +204,7 @@ def _strongest(power: np.ndarray, inside: np.ndarray) -> tuple[int, int, float, 
     A band wider than a bin counts where its mean is stronger by far: noise may be low in the very middle of a band.
     """
     found = []
-    for wide in (1, 4, 16, 64):
+    for wide in (1, 4, 16, 64):  # bins
         if _ROOM * wide > inside.sum():
             break
         reach = max(len(power) // 16, _ROOM * wide // 2)
@@ -225,4 +225,4 @@ def _steady(values: np.ndarray, middle: float, width: float) -> bool:
     frequency = np.fft.rfftfreq(len(values))
     part = np.fft.irfft(np.where(np.abs(frequency - middle) < width / 2, spectrum, 0.0), len(values))
     blocks = np.sort([float(block @ block) for block in np.array_split(part, 8)])
-    return bool(blocks[1] > 0.25 * blocks.mean())
+    return bool(blocks[1] > 0.25 * blocks.mean())  # as nearly every eighth of a record has
