@@ -5,10 +5,9 @@ the command's help does not wait for JAX and pandas.
 """
 # ruff: noqa: F401
 
-import ast
-import importlib
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from fits.io._late import late as _late
 
 if TYPE_CHECKING:
     from fits.control._compensate import Compensation, compensate
@@ -57,27 +56,8 @@ if TYPE_CHECKING:
     from fits.sweeps._run import Outcome, run_sweep
     from fits.sweeps._show import open_sweep
     from fits.sweeps._spec import Sweep, read_sweep
+else:
+    _HOMES, __getattr__ = _late(__name__, __file__)
 
-
-def _read_homes() -> dict[str, str]:
-    """Read the imports above: the module of each public name."""
-    nodes = ast.walk(ast.parse(Path(__file__).read_text(encoding="utf-8")))
-    return {
-        alias.name: str(node.module)
-        for node in nodes
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("fits.")
-        for alias in node.names
-    }
-
-
-_HOMES = _read_homes()
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(_HOMES)
+    def __dir__():
+        return sorted(_HOMES)

@@ -1,11 +1,9 @@
-"""What the commands share: bad input and interruptions in sentences, places to read and write, and what is told.
-
-Of other packages only click is imported before a command runs, so that help does not wait for JAX.
-"""
+"""What the commands share: bad input and interruptions in sentences, places to read and write, and what is told."""
 
 import contextlib
 import errno
 import functools
+import math
 import os
 import re
 import signal
@@ -20,15 +18,12 @@ from typing import Any, NoReturn
 
 import click
 
-from fits.io._errors import DataError
+from fits.cli import _late as late
+from fits.io._errors import DataError, without_middle
 from fits.io._file_set import discard_all
 from fits.io._printable import printable
 
-# Signals that ask the command to end.
-_SIGNALS = ("SIGTERM", "SIGHUP", "SIGINT")
 NOTHING_LEFT = "no unfinished file was left"
-_AGAIN_s = 0.05
-_DEFAULT_HOLDOUT = 0.2
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*([a-zµμ]+)\s*")
 
 
@@ -53,7 +48,7 @@ def heed_signals() -> None:
         except Stopped as end:
             leave(end)
 
-    for name in _SIGNALS:
+    for name in ("SIGTERM", "SIGHUP", "SIGINT"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, stop)
@@ -82,7 +77,7 @@ def _again(lost: Any) -> None:
         sys.__unraisablehook__(lost)
         return
     number = stop.number if isinstance(stop, Terminated) else signal.SIGINT
-    timer = threading.Timer(_AGAIN_s, os.kill, (os.getpid(), number))
+    timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
     timer.daemon = True
     timer.start()
 
@@ -90,9 +85,9 @@ def _again(lost: Any) -> None:
 def stopped(stop: KeyboardInterrupt, what: str) -> NoReturn:
     """Say that the command was stopped, and what is left, and end with the status that shells have for it."""
     discard_all()
-    by_signal = isinstance(stop, Terminated)
-    click.echo(f"{'Terminated' if by_signal else 'Interrupted'}: {what}.", err=True)
-    raise Stopped(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))
+    said, number = ("Terminated", stop.number) if isinstance(stop, Terminated) else ("Interrupted", signal.SIGINT)
+    click.echo(f"{said}: {what}.", err=True)
+    raise Stopped(128 + number)
 
 
 def system_refuses(error: OSError) -> NoReturn:
@@ -125,8 +120,10 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
             command(Given(**options))
         except KeyboardInterrupt as stop:
             stopped(stop, NOTHING_LEFT)
-        except DataError as error:
-            sentence = printable(" ".join(str(error).split()))
+        except (DataError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and not isinstance(error, late.FitError):
+                raise
+            sentence = printable(" ".join(without_middle(str(error)).split()))
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
             sys.exit(2)
         except OSError as error:
@@ -147,10 +144,9 @@ def progress_to_stderr(quiet: bool) -> Callable[[str], None]:
 
 
 def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], None]:
-    """Make what draws on stderr how far the work has come, a step for each stage that is announced.
+    """Make what draws on stderr how far the work has come: a step for each stage, which is announced by itself.
 
-    A stage is announced by itself; other sentences tell of details. On a terminal the bar stays in its line;
-    elsewhere each sentence has its own.
+    Other sentences tell of details. On a terminal the bar stays in its line; elsewhere each sentence has its own.
     """
     began, at = time.monotonic(), 0
 
@@ -172,9 +168,7 @@ def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], Non
 
 def print_result(given: Given, content: Any, lines: Iterable[str]) -> None:
     """Print a result: as JSON where that is asked for, else in lines."""
-    from fits.io._atomic import finite_json
-
-    click.echo(finite_json(content) if given.as_json else "\n".join(lines))
+    click.echo(late.finite_json(content) if given.as_json else "\n".join(lines))
 
 
 def paths_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
@@ -190,14 +184,12 @@ def with_paths(words: str, places: Iterable[tuple[str, str | None]]) -> str:
 
 def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:
     """Tell a fraction from files."""
+    if not given:
+        return 0.2, []
     numbers = []
     for text in given:
-        try:
+        with contextlib.suppress(ValueError):
             numbers.append(float(text))
-        except ValueError:
-            continue
-    if not given:
-        return _DEFAULT_HOLDOUT, []
     if not numbers:
         return 0.0, list(given)
     if len(given) > 1:
@@ -209,14 +201,11 @@ def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:
 
 def length_mm(option: str, text: str, units: Sequence[str], example: str) -> float:
     """Read a length with one of some units, such as `0.02mm`, in mm."""
-    from fits.io._quantity import Quantity
-
-    length = Quantity("length", "mm", {"mm": 0, "um": -3, "µm": -3, "μm": -3, "m": 3})
-    found = _LENGTH.fullmatch(text)
-    try:
-        number = float(found[1]) if found and found[2] in units else 0.0
-    except ValueError:
-        number = 0.0
+    length = late.Quantity("length", "mm", {"mm": 0, "um": -3, "µm": -3, "μm": -3, "m": 3})
+    found, number = _LENGTH.fullmatch(text), 0.0
+    if found and found[2] in units:
+        with contextlib.suppress(ValueError):
+            number = float(found[1])
     if not (found and 0 < number < float("inf")):
         raise DataError(
             f"{option}: expected a length above 0 with its unit, found '{text}'; write one such as {example}."
@@ -235,9 +224,54 @@ def refuse_clashes(places: dict[str, str | None]) -> None:
     """Refuse to write where is read, or twice to one place."""
     seen: dict[str, str] = {}
     for option, place in places.items():
-        if place is None:
-            continue
-        real = os.path.realpath(place)
-        if real in seen:
-            raise DataError(f"{option}: {place} would overwrite the file of {seen[real]}; choose another name.")
-        seen[real] = option
+        if place is not None and (first := seen.setdefault(os.path.realpath(place), option)) != option:
+            raise DataError(f"{option}: {place} would overwrite the file of {first}; choose another name.")
+
+
+def stage_or_preisach(path: str, loaded: "late.ModelFile") -> "late.Preisach | late.Stage":
+    """Return the stage or the hysteresis that a model file holds; a `DataError` where it holds neither."""
+    if isinstance(loaded.model, late.Preisach | late.Stage):
+        return loaded.model
+    raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
+
+
+def hysteresis(model: "late.Preisach | late.Stage") -> "late.Preisach":
+    """The hysteresis of a model, as slow voltages see it."""
+    return late.static_equivalent(model) if isinstance(model, late.Stage) else model
+
+
+def predicted_by(path: str, loaded: "late.ModelFile", program: "late.Record", initial: str) -> "late.Prediction":
+    """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
+    model = stage_or_preisach(path, loaded)
+    if loaded.uncertainty is None and isinstance(model, late.Preisach):
+        raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
+    return late.predict(model, loaded.uncertainty, program, initial)
+
+
+def parse_rig_limits(
+    volts: str | None, limit: Sequence[str], margin: float
+) -> tuple[tuple[float, float] | None, dict[str, tuple[float, float]]]:
+    """Read `--limits`, `--limit` and `--margin`: the range of the command in V, and what else is stated."""
+    stated = late.parse_limits(limit)
+    late.allowed({}, stated, margin)
+    both = parse_limits_V(volts)
+    if "voltage" in stated and both is not None:
+        raise DataError("--limit voltage: --limits states that already; leave one of them out.")
+    return both or stated.get("voltage"), stated
+
+
+def parse_limits_V(text: str | None) -> tuple[float, float] | None:
+    """Read `--limits`: two voltages, or None."""
+    if text is None:
+        return None
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise DataError(
+            f"--limits: expected two voltages such as 0,100, found '{text}'; write LOW,HIGH in V."
+        ) from None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise DataError(
+            f"--limits: expected two finite voltages, the lower one first, found '{text}'; write LOW,HIGH in V."
+        )
+    return low, high

@@ -1,7 +1,4 @@
-"""The `microid` command.
-
-Only the standard library and click are imported before a command runs.
-"""
+"""The `microid` command: only the standard library and click are imported before one of its commands runs."""
 
 import importlib
 import io

@@ -1,7 +1,4 @@
-"""Options that several commands have, each declared once.
-
-Each command is one file of this folder, named after it, and declares there what it has alone.
-"""
+"""Options that several commands have, each declared once; a command's own file declares what it has alone."""
 
 from collections.abc import Callable
 from typing import Any

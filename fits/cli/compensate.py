@@ -2,8 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, paths_in, print_result, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
@@ -24,8 +25,8 @@ from fits.io._file_set import file_set
 @options.plots("a plot")
 @options.columns
 @options.json_output
-@in_sentences
-def compensate(given: Given) -> None:
+@common.in_sentences
+def compensate(given: common.Given) -> None:
     """Find the voltage that makes the stage follow a reference.
 
     REFERENCE.csv needs the columns time_s and displacement_um: what the sensor is to read, its offset included. The
@@ -33,50 +34,35 @@ def compensate(given: Given) -> None:
     """
     import numpy as np
 
-    from fits.cli._models import parse_rig_limits, predicted_by, stage_or_preisach
-    from fits.control._compensate import compensate
-    from fits.control._compensate_stage import static_equivalent
-    from fits.io._atomic import refuse_nonfinite, write_csv
-    from fits.io._jax_setup import start_jax
-    from fits.io._limits import check_command, reached_in
-    from fits.io._read_csv import read_reference
-    from fits.io._record import Record
-    from fits.io._units import parse_columns
-    from fits.plots._control import plot_compensation
-    from fits.stage._model_file import load_model
-    from fits.stage._motion import predicted_ranges
-    from microid import Preisach, Stage
-
-    refuse_overwriting(given.out, [given.model, given.reference])
-    volts, stated = parse_rig_limits(given.limits, given.limit, given.margin)
-    start_jax()
-    loaded = load_model(given.model)
-    stage = stage_or_preisach(given.model, loaded)
-    if given.way == "dynamic" and isinstance(stage, Preisach):
+    common.refuse_overwriting(given.out, [given.model, given.reference])
+    volts, stated = common.parse_rig_limits(given.limits, given.limit, given.margin)
+    late.start_jax()
+    loaded = late.load_model(given.model)
+    stage = common.stage_or_preisach(given.model, loaded)
+    if given.way == "dynamic" and isinstance(stage, late.Preisach):
         raise DataError(
             f"{given.model}: expected a model with mechanics for --dynamic, found a Preisach model, which has none; "
             "leave out --dynamic, or fit a whole stage."
         )
-    wanted = read_reference(given.reference, parse_columns(given.columns))
+    wanted = late.read_reference(given.reference, late.parse_columns(given.columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
-        found = compensate(stage, wanted, given.initial, given.clip, volts, given.way)
-        program = Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
+        found = late.compensate(stage, wanted, given.initial, given.clip, volts, given.way)
+        program = late.Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
         every = bool({"velocity", "acceleration", "current"} & set(stated))
-        predicted = predicted_ranges(stage, program, found.displacement_um, given.initial, every)
-        said = check_command(wanted.source, predicted, reached_in(loaded.report), stated, given.margin)
+        predicted = late.predicted_ranges(stage, program, found.displacement_um, given.initial, every)
+        said = late.check_command(wanted.source, predicted, late.reached_in(loaded.report), stated, given.margin)
         sd_um = None
         if loaded.uncertainty is not None:
-            sd_um = predicted_by(given.model, loaded, program, given.initial).displacement_sd_um
-            refuse_nonfinite("displacement_sd_um", sd_um)
-        drawn = []
-        if drawings is not None:
-            drawn = plot_compensation(stage, wanted, found, sd_um, drawings, initial=given.initial)
+            sd_um = common.predicted_by(given.model, loaded, program, given.initial).displacement_sd_um
+            late.refuse_nonfinite("displacement_sd_um", sd_um)
+        to_draw = stage, wanted, found, sd_um
+        drawn = [] if drawings is None else late.plot_compensation(*to_draw, drawings, initial=given.initial)
         table = {"time_s": wanted.time_s, "voltage_V": found.voltage_V, "displacement_um": found.displacement_um}
-        write_csv(unfinished, table)
+        late.write_csv(unfinished, table)
     off = np.abs(found.displacement_um - found.reference_um)
-    places = paths_in(given.plots, drawn)
+    places = common.paths_in(given.plots, drawn)
     remarks = [*wanted.warnings, *found.remarks, *said]
     summary = {
         "out": given.out,
@@ -85,7 +71,7 @@ def compensate(given: Given) -> None:
         "clipped": int(found.clipped.sum()),
         "voltage_min_V": float(found.voltage_V.min()),
         "voltage_max_V": float(found.voltage_V.max()),
-        "offset_um": float((static_equivalent(stage) if isinstance(stage, Stage) else stage).offset_um),
+        "offset_um": float(common.hysteresis(stage).offset_um),
         "error_max_um": float(off.max()),
         "error_max_within_reach_um": float(off[~found.clipped].max(initial=0.0)),
         "displacement_sd_median_um": None if sd_um is None else float(np.median(sd_um)),
@@ -104,4 +90,4 @@ def compensate(given: Given) -> None:
         lines.append(f"clipped        at {summary['clipped']} of the samples, off by at most {off.max():.3g} um")
     lines += [f"Note: {remark}" for remark in remarks]
     lines += [f"voltage        {given.out}", *(f"plot           {place}" for place in places)]
-    print_result(given, summary, lines)
+    common.print_result(given, summary, lines)

@@ -1,28 +1,22 @@
 """The command `microid control`: its options, and the work."""
 
-from __future__ import annotations
-
 import importlib.util
 import pkgutil
 from pathlib import Path
 
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, paths_in, progress_to_stderr, refuse_overwriting
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
-_PLANTS = 4
 # Finer steps, of um or V, are none.
 _FINEST, _LARGEST = 1e-9, 1e9
 # Fields of the goal by the options that state them.
-_LIMITS = {
-    "gain_margin": "gain_margin_min",
-    "phase_margin": "phase_margin_min_deg",
-    "peak": "sensitivity_peak_max",
-    "overshoot": "overshoot_max_pct",
-}
+_LIMITS = {"gain_margin": "gain_margin_min", "phase_margin": "phase_margin_min_deg"}
+_LIMITS |= {"peak": "sensitivity_peak_max", "overshoot": "overshoot_max_pct"}
 # The least that options may be.
 _LEAST = dict.fromkeys(("noise", "effort", "rate", "skip"), 0.0)
 _LEAST |= {"gain_margin": 1.0, "phase_margin": 1.0, "peak": 1.0, "overshoot": 0.0}
@@ -89,8 +83,8 @@ def _names() -> list[str]:
 @options.columns
 @options.json_output
 @options.quiet
-@in_sentences
-def control(given: Given) -> None:
+@common.in_sentences
+def control(given: common.Given) -> None:
     """Tune a controller on a model, and run it along a reference.
 
     REFERENCE.csv needs the columns time_s, in even steps, and displacement_um: what the sensor is to read, its offset
@@ -100,25 +94,6 @@ def control(given: Given) -> None:
     """
     import numpy as np
 
-    from fits.cli._models import parse_rig_limits, stage_or_preisach
-    from fits.control._gains import read_gains
-    from fits.control._make import Loop, Maker
-    from fits.control._setup import held, setup
-    from fits.control._tune_problem import Goal
-    from fits.control._tune_result import passed_limits
-    from fits.io._atomic import finite_json, write_csv
-    from fits.io._jax_setup import start_jax
-    from fits.io._limits import check_command, joined, reached_in
-    from fits.io._read_csv import read_reference
-    from fits.io._record import Record
-    from fits.io._units import parse_columns
-    from fits.loop._result import FitError
-    from fits.report._control import control_json, describe_control
-    from fits.stage._model_file import load_model
-    from fits.stage._motion import predicted_ranges
-    from fits.stage._uncertainty import draw_plants
-    from microid import CONTROLLERS, Stage
-
     for name, least in _LEAST.items():
         value = getattr(given, name)
         if value is not None and not least <= value <= _LARGEST:
@@ -126,29 +101,29 @@ def control(given: Given) -> None:
     for name in ("resolution", "resolution_voltage"):
         step = getattr(given, name)
         if step is not None and not _FINEST <= step <= _LARGEST:
-            allowed = f"{_FINEST:g} to {_LARGEST:g}"
-            raise DataError(f"{_option(name)}: expected {allowed}, found {step:g}; leave it out for none.")
+            steps = f"{_FINEST:g} to {_LARGEST:g}, found {step:g}"
+            raise DataError(f"{_option(name)}: expected {steps}; leave it out for none.")
     stated = {_option(name): getattr(given, name) for name in _LIMITS}
-    volts, allowed_here = parse_rig_limits(given.limits, given.limit, given.margin)
-    start_jax()
-    tuned_to = [name for name, each in CONTROLLERS.items() if "frequency_Hz" in each.own]
+    volts, allowed_here = common.parse_rig_limits(given.limits, given.limit, given.margin)
+    late.start_jax()
+    tuned_to = [name for name, each in late.CONTROLLERS.items() if "frequency_Hz" in each.own]
     if given.frequency and given.controller not in tuned_to:
         raise DataError(
             f"--frequency: expected --controller {' or '.join(tuned_to)} with it, found {given.controller}; leave it "
             "out."
         )
-    refuse_overwriting(given.out, [given.model, given.reference, *([] if given.gains is None else [given.gains])])
-    progress = progress_to_stderr(given.quiet)
-    known_gains = None if given.gains is None else read_gains(given.gains)
-    loaded = load_model(given.model)
-    known = loaded.uncertainty is not None
-    plant = stage_or_preisach(given.model, loaded)
-    wanted = read_reference(given.reference, parse_columns(given.columns))
+    read = [given.model, given.reference, given.gains]
+    common.refuse_overwriting(given.out, [path for path in read if path is not None])
+    progress = common.progress_to_stderr(given.quiet)
+    known_gains = None if given.gains is None else late.read_gains(given.gains)
+    loaded = late.load_model(given.model)
+    plant = common.stage_or_preisach(given.model, loaded)
+    wanted = late.read_reference(given.reference, late.parse_columns(given.columns))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with file_set() as files:
         unfinished, drawings = files.file(given.out), files.folder(given.plots)
         try:
-            ready = setup(plant, wanted, given.feedforward, initial=given.initial, limits_V=volts)
+            ready = late.setup(plant, wanted, given.feedforward, initial=given.initial, limits_V=volts)
         except DataError as error:
             if not error.of_model:
                 raise
@@ -157,18 +132,18 @@ def control(given: Given) -> None:
         if skipped > len(wanted) - 2:
             longest = f"the reference's {wanted.time_s[-1]:g} s"
             raise DataError(f"--skip: expected less than {longest}, found {given.skip:g} s.")
-        count = given.plants or (_PLANTS if known else 1)
-        nominal = held(plant) if isinstance(plant, Stage) else plant
-        stages = draw_plants(nominal, loaded.uncertainty, count, seed=given.seed)
+        count = given.plants or (1 if loaded.uncertainty is None else 4)
+        nominal = late.held(plant) if isinstance(plant, late.Stage) else plant
+        stages = [late.held(one) for one in late.draw_plants(nominal, loaded.uncertainty, count, seed=given.seed)]
         limits_of = {field: bound for name, field in _LIMITS.items() if (bound := getattr(given, name)) is not None}
-        goal = Goal(given.effort, given.rate, **limits_of)
+        goal = late.Goal(given.effort, given.rate, **limits_of)
         rng = np.random.default_rng(given.seed)
-        loop = Loop(ready, [held(one) for one in stages], given.noise, given.delay, given.resolution, skipped)
+        loop = late.Loop(ready, stages, given.noise, given.delay, given.resolution, skipped)
         noise = rng.normal(0, given.noise, len(wanted)) if given.noise else None
-        tune = Maker(loop, goal, given.starts, given.seed, noise, progress)
+        tune = late.Maker(loop, goal, given.starts, given.seed, noise, progress)
         try:
             made = tune.make(given.controller, known_gains, given.frequency)
-        except FitError as error:
+        except late.FitError as error:
             raise DataError(f"{given.model}: {error}.") from error
         every = loop.margins(made.controller)
         if not all(bool(one.stable) for one in every):
@@ -178,40 +153,30 @@ def control(given: Given) -> None:
             )
         progress("run")
         heard = rng.normal(0, given.noise, len(wanted)) if given.noise else None
-        asked = 1 if given.overshoot is None else len(loop.plants)
         played = [loop.run(made.controller, heard, given.resolution_voltage, k) for k in range(len(loop.plants))]
-        runs, run = played[:asked], played[0]
+        run = played[0]
         if not all(np.all(np.isfinite(one.error_um)) for one in played):
             raise DataError(f"{given.model}: the loop is unstable, its displacement has no bounds; lower --gains.")
-        passed = passed_limits(goal, every, runs)
+        passed = late.passed_limits(goal, every, played[:1] if given.overshoot is None else played)
         in_motion = bool({"velocity", "acceleration", "current"} & set(allowed_here))
-        predicted = joined(
-            predicted_ranges(
-                one,
-                Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source),
-                np.asarray(ran.displacement_um),
-                given.initial,
-                in_motion,
-            )
-            for one, ran in zip(loop.plants, played, strict=True)
-        )
+        predicted = []
+        for one, ran in zip(loop.plants, played, strict=True):
+            program = late.Record(wanted.time_s, np.asarray(ran.command_V), None, source=wanted.source)
+            moved_um = np.asarray(ran.displacement_um)
+            predicted.append(late.predicted_ranges(one, program, moved_um, given.initial, in_motion))
         # Sensor noise alone makes a loop's command jump from sample to sample.
-        said = check_command(
-            wanted.source, predicted, reached_in(loaded.report), allowed_here, given.margin, spared=("slew",)
-        )
+        limits = late.reached_in(loaded.report), allowed_here, given.margin
+        said = late.check_command(wanted.source, late.joined(predicted), *limits, spared=("slew",))
         more = [*made.remarks, *said, *_judged(passed, stated, given.controller, known_gains is not None)]
         names = ("time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um")
         table = {name: np.asarray(getattr(run, name)) for name in names}
-        write_csv(unfinished, table | {"time_s": wanted.time_s})
-        drawn: list[Path] = []
-        if drawings is not None:
-            from fits.plots._control import plot_control
-
-            drawn = plot_control(run, made.controller, loop.plants, drawings, delay=given.delay)
-        about = {"controller": given.controller, "out": given.out, "plots": paths_in(given.plots, drawn)}
+        late.write_csv(unfinished, table | {"time_s": wanted.time_s})
+        to_draw = run, made.controller, loop.plants
+        drawn = [] if drawings is None else late.plot_control(*to_draw, drawings, delay=given.delay)
+        about = {"controller": given.controller, "out": given.out, "plots": common.paths_in(given.plots, drawn)}
         # Before the file is in its place: what cannot be told is not left behind either.
-        summary = control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
-        told = finite_json(summary) if given.as_json else describe_control(summary)
+        summary = late.control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
+        told = late.finite_json(summary) if given.as_json else late.describe_control(summary)
     click.echo(told)
 
 
@@ -221,15 +186,13 @@ def _option(name: str) -> str:
 
 def _judged(passed: dict[str, str], stated: dict[str, float | None], kind: str, given: bool) -> list[str]:
     """What is said of limits that are passed; those that were asked for are not."""
-    from microid import CONTROLLERS
-
     remarks = []
     for option, words in passed.items():
         if stated[option] is None:
             remarks.append(f"a limit that tuning keeps by default is passed: {words} ({option})")
         elif given:
             raise DataError(f"{option}: {words}; choose other --gains, or leave them out to have them tuned.")
-        elif CONTROLLERS[kind].learns:
+        elif late.CONTROLLERS[kind].learns:
             raise DataError(f"{option}: {words} while {kind} learns; relax it, or choose pid.")
         else:
             # Tuning kept it under the noise it heard.

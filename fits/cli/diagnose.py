@@ -1,34 +1,21 @@
 """The command `microid diagnose`: its options, and the work."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-if TYPE_CHECKING:
-    from fits.diagnosis._result import Diagnosis
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import (
-    Given,
-    bar_to_stderr,
-    fraction_or_files,
-    in_sentences,
-    paths_in,
-    print_result,
-    refuse_overwriting,
-)
 from fits.io._errors import DataError
-from fits.io._file_set import file_set
+from fits.io._file_set import file_set, usable_folder
 
 _REPORT, _JSON, _BASELINE, _EXTENDED = "report.html", "diagnosis.json", "baseline.json", "extended.json"
 _PROGRAM = "next_experiment.csv"
 _LONGEST_s = 1e5
-_WIDEST = 10.0
-_FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
 
 
 @click.command()
@@ -45,72 +32,48 @@ _FILES = (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM)
 @options.columns
 @options.json_output
 @options.quiet
-@in_sentences
-def diagnose(given: Given) -> None:
+@common.in_sentences
+def diagnose(given: common.Given) -> None:
     """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.
 
     Writes report.html, diagnosis.json, the plain and the extended stage, and the voltages of the next experiment.
     Name the runs in the order in which they were taken. A column that begins with temp, and one of a second axis in
     um, nm, mm or m, are used. The end of every run is kept aside to check what is found.
     """
-    from fits.io._file_set import usable_folder
-    from fits.io._jax_setup import start_jax
-    from fits.io._limits import parse_limits
-    from fits.io._read_csv import read_csv, read_runs
-    from fits.io._units import parse_columns
-    from fits.loop._result import FitError
-
     if not 0 < given.false_alarm <= 0.5:
         raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {given.false_alarm:g}.")
     if given.duration is not None and not 0 < given.duration <= _LONGEST_s:
         raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {given.duration:g}.")
-    if not 0 <= given.margin <= _WIDEST:
-        raise DataError(
-            f"--margin: expected a share of the ranges reached, 0 to {_WIDEST:g}, found {given.margin:g}."
-        )
-    limits = parse_limits(given.limit)
-    mapping = parse_columns(given.columns)
-    fraction, files = fraction_or_files(given.holdout)
-    for name in _FILES:
-        refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
+    if not 0 <= given.margin <= 10:
+        raise DataError(f"--margin: expected a share of the ranges reached, 0 to 10, found {given.margin:g}.")
+    limits, mapping = late.parse_limits(given.limit), late.parse_columns(given.columns)
+    fraction, files = common.fraction_or_files(given.holdout)
+    for name in (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM):
+        common.refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
     # Before the work, so that a place that cannot be written to is refused before the wait.
     usable_folder(given.out, "--out")
-    start_jax()
-    from fits.diagnosis._result import Step
-
-    progress = bar_to_stderr(given.quiet, tuple(Step))
-    records = read_runs(given.runs, mapping)
-    aside = [read_csv(file, mapping) for file in files]
-    # Not before the files are read: this takes as long as all that.
-    from fits.diagnosis._diagnose import diagnose
-
-    try:
-        diagnosis: Diagnosis = diagnose(
-            records,
-            holdout=aside or fraction,
-            false_alarm=given.false_alarm,
-            duration_s=given.duration,
-            initial=given.initial,
-            limits=limits,
-            margin=given.margin,
-            progress=progress,
-        )
-    except FitError as error:
-        raise DataError(f"{error}.") from error
-    progress(Step.WRITING)
-    from fits.report._diagnosis_json import diagnosis_json
-
-    content = diagnosis_json(diagnosis)
+    late.start_jax()
+    progress = common.bar_to_stderr(given.quiet, tuple(late.Step))
+    records = late.read_runs(given.runs, mapping)
+    aside = [late.read_csv(file, mapping) for file in files]
+    diagnosis = late.diagnose(
+        records,
+        holdout=aside or fraction,
+        false_alarm=given.false_alarm,
+        duration_s=given.duration,
+        initial=given.initial,
+        limits=limits,
+        margin=given.margin,
+        progress=progress,
+    )
+    progress(late.Step.WRITING)
+    content = late.diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)
-    print_result(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
+    common.print_result(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
 
 
-def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[str]:
+def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> list[str]:
     """Write all files, or none; their names come back."""
-    from fits.io._atomic import finite_json, write_csv
-    from fits.io._limits import ranges_json
-    from fits.report._diagnosis import report_html
-    from fits.stage._model_file import model_text
 
     def model(which: str) -> str:
         stage = diagnosis.baseline if which == "baseline" else diagnosis.extended
@@ -118,19 +81,16 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
         uncertainty: Any = diagnosis.details.get(f"{which}_uncertainty")
         try:
             # Their own displacement is without an offset.
-            runs = [{"offset_um": 0.0, "reached": ranges_json(one)} for one in diagnosis.details.get("reached", ())]
+            reached = [late.ranges_json(one) for one in diagnosis.details.get("reached", ())]
+            runs = [{"offset_um": 0.0, "reached": one} for one in reached]
             about = {"part_of": "diagnosis", "stage": which, "runs": runs}
-            return model_text(stage, uncertainty, about)
+            return late.model_text(stage, uncertainty, about)
         except DataError as error:
             raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error
 
     # All are composed before the first is written.
-    texts = {
-        _REPORT: report_html(diagnosis),
-        _JSON: f"{finite_json(content)}\n",
-        _BASELINE: model("baseline"),
-        _EXTENDED: model("extended"),
-    }
+    texts = {_REPORT: late.report_html(diagnosis), _JSON: f"{late.finite_json(content)}\n"}
+    texts |= {_BASELINE: model("baseline"), _EXTENDED: model("extended")}
     ahead = diagnosis.next_experiment
     with file_set() as files:
         place = files.folder(out, "--out")
@@ -138,14 +98,14 @@ def _write(diagnosis: "Diagnosis", content: dict[str, Any], out: str) -> list[st
             (place / name).write_text(text, encoding="utf-8")
         if ahead is not None:
             said = [f"predicted {one}" for one in ahead.extremes]
-            write_csv(place / _PROGRAM, {"time_s": ahead.time_s, "voltage_V": ahead.voltage_V}, said)
+            late.write_csv(place / _PROGRAM, {"time_s": ahead.time_s, "voltage_V": ahead.voltage_V}, said)
         else:
             # One of an earlier diagnosis would pass for this one's.
             files.absent(Path(out) / _PROGRAM)
-    return paths_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
+    return common.paths_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
 
 
-def _lines(diagnosis: "Diagnosis") -> list[str]:
+def _lines(diagnosis: "late.Diagnosis") -> list[str]:
     """What a terminal shows: the verdict, the causes with their parameters, and the gain."""
     found = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
     lines = [f"{found[diagnosis.verdict]}; noise {diagnosis.noise_um:.3g} um, {diagnosis.noise_source}"]

@@ -2,10 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, print_result
-
-_STATIC_ONLY = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
 
 
 @click.command()
@@ -15,24 +14,19 @@ _STATIC_ONLY = "the files hold the hysteresis with the static gains of the stage
 @click.option("--memory", type=int, default=128, show_default=True, help="Extremes remembered, two per nested loop.")
 @options.limits
 @options.json_output
-@in_sentences
-def export(given: Given) -> None:
+@common.in_sentences
+def export(given: common.Given) -> None:
     """Write a model and its inverse as C99 for a controller.
 
     The header and the source need no library and allocate nothing.
     """
-    from fits.cli._models import parse_limits_V, stage_or_preisach
-    from fits.control._compensate_stage import static_equivalent
-    from fits.control._export_c import export_c
-    from fits.io._jax_setup import start_jax
-    from fits.stage._model_file import load_model
-    from microid import Stage
-
-    start_jax()
-    stage = stage_or_preisach(given.model, load_model(given.model))
-    hysteresis = static_equivalent(stage) if isinstance(stage, Stage) else stage
-    made = export_c(hysteresis, given.out, given.name, size=given.memory, limits_V=parse_limits_V(given.limits))
+    late.start_jax()
+    stage = common.stage_or_preisach(given.model, late.load_model(given.model))
+    limits_V = common.parse_limits_V(given.limits)
+    made = late.export_c(common.hysteresis(stage), given.out, given.name, size=given.memory, limits_V=limits_V)
     files = [str(file) for file in made]
     # The inverse of mechanics needs the samples to come, which a controller does not have.
-    remarks = [_STATIC_ONLY] if isinstance(stage, Stage) else []
-    print_result(given, {"files": files, "remarks": remarks}, [*(f"Note: {remark}" for remark in remarks), *files])
+    static = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
+    remarks = [static] if isinstance(stage, late.Stage) else []
+    lines = [*(f"Note: {remark}" for remark in remarks), *files]
+    common.print_result(given, {"files": files, "remarks": remarks}, lines)

@@ -1,28 +1,16 @@
 """The command `microid fit`: its options, and the work."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import (
-    Given,
-    fraction_or_files,
-    in_sentences,
-    paths_in,
-    print_result,
-    progress_to_stderr,
-    refuse_overwriting,
-)
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
-if TYPE_CHECKING:
-    from microid import Hold
-
-_HOLDS: dict[str, Hold] = {"lines": "first", "steps": "zero", "curves": "smooth"}
+_HOLDS: dict[str, "late.Hold"] = {"lines": "first", "steps": "zero", "curves": "smooth"}
 
 
 @click.command()
@@ -63,57 +51,43 @@ _HOLDS: dict[str, Hold] = {"lines": "first", "steps": "zero", "curves": "smooth"
 @click.option("--seed", type=options.SEEDS, help="Seed of the starts (default 0).")
 @options.json_output
 @options.quiet
-@in_sentences
-def fit(given: Given) -> None:
+@common.in_sentences
+def fit(given: common.Given) -> None:
     """Fit Preisach weights to measured loops, or a whole stage to slow and fast runs.
 
     The files are runs of one rig, with the columns time_s, voltage_V and displacement_um. A stage needs a slow run
     over the whole range, and one with steps, a chirp or a multisine beyond the resonance.
     """
-    from fits.io._jax_setup import start_jax
-    from fits.io._read_csv import read_csv, read_runs
-    from fits.io._units import parse_columns
-    from fits.loop._fit import fit
-    from fits.loop._result import FitError
-    from fits.plots._loop import plot_fit
-    from fits.plots._stage import plot_stage
-    from fits.report._fit import describe, fit_report
-    from fits.stage._fit import fit_stage
-    from fits.stage._model_file import model_text
-
-    start_jax()
+    late.start_jax()
     estimate: Any
     draw: Any
     if given.model == "stage":
-        estimate, draw, asked = fit_stage, plot_stage, _for_stage(given)
+        estimate, draw, asked = late.fit_stage, late.plot_stage, _for_stage(given)
     else:
-        estimate, draw, asked = fit, plot_fit, _for_loop(given)
+        estimate, draw, asked = late.fit, late.plot_fit, _for_loop(given)
     initial = list(given.initial) if len(given.initial) > 1 else (given.initial or ("unknown",))[0]
-    progress = progress_to_stderr(given.quiet)
-    mapping = parse_columns(given.columns)
-    fraction, files = fraction_or_files(given.holdout)
-    refuse_overwriting(given.out, [*given.runs, *files])
+    progress = common.progress_to_stderr(given.quiet)
+    mapping = late.parse_columns(given.columns)
+    fraction, files = common.fraction_or_files(given.holdout)
+    common.refuse_overwriting(given.out, [*given.runs, *files])
     # Entered before the fit, so that a place that cannot be written to is refused before the wait.
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
-        records = read_runs(given.runs, mapping)
-        same = {"holdout": [read_csv(file, mapping) for file in files] or fraction, "initial": initial}
+        records = late.read_runs(given.runs, mapping)
+        same = {"holdout": [late.read_csv(file, mapping) for file in files] or fraction, "initial": initial}
         asked |= {"levels": given.levels, "loss": given.loss or "squares", "progress": progress}
-        try:
-            result = estimate(records, **same, **asked)
-        except FitError as error:
-            raise DataError(f"{error}.") from error
-        report, drawn = fit_report(result), []
+        result = estimate(records, **same, **asked)
+        report, drawn = late.fit_report(result), []
         if drawings is not None:
             progress("drawing")
             drawn = draw(result, records, drawings, **same)
-        unfinished.write_text(model_text(result.model, result.uncertainty, report), encoding="utf-8")
-    places = paths_in(given.plots, drawn)
-    lines = [describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)]
-    print_result(given, {"out": given.out, "plots": places, **report}, lines)
+        unfinished.write_text(late.model_text(result.model, result.uncertainty, report), encoding="utf-8")
+    places = common.paths_in(given.plots, drawn)
+    lines = [late.describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)]
+    common.print_result(given, {"out": given.out, "plots": places, **report}, lines)
 
 
-def _for_loop(given: Given) -> dict[str, Any]:
+def _for_loop(given: common.Given) -> dict[str, Any]:
     """What `fit` is asked for, beside what `fit_stage` is too; what it cannot honour is refused."""
     if given.hold is not None:
         raise DataError(
@@ -126,10 +100,8 @@ def _for_loop(given: Given) -> dict[str, Any]:
     return {"family": given.family or "grid", "starts": given.starts or 8, "seed": given.seed or 0}
 
 
-def _for_stage(given: Given) -> dict[str, Any]:
+def _for_stage(given: common.Given) -> dict[str, Any]:
     """What `fit_stage` is asked for, beside what `fit` is too; what it cannot honour is refused."""
-    from fits.stage._fit import default_stage
-
     if given.family not in (None, "grid"):
         raise DataError(
             f"--family {given.family}: the hysteresis of a stage is fitted on a grid; leave out --family, or use "
@@ -146,4 +118,4 @@ def _for_stage(given: Given) -> dict[str, Any]:
             f"--initial: {len(given.initial)} states were given for {len(given.runs)} runs; give one for all, or one "
             "for each in their order."
         )
-    return {"stage": default_stage(_HOLDS[given.hold or "lines"])}
+    return {"stage": late.default_stage(_HOLDS[given.hold or "lines"])}

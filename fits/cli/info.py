@@ -1,35 +1,25 @@
 """The command `microid info`: its options, and the work."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, print_result
 from fits.io._errors import DataError
-
-if TYPE_CHECKING:
-    from fits.stage._model_file import ModelFile
 
 
 @click.command()
 @options.model
 @options.json_output
-@in_sentences
-def info(given: Given) -> None:
+@common.in_sentences
+def info(given: common.Given) -> None:
     """Say what a model file holds."""
-    from fits.io._jax_setup import start_jax
-    from fits.stage._model_file import load_model
-    from microid import Stage, parameter_table
-
-    start_jax()
-    loaded = load_model(given.model)
-    named = loaded.model.named if isinstance(loaded.model, Stage) else str
+    late.start_jax()
+    loaded = late.load_model(given.model)
+    named = loaded.model.named if isinstance(loaded.model, late.Stage) else str
     parameters = [
         {"path": named(row.path), "shape": list(row.shape), "unit": row.spec.unit}
-        for row in parameter_table(loaded.model)
+        for row in late.parameter_table(loaded.model)
     ]
     kind = type(loaded.model).__name__
     lines = [f"{kind}, written by {loaded.written_by}"]
@@ -38,16 +28,15 @@ def info(given: Given) -> None:
     if not given.as_json:
         lines += ["", _known_of_fit(given.model, loaded)]
     content = {"written_by": loaded.written_by, "model": kind, "parameters": parameters, "fit": loaded.report}
-    print_result(given, content, lines)
+    common.print_result(given, content, lines)
 
 
-def _known_of_fit(path: str, loaded: ModelFile) -> str:
-    from fits.report._fit import describe
+def _known_of_fit(path: str, loaded: "late.ModelFile") -> str:
 
     if loaded.uncertainty is None:
         return "written by 'microid diagnose', whose report says how well it predicts"
     try:
-        return describe(loaded.report)
+        return late.describe(loaded.report)
     except (LookupError, TypeError, ValueError, AttributeError):
         # The format does not say what a report holds, and the words are made for that of a fit.
         raise DataError(f"{path}: its report is not that of a fit; fit again, or add --json to see it.") from None

@@ -2,8 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, paths_in, progress_to_stderr
 from fits.io._file_set import file_set
 
 
@@ -14,19 +15,16 @@ from fits.io._file_set import file_set
 )
 @click.option("--seed", type=options.SEEDS, default=0, show_default=True, help="Where all randomness starts.")
 @options.quiet
-@in_sentences
-def paper(given: Given) -> None:
+@common.in_sentences
+def paper(given: common.Given) -> None:
     """Repeat the paper's compensation on a virtual stage: its tables and figures beside ours.
 
     Writes paper.md with pictures, and paper.json. The stage is identified from noisy CSVs, then run open, under
     feedforward, and with each of the paper's three controllers.
     """
-    from fits.io._jax_setup import start_jax
-    from fits.paper._regenerate import paper_result
-
-    start_jax()
-    progress = progress_to_stderr(given.quiet)
+    late.start_jax()
+    progress = common.progress_to_stderr(given.quiet)
     with file_set() as files:
-        result = paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), progress)
-    page, figures = paths_in(given.out, ("paper.md", "paper.json"))
+        result = late.paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), progress)
+    page, figures = common.paths_in(given.out, ("paper.md", "paper.json"))
     click.echo(f"page   {page}\njson   {figures}\nworse than the paper: {'; '.join(result.worse()) or 'no row'}")

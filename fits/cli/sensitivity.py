@@ -1,19 +1,14 @@
 """The command `microid sensitivity`: its options, and the work."""
 
-from __future__ import annotations
-
 import dataclasses
-from typing import TYPE_CHECKING
 
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, length_mm, paths_in, refuse_clashes, with_paths
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
-
-if TYPE_CHECKING:
-    from fits.machining._design import Design
 
 
 @click.command()
@@ -29,64 +24,48 @@ if TYPE_CHECKING:
 @options.json_file("tables")
 @options.plots("plots")
 @click.option("--write-stage", metavar="FILE", help="TOML file of the stage to write, to change and come back with.")
-@in_sentences
-def sensitivity(given: Given) -> None:
+@common.in_sentences
+def sensitivity(given: common.Given) -> None:
     """Rank what machining errors of the dimensions do to each motion of a stage.
 
     STAGE.toml holds the dimensions with their tolerances; without it, the stage is the paper's, and the tables are
     followed by what the paper reads in its Fig. 7. --write-stage writes one to begin with.
     """
-    import microid as m
-    from fits.io._atomic import finite_json
-    from fits.io._jax_setup import start_jax
-    from fits.machining._claims import describe_claims, paper_claims
-    from fits.machining._design_file import design_text
-    from fits.machining._sensitivity import sensitivities
-    from fits.report._machining import describe_sensitivity, sensitivity_json
-
-    start_jax()
+    late.start_jax()
     printed = given.json_file == "-"
     out = None if printed else given.json_file
-    refuse_clashes({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
+    common.refuse_clashes({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
     design = _design(given.stage, given.tolerance, given.level)
-    axes = tuple(name for name in m.AXES if given.axis in (name, "all"))
+    axes = tuple(name for name in late.AXES if given.axis in (name, "all"))
     with file_set() as files:
         # Entered before the work, so that a place that cannot be written to is refused before the wait.
-        unfinished = None if out is None else files.file(out)
+        unfinished, drawings = None if out is None else files.file(out), files.folder(given.plots)
         unfinished_stage = None if given.write_stage is None else files.file(given.write_stage)
-        drawings = files.folder(given.plots)
-        report = sensitivities(design, axes)
-        text = finite_json(sensitivity_json(report))
-        claims = (
-            [] if given.stage or printed else [claim for claim in paper_claims(design) if {*claim.axes} & {*axes}]
-        )
-        drawn = []
-        if drawings is not None:
-            from fits.plots._machining import plot_sensitivity
-
-            drawn = plot_sensitivity(design, report, drawings)
+        report = late.sensitivities(design, axes)
+        text = late.finite_json(late.sensitivity_json(report))
+        claimed = [] if given.stage or printed else late.paper_claims(design)
+        claims = [claim for claim in claimed if {*claim.axes} & {*axes}]
+        drawn = [] if drawings is None else late.plot_sensitivity(design, report, drawings)
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
         if unfinished_stage is not None:
-            unfinished_stage.write_text(design_text(design), encoding="utf-8")
+            unfinished_stage.write_text(late.design_text(design), encoding="utf-8")
     if printed:
         click.echo(text)
         return
-    words = describe_sensitivity(report, given.voltage)
+    words = late.describe_sensitivity(report, given.voltage)
     if claims:
-        words += f"\n\n{describe_claims(claims)}"
-    places = [("json", out), ("stage", given.write_stage), *(("plot", each) for each in paths_in(given.plots, drawn))]
-    click.echo(with_paths(words, places))
+        words += f"\n\n{late.describe_claims(claims)}"
+    plots = [("plot", place) for place in common.paths_in(given.plots, drawn)]
+    places = [("json", out), ("stage", given.write_stage), *plots]
+    click.echo(common.with_paths(words, places))
 
 
-def _design(stage: str | None, tolerance: str | None, level: int | None) -> Design:
+def _design(stage: str | None, tolerance: str | None, level: int | None) -> "late.Design":
     """The stage that is asked about."""
-    from fits.machining._design import paper_design
-    from fits.machining._design_file import read_design
-
-    design = paper_design() if stage in (None, "paper") else read_design(stage)
+    design = late.paper_design() if stage in (None, "paper") else late.read_design(stage)
     if tolerance is not None:
-        size_mm = length_mm("--tolerance", tolerance, ("mm", "um", "µm", "μm"), "0.02mm or 20um")
+        size_mm = common.length_mm("--tolerance", tolerance, ("mm", "um", "µm", "μm"), "0.02mm or 20um")
         try:
             design = design.with_tolerance(size_mm)
         except DataError as error:

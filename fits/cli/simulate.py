@@ -2,8 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, print_result, refuse_overwriting
 
 
 @click.command()
@@ -13,8 +14,8 @@ from fits.cli._common import Given, in_sentences, print_result, refuse_overwriti
 @options.initial("the program")
 @options.columns
 @options.json_output
-@in_sentences
-def simulate(given: Given) -> None:
+@common.in_sentences
+def simulate(given: common.Given) -> None:
     """Predict the displacement of a voltage program, with its standard deviation.
 
     PROGRAM.csv needs the columns time_s and voltage_V. The prediction has time_s, voltage_V, displacement_um and
@@ -22,22 +23,15 @@ def simulate(given: Given) -> None:
     """
     import numpy as np
 
-    from fits.cli._models import predicted_by
-    from fits.io._atomic import write_csv
-    from fits.io._jax_setup import start_jax
-    from fits.io._read_csv import read_csv
-    from fits.io._units import parse_columns
-    from fits.stage._model_file import load_model
-
-    start_jax()
-    refuse_overwriting(given.out, [given.model, given.program])
-    loaded = load_model(given.model)
-    record = read_csv(given.program, parse_columns(given.columns), required=("time_s", "voltage_V"))
-    prediction = predicted_by(given.model, loaded, record, given.initial)
+    late.start_jax()
+    common.refuse_overwriting(given.out, [given.model, given.program])
+    loaded = late.load_model(given.model)
+    record = late.read_csv(given.program, late.parse_columns(given.columns), required=("time_s", "voltage_V"))
+    prediction = common.predicted_by(given.model, loaded, record, given.initial)
     displacement_um, sd_um = prediction.displacement_um, prediction.displacement_sd_um
     known = loaded.uncertainty is not None
     table = {"time_s": record.time_s, "voltage_V": record.voltage_V, "displacement_um": displacement_um}
-    write_csv(given.out, table | ({"displacement_sd_um": sd_um} if known else {}))
+    late.write_csv(given.out, table | ({"displacement_sd_um": sd_um} if known else {}))
     summary = {
         "out": given.out,
         "samples": len(record),
@@ -55,4 +49,4 @@ def simulate(given: Given) -> None:
         *(f"Note: {remark}" for remark in record.warnings),
         f"prediction  {given.out}",
     ]
-    print_result(given, summary, lines)
+    common.print_result(given, summary, lines)

@@ -2,8 +2,9 @@
 
 import click
 
+from fits.cli import _common as common
+from fits.cli import _late as late
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, paths_in, print_result, progress_to_stderr, stopped
 from fits.io._file_set import file_set
 from fits.sweeps import kinds
 
@@ -45,26 +46,20 @@ def sweep(context: click.Context, example: str | None) -> None:
 )
 @options.json_output
 @options.quiet
-@in_sentences
-def run(given: Given) -> None:
+@common.in_sentences
+def run(given: common.Given) -> None:
     """Run SWEEP.toml.
 
     DIR will hold results.zarr, which xarray opens, results.parquet, and what is needed to go on. A row that fails is
     kept with its reason and stops nothing else. Without --cluster all is computed in this process.
     """
-    from fits.io._jax_setup import start_jax
-
-    start_jax()
-    from fits.sweeps._run import run_sweep as run_all
-    from fits.sweeps._spec import read_sweep
-    from fits.sweeps._store import RESULTS, TABLE
-
-    progress = progress_to_stderr(given.quiet)
-    sweep = read_sweep(given.file)
+    late.start_jax()
+    progress = common.progress_to_stderr(given.quiet)
+    sweep = late.read_sweep(given.file)
     try:
-        outcome = run_all(sweep, given.out, resume=given.resume, cluster=given.cluster, progress=progress)
+        outcome = late.run_sweep(sweep, given.out, resume=given.resume, cluster=given.cluster, progress=progress)
     except KeyboardInterrupt as stop:
-        stopped(stop, "what was computed is kept; go on with --resume")
+        common.stopped(stop, "what was computed is kept; go on with --resume")
     content = {
         "out": given.out,
         "rows": outcome.rows,
@@ -72,11 +67,11 @@ def run(given: Given) -> None:
         "computed": outcome.computed,
         "chunks_computed_again": outcome.again,
         "seconds": outcome.seconds,
-        "files": paths_in(given.out, (RESULTS, TABLE)),
+        "files": common.paths_in(given.out, (late.RESULTS, late.TABLE)),
     }
     failed = f", {outcome.failed:,} of them failed" if outcome.failed else ""
     line = f"{outcome.rows:,} rows{failed}; {outcome.computed:,} computed in {outcome.seconds:.1f} s"
-    print_result(given, content, [line, *(f"results  {name}" for name in content["files"])])
+    common.print_result(given, content, [line, *(f"results  {name}" for name in content["files"])])
 
 
 @sweep.command()
@@ -85,16 +80,12 @@ def run(given: Given) -> None:
 @click.option("--largest", is_flag=True, help="Large is good.")
 @options.plots("heat maps and parallel coordinates")
 @options.json_output
-@in_sentences
-def show(given: Given) -> None:
+@common.in_sentences
+def show(given: common.Given) -> None:
     """Say how far the sweep in DIR is, and what came out."""
-    from fits.sweeps._show import describe, summarise
-
-    summary, drawn = summarise(given.folder, given.best, given.largest), []
+    summary = late.summarise(given.folder, given.best, given.largest)
     with file_set() as files:
         drawings = files.folder(given.plots)
-        if drawings is not None:
-            from fits.plots._sweep import plot_sweep
-
-            drawn = plot_sweep(given.folder, drawings, given.best)
-    print_result(given, summary, [describe(summary), *(f"plot  {place}" for place in paths_in(given.plots, drawn))])
+        drawn = [] if drawings is None else late.plot_sweep(given.folder, drawings, given.best)
+    places = [f"plot  {place}" for place in common.paths_in(given.plots, drawn)]
+    common.print_result(given, summary, [late.describe_sweep(summary), *places])

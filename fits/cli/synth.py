@@ -2,13 +2,13 @@
 
 import click
 
+from fits.cli import _common as common
 from fits.cli import _options as options
-from fits.cli._common import Given, in_sentences, paths_in, print_result
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
 
-def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+def _list(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted and not context.resilient_parsing:
         import data_synth
 
@@ -22,16 +22,11 @@ def _list_scenarios(context: click.Context, _: click.Parameter, wanted: bool) ->
 @options.out_folder
 @click.option("--seed", type=click.IntRange(0, 2**64 - 1), help="Seed; the scenario's own by default.")
 @click.option(
-    "--list",
-    is_flag=True,
-    expose_value=False,
-    is_eager=True,
-    callback=_list_scenarios,
-    help="List the scenarios and exit.",
+    "--list", is_flag=True, expose_value=False, is_eager=True, callback=_list, help="List the scenarios and exit."
 )
 @options.json_output
-@in_sentences
-def synth(given: Given) -> None:
+@common.in_sentences
+def synth(given: common.Given) -> None:
     """Write example CSVs from a virtual test bench.
 
     SCENARIO is one of those that --list shows, or a .toml file.
@@ -48,5 +43,5 @@ def synth(given: Given) -> None:
         contents = data_synth.files(bench)
         for name, text in contents.items():
             (folder / name).write_bytes(text.encode())
-    files = paths_in(given.out, contents)
-    print_result(given, {"seed": bench.seed, "files": files}, [f"seed {bench.seed}", *files])
+    files = common.paths_in(given.out, contents)
+    common.print_result(given, {"seed": bench.seed, "files": files}, [f"seed {bench.seed}", *files])

@@ -3,7 +3,6 @@
 import csv
 import gzip
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.io._errors import DataError
+from fits.io._errors import AnyPath, DataError
 from fits.io._file_set import file_set
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: AnyPath) -> Iterator[Path]:
     """Yield a temporary path; on success it becomes `path`, on any exception it is deleted.
 
     It does not exist yet, lies in the same folder and ends as `path` does, so that Matplotlib infers the format. What
@@ -27,7 +26,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield files.file(path)
 
 
-def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
+def atomic_write_text(path: AnyPath, text: str) -> None:
     """Write text to `path` as UTF-8 with its line ends kept, whole or not at all; errors as `atomic_path`."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(text.encode())
@@ -54,9 +53,7 @@ def finite_json(content: Any) -> str:
         ) from None
 
 
-def write_csv(
-    path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]], comments: Sequence[str] = ()
-) -> None:
+def write_csv(path: AnyPath, columns: Mapping[str, NDArray[Any]], comments: Sequence[str] = ()) -> None:
     """Write columns, shape `(n,)` each, as CSV that is read back exactly, with comments before the header.
 
     A name that ends in `.gz` is compressed. A `DataError` refuses values that are not finite.

@@ -1,12 +1,13 @@
-"""The one exception for bad input, and how its sentences quote what was found."""
+"""The one exception for bad input, how its sentences quote what was found, and what names a file."""
 
 import json
+import os
 from typing import Any
+
+AnyPath = str | os.PathLike[str]
 
 # What is quoted, and a whole sentence, are cut to so many characters; so many are kept at its end.
 _SHOWN, _SENTENCE, _END = 60, 1000, 400
-# Integers of more digits take long to write.
-_ENORMOUS = 10**_SHOWN
 
 
 class DataError(ValueError):
@@ -31,7 +32,7 @@ def shown(found: Any) -> str:
     """Write what was found in a file as TOML and JSON have it, short enough for a sentence."""
     if isinstance(found, dict | list):
         return "a table" if isinstance(found, dict) else "a list"
-    if isinstance(found, int) and abs(found) >= _ENORMOUS:
+    if isinstance(found, int) and abs(found) >= 10**_SHOWN:  # more digits take long to write
         return "an enormous number"
     if isinstance(found, str):
         found = " ".join(found[: 2 * _SHOWN].split())

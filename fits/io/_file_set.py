@@ -7,19 +7,16 @@ import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import overload
 
-from fits.io._errors import DataError
+from fits.io._errors import AnyPath, DataError
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
 _DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
-# Of file systems that have no such thing as flushing.
-_NO_FLUSH = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
 
 
-def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path]:
+def usable_folder(path: AnyPath, option: str) -> tuple[Path, Path]:
     """Refuse a folder that cannot be written to, or made; itself and the nearest one that exists come back."""
     shown = os.fspath(path)
     if not shown:
@@ -42,7 +39,7 @@ def usable_folder(path: str | os.PathLike[str], option: str) -> tuple[Path, Path
     return target, anchor
 
 
-def check_file(path: str | os.PathLike[str], shown: str | None = None) -> Path:
+def check_file(path: AnyPath, shown: str | None = None) -> Path:
     """Refuse what cannot become, or be replaced by, a regular file; its real path comes back."""
     shown = os.fspath(path) if shown is None else shown
     if not shown:
@@ -102,9 +99,8 @@ class _Folder:
 
     def refused(self, error: OSError) -> DataError:
         """Say that nothing can be put there."""
-        return DataError(
-            f"{self.shown}: files cannot be put there ({reason_of(error)}); choose another for {self.option}."
-        )
+        why = reason_of(error)
+        return DataError(f"{self.shown}: files cannot be put there ({why}); choose another for {self.option}.")
 
 
 class FileSet:
@@ -115,7 +111,7 @@ class FileSet:
         self._folders: list[_Folder] = []
         self._scraps: list[Path] = []
 
-    def file(self, path: str | os.PathLike[str]) -> Path:
+    def file(self, path: AnyPath) -> Path:
         """Give a temporary name, of the ending of `path`, for a file to write; a `DataError` if `path` cannot be."""
         target = check_file(path)
         if any(is_temporary(part) for part in target.parts):
@@ -127,15 +123,15 @@ class FileSet:
         self._files.append(_Move(staged, target, os.fspath(path)))
         return staged
 
-    def absent(self, path: str | os.PathLike[str]) -> None:
+    def absent(self, path: AnyPath) -> None:
         """Have no file at `path` in the end; a missing one is fine."""
         self._files.append(_Move(None, Path(os.path.realpath(path)), os.fspath(path)))
 
     @overload
-    def folder(self, path: str | os.PathLike[str], option: str = ...) -> Path: ...
+    def folder(self, path: AnyPath, option: str = ...) -> Path: ...
     @overload
-    def folder(self, path: str | os.PathLike[str] | None, option: str = ...) -> Path | None: ...
-    def folder(self, path: str | os.PathLike[str] | None, option: str = "--plots") -> Path | None:
+    def folder(self, path: AnyPath | None, option: str = ...) -> Path | None: ...
+    def folder(self, path: AnyPath | None, option: str = "--plots") -> Path | None:
         """Make a temporary folder, whose files go to the folder `path` that an option named; for None there is none.
 
         A `DataError` says that `path`, which is made if need be, cannot be written to, or is no folder.
@@ -159,8 +155,8 @@ class FileSet:
 
     def commit(self) -> None:
         """Put all files in their places, or none."""
-        files = [move for move in self._files if move.staged is not None or os.path.lexists(move.target)]
-        moves = [*self._from_folders(), *files]
+        moves = self._from_folders()
+        moves += [move for move in self._files if move.staged is not None or os.path.lexists(move.target)]
         for k, move in enumerate(moves):
             _refuse_twice(move.target, move.shown, moves[:k])
             if move.staged is None or not move.staged.is_dir():
@@ -180,8 +176,14 @@ class FileSet:
                     else:
                         os.replace(move.staged, move.target)
             undo.pop_all()
-        for folder in {move.target.parent for move in moves}:
-            _flush_folder(folder)
+        for path in {move.target.parent for move in moves}:
+            # Not all systems can; and what is renamed stays renamed.
+            with suppress(OSError):
+                folder = os.open(path, os.O_RDONLY)
+                try:
+                    os.fsync(folder)
+                finally:
+                    os.close(folder)
 
     def _from_folders(self) -> list[_Move]:
         moves = []
@@ -202,17 +204,24 @@ class FileSet:
 
     def _undoing(self, move: _Move) -> Callable[[], None]:
         """Make what undoes a move, whether or not it has been made."""
-        if not move.target.exists():
-            return partial(_take_back, move.target, move.staged)
-        kept = move.target.with_name(temporary_name())
-        self._scraps.append(kept)
-        with _explained(move):
-            try:
-                # A second name: at no moment there is no file under the first.
-                os.link(move.target, kept)
-            except OSError:
-                shutil.copy2(move.target, kept)
-        return partial(_restore, kept, move.target)
+        kept = move.target.with_name(temporary_name()) if move.target.exists() else None
+        if kept is not None:
+            self._scraps.append(kept)
+            with _explained(move):
+                try:
+                    # A second name: at no moment there is no file under the first.
+                    os.link(move.target, kept)
+                except OSError:
+                    shutil.copy2(move.target, kept)
+
+        def undo() -> None:
+            if kept is not None:
+                if kept.exists():
+                    os.replace(kept, move.target)
+            elif move.staged is not None and not move.staged.exists():
+                os.rename(move.target, move.staged)
+
+        return undo
 
     def discard(self) -> None:
         """Delete all that is left under temporary names."""
@@ -226,7 +235,7 @@ class FileSet:
         """Put what the system says of these files into a sentence; errors of others are not ours to explain."""
         name = os.fspath(error.filename) if isinstance(error.filename, str | os.PathLike) else ""
         for each in self._all():
-            if name == str(each.staged) or name.startswith(f"{each.staged}{os.sep}"):
+            if f"{name}{os.sep}".startswith(f"{each.staged}{os.sep}"):
                 return each.refused(error)
         if error.errno in _DISK_TROUBLE and self._all():
             first = self._all()[0]
@@ -273,34 +282,15 @@ def _refuse_twice(target: Path, shown: str, others: Iterable[_Move | _Folder]) -
         raise DataError(f"{shown}: two results would go to this place; choose another for one of them.")
 
 
-def _take_back(target: Path, staged: Path | None) -> None:
-    if staged is not None and not staged.exists():
-        os.rename(target, staged)
-
-
-def _restore(kept: Path, target: Path) -> None:
-    if kept.exists():
-        os.replace(kept, target)
-
-
 def flush(path: Path) -> None:
     """Have a file on the disk before it gets its name; an OSError says that the disk is full after all."""
     with open(path, "r+b") as file:
         try:
             os.fsync(file.fileno())
         except OSError as error:
-            if error.errno not in _NO_FLUSH:
+            # Some file systems have no such thing as flushing.
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS):
                 raise OSError(error.errno, error.strerror, str(path)) from error
-
-
-def _flush_folder(path: Path) -> None:
-    # Not all systems can; and what is renamed stays renamed.
-    with suppress(OSError):
-        folder = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
 
 
 @contextmanager

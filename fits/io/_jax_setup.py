@@ -11,9 +11,6 @@ import jax
 
 from fits.io._errors import DataError
 
-# Functions that compile faster than this are not worth a file.
-_KEPT_S = 0.3
-
 
 def start_jax() -> None:
     """Configure JAX before any computation; a `DataError` if others can write to the folder MICROID_CACHE names."""
@@ -21,15 +18,15 @@ def start_jax() -> None:
     folder = _cache_folder()
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", _KEPT_S)
+        # Functions that compile faster than this are not worth a file.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def _cache_folder() -> Path | None:
     """Make the folder for compiled functions; None where there is none or it cannot be written to.
 
-    What is in it runs as the user's own code. One that others can write to is refused if it was asked for, else not
-    used.
+    What is in it runs as the user's own code: one that others can write to is refused if asked for, else not used.
     """
     stated = os.environ.get("MICROID_CACHE")
     if stated in ("", "0", "off"):

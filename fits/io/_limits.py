@@ -15,31 +15,21 @@ from fits.io._record import Record
 
 # Range of each quantity, by name: lowest and highest value.
 Ranges = dict[str, tuple[float, float]]
-AnyRanges = Mapping[str, tuple[float, float]]
+RangeMap = Mapping[str, tuple[float, float]]
 
-UNITS = {
-    "voltage": "V",
-    "slew": "V/s",
-    "displacement": "um",
-    "velocity": "um/s",
-    "acceleration": "um/s^2",
-    "current": "A/F",
-}
+UNITS = {"voltage": "V", "slew": "V/s", "displacement": "um", "velocity": "um/s"}
+UNITS |= {"acceleration": "um/s^2", "current": "A/F"}
 """Quantities that are limited, and their units. The driver's current is stated per farad of the piezo: it is the slew
 of the voltage at the piezo, C dU/dt, and records of voltage and displacement do not tell C."""
 
 # By how much of its range a predicted quantity may go beyond what the records reached.
 MARGIN = 0.02
 
-# What the command is, as against what it makes the rig do; a margin is for predictions.
-_COMMANDED = ("voltage", "slew")
 # These have a sign that means something; of the others the size is limited.
 _TWO_SIDED = ("voltage", "displacement")
 _PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "n": 1e-9}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _RANGE = re.compile(rf"(?:({_NUMBER}):)?({_NUMBER})\s*([^\d\s.:].*)?")
-# Part of a limit by which rounding may exceed it.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -61,7 +51,7 @@ class Extreme:
     def excess(self) -> float:
         """How far the worse side is beyond its limit; 0 or less where it is inside."""
         sizes = [abs(value) for value in (self.low, self.high, self.lowest, self.highest) if math.isfinite(value)]
-        return max(self.high - self.highest, self.lowest - self.low) - _ROUNDING * max(sizes, default=0.0)
+        return max(self.high - self.highest, self.lowest - self.low) - 1e-9 * max(sizes, default=0.0)
 
     def __str__(self) -> str:
         """As in `displacement 0.1 to 38.2 um (limits 0 to 40 um)`."""
@@ -120,24 +110,20 @@ def measured_ranges(record: Record, offset_um: float = 0.0) -> Ranges:
 
 def reached_in(report: Mapping[str, Any]) -> Ranges:
     """What the runs of a model reached, by its file's `fit`, displacements as in the first run; or nothing."""
-    listed = report.get("runs")
-    runs = (
-        [run for run in listed if isinstance(run, Mapping) and run.get("reached")] if isinstance(listed, list) else []
-    )
-    stated = [run.get("offset_um") for run in runs]
-    offsets_um = [float(offset) if isinstance(offset, int | float) else 0.0 for offset in stated]
-    found = []
-    for run, offset_um in zip(runs, offsets_um, strict=True):
-        ranges = ranges_of_json(run["reached"])
-        shift_um = offsets_um[0] - offset_um
-        if "displacement" in ranges:
-            low, high = ranges["displacement"]
-            ranges["displacement"] = low + shift_um, high + shift_um
-        found.append(ranges)
+    listed, found, first_um = report.get("runs"), [], None
+    for run in listed if isinstance(listed, list) else ():
+        if isinstance(run, Mapping) and run.get("reached"):
+            ranges, offset = ranges_of_json(run["reached"]), run.get("offset_um")
+            offset_um = float(offset) if isinstance(offset, int | float) else 0.0
+            first_um = offset_um if first_um is None else first_um
+            if "displacement" in ranges:
+                (low, high), shift_um = ranges["displacement"], first_um - offset_um
+                ranges["displacement"] = low + shift_um, high + shift_um
+            found.append(ranges)
     return joined(found)
 
 
-def joined(ranges: Iterable[AnyRanges]) -> Ranges:
+def joined(ranges: Iterable[RangeMap]) -> Ranges:
     """The smallest ranges that hold all of several."""
     found: Ranges = {}
     for one in ranges:
@@ -147,7 +133,7 @@ def joined(ranges: Iterable[AnyRanges]) -> Ranges:
     return found
 
 
-def allowed(reached: AnyRanges, stated: AnyRanges, margin: float) -> Ranges:
+def allowed(reached: RangeMap, stated: RangeMap, margin: float) -> Ranges:
     """Limits: what a user stated, or else what the records reached.
 
     Of what has no sign that matters, the larger size counts both ways. A predicted quantity may go by `margin` of its
@@ -164,12 +150,14 @@ def allowed(reached: AnyRanges, stated: AnyRanges, margin: float) -> Ranges:
             if name not in _TWO_SIDED:
                 high = max(abs(low), abs(high))
                 low = -high
-            more = 0.0 if name in _COMMANDED else margin * (high - low) * (1.0 if name in _TWO_SIDED else 0.5)
-            found[name] = low - more, high + more
+            if name not in ("voltage", "slew"):  # which are the command itself, and not predicted
+                more = margin * (high - low) * (1.0 if name in _TWO_SIDED else 0.5)
+                low, high = low - more, high + more
+            found[name] = low, high
     return found
 
 
-def compared(predicted: AnyRanges, limits: AnyRanges) -> tuple[Extreme, ...]:
+def compared(predicted: RangeMap, limits: RangeMap) -> tuple[Extreme, ...]:
     """What is predicted beside its limits, for all that is limited."""
     both = [name for name in UNITS if name in predicted and name in limits]
     return tuple(Extreme(name, *predicted[name], *limits[name]) for name in both)
@@ -181,21 +169,15 @@ def beyond(extremes: Iterable[Extreme]) -> tuple[Extreme, ...]:
 
 
 def check_command(
-    source: str,
-    predicted: AnyRanges,
-    reached: AnyRanges,
-    stated: AnyRanges,
-    margin: float,
-    spared: Collection[str] = (),
+    source: str, predicted: RangeMap, reached: RangeMap, stated: RangeMap, margin: float, spared: Collection[str] = ()
 ) -> list[str]:
     """Refuse, in a `DataError`, a command that leaves what the rig has shown; remarks come back.
 
     It follows the reference `source`; `predicted` is what it is, and makes the rig do. For `reached`, `stated` and
     `margin` see `allowed`. Of the quantities `spared` a remark is made instead, unless their limit is stated.
     """
-    unknown = [name for name in stated if name not in predicted]
-    if unknown:
-        raise DataError(f"--limit {unknown[0]}: nothing says how large it becomes here; leave it out.")
+    for name in (name for name in stated if name not in predicted):
+        raise DataError(f"--limit {name}: nothing says how large it becomes here; leave it out.")
     remarks = []
     if not reached:
         remarks.append(
@@ -211,12 +193,10 @@ def check_command(
                 f"{words}but --limit allows {limit:.4g} {one.unit}; slow it down, shrink it, or widen that."
             )
         words += f"where the runs that the model was fitted to reached {limit:.4g} {one.unit}"
-        if one.name in spared:
-            remarks.append(f"{words}; state what the rig stands with {stated_as(one)} to have it kept")
-            continue
-        raise DataError(
-            f"{words}; slow the reference down or shrink it, or state what the rig stands with {stated_as(one)}."
-        )
+        stated_so = f"state what the rig stands with {stated_as(one)}"
+        if one.name not in spared:
+            raise DataError(f"{words}; slow the reference down or shrink it, or {stated_so}.")
+        remarks.append(f"{words}; {stated_so} to have it kept")
     return remarks
 
 
@@ -239,7 +219,7 @@ def _below(value: float) -> str:
     return f"{-float(_above(-value)):.4g}"
 
 
-def ranges_json(ranges: AnyRanges) -> dict[str, list[float]]:
+def ranges_json(ranges: RangeMap) -> dict[str, list[float]]:
     """Ranges as a model file keeps them, each under its name with the unit, as in `velocity_um_per_s`."""
     return {_key(name): [float(low), float(high)] for name, (low, high) in ranges.items()}
 

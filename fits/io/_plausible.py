@@ -11,10 +11,6 @@ _LARGEST, _LARGEST_BY_UNIT = 1e9, {"s": 1e11, "um^2/V^2": 1e18, "dB": 180.0}
 # What changes by less than so much, in V or um, was not measured.
 LEAST_CHANGE = 1e-9
 SHORTEST_STEP_s = 1e-12
-# Steps of fewer last digits than these are not even where the clock was.
-_DIGITS = 8
-# Further columns serve for little, and may hold anything that has a square and a cube.
-LARGEST_EXTRA = 1e30
 
 
 def check_size(table: Table, column: str, values: FloatArray, unit: str, given: str = "") -> None:
@@ -30,18 +26,3 @@ def check_size(table: Table, column: str, values: FloatArray, unit: str, given: 
     if unit in ("V", "um") and 0 < change < LEAST_CHANGE:
         what = f"expected changes of at least {LEAST_CHANGE:g} {unit}, found {change:.3g} in all; {remedy}"
         raise table.error(what, 0, column)
-
-
-def check_steps(table: Table, column: str, time_s: FloatArray) -> None:
-    """Refuse, in a `DataError`, increasing times, shape `(n,)`, whose steps double precision cannot resolve."""
-    steps_s = np.diff(time_s)
-    if not len(steps_s):
-        return
-    row = int(np.argmin(steps_s))
-    least_s = max(SHORTEST_STEP_s, _DIGITS * float(np.spacing(np.abs(time_s[[0, -1]]).max())))
-    if steps_s[row] < least_s:
-        what = (
-            f"expected time steps of at least {least_s:.3g} s, which is what double precision resolves here, found "
-            f"{steps_s[row]:.3g} s; begin at 0 s, or check the unit"
-        )
-        raise table.error(what, row + 1, column)

@@ -14,7 +14,6 @@ LENGTH = {"um": 0, "nm": -3, "mm": 3, "m": 6, "pm": -6}
 VOLTAGE = {"V": 0, "mV": -3, "uV": -6, "kV": 3}
 _PLAIN_SIGNS = {"µ": "u", "μ": "u", "°C": "degC"}  # both Unicode micro signs, and the degree sign
 BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]")
-_KELVIN_AT_0_DEGC = 273.15
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Quantity:
     def convert(self, values: Any, unit: str) -> Any:
         """Values, or one, of a known unit in the canonical unit."""
         if unit == "K":
-            return values - _KELVIN_AT_0_DEGC
+            return values - 273.15
         # Dividing by an exact power is rounded once; multiplying by 1e-3 would be rounded twice.
         power = self.powers[unit]
         return values * 10.0**power if power >= 0 else values / 10.0**-power

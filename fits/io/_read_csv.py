@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fits.io._errors import DataError
-from fits.io._plausible import LARGEST_EXTRA, check_size, check_steps
+from fits.io._errors import AnyPath, DataError
+from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._quantity import FloatArray
 from fits.io._record import Record, Reference
 from fits.io._table import Problem, Table, open_table
@@ -19,17 +19,9 @@ STROKE_PER_VOLT_MIN_um_per_V = 0.005
 STROKE_PER_VOLT_MAX_um_per_V = 50.0
 MIN_SAMPLES = 50
 
-_MAX_REVERSALS = 0.2  # share of the samples
-# Median swing between reversals, as a share of the voltage range. Larger swings are a commanded multisine or
-# noise drive; smaller ones are the last digit of a 14-bit converter, too small to matter.
-_WIGGLE_MIN, _WIGGLE_MAX = 1e-4, 0.05
-_GAP = 5.0  # in median time steps
-# So many equal readings, over so much of the voltage's range, are no peak: the sensor is at its end.
-_EQUAL_READINGS, _MOVED_SHARE = 8, 0.03
-
 
 def read_csv(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     columns: Mapping[str, str] | None = None,
     required: Iterable[str] = ("time_s", "voltage_V", "displacement_um"),
 ) -> Record:
@@ -37,7 +29,9 @@ def read_csv(
 
     The separator (comma, semicolon, tab), a decimal comma, the encoding (UTF-8, UTF-16 with a byte-order mark,
     Latin-1) and gzip are recognised; lines that begin with ``#`` or ``%`` and blank lines are skipped. Headers
-    such as ``voltage_mV`` are recognised by stem and suffix and converted to the canonical unit.
+    such as ``voltage_mV`` are recognised by stem and suffix and converted to the canonical unit: times are in s,
+    voltages in V and displacements in um, each of shape (n,), and all other numeric columns in `extra`. A `DataError`
+    says in one sentence with file, line and column what was expected and what to do.
 
     Parameters
     ----------
@@ -49,16 +43,6 @@ def read_csv(
     required
         Canonical columns that must be there. Time and voltage always are; without ``displacement_um`` the file is
         a voltage programme, which may be short and may hold the voltage.
-
-    Returns
-    -------
-    Record
-        Times in s, voltages in V and displacements in um, each of shape (n,); all other numeric columns in `extra`.
-
-    Raises
-    ------
-    DataError
-        One sentence with file, line and column, what was expected and what to do.
     """
     required = tuple(dict.fromkeys(("time_s", "voltage_V", *required)))
     read = KnownColumns.read(path, columns, required)
@@ -85,11 +69,12 @@ def read_csv(
         "the column matters."
         for name, (line, found) in read.problems.items()
     ]
-    for name in [name for name, array in extra.items() if np.abs(array).max() > LARGEST_EXTRA]:
+    # Further columns serve for little, and may hold anything that has a square and a cube.
+    for name in [name for name, array in extra.items() if np.abs(array).max() > 1e30]:
         del extra[name]
         warnings.append(
-            f"{table.path}, column '{name}': dropped, because it holds numbers beyond {LARGEST_EXTRA:g}; correct "
-            "them if the column matters."
+            f"{table.path}, column '{name}': dropped, because it holds numbers beyond 1e+30; correct them if the "
+            "column matters."
         )
     with np.errstate(all="ignore"):  # absurd magnitudes overflow here, and then warn of nothing
         warnings += [*read.odd_gaps(), *read.odd_voltage()]
@@ -98,9 +83,7 @@ def read_csv(
     return Record(time_s, voltage_V, displacement_um, extra, os.path.basename(table.path), tuple(warnings))
 
 
-def read_runs(
-    paths: Iterable[str | os.PathLike[str]], columns: Mapping[str, str] | None = None
-) -> tuple[Record, ...]:
+def read_runs(paths: Iterable[AnyPath], columns: Mapping[str, str] | None = None) -> tuple[Record, ...]:
     """Read several files as several runs of one rig; arguments and errors are those of `read_csv`."""
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not paths:
@@ -108,11 +91,8 @@ def read_runs(
     return tuple(read_csv(path, columns) for path in paths)
 
 
-def read_reference(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> Reference:
-    """Read a displacement to follow, with the columns `time_s` and `displacement_um`; others are not looked at.
-
-    Arguments and errors are those of `read_csv`.
-    """
+def read_reference(path: AnyPath, columns: Mapping[str, str] | None = None) -> Reference:
+    """Read a displacement to follow: the columns `time_s` and `displacement_um`; see `read_csv` for all else."""
     read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), alone=True)
     with np.errstate(all="ignore"):
         warnings = tuple(read.odd_gaps())
@@ -133,7 +113,7 @@ class KnownColumns:
     @classmethod
     def read(
         cls,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         columns: Mapping[str, str] | None,
         required: Sequence[str],
         more: Sequence[str] = (),
@@ -168,7 +148,7 @@ class KnownColumns:
         median_s = float(np.median(steps_s))
         if np.quantile(steps_s, 0.95, method="lower") > 2.0 * median_s:
             return
-        gaps = np.flatnonzero(steps_s > _GAP * median_s)
+        gaps = np.flatnonzero(steps_s > 5.0 * median_s)
         if gaps.size:
             worst = int(np.argmax(steps_s))
             count = "a gap" if gaps.size == 1 else f"{gaps.size} gaps, the longest"
@@ -183,10 +163,12 @@ class KnownColumns:
         voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays.get("displacement_um")
         turns_V = _reversals(voltage_V)
         share = turns_V.size / voltage_V.size
-        if voltage_V.size < MIN_SAMPLES or share <= _MAX_REVERSALS:
+        if voltage_V.size < MIN_SAMPLES or share <= 0.2:
             return
         wiggle = float(np.median(np.abs(np.diff(turns_V)))) / float(np.ptp(voltage_V))
-        if not _WIGGLE_MIN < wiggle < _WIGGLE_MAX:
+        # Larger swings between reversals, as a share of the range, are a commanded multisine or noise drive; smaller
+        # ones are the last digit of a 14-bit converter, too small to matter.
+        if not 1e-4 < wiggle < 0.05:
             return
         place = self.place("voltage_V")
         if displacement_um is not None and _reversals(displacement_um).size < turns_V.size / 4:
@@ -221,15 +203,14 @@ class KnownColumns:
             )
 
     def saturated(self) -> Iterator[str]:
-        """Readings that stand at one end while the voltage moves on: the longest such stretch."""
+        """Readings that stand at one end, eight or more, while the voltage moves by 3 % of its range: no peak."""
         voltage_V, displacement_um = self.arrays["voltage_V"], self.arrays["displacement_um"]
-        enough_V = _MOVED_SHARE * float(np.ptp(voltage_V))
+        enough_V = 0.03 * float(np.ptp(voltage_V))
         for end, words in ((displacement_um.max(), "largest"), (displacement_um.min(), "smallest")):
-            stands = np.concatenate([[False], displacement_um == end, [False]])
-            edges = np.flatnonzero(np.diff(stands.astype(int)))
+            edges = np.flatnonzero(np.diff((displacement_um == end).astype(int), prepend=0, append=0))
             for first, stop in zip(edges[::2], edges[1::2], strict=True):
                 moved = float(np.ptp(voltage_V[first:stop]))
-                if stop - first >= _EQUAL_READINGS and moved > enough_V:
+                if stop - first >= 8 and moved > enough_V:
                     yield (
                         f"{self.place('displacement_um', int(first))}: {stop - first} readings in a row are the "
                         f"{words}, {end:.6g} um, while the voltage moves by {moved:.3g} V, so the sensor is at its "
@@ -264,7 +245,15 @@ class KnownColumns:
 def _check_time(table: Table, column: str, time_s: FloatArray) -> None:
     wrong = np.flatnonzero(time_s[1:] <= time_s[:-1])
     if wrong.size == 0:
-        check_steps(table, column, time_s)
+        # Steps of fewer last digits than eight are not even where the clock was.
+        least_s = max(SHORTEST_STEP_s, 8 * float(np.spacing(np.abs(time_s[[0, -1]]).max())))
+        steps_s = np.diff(time_s)
+        if steps_s.min(initial=np.inf) < least_s:
+            what = (
+                f"expected time steps of at least {least_s:.3g} s, which is what double precision resolves here, "
+                f"found {steps_s.min():.3g} s; begin at 0 s, or check the unit"
+            )
+            raise table.error(what, int(np.argmin(steps_s)) + 1, column)
         return
     row = int(wrong[0]) + 1
     before, now = float(time_s[row - 1]), float(time_s[row])

@@ -10,19 +10,17 @@ import tomllib
 import zlib
 from typing import Any
 
-from fits.io._errors import DataError, shown
+from fits.io._errors import AnyPath, DataError, shown
 
 # Each is many times what real files need, and fits in the memory of a small computer.
 MOST_CSV_BYTES = 512_000_000
 MOST_JSON_BYTES = 64_000_000
 MOST_TOML_BYTES = 1_000_000
 MOST_DEPTH = 32
-_PIECE = 1 << 20
-_LONGEST_PATH = 200
 _LARGEST_INTEGER = 2**63 - 1
 
 
-def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
+def read_bytes(path: AnyPath, what: str, most: int) -> bytes:
     """Read `what` is expected at a path, such as `a CSV file`; a `DataError` if it cannot be, or is too large."""
     name = os.fspath(path)
     try:
@@ -43,7 +41,7 @@ def read_bytes(path: str | os.PathLike[str], what: str, most: int) -> bytes:
         raise DataError(f"{name}: cannot be read ({reason}); check the name and the permissions.") from None
 
 
-def read_text(path: str | os.PathLike[str], what: str, most: int) -> str:
+def read_text(path: AnyPath, what: str, most: int) -> str:
     """Read a file of UTF-8 text, with or without a byte-order mark; arguments and errors as of `read_bytes`."""
     data = read_bytes(path, what, most)
     try:
@@ -121,7 +119,7 @@ def _check(value: Any, place: str, finite: bool, path: str = "", depth: int = 0)
             name = f"{path}[{key}]" if listed else f"{path}.{key}".lstrip(".")
             if wrong:
                 raise DataError(f"{place}: {shown(name)[1:-1]}: expected {wrong}; correct it.")
-            _check(item, place, finite, name[:_LONGEST_PATH], depth + 1)
+            _check(item, place, finite, name[:200], depth + 1)
 
 
 def _fault(item: Any, finite: bool) -> str:
@@ -140,7 +138,7 @@ def _fault(item: Any, finite: bool) -> str:
 
 def _bounded(file: Any, name: str, most: int) -> bytes:
     pieces, size = [], 0
-    while piece := file.read(_PIECE):
+    while piece := file.read(1 << 20):
         pieces.append(piece)
         size += len(piece)
         if size > most:

@@ -25,24 +25,11 @@ def _read_only(values: ArrayLike) -> FloatArray:
 class Record:
     """One run of one rig, `n` samples long.
 
-    Parameters
-    ----------
-    time_s
-        Sample times in s, shape (n,), strictly increasing; the steps may be uneven.
-    voltage_V
-        Commanded voltage in V, shape (n,).
-    displacement_um
-        Measured displacement in um, shape (n,), or None for a voltage programme.
-    extra
-        All other numeric columns by name, each of shape (n,), such as ``temperature_degC``.
-    source, warnings
-        Name of the file, without its folder, and what looked odd when it was read, one sentence each; what cannot be
-        printed of them is kept as codes.
-
-    Raises
-    ------
-    ValueError
-        The arrays are not one-dimensional or differ in length.
+    Sample times in s increase strictly, in steps that may be uneven; commanded voltages are in V, measured
+    displacements in um, or None for a voltage programme, shape (n,) each. `extra` holds all other numeric columns by
+    name, each of shape (n,), such as ``temperature_degC``; `source` is the name of the file, without its folder, and
+    `warnings` say what looked odd when it was read, one sentence each; what cannot be printed of them is kept as
+    codes. A `ValueError` says that the arrays are not one-dimensional or differ in length.
     """
 
     time_s: FloatArray

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fits.io._errors import DataError
+from fits.io._errors import AnyPath, DataError
 from fits.io._quantity import FloatArray
 from fits.io._read_file import MOST_CSV_BYTES, read_bytes, unpack
 
@@ -42,10 +42,7 @@ Problem = tuple[int, str]
 
 @dataclass(frozen=True)
 class Table:
-    r"""A CSV file of which the header is read and the body is still text, with lines that all end in `\n`.
-
-    Headers are without quotes and spaces around them, and physical lines are counted from 1.
-    """
+    r"""A CSV file whose header is read, without quotes and spaces, and whose body is text whose lines end in `\n`."""
 
     path: str
     names: tuple[str, ...]
@@ -56,8 +53,7 @@ class Table:
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
         """Parse all columns: the numeric ones, each of shape (n,), and the first problem of each other.
 
-        A `DataError` refuses a file without rows, a row of another length, and what is not finite in a `strict`
-        column.
+        A `DataError` refuses what has no rows, rows of another length, and what is not finite in a `strict` column.
         """
         if next(self._lines(), None) is None:
             what = "expected rows of numbers below the header, found none; export again"
@@ -209,7 +205,7 @@ class Table:
         return data_error(self.path, what, line, column)
 
 
-def open_table(path: str | os.PathLike[str]) -> Table:
+def open_table(path: AnyPath) -> Table:
     """Read a file and its header; a `DataError` says that this is no readable text with a header of its own."""
     shown = os.fspath(path)
     data = read_bytes(shown, "a CSV file", MOST_CSV_BYTES)

@@ -17,10 +17,6 @@ import time
 from pathlib import Path
 
 _NAME = re.compile(r"\.microid-([0-9a-f]{8})-([0-9a-f]{8})-(\d{1,10})-(\d{1,20})-[0-9a-f]{16}(\..*)?", re.DOTALL)
-# Longer endings tell no format.
-_LONGEST_ENDING = 12
-# A process that is listed, but has ended.
-_ENDED = ("Z", "X", "x")
 # Folders that were looked through: once in a process is enough.
 _CLEANED: set[str] = set()
 
@@ -29,7 +25,7 @@ def temporary_name(ending: str = "") -> str:
     """Make a new name for this process's use, with an ending such as `.csv` by which a format is told."""
     host, boot = _machine()
     pid = os.getpid()
-    kept = ending if len(ending) <= _LONGEST_ENDING else ""
+    kept = ending if len(ending) <= 12 else ""  # longer ones tell no format
     return f".microid-{host}-{boot}-{pid}-{_started(pid) or 0}-{secrets.token_hex(8)}{kept}"
 
 
@@ -69,8 +65,11 @@ def _stale(entry: os.DirEntry[str], host: str, boot: str, pid: str, start: str) 
         return False
     if boot != now:
         # Another container on this machine looks like another start of it, but has not written before this start.
-        began = _machine_started_s()
-        return began is not None and status.st_mtime < began
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            uptime_s = float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
+            # A clock that was set right meanwhile must not make a live file look old.
+            return status.st_mtime < time.time() - uptime_s - 60
+        return False
     return not _lives(int(pid), int(start))
 
 
@@ -92,7 +91,7 @@ def _started(pid: int) -> int | None:
         with open(f"/proc/{pid}/stat", "rb") as file:
             # The second field is a name in brackets, which may hold anything.
             fields = file.read().decode("ascii", "replace").rpartition(")")[2].split()
-        return -1 if fields[0] in _ENDED else int(fields[19])
+        return -1 if fields[0] in ("Z", "X", "x") else int(fields[19])  # listed, but ended
     except (OSError, ValueError, IndexError):
         return None
 
@@ -100,29 +99,11 @@ def _started(pid: int) -> int | None:
 @functools.cache
 def _machine() -> tuple[str, str]:
     """Digests of this machine, and of its running since the last start, as far as processes see each other."""
-    host = [socket.gethostname(), *_contents("/etc/machine-id")]
-    boot = _contents("/proc/sys/kernel/random/boot_id")
+    host, boot = [socket.gethostname()], list[str]()
+    for parts, path in ((host, "/etc/machine-id"), (boot, "/proc/sys/kernel/random/boot_id")):
+        with contextlib.suppress(OSError):
+            parts.append(Path(path).read_text(encoding="ascii", errors="replace").strip())
     with contextlib.suppress(OSError):
         boot.append(os.readlink("/proc/self/ns/pid"))
-    return _digest(host), _digest(boot)
-
-
-def _digest(parts: list[str]) -> str:
-    return hashlib.sha256("\n".join(parts).encode("utf-8", "replace")).hexdigest()[:8]
-
-
-def _contents(path: str) -> list[str]:
-    try:
-        return [Path(path).read_text(encoding="ascii", errors="replace").strip()]
-    except OSError:
-        return []
-
-
-def _machine_started_s() -> float | None:
-    """When this machine was started, in s since 1970; None where it is not known."""
-    try:
-        uptime_s = float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
-    except (OSError, ValueError, IndexError):
-        return None
-    # A clock that was set right meanwhile must not make a live file look old.
-    return time.time() - uptime_s - 60
+    first, second = (hashlib.sha256("\n".join(parts).encode("utf-8", "replace")) for parts in (host, boot))
+    return first.hexdigest()[:8], second.hexdigest()[:8]

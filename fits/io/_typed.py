@@ -25,9 +25,8 @@ _OTHER = "a value of another kind", "correct it"
 def typed(table: Any, kind: type[_Table], place: str = "") -> _Table:
     """Read a table whose keys are the fields of a struct, nested ones and lists of them included.
 
-    The description of a field's `msgspec.Meta`, if it has one, says what is expected. A `DataError`, which begins
-    with the place such as `geometry.t2.value`, refuses what is not as the struct says, and numbers that are not
-    finite.
+    The description of a field's `msgspec.Meta`, if any, says what is expected. A `DataError`, which begins with the
+    place such as `geometry.t2.value`, refuses what is not as the struct says, and numbers that are not finite.
     """
     _check(table, kind, place)
     return msgspec.convert(table, kind)

@@ -75,8 +75,7 @@ def find_sources(
 ) -> dict[str, Source]:
     """Choose the source column of every canonical column that the user's mapping or, failing that, the headers give.
 
-    A `DataError`, which begins with the place, refuses a required column that is missing, duplicates, and wrong
-    units.
+    A `DataError`, which begins with the place, refuses missing required columns, duplicates, and wrong units.
     """
     sources = {column: _mapped(column, text, names, place) for column, text in columns.items()}
     taken = {source.column for source in sources.values()}

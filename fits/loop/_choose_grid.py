@@ -12,29 +12,11 @@ from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, relaxat
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, LevelTrial
-from fits.loop._run import Run, simulate_run
+from fits.loop._run import Progress, Run, simulate_run
 from fits.stats._noise import WHITE, correlation_samples, huber_weight, quantum_um
 
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
-# Refining goes on while it takes this fraction off the error of predicted blocks.
-_LEAST_GAIN = 0.005
-# From so many levels on more, by the square of their number.
-_COSTLY = 32
-# Errors up to so many times what a last digit rounds off are rounding.
-_ROUNDED = 1.2
-# Rounds after which the weights of outliers have settled.
-_REWEIGHED = 8
-# Correlation of displacement with voltage below which there is no loop.
-_CORRELATED = 0.3
-# Coherence from which on it follows all the same.
-_COHERENT = 0.2
-# Coherence of lines whose gain is trusted.
-_CLEAR = 0.3
-# Segments whose spectra are averaged: chance gives a coherence of 1 / 16.
-_SEGMENTS = 16
-# Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
-_LEADING = 0.5
 
 
 @dataclass(frozen=True)
@@ -49,11 +31,7 @@ class GridTrial:
 
 
 def choose_grid(
-    runs: Sequence[Run],
-    levels: int | None,
-    progress: Callable[[str], None],
-    finest: int = LADDER[-1],
-    alone: bool = False,
+    runs: Sequence[Run], levels: int | None, progress: Progress, finest: int = LADDER[-1], alone: bool = False
 ) -> tuple[float, GridTrial, list[LevelTrial]]:
     """Fit grids of rising resolution up to the finest, or of the one given, and keep the one that predicts best.
 
@@ -68,7 +46,7 @@ def choose_grid(
         return try_grid(gather(grid_of(runs, n), runs), runs, stroke, hyper, levels is None, alone)
 
     digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
-    tried, trials = _resolve(trial, levels, finest, _ROUNDED * digit / 12**0.5)
+    tried, trials = _resolve(trial, levels, finest, 1.2 * digit / 12**0.5)
     return stroke, tried, trials
 
 
@@ -77,8 +55,7 @@ def _resolve(
 ) -> tuple[GridTrial, list[LevelTrial]]:
     """Refine until it no longer pays; of grids that predict alike the finest is kept.
 
-    What a last digit rounds off repeats itself with every loop, and a fine grid follows it from digit to digit: an
-    error that is no more than that is not worth refining.
+    What a last digit rounds off repeats itself with every loop, and a fine grid would follow it from digit to digit.
     """
     best = trial(levels or LADDER[0], Hyper.start())
     trials = [LevelTrial(best.data.grid.levels, best.error_um)]
@@ -92,7 +69,7 @@ def _resolve(
             break
         trials.append(LevelTrial(n, finer.error_um))
         # A fit takes eight times as long for twice the levels, and must be worth it.
-        pays = finer.error_um < (1 - _LEAST_GAIN * max(1.0, n / _COSTLY) ** 2) * best.error_um
+        pays = finer.error_um < (1 - 0.005 * max(1.0, n / 32) ** 2) * best.error_um
         best = finer if finer.error_um <= best.error_um else best
         if not pays:
             break
@@ -124,7 +101,7 @@ def _stroke(run: Run) -> float:
     if np.ptp(displacement) == 0 or np.ptp(voltage) == 0:
         raise DataError(f"{run.record.source}: nothing moves in the samples to be fitted; hold out less")
     together = float(np.corrcoef(voltage, displacement)[0, 1])
-    if abs(together) < _CORRELATED:
+    if abs(together) < 0.3:
         _refuse_ringing(run)
         raise DataError(
             f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so "
@@ -135,7 +112,8 @@ def _stroke(run: Run) -> float:
             f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
             "change the sign of one of the two columns"
         )
-    if _leads(voltage, displacement) > _LEADING:
+    # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
+    if _leads(voltage, displacement) > 0.5:
         raise DataError(
             f"{run.record.source}: the displacement runs ahead of the voltage round its loops, where a piezo stays "
             "behind: the two columns are exchanged; correct the header, or name them the other way with --columns"
@@ -149,14 +127,14 @@ def _refuse_ringing(run: Run) -> None:
     piece = slice(which[0], which[-1] + 1)
     voltage, displacement = run.record.voltage_V[piece], run.displacement_um[piece]
     rate_Hz = float(1 / np.median(np.diff(run.record.time_s[piece])))
-    settings: dict[str, Any] = {"fs": rate_Hz, "nperseg": max(len(voltage) // _SEGMENTS, 16)}
+    settings: dict[str, Any] = {"fs": rate_Hz, "nperseg": max(len(voltage) // 16, 16)}
     frequency, cross = signal.csd(voltage, displacement, **settings)
     power, out = (signal.welch(one, **settings)[1] for one in (voltage, displacement))
     shared = np.abs(cross) ** 2 / (power * out + 1e-300)
     follows = float(np.average(shared, weights=power))
-    if follows < _COHERENT:
+    if follows < 0.2:
         return
-    clear = (shared > min(_CLEAR, follows)) & (power > np.median(power))
+    clear = (shared > min(0.3, follows)) & (power > np.median(power))  # lines whose gain is trusted
     gain = np.where(clear, np.abs(cross) / (power + 1e-300), 0.0)
     raise DataError(
         f"{run.record.source}: the displacement follows the voltage (coherence {follows:.2f}), but not at once, and "
@@ -173,12 +151,12 @@ def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:
     return float(parts.sum() / (np.abs(parts).sum() + 1e-300))
 
 
-def weigh_robustly(runs: Sequence[Run], progress: Callable[[str], None]) -> list[Run]:
+def weigh_robustly(runs: Sequence[Run], progress: Progress) -> list[Run]:
     """Weigh samples so that outliers count linearly (Huber), by reweighted fits on a coarse grid."""
     progress("weighing outliers")
     stroke = max(_stroke(run) for run in runs)
     grid, hyper = grid_of(runs, LADDER[0]), Hyper.start()
-    for _ in range(_REWEIGHED):
+    for _ in range(8):  # outliers have settled by then
         solution = solve_grid(gather(grid, runs), stroke, 1.0, hyper)
         hyper = solution.hyper
         model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))

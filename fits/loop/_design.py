@@ -51,9 +51,8 @@ class Grid(eqx.Module):
         weights, slopes = columns[: self.weights], columns[self.weights :]
         packed = weights * node_areas(self.levels)[np.tril_indices(self.levels)]
         density = GridDensity(packed, self.lower_V, self.upper_V)
-        return Preisach(
-            density, Reversible(slopes / self.range_V, self.lower_V, self.upper_V), jnp.asarray(offset_um)
-        )
+        reversible = Reversible(slopes / self.range_V, self.lower_V, self.upper_V)
+        return Preisach(density, reversible, jnp.asarray(offset_um))
 
 
 @eqx.filter_jit

@@ -1,6 +1,6 @@
 """From records to a fitted Preisach operator, and to what a rig must have been through before its record."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._prior import interpolation
 from fits.loop._result import FitResult, FitStatus, RunReport
-from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
+from fits.loop._run import Progress, Run, command_range_V, prepare_run, simulate_run
 from fits.loop._shapes import solve_shape
 from fits.loop._uncertainty import Uncertainty
 from fits.stats._noise import LOSSES, WHITE
@@ -27,9 +27,6 @@ from microid import FAMILIES, Preisach, Staircase
 
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
-# Fraction of the range at either end that counts as the end, and of samples on branches of smaller loops that count.
-_EDGE = 0.02
-_MINOR = 0.01
 # Pairs of extremes that stand for the unknown history, and samples that are compared.
 _PAIRS = 6
 _SAMPLES = 1024
@@ -46,12 +43,15 @@ def fit(
     loss: str = "squares",
     starts: int = 8,
     seed: int = 0,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> FitResult[Preisach]:
     """Fit a Preisach operator to measured voltage and displacement (Eq. 8-11).
 
     The weights are found by a smooth, non-negative regression whose smoothness and noise level maximise the
     evidence; the resolution is raised until blocks of the record are no longer predicted better from the others.
+
+    A `DataError` says that the records cannot be fitted, or are not of one rig, a `FitError` that a solver failed,
+    and a `RuntimeError` that JAX computes in single precision.
 
     Parameters
     ----------
@@ -69,18 +69,6 @@ def fit(
         Number of starts, and their seed, for families whose fit is not convex.
     progress
         Told what is being done, a sentence at a time.
-
-    Returns
-    -------
-    FitResult
-        Never the start: a fit that fails raises.
-
-    Raises
-    ------
-    DataError
-        If the records cannot be fitted, or are not of one rig.
-    FitError, RuntimeError
-        If a solver fails, or JAX computes in single precision.
     """
     fraction, aside, range_V = check_fit(records, holdout, loss)
     if family not in FAMILIES:
@@ -193,9 +181,9 @@ def _remarks(runs: list[Run]) -> list[str]:
                 "they were not used for the weights, and the initial state was estimated from them"
             )
     lower, upper = min(run.lower_V for run in runs), max(run.upper_V for run in runs)
-    edge = _EDGE * (upper - lower)
+    edge = 0.02 * (upper - lower)
     anchors = np.concatenate([run.path.anchor_V[run.fitted] for run in runs])
-    if np.mean((anchors > lower + edge) & (anchors < upper - edge)) < _MINOR:
+    if np.mean((anchors > lower + edge) & (anchors < upper - edge)) < 0.01:
         remarks.append(
             "the fitted samples hold no loop smaller than the full range: what the model says about smaller loops "
             "rests on the smoothness of the density alone and its band there is too narrow; "

@@ -24,20 +24,7 @@ from microid import Preisach
 EVIDENCE_LEVELS = 16
 # And this many to say how sure predictions are; finer perturbations move no displacement.
 BELIEF_LEVELS = 24
-# Noise that changes by less, in the logarithm of its variance, is not worth another factorisation.
-_SAME_NOISE = 0.02
 _ATOL = 1e-6
-_STEPS = 500
-# Steps per column where one column at a time is bounded or let go.
-_STEPS_PER_COLUMN = 30
-# More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
-_MOST_COLUMNS = 1100
-# At least this many columns are bounded at first.
-_FIRST_BOUNDED = 64
-# E-folds by which curvature may count less, and the part of the squared error of predicted blocks that is worth it.
-_RELAXATIONS, _WORTH = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0), 0.01
-# Blocks are made of so many pieces at most, each as long as what is left stays alike.
-_MOST_PIECES = 40
 
 
 @dataclass(frozen=True)
@@ -84,7 +71,7 @@ def solve_grid(
         # What the coarse levels could not follow was noise to them.
         determined = effective(even, hyper, Posterior.of(few, even, hyper))
         renewed = renew_noise(moments, hyper, posterior, determined)
-        if abs(float(renewed.log_variance - hyper.log_variance)) > _SAME_NOISE:
+        if abs(float(renewed.log_variance - hyper.log_variance)) > 0.02:  # worth another factorisation
             hyper, posterior = renewed, Posterior.of(moments, rough, renewed)
     else:
         hyper = maximise_evidence(moments, rough, start).relaxed(relaxation)
@@ -104,7 +91,7 @@ def relaxation_of(runs: Sequence[Run], stroke_um: float, correlation: float, sta
     pieces of the whole record: consecutive fifths of a record that swings ever farther would ask what lies beyond.
     """
     count = sum(float(run.fitted.sum()) for run in runs)
-    pieces = int(np.clip(count / correlation, BLOCKS, _MOST_PIECES))
+    pieces = int(np.clip(count / correlation, BLOCKS, 40))
     data = gather(grid_of(runs, EVIDENCE_LEVELS), runs, pieces)
     rough = roughness(EVIDENCE_LEVELS)
     hyper = maximise_evidence(data.total.scaled(1 / correlation, stroke_um), rough, start)
@@ -121,9 +108,9 @@ def relaxation_of(runs: Sequence[Run], stroke_um: float, correlation: float, sta
             square += float(off) if found else np.inf
         return square
 
-    errors = {efolds: error(efolds) for efolds in _RELAXATIONS}
+    errors = {efolds: error(efolds) for efolds in (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0)}
     best = min(errors, key=lambda efolds: errors[efolds])
-    return best if errors[best] < (1 - _WORTH) * errors[0.0] else 0.0
+    return best if errors[best] < 0.99 * errors[0.0] else 0.0
 
 
 def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
@@ -135,7 +122,7 @@ def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
     scale = np.sqrt(np.diagonal(posterior.precision))
     lowest = np.asarray(posterior.mean) * scale
     size = len(lowest)
-    bounded = _FIRST_BOUNDED
+    bounded = 64
     while True:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
@@ -154,13 +141,14 @@ def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
 def _one_by_one(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
     precision = np.asarray(posterior.precision)
-    if len(precision) > _MOST_COLUMNS:
+    # More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
+    if len(precision) > 1100:
         return jnp.maximum(posterior.mean, 0), False
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
     try:
-        columns, _ = nnls(root, root @ (scale * np.asarray(posterior.mean)), maxiter=_STEPS_PER_COLUMN * len(scale))
+        columns, _ = nnls(root, root @ (scale * np.asarray(posterior.mean)), maxiter=30 * len(scale))
     except RuntimeError:
         return jnp.maximum(posterior.mean, 0), False
     return jnp.asarray(columns / scale), True
@@ -185,7 +173,7 @@ def _marginal(
 
 @eqx.filter_jit
 def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Float[Array, " k"], Bool[Array, ""]]:
-    return minimise_nonnegative(precision, -(precision @ mean), jnp.maximum(mean, 0), _ATOL, _STEPS)
+    return minimise_nonnegative(precision, -(precision @ mean), jnp.maximum(mean, 0), _ATOL, 500)
 
 
 @eqx.filter_jit

@@ -10,26 +10,12 @@ from fits.io._record import Record
 from fits.loop._run import Run
 from fits.stats._noise import idle_stretches, quantum_um, rough_noise_um, stretches
 
-# So many samples of a command at rest say what the noise is.
-_IDLE = 150
-# A residual beyond so many times the noise, and such a part of the stroke in %, is far from it.
-_FAR_TIMES_NOISE, _FAR_PCT = 2.0, 0.1
 # A sensor sticks where so many readings in a row are the same to the last bit.
 _STUCK_SAMPLES = 8
 # Meanwhile the stage, by its mean gain, moves by such a part of its stroke, and by so many last digits.
 _MOVED_SHARE, _DIGITS = 0.05, 3.0
-# Readings count as impulses beyond so many deviations from their neighbours, where at most so many stand together.
-_IMPULSE, _MOST_TOGETHER = 8.0, 3
-# They are so many times as large as the median of those within so many samples.
-_LEAST_RATIO, _COMPARED_SAMPLES = 4.0, 16
 # So many impulses are no chance; so many are listed.
 _FEW, _LISTED = 3, 6
-# Impulses count where they make such a part of the residual's squares.
-_MATTERS = 0.1
-# And are so large, beside the root mean square of all.
-_PULLED = 0.2
-# Samples farther apart than this, in s, are rare with piezo stages.
-_SPARSE_s = 1.0
 
 
 @dataclass(frozen=True)
@@ -54,7 +40,7 @@ class Misfit:
     @property
     def far(self) -> bool:
         """Whether more than noise is left, and more than a trifle of the stroke."""
-        return self.times_noise > _FAR_TIMES_NOISE and self.share_pct > _FAR_PCT
+        return self.times_noise > 2.0 and self.share_pct > 0.1
 
 
 def misfits(runs: Sequence[Run], residuals: Sequence[np.ndarray]) -> list[Misfit]:
@@ -102,7 +88,7 @@ def sensor_noise_um(record: Record, residual_um: np.ndarray) -> tuple[float, str
         # What settles is no noise.
         pieces.append(piece - np.polyval(np.polyfit(time, piece, min(3, len(piece) // 12)), time))
     found = []
-    if sum(map(len, pieces)) >= _IDLE:
+    if sum(map(len, pieces)) >= 150:  # samples at rest say what the noise is
         joined = np.concatenate(pieces)
         found.append((1.4826 * float(np.median(np.abs(joined))), f"{record.source} at rest"))
     words = f"the fastest changes in {record.source}"
@@ -121,7 +107,7 @@ def remarks_on(runs: Sequence[Run], residuals: Sequence[np.ndarray], robust: boo
         out += stuck(record)
         out += impulses(run, residual, robust)
         interval = float(np.median(np.diff(record.time_s)))
-        if interval > _SPARSE_s:
+        if interval > 1.0:
             out.append(
                 f"{record.source}: samples are {interval:.4g} s apart and the run takes {record.duration_s:.4g} s, "
                 "which is rare with piezo stages: if the time is in ms, name it so, as in --columns time_s=time_ms"
@@ -161,8 +147,8 @@ def outlying(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     height = _height(residual_um)
     if bad.any():
         # Where large ones pull the fit, what it leaves beside them jumps, too.
-        bad &= height > _PULLED * float(np.sqrt(np.mean(height[bad] ** 2)))
-    if bad.sum() < _FEW or np.sum(height[bad] ** 2) < _MATTERS * np.sum(residual_um[fitted] ** 2):
+        bad &= height > 0.2 * float(np.sqrt(np.mean(height[bad] ** 2)))
+    if bad.sum() < _FEW or np.sum(height[bad] ** 2) < 0.1 * np.sum(residual_um[fitted] ** 2):
         return np.zeros_like(bad)
     return bad
 
@@ -205,11 +191,11 @@ def impulsive(residual_um: np.ndarray, digit_um: float = 0.0) -> np.ndarray:
     """Mark readings that are far off their neighbours, in last digits, too, shape `(n,)`."""
     off = _height(residual_um)
     spread = np.maximum(median_filter(off, 101, mode="nearest"), max(float(np.median(off)), digit_um))
-    far = off > _IMPULSE * 1.4826 * spread + 1e-300
+    far = off > 8.0 * 1.4826 * spread + 1e-300  # eight standard deviations
     # What rings, or turns back, goes on as fast as it came: its neighbours move about as far from sample to sample.
     steps = np.abs(np.diff(residual_um, append=residual_um[-1]))
-    far &= off > _LEAST_RATIO * median_filter(steps, 2 * _COMPARED_SAMPLES + 1, mode="nearest")
+    far &= off > 4.0 * median_filter(steps, 33, mode="nearest")
     for first, stop in stretches(far):
-        if stop - first > _MOST_TOGETHER:
+        if stop - first > 3:  # more do not jump back
             far[first:stop] = False
     return far

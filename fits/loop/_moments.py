@@ -22,17 +22,9 @@ from fits.loop._past import past_columns
 from fits.loop._run import Run
 from microid import Staircase
 
-# A branch that goes less far than this, in steps of the grid, stands still.
-_SMALLEST_MOVE = 1e-12
 _SLOTS = 4
 _NEGLIGIBLE = 1e-14
-# Groups of four pseudo-samples that go through the compiled regression at a time: few, so that little is padded,
-# or many, where the products of many columns pay for it.
-_FEW, _MANY = 256, 512
-_MANY_LEVELS = 32
 BLOCKS = 5
-# Squares below which a column is nothing, and parts of the largest below which a combination of columns is.
-_TINY, _SHOWN = 1e-300, 1e-11
 
 
 @dataclass(frozen=True)
@@ -77,7 +69,7 @@ def compress(run: Run, levels_V: np.ndarray, pieces: int) -> Compressed:
 
     # Visits of many samples: moments of the fraction of the way, then the square root of their Gram matrix.
     start, span = voltage_V[first], voltage_V[last] - voltage_V[first]
-    safe = np.where(np.abs(span) <= _SMALLEST_MOVE * step, 1.0, span)
+    safe = np.where(np.abs(span) <= 1e-12 * step, 1.0, span)  # it stands still
     way = (voltage_V - start[group]) / safe[group]
     powers = np.vander(way, 2 * _SLOTS - 1, increasing=True)
     powers *= share[:, None]
@@ -161,12 +153,8 @@ class Moments(eqx.Module):
 
     def scaled(self, count: Float[Array, ""] | float, unit_um: float) -> "Moments":
         """Measure displacement in `unit_um`, and count each sample as `count` independent ones."""
-        return Moments(
-            self.gram * count,
-            self.cross_um * (count / unit_um),
-            self.energy_um2 * (count / unit_um**2),
-            self.count * count,
-        )
+        cross_um, energy_um2 = self.cross_um * (count / unit_um), self.energy_um2 * (count / unit_um**2)
+        return Moments(self.gram * count, cross_um, energy_um2, self.count * count)
 
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Moments":
         """Keep only combinations of columns."""
@@ -227,16 +215,16 @@ def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) ->
     size = grid.columns + past.shape[2] + 1
     sums = [Moments.empty(size) for _ in range(BLOCKS)]
     table = jnp.asarray(branch_table(grid.levels))
-    length = _MANY if grid.levels > _MANY_LEVELS else _FEW
+    # Groups that are regressed at a time: few, so that little is padded, or many where the many columns pay for it.
+    length = 512 if grid.levels > 32 else 256
     for begin in range(0, len(groups.block), length):
         piece = slice(begin, begin + length)
         pad = (0, length - len(groups.block[piece]))
         voltage = np.pad(groups.voltage_V[piece].ravel(), (0, 4 * pad[1]), mode="edge")
         mix = np.pad(groups.mix[piece], (pad, (0, 0), (0, 0)))
         mixed, start = _regress(grid, table, jnp.asarray(voltage), start, jnp.asarray(mix))
-        beside = np.einsum("gij,gjk->gik", groups.mix[piece], past[piece]).reshape(
-            4 * len(past[piece]), past.shape[2]
-        )
+        shape = 4 * len(past[piece]), past.shape[2]
+        beside = np.einsum("gij,gjk->gik", groups.mix[piece], past[piece]).reshape(shape)
         rows = np.asarray(mixed)[: len(beside)]
         rows = np.concatenate([rows[:, :-1], beside, rows[:, -1:]], axis=1)
         for block in np.unique(groups.block[piece]):
@@ -269,10 +257,10 @@ def _regress(
 def _without_nuisance(sums: Moments, size: int) -> tuple[Moments, RunMean]:
     """Eliminate a run's nuisance parameters, all unknowns but the first `size`; the last of them is its offset."""
     gram, cross = np.asarray(sums.gram), np.asarray(sums.cross_um)
-    scale = np.sqrt(np.maximum(np.diagonal(gram)[size:], _TINY))
+    scale = np.sqrt(np.maximum(np.diagonal(gram)[size:], 1e-300))
     block = gram[size:, size:] / scale / scale[:, None]
     # A past that has ended before a block is not seen in it.
-    inverse = np.linalg.pinv(block, rcond=_SHOWN, hermitian=True) / scale / scale[:, None]
+    inverse = np.linalg.pinv(block, rcond=1e-11, hermitian=True) / scale / scale[:, None]
     follow, answer = inverse @ gram[size:, :size], inverse @ cross[size:]
     reduced = Moments(
         gram[:size, :size] - gram[:size, size:] @ follow,

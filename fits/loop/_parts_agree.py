@@ -20,31 +20,14 @@ from microid import Preisach
 _LEVELS = 16
 # Parts disagree where both together leave so many times what each leaves alone.
 _TIMES = 2.0
-# Gains that differ by more than this are not those of one rig.
-_REFUSED = 0.1
-# A change is looked for at so many places of a run, and the best one is moved in so many rounds.
-_PLACES, _ROUNDS = 5, 4
+# A change is looked for at so many places of a run.
+_PLACES = 5
 # Samples that each part of a run needs.
 _FEWEST_SAMPLES = 200
-# Shifts, in samples, at which a delay is looked for first, and how far.
-_FARTHEST = 64
-# A delay must raise twice the log likelihood of a run by this.
-_LEAST_GAIN = 30.0
-# It must leave no more than this part of the residual where that is more than so many times the noise.
-_LEFT_SHARE, _NEAR_NOISE = 0.4, 2.0
-# What is so near the noise, and as white, holds no delay.
-_QUIET = 1.3
-# A hysteresis takes part of a delay for width: it is known to half a sample at best.
-_ROUGHLY = 0.5
 
 
 def check_loops(
-    runs: Sequence[Run],
-    prepare: Callable[[Record], Run],
-    model: Preisach,
-    stroke_um: float,
-    hyper: Hyper,
-    robust: bool,
+    runs: list[Run], prepare: Callable[[Record], Run], model: Preisach, stroke_um: float, hyper: Hyper, robust: bool
 ) -> tuple[Misfit, list[str]]:
     """Say how far from noise a fitted hysteresis is, and what is wrong with its runs; errors of `disagreements`.
 
@@ -59,7 +42,7 @@ def check_loops(
         # Fits of parts are only asked for an opinion.
         told = []
     quiet = all(
-        one.times_noise < _QUIET and correlation_samples([residual[run.fitted]]) < WHITE
+        one.times_noise < 1.3 and correlation_samples([residual[run.fitted]]) < WHITE
         for one, residual, run in zip(left, residuals, runs, strict=True)
     )
     if not told and not quiet:
@@ -98,8 +81,7 @@ def disagreements(
 ) -> list[str]:
     """Look for runs, and parts of runs, that a hysteresis explains one by one but not together: a sentence for each.
 
-    The residuals are those of all runs together. A `DataError` if the gains of two runs differ by so much that they
-    are not of one rig in one setting.
+    The residuals are those of all runs together. A `DataError` if gains of two runs differ too much for one rig.
     """
     if not any(one.far for one in left):
         return []
@@ -121,7 +103,7 @@ def disagreements(
             f"{runs[high].record.source} moves {ratio:.3g} times as far as {runs[low].record.source}: they are of "
             "different rigs or settings, or differ in rate, drift, load or temperature; fit them apart"
         )
-        if ratio > 1 + _REFUSED:
+        if ratio > 1.1:
             raise DataError(sentence)
         remarks.append(sentence)
     for run, rms in zip(runs, own, strict=True):
@@ -143,7 +125,7 @@ def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
         place = int(np.searchsorted(order, total * k / _PLACES))
         if min(order[place], total - order[place]) < _FEWEST_SAMPLES:
             continue
-        for _ in range(_ROUNDS):
+        for _ in range(4):  # each round moves the place to where it is best
             first, second = parts(place)
             if min(first.fitted.sum(), second.fitted.sum()) < _FEWEST_SAMPLES:
                 break
@@ -193,13 +175,15 @@ def delays(
         if found is None:
             continue
         samples, sd, before, after, gained = found
+        # Where it leaves more than twice the noise it must take most of the residual away.
         if (
-            gained < _LEAST_GAIN
+            gained < 30.0  # in twice the log likelihood
             or abs(samples) < 5 * sd
-            or after > (_LEFT_SHARE if after > _NEAR_NOISE * miss.noise_um else 1.0) * before
+            or after > (0.4 if after > 2.0 * miss.noise_um else 1.0) * before
         ):
             continue
-        sd = max(sd, _ROUGHLY)
+        # A hysteresis takes part of a delay for width: it is known to half a sample at best.
+        sd = max(sd, 0.5)
         size = f"{abs(samples):.1f} +- {sd:.1f} samples ({abs(samples) * interval:.3g} s)"
         where = "AFTER the voltage" if samples > 0 else "BEFORE the voltage that causes it"
         remarks.append(
@@ -220,7 +204,7 @@ def _profile(residual: Callable[[float], np.ndarray]) -> tuple[float, float, flo
 
     # Down from none, by steps that double, and back by halves.
     best, step = 0.0, 1.0 if cost(1.0) < cost(-1.0) else -1.0
-    while abs(best + step) <= _FARTHEST and cost(best + step) < cost(best):
+    while abs(best + step) <= 64 and cost(best + step) < cost(best):
         best, step = best + step, 2 * step
     while abs(step) > 1:
         step /= 2

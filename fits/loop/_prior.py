@@ -12,15 +12,6 @@ from jaxtyping import Array, Float
 
 from fits.loop._moments import Moments
 
-# Standard deviation, in strokes, beyond which no density is believed even where the smoothness does not bind.
-_WIDE = 100.0
-_ROUNDING = 1e-14
-# Curvature counts by the square of the distance from the diagonal, in ranges, increased by this and over that: relays
-# that switch close together are many, and their density changes fast.
-_CLOSE_TO_DIAGONAL, _FAR_FROM_DIAGONAL = 0.05, 0.35
-# Where the evidence is flat the smoothness stays within a few times this factor, in e-folds, of a middling one.
-_MIDDLE, _WIDTH = -4.6, 6.0
-
 
 class Hyper(eqx.Module):
     """How smooth and how noisy, as natural logarithms; found from the data by the evidence.
@@ -61,8 +52,9 @@ class Roughness(eqx.Module):
             + jnp.exp(hyper.log_along) * self.along
             + jnp.exp(hyper.log_reversible) * self.reversible
         )
-        # What is straight has no curvature; a great weight on the rest must not make it negative by rounding.
-        floor = 1 / _WIDE**2 + _ROUNDING * jnp.max(jnp.diagonal(curvature))
+        # What is straight has no curvature, but no density of 100 strokes is believed; and a great weight on the rest
+        # must not make it negative by rounding.
+        floor = 1 / 100.0**2 + 1e-14 * jnp.max(jnp.diagonal(curvature))
         return curvature + floor * jnp.eye(curvature.shape[0])
 
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Roughness":
@@ -104,7 +96,8 @@ def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) 
     nodes = np.array([(i + di, j + dj) for di, dj in offsets])
     inside = np.all((nodes >= 0) & (nodes < n), axis=(0, 1)) & np.all(nodes[:, 0] >= nodes[:, 1], axis=0)
     columns = place[nodes[:, 0][:, inside], nodes[:, 1][:, inside]]
-    weight = (((i - j)[inside] / (n - 1) + _CLOSE_TO_DIAGONAL) / _FAR_FROM_DIAGONAL) ** 2
+    # Relays that switch close together are many, and their density changes fast: by distance in ranges.
+    weight = (((i - j)[inside] / (n - 1) + 0.05) / 0.35) ** 2
     form = np.zeros((weights, weights))
     for one, left in zip(columns, factors, strict=True):
         for other, right in zip(columns, factors, strict=True):
@@ -169,7 +162,8 @@ def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array,
     volume = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
     prior_volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(prior))))
     weights = jnp.stack([hyper.log_density, hyper.log_along, hyper.log_reversible])
-    unlikely = jnp.sum(((weights - _MIDDLE) / _WIDTH) ** 2)
+    # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
+    unlikely = jnp.sum(((weights + 4.6) / 6.0) ** 2)
     return jnp.asarray(moments.count * hyper.log_variance + misfit + volume - prior_volume + unlikely) / 2
 
 

@@ -54,8 +54,7 @@ class LevelTrial:
 class ParameterEstimate:
     """One parameter of a stage, by part and field, such as `mechanics.natural_frequency_Hz`.
 
-    The noise counts as coloured as the residual is in the standard deviation and the ends of the 95 % interval, which
-    lies within the bounds.
+    Standard deviation and ends of the 95 % interval, within the bounds, count the noise as coloured as the residual.
     """
 
     name: str
@@ -70,23 +69,14 @@ class ParameterEstimate:
 class RunReport:
     """How a model does on one run.
 
-    Attributes
-    ----------
-    source, offset_um
-        Name of the file, and the sensor offset of the run.
-    in_sample, held_out
-        Errors on the samples that were fitted, and on those that were only predicted; None where there are none.
-    unknown
-        Number of samples that depend on an unknown past; neither fitted nor counted in the errors.
-    start
-        Memory before the first sample; a hysteresis alone estimates it where it is unknown.
-    loop_measured_pct, loop_model_pct
-        Width of the widest loop (Eq. 34); None where the record holds none.
-    reached
-        Ranges of voltage, slew and displacement in the record.
-    noise_um, correlation_samples, substeps
-        Standard deviation of the residual (of all runs, for a hysteresis alone), number of its samples that are worth
-        one independent one, and steps into which each interval was divided; None of a run that was only predicted.
+    `offset_um` is the sensor offset of the run. Errors are on the samples that were fitted (`in_sample`), and on
+    those that were only predicted (`held_out`); None where there are none. `unknown` samples depend on an unknown
+    past, and are neither fitted nor counted in the errors. `start` is the memory before the first sample; a
+    hysteresis alone estimates it where it is unknown. Widths of the widest loop (Eq. 34) are None where the record
+    holds none. What was `reached` are the ranges of voltage, slew and displacement in the record. `noise_um` is the
+    standard deviation of the residual (of all runs, for a hysteresis alone), `correlation_samples` the number of its
+    samples that are worth one independent one, and `substeps` the steps into which each interval was divided; None of
+    a run that was only predicted.
     """
 
     source: str
@@ -133,25 +123,14 @@ class RunReport:
 class FitResult(Generic[_M]):
     """A fitted hysteresis or stage, and how far to trust it.
 
-    Attributes
-    ----------
-    model, uncertainty
-        The Preisach operator, or the stage, with the offset of the first run; and how sure its predictions are.
-    status, remarks
-        How the fit ended, and what the user should know, one sentence each.
-    runs
-        One report per fitted run, then one per held-out record.
-    misfit
-        How far the residual of the run that is described worst is from noise.
-    smoothness
-        Weight on the squared curvature of the density that the data chose, in 1/strokes^2; None without a grid.
-    trials
-        The resolutions that the fit of a hysteresis tried, in order.
-    parameters, correlation
-        Those of a stage outside of the hysteresis' grid, in the order of the solver's coordinates, and the
-        correlation between them, shape `(p, p)`.
-    unseen
-        Combinations of them that the data leave open, one sentence each.
+    The `model` is the Preisach operator, or the stage, with the offset of the first run; `uncertainty` says how sure
+    its predictions are, `status` how the fit ended, and `remarks`, one sentence each, what the user should know.
+    There is one report per fitted run, then one per held-out record. `misfit` is how far the residual of the run that
+    is described worst is from noise. `smoothness` is the weight on the squared curvature of the density that the data
+    chose, in 1/strokes^2, None without a grid; `trials` are the resolutions that the fit of a hysteresis tried, in
+    order. `parameters` are those of a stage outside of the hysteresis' grid, in the order of the solver's
+    coordinates, with the correlation between them, shape `(p, p)`; `unseen` are combinations of them that the data
+    leave open, one sentence each.
     """
 
     model: _M

@@ -1,6 +1,6 @@
 """A record made ready for fitting: which samples count, what it began from, and the arrays that models take."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,40 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+import microid as m
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import columns_beside
 from fits.loop._past import past_columns
-from microid import (
-    Hold,
-    Preisach,
-    Staircase,
-    Start,
-    demagnetised,
-    negative_saturation,
-    positive_saturation,
-    refined,
-    remember,
-)
 
-# Records are filled up to a power of two, so that those of like length share what was compiled.
-_SHORTEST = 1024
-# Instants that differ by less than this part of the interval from those of an even clock were taken by one: the time
-# was rounded when it was written.
-_EVEN = 1e-3
-# Extremes that a memory may hold: filtered multisines nest deeply.
-_EXTREMES = 512
 # A hundred arrays of so many values are 8 GB.
 _MOST_STEPS = 10_000_000
 # All records pass through the same compiled functions in pieces of this many samples.
 _PIECE = 8192
 _STAIRCASES = (64, 512, 4096)
-# A record has met an end of the range, or an extreme of its own, once it comes this close, as a fraction of the
-# range: the first of these that does not cost most of the samples, as peaks of a smooth command miss an end by a
-# little.
-_END_SHARES = (1e-3, 3e-3, 1e-2)
 # Samples that a run must leave to fit.
 _FEWEST = 50
+# Told what is being done, a sentence at a time.
+Progress = Callable[[str], None]
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 
 
@@ -60,17 +41,17 @@ class Samples(eqx.Module):
     voltage_V: Float[Array, " m"]
     displacement_um: Float[Array, " n"]
     weight: Float[Array, " n"]
-    start: Start
+    start: m.Start
     stride: int = eqx.field(static=True)
     moving: bool = eqx.field(static=True)
     has_past: bool = eqx.field(static=True)
     beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
 
 
-def resized(start: Staircase, size: int) -> Staircase:
+def resized(start: m.Staircase, size: int) -> m.Staircase:
     """Give a memory room for so many extremes at least."""
     pad = jnp.full(max(0, size - start.extremes_V.shape[0]), start.extremes_V[0])
-    return Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
+    return m.Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
 
 
 def refuse_many_steps(record: Record, stride: int) -> None:
@@ -90,7 +71,7 @@ class Path:
     from the remembered extreme `anchor_V` and is `rising` or not, shape `(n,)`.
     """
 
-    pieces: tuple[tuple[Float[Array, " k"], Staircase], ...]
+    pieces: tuple[tuple[Float[Array, " k"], m.Staircase], ...]
     anchor_V: np.ndarray
     rising: np.ndarray
 
@@ -110,13 +91,13 @@ class Run:
     record: Record
     lower_V: float
     upper_V: float
-    start: Staircase
+    start: m.Staircase
     known: np.ndarray
     fitted: np.ndarray
     weight: np.ndarray | None = None
     gain: float = 1.0
     stride: int = 1
-    hold: Hold = "first"
+    hold: m.Hold = "first"
     moving: bool = False
     has_past: bool = False
 
@@ -176,11 +157,12 @@ class Run:
         record, stride = self.record, self.stride
         refuse_many_steps(record, stride)
         n, time_s = len(record), record.time_s
-        pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
+        pad = (0, max(1024, 1 << (n - 1).bit_length()) - n)
         step = (time_s[-1] - time_s[0]) / (n - 1)
         share = np.arange((n + pad[1] - 1) * stride + 1) / stride
         voltage = jnp.asarray(np.pad(record.voltage_V, pad, mode="edge"))
-        if np.max(np.abs(time_s - time_s[0] - step * np.arange(n))) <= _EVEN * step:
+        # So near to those of an even clock, instants were taken by one: the time was rounded when it was written.
+        if np.max(np.abs(time_s - time_s[0] - step * np.arange(n))) <= 1e-3 * step:
             time: Any = np.asarray(step / stride)
         else:
             longer = np.concatenate([time_s, time_s[-1] + step * np.arange(1, pad[1] + 1)])
@@ -189,10 +171,10 @@ class Run:
         beside = {name: np.interp(share, np.arange(n), v) for name, v in columns_beside(record).items()}
         return Samples(
             time_s=jnp.asarray(time),
-            voltage_V=refined(jnp.ones(()), voltage, stride, self.hold)[1],
+            voltage_V=m.refined(jnp.ones(()), voltage, stride, self.hold)[1],
             displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
             weight=jnp.asarray(np.pad(self.fit_weight, pad)),
-            start=Start(memory=resized(self.start, _EXTREMES)),
+            start=m.Start(memory=resized(self.start, 512)),  # filtered multisines nest deeply
             stride=stride,
             moving=self.moving,
             has_past=self.has_past,
@@ -221,7 +203,7 @@ def prepare_run(
     holdout: float,
     stride: int = 1,
     gain: float | None = 1.0,
-    hold: Hold = "first",
+    hold: m.Hold = "first",
     usable: np.ndarray | None = None,
     estimated: bool = False,
 ) -> Run:
@@ -260,17 +242,17 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
     return min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
 
 
-def initial_state(name: str, lower_V: float, upper_V: float) -> Staircase:
+def initial_state(name: str, lower_V: float, upper_V: float) -> m.Staircase:
     """Make the memory before a record from its name, one of `INITIAL_STATES`; a `DataError` for another name.
 
     Negative saturation stands in for an unknown state, as the samples that would show the difference are not used.
     """
     if name in ("negative", "unknown"):
-        return negative_saturation(lower_V)
+        return m.negative_saturation(lower_V)
     if name == "positive":
-        return positive_saturation(lower_V, upper_V)
+        return m.positive_saturation(lower_V, upper_V)
     if name == "demagnetised":
-        return demagnetised(lower_V, upper_V)
+        return m.demagnetised(lower_V, upper_V)
     raise DataError(f"unknown initial state {name!r}: choose one of {', '.join(INITIAL_STATES)}")
 
 
@@ -285,7 +267,9 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
         return np.ones(len(voltage), dtype=bool)
     highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
     found: list[np.ndarray] = []
-    for share in _END_SHARES:
+    # How near to an end or an own extreme, as a fraction of the range, has met it: peaks of smooth commands miss ends
+    # by a little, and the first that does not cost most of the samples is taken.
+    for share in (1e-3, 3e-3, 1e-2):
         near = share * (upper_V - lower_V)
         saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
         own = near if found else 0.0
@@ -296,19 +280,19 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
 
 @eqx.filter_jit
 def _remember(
-    voltage_V: Float[Array, " n"], start: Staircase
-) -> tuple[Float[Array, " n"], Bool[Array, " n"], Staircase]:
-    memory = remember(voltage_V, start)
+    voltage_V: Float[Array, " n"], start: m.Staircase
+) -> tuple[Float[Array, " n"], Bool[Array, " n"], m.Staircase]:
+    memory = m.remember(voltage_V, start)
     anchor = memory.path_V[memory.anchor]
     return anchor[memory.lead :], memory.rising[memory.lead :], memory.end()
 
 
 @eqx.filter_jit
-def _respond(model: Preisach, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
+def _respond(model: m.Preisach, voltage_V: Float[Array, " n"], start: m.Staircase) -> Float[Array, " n"]:
     return model(voltage_V, start)
 
 
-def simulate_run(model: Preisach, run: Run) -> np.ndarray:
+def simulate_run(model: m.Preisach, run: Run) -> np.ndarray:
     """Predict the displacement of a run by a hysteresis alone, in um, shape `(n,)`."""
     out = [_respond(model, voltage, start) for voltage, start in run.path.pieces]
     return np.concatenate(out)[: len(run.record)]

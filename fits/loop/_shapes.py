@@ -1,6 +1,6 @@
 """Fitting densities with few or tangled parameters: Powell's dogleg from several starts."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -15,25 +15,14 @@ from fits.loop._grid import Estimate
 from fits.loop._moments import Data, square_root
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import Run, simulate_run
+from fits.loop._run import Progress, Run, simulate_run
 from fits.stats._noise import correlation_samples, shared_square
 from microid import FAMILIES, Coordinates, Preisach, Reversible
 
 # Steps at a time; every start gets these, the leading ones are followed while their cost falls.
 _STEPS = 60
 _TIMES = 12
-_FOLLOWED = 2
-# A cost that fell by less than this has settled: a tenth of what noise does to it.
-_SETTLED = 0.05
 _ROUNDS = 4
-# Noise, in strokes, at which starts are compared.
-_COARSE = 3e-3
-# Starts whose cost comes this close to the best one's agree with it, in units of the noise.
-_AGREE = 2.0
-# A fit ends where the optimum is closer than this, in standard deviations per parameter that the data determine.
-_STATIONARY = 0.2
-# Directions of the data that hold less than this fraction of its largest are rounding.
-_NEGLIGIBLE = 1e-13
 
 
 class _Problem(eqx.Module):
@@ -68,7 +57,7 @@ def _follow(problem: _Problem, z: Float[Array, " k"]) -> tuple[Float[Array, " k"
     cost = float("inf")
     for _ in range(_TIMES):
         z, lower = _descend(problem, z)
-        settled = not float(lower) < cost - _SETTLED
+        settled = not float(lower) < cost - 0.05  # a tenth of what noise does
         cost = float(lower)
         if settled:
             break
@@ -97,14 +86,13 @@ def solve_shape(
     hyper: Hyper,
     starts: int,
     key: PRNGKeyArray,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> tuple[Estimate, bool]:
     """Fit a family of `microid.FAMILIES` that is not linear in its parameters, on the moments of the record alone.
 
     The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise is
     what this family leaves, which may be more than the grid's, in `hyper`. Returns the best of all starts, and
-    whether the two best ended at the same cost. A `FitError` if no start ends finite, or the best one is not
-    stationary.
+    whether the two best ended at the same cost. A `FitError` if no start ends finite, or the best is not stationary.
     """
     grid = data.grid
     moments = data.total.scaled(1.0, stroke_um)
@@ -119,13 +107,13 @@ def solve_shape(
     keys = jax.random.split(key, starts)
     coordinates = Coordinates(draw(keys[0]), free=lambda info: info.path != "offset_um")
     gram, cross, energy = (np.asarray(x)[None] for x in (moments.gram, moments.cross_um, moments.energy_um2))
-    root, target = (jnp.asarray(x[0]) for x in square_root(gram, cross, energy, _NEGLIGIBLE)[:2])
+    root, target = (jnp.asarray(x[0]) for x in square_root(gram, cross, energy, negligible=1e-13)[:2])
     rough = roughness(grid.levels).reversible[grid.weights :, grid.weights :]
     values, vectors = jnp.linalg.eigh(rough * jnp.exp(hyper.log_reversible))
     slopes = jnp.sqrt(jnp.maximum(values, 0))[:, None] * vectors.T
     unit = jnp.asarray(1.0)
     # Starts race on a coarse scale: at the grid's own noise, most would crawl along narrow valleys.
-    scale = jnp.asarray(1 / max(variance, _COARSE**2) ** 0.5)
+    scale = jnp.asarray(1 / max(variance, 3e-3**2) ** 0.5)
     problem = _Problem(root, target, scale, slopes, unit, coordinates, jnp.asarray(stroke_um))
 
     ends = []
@@ -134,7 +122,7 @@ def solve_shape(
         end, cost = _descend(problem, coordinates.of(draw(one)))
         ends.append((end, float(cost)))
     # Narrow valleys cost many steps: only those that lead the race go through them.
-    ends = sorted((end for end in ends if np.isfinite(end[1])), key=lambda end: end[1])[:_FOLLOWED]
+    ends = sorted((end for end in ends if np.isfinite(end[1])), key=lambda end: end[1])[:2]
     if not ends:
         raise FitError(FitStatus.NONFINITE)
     for number, (end, _) in enumerate(ends):
@@ -142,7 +130,7 @@ def solve_shape(
         ends[number] = _follow(problem, end)
     costs = [cost for _, cost in ends]
     best = int(np.argmin(costs))
-    agree = max(costs) < costs[best] + _AGREE
+    agree = max(costs) < costs[best] + 2.0  # in units of the noise
 
     z, count = ends[best][0], float(moments.count)
     precision, determined = 1.0, 0.0
@@ -153,16 +141,14 @@ def solve_shape(
         off = [o - o.mean() for o in off]
         variance = sum(float(np.sum(o**2)) for o in off) / stroke_um**2 / max(count - determined, 1)
         correlation = correlation_samples(off)
-        problem = eqx.tree_at(
-            lambda p: (p.scale, p.precision),
-            problem,
-            (jnp.asarray((variance * correlation) ** -0.5), jnp.asarray(precision)),
-        )
+        weights = jnp.asarray((variance * correlation) ** -0.5), jnp.asarray(precision)
+        problem = eqx.tree_at(lambda p: (p.scale, p.precision), problem, weights)
         z, _ = _follow(problem, z)
         factor, known, distance = _laplace(problem, z)
         determined = float(known)
         precision = max(determined, 1e-3) / float(jnp.sum(z**2))
-    if not float(distance) < _STATIONARY * max(determined, 1) ** 0.5:
+    # In standard deviations per parameter that the data determine.
+    if not float(distance) < 0.2 * max(determined, 1) ** 0.5:
         raise FitError(FitStatus.NOT_STATIONARY)
     shared = sum(shared_square(o) * len(o) for o in off) / sum(len(o) for o in off)
     estimate = Estimate(

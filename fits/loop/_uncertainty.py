@@ -15,8 +15,6 @@ from fits.loop._design import Grid
 from fits.loop._run import Run, prepare_run, simulate_run
 from microid import Preisach, Stage, Staircase, everett, remember
 
-_BATCH = 32
-
 
 @dataclass(frozen=True)
 class Prediction:
@@ -32,8 +30,7 @@ class Prediction:
 class AbstractUncertainty(eqx.Module):
     """How sure the predictions of a fitted model are.
 
-    `discrepancy_um` is the standard deviation of the model's own error, as predicting parts of the record from others
-    shows it.
+    `discrepancy_um` is the standard deviation of the model's own error, as predicting parts of records shows it.
     """
 
     discrepancy_um: eqx.AbstractVar[Float[Array, ""]]
@@ -88,7 +85,7 @@ def _sd(uncertainty: Uncertainty, voltage_V: Float[Array, " n"], start: Staircas
         return (everett(nodes, slopes, grid.lower_V, grid.upper_V).respond(memory) + offset) ** 2
 
     # In batches: all at once would take k times the memory of a simulation.
-    each = lax.map(variance, (uncertainty.columns_um, uncertainty.offset_um), batch_size=_BATCH)
+    each = lax.map(variance, (uncertainty.columns_um, uncertainty.offset_um), batch_size=32)
     return jnp.sqrt(jnp.sum(each, axis=0) + uncertainty.discrepancy_um**2)
 
 

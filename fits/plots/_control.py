@@ -1,6 +1,5 @@
 """Pictures of a reference that is followed: feedforward as in the paper's Fig. 9, and closed loops."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,22 +9,15 @@ import numpy as np
 from fits.control._compensate import Compensation
 from fits.control._compensate_stage import simulate_model
 from fits.control._tune_start import slope_array
+from fits.io._errors import AnyPath
 from fits.io._record import Record, Reference
-from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save
 from fits.stats._metrics import TWO_SIDED_95
 from microid import AbstractController, ControlledRun, Preisach, Stage, loop_gain
 
-_FREQUENCIES = 600
-_DECADES = 3.5
-
 
 def plot_control(
-    run: ControlledRun,
-    controller: AbstractController,
-    plants: Sequence[Stage],
-    folder: str | os.PathLike[str],
-    *,
-    delay: int = 0,
+    run: ControlledRun, controller: AbstractController, plants: Sequence[Stage], folder: AnyPath, *, delay: int = 0
 ) -> list[Path]:
     """Draw a run, and the loop gain and sensitivity of every plant.
 
@@ -34,8 +26,7 @@ def plot_control(
     per inch; a `DataError` says if they cannot be.
     """
     time_s = np.asarray(run.time_s)
-    picture = figure(WIDE_in, 5.2)
-    above, error, below = picture.subplots(3, 1, sharex=True, height_ratios=(1.6, 1, 1))
+    picture, (above, error, below) = panels(WIDE_in, 5.2, 3, 1, sharex=True, height_ratios=(1.6, 1, 1))
     curve(above, time_s, np.asarray(run.measured_um), "measured", **MEASURED)
     curve(above, time_s, np.asarray(run.reference_um), "reference", color=DARK, linewidth=0.9, linestyle="--")
     curve(above, time_s, np.asarray(run.displacement_um), "displacement", **MODEL)
@@ -49,14 +40,11 @@ def plot_control(
     files = [save(picture, Path(folder) / "run.png")]
 
     linear = controller.linear()
-    nyquist = 0.5 / float(controller.interval_s)
-    frequency = nyquist * np.logspace(-_DECADES, 0, _FREQUENCIES)
-    picture = figure(WIDE_in, 4.4)
-    size, turn, peak = picture.subplots(3, 1, sharex=True)
+    frequency = 0.5 / float(controller.interval_s) * np.logspace(-3.5, 0, 600)
+    picture, (size, turn, peak) = panels(WIDE_in, 4.4, 3, 1, sharex=True)
     for k, plant in reversed(list(enumerate(plants))):
-        gain = np.asarray(
-            loop_gain(linear, plant, jnp.asarray(frequency), delay=delay, slope_um_per_V=slope_array(plant))
-        )
+        slope = slope_array(plant)
+        gain = np.asarray(loop_gain(linear, plant, jnp.asarray(frequency), delay=delay, slope_um_per_V=slope))
         style = MODEL | {"linewidth": 0.9} if k == 0 else {"color": LIGHT, "linewidth": 0.7}
         words = {0: "the model", 1: "within its uncertainty"}.get(k, "")
         size.loglog(frequency, np.abs(gain), label=words, **style)
@@ -76,7 +64,7 @@ def plot_compensation(
     reference: Reference | Record,
     compensation: Compensation,
     displacement_sd_um: np.ndarray | None,
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     *,
     initial: str = "negative",
 ) -> list[Path]:
@@ -96,8 +84,7 @@ def plot_compensation(
     straight_V = np.clip(voltage.mean() + gain * centred, voltage.min(), voltage.max())
     plain = simulate_model(model, Record(reference.time_s, straight_V, None, source=reference.source), initial)
 
-    picture = figure(WIDE_in, 4.8, gap=0.08)
-    (loop, inverse), (output, error) = picture.subplots(2, 2)
+    picture, ((loop, inverse), (output, error)) = panels(WIDE_in, 4.8, 2, 2, gap=0.08)
     curve(loop, straight_V, plain, "without compensation", **MEASURED)
     label(loop, "voltage (V)", "displacement (µm)", "loop")
     curve(inverse, wanted, voltage, "with compensation", **MODEL)

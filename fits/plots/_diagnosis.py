@@ -17,7 +17,8 @@ from matplotlib.text import Text
 
 from fits.diagnosis._result import Diagnosis, Experiment, RunView
 from fits.plots._residual_views import VIEWS
-from fits.plots._style import figure, label, thinned, verbatim
+from fits.plots._style import label, panels, thinned, verbatim
+from fits.stats._noise import stretches
 from microid.effects import card_of
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
@@ -25,19 +26,8 @@ BEFORE, AFTER = "#d55e00", "#0072b2"
 NOISE, ASIDE, INK = "#d9dde2", "#f4f1e4", "#22272e"
 # Width of the column and of a phone, in CSS pixels over 96.
 _WIDE_in, _NARROW_in = 7.3, 3.4
-_FONT_pt = 8.5
 # Points of all curves of one picture together.
 _POINTS = 5000
-# More runs than this make a page that nobody scrolls through.
-_MOST_RUNS = 6
-# Half-width of the band of the noise, in standard deviations.
-_BAND = 2.0
-_HEAD = re.compile(r"^.*?(?=<svg)", re.DOTALL)
-_IDS = re.compile(r'( id="|href="#|url\(#)')
-_DIGITS = re.compile(r"(\d\.\d)\d+")
-_PATHS = re.compile(r' d="[^"]*"')
-_SIZE = re.compile(r'(<svg[^>]*?) width="[^"]*"')
-_HEIGHT = re.compile(r'(<svg[^>]*?) height="[^"]*"')
 
 
 @dataclass(frozen=True)
@@ -60,26 +50,28 @@ def _svg(picture: Figure, prefix: str, words: str) -> str:
             spine.set_linewidth(0.6)
             spine.set_color(INK)
     for each in picture.findobj(Text):
-        each.set_fontsize(_FONT_pt)
+        each.set_fontsize(8.5)
         if each.get_color() in ("black", "k"):
             each.set_color(INK)
     out = StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": prefix}):
         nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
         picture.savefig(out, format="svg", metadata=nothing, transparent=True)
-    text = _HEAD.sub("", out.getvalue(), count=1)
-    text = _IDS.sub(lambda found: found[1] + prefix, text)
+    text = out.getvalue()
+    text = re.sub(r'( id="|href="#|url\(#)', lambda found: found[1] + prefix, text[text.index("<svg") :])
     # A tenth of a point is finer than any screen.
-    text = _PATHS.sub(lambda found: _DIGITS.sub(r"\1", found[0]).replace("\n", ""), text)
-    text = _HEIGHT.sub(r"\1", _SIZE.sub(r"\1", text, count=1), count=1)
+    digits = re.compile(r"(\d\.\d)\d+")
+    text = re.sub(r' d="[^"]*"', lambda found: digits.sub(r"\1", found[0]).replace("\n", ""), text)
+    for size in ("width", "height"):
+        text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
     return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(words)}"', 1).strip()
 
 
 def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
-    """Choose the runs with the largest residuals, in their order."""
+    """Choose the six runs with the largest residuals, in their order: nobody scrolls through more."""
     runs = [run for run in runs if run.time_s.size > 1]
     sizes = [np.nanmean(run.before_um**2) if np.isfinite(run.before_um).any() else 0.0 for run in runs]
-    keep = sorted(np.argsort(sizes)[::-1][:_MOST_RUNS])
+    keep = sorted(np.argsort(sizes)[::-1][:6])
     return [runs[k] for k in keep]
 
 
@@ -92,25 +84,24 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
     extended = bool(diagnosis.causes)
 
     def draw(width_in: float) -> Figure:
-        picture = figure(width_in, 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0))
-        panels = picture.subplots(len(runs), 1, sharey=True, squeeze=False)[:, 0]
-        for axes, run in zip(panels, runs, strict=True):
+        height_in = 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0)
+        picture, grid = panels(width_in, height_in, len(runs), sharey=True, squeeze=False)
+        for axes, run in zip(grid[:, 0], runs, strict=True):
             _set_aside(axes, run)
-            band = _BAND * diagnosis.noise_um * per_um
-            if np.isfinite(band):
-                axes.axhspan(-band, band, color=NOISE, linewidth=0)
+            band = 2.0 * diagnosis.noise_um * per_um
             curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if extended else [])
             for values, colour, line in curves:
                 keep = thinned(values, points)
                 axes.plot(run.time_s[keep], per_um * values[keep], color=colour, linewidth=line)
             if np.isfinite(band):
+                axes.axhspan(-band, band, color=NOISE, linewidth=0)
                 # Over the curves, which else hide the band.
                 for edge in (-band, band):
                     axes.axhline(edge, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=3)
             axes.set_xlim(run.time_s[0], run.time_s[-1])
             axes.set_title(verbatim(run.source, int(12 * width_in)), loc="left")
             label(axes, y=f"residual ({unit})" if len(runs) < 3 or width_in == _WIDE_in else unit)
-        label(panels[-1], "time (s)")
+        label(grid[-1, 0], "time (s)")
         return picture
 
     return _drawn("residuals", "Residual over time before and after the extension, with the band of the noise", draw)
@@ -118,10 +109,8 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
 
 def _set_aside(axes: Axes, run: RunView) -> None:
     """Shade what was not used for the fit."""
-    aside = np.concatenate([[False], ~np.asarray(run.fitted, bool), [False]])
-    begins, ends = (np.flatnonzero(np.diff(aside.astype(int)) == sign) for sign in (1, -1))
     # Single samples without a value are not what was held out.
-    for begin, end in zip(begins, ends, strict=True):
+    for begin, end in stretches(~np.asarray(run.fitted, bool)):
         if end - begin > 0.01 * run.time_s.size:
             axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
 
@@ -139,8 +128,7 @@ def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, uni
     view, extended = found, bool(diagnosis.causes)
 
     def draw(width_in: float) -> Figure:
-        picture = figure(width_in, 2.7 if width_in == _WIDE_in else 2.5)
-        axes = picture.subplots()
+        picture, axes = panels(width_in, 2.7 if width_in == _WIDE_in else 2.5)
         if not view.spectrum:
             axes.axhline(0.0, color=INK, linewidth=0.5)
         for curve in seen:
@@ -149,8 +137,7 @@ def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, uni
             colour = AFTER if curve.after else BEFORE
             if curve.low is not None and curve.high is not None:
                 axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.14, linewidth=0)
-            style = "--" if curve.downwards else "-"
-            axes.plot(curve.x, curve.y, color=colour, linewidth=1.3, linestyle=style)
+            axes.plot(curve.x, curve.y, "--" if curve.downwards else "-", color=colour, linewidth=1.3)
         if view.logarithmic:
             axes.set_xscale("log")
         if view.spectrum:
@@ -168,8 +155,7 @@ def program(ahead: Experiment) -> Picture | None:
         return None
 
     def draw(width_in: float) -> Figure:
-        picture = figure(width_in, 2.0)
-        axes = picture.subplots()
+        picture, axes = panels(width_in, 2.0)
         keep = thinned(ahead.voltage_V, _POINTS // 2)
         axes.plot(ahead.time_s[keep], ahead.voltage_V[keep], color=INK, linewidth=0.9)
         axes.set_xlim(ahead.time_s[0], ahead.time_s[-1])

@@ -1,6 +1,5 @@
 """Pictures of a fit, for print: columns of 90 mm or 180 mm, readable in grey."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,14 +10,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fits.io._errors import AnyPath
 from fits.io._record import Record
 from fits.loop._result import FitResult, RunReport
 from fits.loop._run import Run, prepare_run, simulate_run
 from fits.plots._runs import Drawn, held_out, loops, over_time
-from fits.plots._style import DARK, NARROW_in, WIDE_in, figure, label, save
+from fits.plots._style import DARK, NARROW_in, WIDE_in, label, panels, save
 from microid import Preisach, Reversible
 
-_MESH = 361
 _surfaces = eqx.filter_jit(lambda model, alpha, beta: (model.density(alpha, beta), model.everett(alpha, beta)))
 _ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
 
@@ -26,7 +25,7 @@ _ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
 def plot_fit(
     result: FitResult[Preisach],
     records: Sequence[Record],
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     *,
     holdout: float | Sequence[Record] = 0.2,
     initial: str = "unknown",
@@ -66,7 +65,7 @@ def _simulated(result: FitResult[Preisach], run: Run, report: RunReport) -> Draw
 
 def _over_half_plane(model: Preisach) -> tuple[np.ndarray, list[np.ma.MaskedArray]]:
     """Evaluate the density and the Everett surface on a mesh of voltages; beta runs along the last axis."""
-    voltage = np.linspace(float(model.density.lower_V), float(model.density.upper_V), _MESH)
+    voltage = np.linspace(float(model.density.lower_V), float(model.density.upper_V), 361)
     alpha, beta = np.meshgrid(voltage, voltage, indexing="ij")
     surfaces = _surfaces(model, jnp.asarray(alpha), jnp.asarray(beta))
     return voltage, [np.ma.masked_where(alpha < beta, np.asarray(surface)) for surface in surfaces]
@@ -78,8 +77,7 @@ def _half_plane(axes: Axes, voltage: np.ndarray) -> None:
 
 
 def _density(voltage: np.ndarray, values: np.ma.MaskedArray, reversible: Reversible) -> Figure:
-    picture = figure(WIDE_in, 2.9, gap=0.08)
-    plane, curve = picture.subplots(1, 2, width_ratios=(1.25, 1))
+    picture, (plane, curve) = panels(WIDE_in, 2.9, 1, 2, width_ratios=(1.25, 1), gap=0.08)
     # One sharp peak at the diagonal would otherwise leave the rest white.
     top = float(np.quantile(values.compressed(), 0.995)) or None
     mesh = plane.pcolormesh(voltage, voltage, values, cmap="Greys", vmin=0, vmax=top, rasterized=True)
@@ -93,8 +91,7 @@ def _density(voltage: np.ndarray, values: np.ma.MaskedArray, reversible: Reversi
 
 
 def _everett(voltage: np.ndarray, values: np.ma.MaskedArray) -> Figure:
-    picture = figure(NARROW_in, 2.9)
-    axes = picture.subplots()
+    picture, axes = panels(NARROW_in, 2.9)
     filled = axes.contourf(voltage, voltage, values, levels=12, cmap="Greys")
     axes.contour(voltage, voltage, values, levels=filled.levels, colors=DARK, linewidths=0.4)
     _half_plane(axes, voltage)

@@ -1,6 +1,5 @@
 """Pictures of machining errors (Fig. 7 of the paper), of measuring errors (its Fig. 8), and of error budgets."""
 
-import os
 import re
 import textwrap
 from collections.abc import Sequence
@@ -15,33 +14,27 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 import microid as m
+from fits.io._errors import AnyPath
 from fits.io._printable import plain
 from fits.io._record import Reference
 from fits.machining._budget import Budget
 from fits.machining._claims import Claim, paper_claims
 from fits.machining._design import Design, lever_mm, paper_design
 from fits.machining._idle import IdleNoise
-from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at
+from fits.machining._sensitivity import AxisSensitivity, SensitivityReport, gains_at
 from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save, verbatim
 
 AXIS_SIGNS: dict[m.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamma": r"$\gamma$"}
 UNIT_SIGNS = {"um": "µm", "urad": "µrad"}
 # Odd, so that the nominal dimensions are among the steps.
 _STEPS = 41
-_COLUMNS = 2
-# Of the height of a panel: the least distance of two labels.
-_LABEL_GAP = 0.085
-_PANEL_in, _LINE_in = 2.3, 0.125
+_LINE_in = 0.125
 _SMALL_pt = 6
 _CHARACTERS = 64
 _DIMENSION = re.compile(rf"\b(?:{'|'.join({name for motion in m.MOTIONS.values() for name in motion.dimensions})})\b")
-
-
 # A thin line from a label to its curve; without `patchA` it would end at the frame of the label.
 _LEADER: dict[str, Any] = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.4, "patchA": None}
 _LEADER |= {"shrinkA": 1.5, "shrinkB": 0, "relpos": (0, 0.5)}
-_PARTS = {"driving": "0.3", "machining": "0.65", "measuring": "0.95"}
-_MOST_LINES = 5
 
 
 @dataclass(frozen=True)
@@ -56,7 +49,7 @@ class _Panel:
     curves: dict[str, NDArray[np.float64]]
 
 
-def plot_sensitivity(design: Design, report: SensitivityReport, folder: str | os.PathLike[str]) -> list[Path]:
+def plot_sensitivity(design: Design, report: SensitivityReport, folder: AnyPath) -> list[Path]:
     """Draw which dimensions matter, and the output error over the machining error of each (Fig. 7).
 
     Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel. The
@@ -105,15 +98,17 @@ def _draw_bars(axes: Axes, panel: _Panel) -> None:
     places = range(len(effects))
     changes = np.array([effect.relative_change_pct for effect in effects])
     exact = 100 * np.array([panel.curves[effect.name][[0, -1]] for effect in effects])
-    bars: dict[str, Any] = {"height": 0.72, "linewidth": 0.4, "edgecolor": DARK}
-    marks: dict[str, Any] = {"markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
     for name, values, color in (("plus", changes, "0.45"), ("minus", -changes, "0.9")):
-        axes.barh(places, values, color=color, label=f"{name} one tolerance, first order", **bars)
+        words = f"{name} one tolerance, first order"
+        axes.barh(places, values, 0.72, color=color, label=words, linewidth=0.4, edgecolor=DARK)
+    marks: dict[str, Any] = {"markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
     for name, values, color in (("plus", exact[:, 1], "0.0"), ("minus", exact[:, 0], "1.0")):
         axes.plot(values, places, "D", label=f"{name}, exact", markerfacecolor=color, **marks)
     axes.axvline(0, color=DARK, linewidth=0.6)
     axes.set_ylim(len(effects) - 0.4, -0.6)
-    axes.set_yticks(places, [f"{symbol(effect.name)} ± {_tolerance(effect)}" for effect in effects])
+    units = ["mrad" if effect.unit == "rad" else "µm" for effect in effects]
+    named = [f"{symbol(e.name)} ± {1e3 * e.tolerance:.3g} {unit}" for e, unit in zip(effects, units, strict=True)]
+    axes.set_yticks(places, named)
     beside: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "ha": "right", "va": "center", "fontsize": 7}
     for place, effect in zip(places, effects, strict=True):
         axes.text(1.10, place, _signed(f"{effect.relative_change_pct:+.3f} %"), **beside)
@@ -128,11 +123,11 @@ def _draw_bars(axes: Axes, panel: _Panel) -> None:
 
 def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[Claim]) -> Figure:
     """Fig. 7: panels in two columns, each with its claims below."""
-    columns = min(_COLUMNS, len(panels))
+    columns = min(2, len(panels))
     lines = [_claim_lines(panel, claims) for panel in panels]
     heights = []
     for k in range(0, len(panels), columns):
-        heights += [_PANEL_in, _LINE_in * max(1, *map(len, lines[k : k + columns]))]
+        heights += [2.3, _LINE_in * max(1, *map(len, lines[k : k + columns]))]
     width_in = WIDE_in * (1 if columns > 1 else 0.55)
     picture = figure(width_in, sum(heights) + 0.55 * len(heights) / 2 + 0.25, gap=0.06)
     grid = picture.add_gridspec(len(heights), columns, height_ratios=heights)
@@ -166,8 +161,8 @@ def _draw_curves(axes: Axes, design: Design, panel: _Panel) -> None:
     axes.set_ylim(-reach, reach)
     axes.axhline(0, color=LIGHT, linewidth=0.6)
     axes.axvline(0, color=LIGHT, linewidth=0.6)
-    gap = _LABEL_GAP * 2 * reach
-    heights = _spaced(np.array([curve[-1] for curve in curves.values()]), gap)
+    # Labels are apart by a part of the panel's height.
+    heights = _spaced(np.array([curve[-1] for curve in curves.values()]), 0.085 * 2 * reach)
     for effect, height in zip(effects, heights, strict=True):
         curve, end_mm = curves[effect.name], ends_mm[effect.name]
         style = "-" if effect.unit == "mm" else "--"
@@ -226,11 +221,7 @@ def symbol(name: str) -> str:
     return f"${stem}_{{{index}}}$" if index else f"${stem}$"
 
 
-def _tolerance(effect: DimensionEffect) -> str:
-    return f"{1e3 * effect.tolerance:.3g} {'mrad' if effect.unit == 'rad' else 'µm'}"
-
-
-def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
+def plot_budget(found: Budget, folder: AnyPath) -> list[Path]:
     """Draw the parts of the worst case of each axis in percent of its stroke, and the root sum of squares.
 
     `budget.png` is written into an existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
@@ -241,7 +232,8 @@ def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
     bars = picture.subplots()
     ends = [0.0] * len(axes)
     parts = [(abs(axis.driving), axis.machining_worst_case, axis.measuring or 0.0) for axis in axes]
-    for (part, color), sizes in zip(_PARTS.items(), zip(*parts, strict=True), strict=True):
+    shades = {"driving": "0.3", "machining": "0.65", "measuring": "0.95"}
+    for (part, color), sizes in zip(shades.items(), zip(*parts, strict=True), strict=True):
         widths = [100 * size / axis.stroke for size, axis in zip(sizes, axes, strict=True)]
         bars.barh(places, widths, 0.62, ends, color=color, edgecolor=DARK, linewidth=0.4, label=f"{part}, largest")
         ends = [end + width for end, width in zip(ends, widths, strict=True)]
@@ -262,7 +254,7 @@ def plot_budget(found: Budget, folder: str | os.PathLike[str]) -> list[Path]:
     return [save(picture, Path(folder) / "budget.png")]
 
 
-def plot_idle(reference: Reference, noise: IdleNoise, folder: str | os.PathLike[str]) -> list[Path]:
+def plot_idle(reference: Reference, noise: IdleNoise, folder: AnyPath) -> list[Path]:
     """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
 
     The noise is that of the record, from `idle_noise`. `idle.png` is written into an existing folder, at 200 dots per
@@ -307,7 +299,7 @@ def _draw_spectrum(axes: Axes, noise: IdleNoise) -> None:
     density = noise.asd_um_per_rtHz
     curve(axes, noise.frequency_Hz, density, **MODEL)
     axes.set(xscale="log", yscale="log")
-    at_Hz = [line.frequency_Hz for line in noise.lines[:_MOST_LINES]]
+    at_Hz = [line.frequency_Hz for line in noise.lines[:5]]
     if at_Hz:
         tops = [float(density[np.argmin(np.abs(noise.frequency_Hz - each))]) for each in at_Hz]
         axes.plot(at_Hz, tops, "v", color=DARK, markersize=3.5)

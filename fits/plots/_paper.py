@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from fits.plots._style import LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save
+from fits.plots._style import LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save
 
 _STYLES: dict[str, dict[str, Any]] = {
     "reference": {"color": "0.75", "linewidth": 2.5},
@@ -21,8 +20,7 @@ _STYLES: dict[str, dict[str, Any]] = {
 
 def plot_loop(voltage_V: np.ndarray, measured_um: np.ndarray, model_um: np.ndarray, path: Path) -> Path:
     """Draw Fig. 6: the loops that were measured and those of the fit, and their difference."""
-    picture = figure(WIDE_in, 2.8, gap=0.08)
-    loop, error = picture.subplots(1, 2)
+    picture, (loop, error) = panels(WIDE_in, 2.8, 1, 2, gap=0.08)
     loop.plot(voltage_V, measured_um, label="measured", **MEASURED)
     loop.plot(voltage_V, model_um, label="model", **MODEL)
     label(loop, "voltage (V)", "elongation (µm)")
@@ -41,8 +39,7 @@ def plot_inverse(
     path: Path,
 ) -> Path:
     """Draw Fig. 9: the loop, the inverse loop, what came of the two in series on the bench, and its error."""
-    picture = figure(WIDE_in, 4.8, gap=0.08)
-    (loop, inverse), (output, error) = picture.subplots(2, 2)
+    picture, ((loop, inverse), (output, error)) = panels(WIDE_in, 4.8, 2, 2, gap=0.08)
     curves = [
         (loop, voltage_V, loop_um, "voltage (V)", "elongation (µm)"),
         (inverse, wanted_um, inverse_V, "wanted (µm)", "voltage (V)"),
@@ -57,8 +54,7 @@ def plot_inverse(
 
 def plot_steps(time_s: np.ndarray, target_um: float, steps: Mapping[str, np.ndarray], path: Path) -> Path:
     """Draw Fig. 10: answers to a step by scheme, each of shape `(n,)`."""
-    picture = figure(WIDE_in, 2.8)
-    axes = picture.subplots()
+    picture, axes = panels(WIDE_in, 2.8)
     axes.axhline(target_um, label="reference", **_STYLES["reference"])
     for scheme, displacement_um in steps.items():
         axes.plot(time_s, displacement_um, label=scheme, **_STYLES[scheme])
@@ -72,8 +68,7 @@ def plot_tracking(
     interval_s: float, runs: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]], path: Path
 ) -> Path:
     """Draw Fig. 11 and 12: rows of a title, a reference and displacements by scheme, each of shape `(n,)`."""
-    picture: Figure = figure(WIDE_in, 2.1 * len(runs) + 0.4, gap=0.08)
-    rows = np.atleast_2d(picture.subplots(len(runs), 2))
+    picture, rows = panels(WIDE_in, 2.1 * len(runs) + 0.4, len(runs), 2, gap=0.08, squeeze=False)
     for (shown, error), (title, reference_um, schemes) in zip(rows, runs, strict=True):
         time_s = interval_s * np.arange(len(reference_um))
         curve(shown, time_s, reference_um, "reference", **_STYLES["reference"])

@@ -13,10 +13,6 @@ from microid.effects import View
 _BINS = 36
 # Fewer samples than this make no mean.
 _FEWEST_IN_MEAN = 4
-# Samples whose mean is where a change begins: more would hide what happens meanwhile.
-_FIRST = 3
-# A change of the voltage below this part of its range is none.
-_SMALLEST_MOVE = 1e-6
 # Whether a residual is that after the extension, and what takes it from a run.
 _RESIDUALS: tuple[tuple[bool, Callable[[RunView], np.ndarray]], ...] = (
     (False, attrgetter("before_um")),
@@ -40,14 +36,14 @@ class Curve:
 class ResidualView:
     """A residual against one variable.
 
-    `look` makes curves from runs, with lengths times a factor; a `ValueError` where the runs do not allow it. `per`
-    follows the unit of the length. The first axis is `logarithmic`, or both are where it is a `spectrum`.
+    `look` makes curves from runs, with lengths times a factor; a `ValueError` where the runs, or none at all, do not
+    allow it. `per` follows the unit of the length. The first axis is `logarithmic`, or both are of a `spectrum`.
     """
 
     look: Callable[[Sequence[RunView], float], list[Curve]]
     x_label: str
-    y_label: str
     caption: str
+    y_label: str = "residual"
     per: str = ""
     logarithmic: bool = False
     spectrum: bool = False
@@ -59,9 +55,8 @@ def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, 
     x, y = x[known], y[known]
     if x.size < _FEWEST_IN_MEAN * 3 or np.ptp(x) == 0:
         raise ValueError("too few samples")
-    edges = (
-        np.linspace(x.min(), x.max(), _BINS + 1) if even else np.unique(np.quantile(x, np.linspace(0, 1, _BINS + 1)))
-    )
+    steps = np.linspace(0, 1, _BINS + 1)
+    edges = np.linspace(x.min(), x.max(), _BINS + 1) if even else np.unique(np.quantile(x, steps))
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     rows = []
     for k in range(len(edges) - 1):
@@ -76,7 +71,7 @@ def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, 
 
 
 def _together(runs: Sequence[RunView], of: Callable[[RunView], np.ndarray]) -> np.ndarray:
-    return np.concatenate([np.ravel(of(run)) for run in runs]) if runs else np.empty(0)
+    return np.concatenate([np.ravel(of(run)) for run in runs])
 
 
 def _over(x: Callable[[RunView], np.ndarray], even: bool = True) -> Callable[[Sequence[RunView], float], list[Curve]]:
@@ -104,7 +99,7 @@ def _over_voltage(runs: Sequence[RunView], factor: float) -> list[Curve]:
 def _last_move(run: RunView) -> tuple[np.ndarray, np.ndarray]:
     """Direction of the last move of the voltage, and the sample at which it last started, stopped or turned."""
     step = np.diff(run.voltage_V, prepend=run.voltage_V[:1])
-    sign = np.sign(np.where(np.abs(step) > _SMALLEST_MOVE * (np.ptp(run.voltage_V) or 1.0), step, 0.0))
+    sign = np.sign(np.where(np.abs(step) > 1e-6 * (np.ptp(run.voltage_V) or 1.0), step, 0.0))  # less is none
     index = np.arange(sign.size)
     moved = np.maximum.accumulate(np.where(sign != 0, index, 0))
     changed = np.concatenate([[0.0], np.diff(sign)]) != 0
@@ -127,24 +122,20 @@ def _since_move(runs: Sequence[RunView], factor: float) -> list[Curve]:
 
 
 def _since_event(run: RunView, residual_um: np.ndarray) -> np.ndarray:
-    """Change of a residual since the voltage last started, stopped or turned."""
+    """Change of a residual since the voltage last started, stopped or turned: from the mean of three samples on."""
     begins = np.unique(_last_move(run)[1])
     out = np.array(residual_um, dtype=float)
     for begin, end in zip(begins, [*begins[1:], out.size], strict=True):
-        out[begin:end] -= np.mean(out[begin : min(begin + _FIRST, end)])
+        out[begin:end] -= np.mean(out[begin : min(begin + 3, end)])
     return out
 
 
 def _over_time(runs: Sequence[RunView], factor: float) -> list[Curve]:
-    if not runs:
-        raise ValueError("no runs")
     longest = max(runs, key=lambda run: run.time_s[-1] - run.time_s[0] if run.time_s.size else 0.0)
     return [_binned(longest.time_s, factor * of(longest), after) for after, of in _RESIDUALS]
 
 
 def _spectrum(runs: Sequence[RunView], factor: float) -> list[Curve]:
-    if not runs:
-        raise ValueError("no runs")
     finest = max(
         runs, key=lambda run: run.time_s.size / (np.median(np.diff(run.time_s)) if run.time_s.size > 2 else 1)
     )
@@ -171,32 +162,28 @@ VIEWS: dict[View, ResidualView] = {
     "voltage": ResidualView(
         _over_voltage,
         "voltage (V)",
-        "residual",
         f"Solid while the voltage rises or last rose, dashed while it falls or last fell. {_BAND}",
     ),
-    "position": ResidualView(_over(attrgetter("measured_um")), "measured displacement (µm)", "residual", _BAND),
+    "position": ResidualView(_over(attrgetter("measured_um")), "measured displacement (µm)", _BAND),
     "velocity": ResidualView(
-        _over(lambda run: np.gradient(run.voltage_V, run.time_s), even=False),
-        "rate of the voltage (V/s)",
-        "residual",
-        _BAND,
+        _over(lambda run: np.gradient(run.voltage_V, run.time_s), even=False), "rate of the voltage (V/s)", _BAND
     ),
     "frequency": ResidualView(
         _spectrum,
         "frequency (Hz)",
-        "residual density",
         "Spectrum of the residual of the most finely sampled run; of each narrow band the largest value is drawn.",
+        "residual density",
         per="/√Hz",
         logarithmic=True,
         spectrum=True,
     ),
-    "time": ResidualView(_over_time, "time (s)", "residual", f"The longest run. {_BAND}"),
+    "time": ResidualView(_over_time, "time (s)", f"The longest run. {_BAND}"),
     "since_move": ResidualView(
         _since_move,
         "time since the last event (s)",
-        "change of the residual",
         "How the residual changes after the voltage starts, stops or turns; positive in the direction of the last "
         f"move. {_BAND}",
+        "change of the residual",
         logarithmic=True,
     ),
 }

@@ -10,24 +10,8 @@ from matplotlib.figure import Figure
 from fits.io._record import Record
 from fits.loop._result import RunReport
 from fits.loop._run import Run
-from fits.plots._style import (
-    DARK,
-    LIGHT,
-    MEASURED,
-    MODEL,
-    NARROW_in,
-    WIDE_in,
-    curve,
-    figure,
-    label,
-    legend,
-    thinned,
-    verbatim,
-)
+from fits.plots import _style as style
 from fits.stats._metrics import TWO_SIDED_95
-
-# Runs side by side in one picture.
-_MOST_RUNS = 3
 
 
 @dataclass(frozen=True)
@@ -56,59 +40,59 @@ def held_out(holdout: float | Sequence[Record], records: int, runs: int) -> tupl
 
 def loops(runs: Sequence[Drawn]) -> Figure:
     """Draw displacement and error against the voltage, with a column for each of the first runs."""
-    picture, axes = _columns(runs, NARROW_in if len(runs) == 1 else WIDE_in)
+    picture, axes = _columns(runs, style.NARROW_in if len(runs) == 1 else style.WIDE_in)
     for each, (loop, error) in zip(runs, axes.T, strict=False):
         voltage, known = each.run.record.voltage_V, each.run.known
         # Nested loops lie close together, so the lines are thinner than elsewhere.
-        curve(loop, voltage, each.run.displacement_um, "measured", **MEASURED | {"linewidth": 1.1})
-        curve(loop, voltage, each.predicted_um, "model", **MODEL | {"linewidth": 0.3})
-        error.axhline(0.0, color=LIGHT, linewidth=0.6)
-        curve(error, voltage[known], each.off_um[known], color=DARK, linewidth=0.25)
-        label(error, "voltage (V)")
-        label(loop, title=_caption(each.report))
-    legend(picture, axes[:1, 0])
+        style.curve(loop, voltage, each.run.displacement_um, "measured", **style.MEASURED | {"linewidth": 1.1})
+        style.curve(loop, voltage, each.predicted_um, "model", **style.MODEL | {"linewidth": 0.3})
+        error.axhline(0.0, color=style.LIGHT, linewidth=0.6)
+        style.curve(error, voltage[known], each.off_um[known], color=style.DARK, linewidth=0.25)
+        style.label(error, "voltage (V)")
+        style.label(loop, title=_caption(each.report))
+    style.legend(picture, axes[:1, 0])
     return picture
 
 
 def over_time(runs: Sequence[Drawn], held_out_alone: bool = False) -> Figure:
     """Draw displacement and error against time, with their 95 % bands and a column for each of the first runs."""
-    picture, axes = _columns(runs, WIDE_in)
+    picture, axes = _columns(runs, style.WIDE_in)
     for each, (above, below) in zip(runs, axes.T, strict=False):
         samples = each.run.held_out if held_out_alone else np.ones(len(each.run.record), dtype=bool)
         time_s, predicted = each.run.record.time_s[samples], each.predicted_um[samples]
         half = TWO_SIDED_95 * each.sd_um[samples]
-        curve(above, time_s, each.run.displacement_um[samples], "measured", **MEASURED)
-        curve(above, time_s, predicted, "model", **MODEL)
-        keep = thinned(predicted)
+        style.curve(above, time_s, each.run.displacement_um[samples], "measured", **style.MEASURED)
+        style.curve(above, time_s, predicted, "model", **style.MODEL)
+        keep = style.thinned(predicted)
         low, high = (predicted - half)[keep], (predicted + half)[keep]
         above.fill_between(time_s[keep], low, high, color="0.3", linewidth=0, zorder=1)
-        curve(below, time_s, each.off_um[samples], "error", color="0.6", linewidth=0.35)
+        style.curve(below, time_s, each.off_um[samples], "error", color="0.6", linewidth=0.35)
         noisy = np.hypot(half, TWO_SIDED_95 * each.noise_um)
-        for size, style, name in ((half, "-", "95 % band"), (noisy, ":", "95 % band with noise")):
-            curve(below, time_s, size, name, color=DARK, linestyle=style, linewidth=0.8)
-            curve(below, time_s, -size, color=DARK, linestyle=style, linewidth=0.8)
+        for size, line, name in ((half, "-", "95 % band"), (noisy, ":", "95 % band with noise")):
+            style.curve(below, time_s, size, name, color=style.DARK, linestyle=line, linewidth=0.8)
+            style.curve(below, time_s, -size, color=style.DARK, linestyle=line, linewidth=0.8)
         if not held_out_alone:
             for panel in (above, below):
                 _mark_held_out(panel, each)
-        label(below, "time (s)")
-        label(above, title=_caption(each.report, held_out_alone))
-    legend(picture, axes[:, 0])
+        style.label(below, "time (s)")
+        style.label(above, title=_caption(each.report, held_out_alone))
+    style.legend(picture, axes[:, 0])
     return picture
 
 
 def _columns(runs: Sequence[Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
     """Two rows of axes, values above errors, with a column for each of the first runs."""
-    picture = figure(width_in, 3.6, gap=0.04)
-    axes = picture.subplots(2, min(len(runs), _MOST_RUNS), squeeze=False, sharex="col", height_ratios=(2, 1))
-    label(axes[0, 0], "", "displacement (µm)")
-    label(axes[1, 0], "", "error (µm)")
+    many = min(len(runs), 3)
+    picture, axes = style.panels(width_in, 3.6, 2, many, 0.04, squeeze=False, sharex="col", height_ratios=(2, 1))
+    style.label(axes[0, 0], "", "displacement (µm)")
+    style.label(axes[1, 0], "", "error (µm)")
     return picture, axes
 
 
 def _caption(report: RunReport, held_out_alone: bool = False) -> str:
     errors = report.held_out if held_out_alone else report.in_sample or report.held_out
     figures = "" if errors is None else f"\ne_rms {errors.e_rms_pct:.3g} %, e_max {errors.e_max_pct:.3g} %"
-    return verbatim(report.source) + figures
+    return style.verbatim(report.source) + figures
 
 
 def _mark_held_out(axes: Axes, each: Drawn) -> None:

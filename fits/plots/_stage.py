@@ -1,6 +1,5 @@
 """Pictures of the fit of a stage: its frequency response, every run with its residual, and the slow loop."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,25 +11,26 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from fits.control._compensate_stage import static_equivalent
+from fits.io._errors import AnyPath
 from fits.io._record import Record
 from fits.loop._result import FitResult
-from fits.loop._run import Run, prepare_run, simulate_run
+from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
 from fits.plots._runs import Drawn, held_out, loops, over_time
-from fits.plots._style import WIDE_in, figure, label, legend, save, verbatim
-from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of
+from fits.plots._style import WIDE_in, label, legend, panels, save, verbatim
+from fits.stage._run import gain_ahead, hysteresis_of, residual_of
 from fits.stage._start import MeasuredResponse, measure_response
 from microid import AbstractLinear, Preisach, Stage
 
-# Frequencies at which the model's response is drawn, and how far beyond the measured ones.
-_FREQUENCIES, _BEYOND = 600, 1.3
-# Coherence from which a line counts as measured, and the lightest grey of those that do not.
-_COHERENT, _FAINTEST = 0.8, 0.85
+# How far beyond the measured frequencies the model's response is drawn.
+_BEYOND = 1.3
+# Coherence from which a line counts as measured.
+_COHERENT = 0.8
 
 
 def plot_stage(
     result: FitResult[Stage],
     records: Sequence[Record],
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     *,
     holdout: float | Sequence[Record] = 0.2,
     initial: str | Sequence[str] = "unknown",
@@ -39,8 +39,7 @@ def plot_stage(
 
     Records, holdout and initial memory are those that `fit_stage` was given; a ValueError says that they are not
     those of the result. `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
-    out) and `loop.png` are written into an existing folder, at 200 dots per inch; a `DataError` says if they cannot
-    be.
+    out) and `loop.png` are written into an existing folder, at 200 dots per inch; a `DataError` if they cannot be.
     """
     fraction, aside = held_out(holdout, len(records), len(result.runs))
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
@@ -49,8 +48,7 @@ def plot_stage(
         raise ValueError(f"the result is of {len(known)} fitted runs, and {len(records)} were given")
     # The runs are refined already.
     stage, gain = result.model.with_substeps(1), gain_ahead(result.model)
-    voltages = np.concatenate([record.voltage_V for record in (*records, *aside)])
-    range_V = float(voltages.min()), float(voltages.max())
+    range_V = command_range_V([*records, *aside])
     runs = [
         prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold)
         for record, state, report in zip(records, states, known, strict=True)
@@ -103,8 +101,7 @@ def _highest_Hz(measured: MeasuredResponse) -> float:
 
 def _static_um(stage: Stage, record: Record, state: str, fraction: float) -> np.ndarray:
     """Displacement that the stage would have without delay, shape `(n,)`."""
-    place = place_of_hysteresis(stage)
-    law: Any = None if place is None else stage.parts[place]
+    law = hysteresis_of(stage)
     if isinstance(law, Preisach):
         static = static_equivalent(stage)
         range_V = float(static.density.lower_V), float(static.density.upper_V)
@@ -128,27 +125,19 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
     low, high = float(measured.frequency_Hz.min()), _BEYOND * _highest_Hz(measured)
     shown = measured.frequency_Hz <= high
     measured = MeasuredResponse(measured.frequency_Hz[shown], measured.response[shown], measured.coherence[shown])
-    frequency = np.geomspace(low / _BEYOND, high, _FREQUENCIES)
+    frequency = np.geomspace(low / _BEYOND, high, 600)
     model = _linear(stage, frequency)
     phase = np.unwrap(np.angle(model))
     at_lines = _linear(stage, measured.frequency_Hz)
     # The measured phase is drawn on the branch of the model's.
     near = np.interp(measured.frequency_Hz, frequency, phase) + np.angle(measured.response / at_lines)
 
-    picture = figure(WIDE_in, 3.9)
-    size, turn = picture.subplots(2, 1, sharex=True, height_ratios=(1.4, 1))
-    grey = {
-        "c": _FAINTEST * np.minimum(1.0, (1 - measured.coherence) / (1 - _COHERENT) / 2),
-        "cmap": "gray",
-        "vmin": 0.0,
-        "vmax": 1.0,
-        "s": 5.0,
-        "linewidths": 0.0,
-        "zorder": 3,
-    }
-    size.scatter(
-        measured.frequency_Hz, np.abs(measured.response), label="measured (Welch: peaks are rounded)", **grey
-    )
+    picture, (size, turn) = panels(WIDE_in, 3.9, 2, 1, sharex=True, height_ratios=(1.4, 1))
+    # The less coherent a line, the lighter.
+    shade = 0.85 * np.minimum(1.0, (1 - measured.coherence) / (1 - _COHERENT) / 2)
+    grey: dict[str, Any] = {"c": shade, "cmap": "gray", "vmin": 0.0, "vmax": 1.0, "s": 5.0, "linewidths": 0.0}
+    grey["zorder"], name = 3, "measured (Welch: peaks are rounded)"
+    size.scatter(measured.frequency_Hz, np.abs(measured.response), label=name, **grey)
     size.loglog(frequency, np.abs(model), label="driver and mechanics", color="0.5", linewidth=1.2)
     turn.scatter(measured.frequency_Hz, np.degrees(near), **grey)
     turn.semilogx(frequency, np.degrees(phase), color="0.5", linewidth=1.2)

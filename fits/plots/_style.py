@@ -20,7 +20,6 @@ DARK, LIGHT = "0.1", "0.75"
 MEASURED: dict[str, Any] = {"color": "0.65", "linewidth": 1.5}
 MODEL: dict[str, Any] = {"color": "0.0", "linewidth": 0.5}
 _FONT_pt = 8
-_DPI = 200
 # More points than this do not show at this size.
 _POINTS = 6000
 
@@ -30,6 +29,14 @@ def figure(width_in: float, height_in: float, gap: float = 0.02) -> Figure:
     made = Figure(figsize=(width_in, height_in), layout=ConstrainedLayoutEngine(wspace=gap, compress=True))
     FigureCanvasAgg(made)
     return made
+
+
+def panels(
+    width_in: float, height_in: float, rows: int = 1, columns: int = 1, gap: float = 0.02, **layout: Any
+) -> tuple[Figure, Any]:
+    """Make a figure with rows and columns of axes; the further settings are those of `Figure.subplots`."""
+    made = figure(width_in, height_in, gap)
+    return made, made.subplots(rows, columns, **layout)
 
 
 def label(axes: Axes, x: str = "", y: str = "", title: str = "", size_pt: float = 7) -> None:
@@ -86,5 +93,5 @@ def save(picture: Figure, path: Path) -> Path:
     for text in picture.findobj(Text):
         text.set_fontsize(min(_FONT_pt, text.get_fontsize()))
     with atomic_path(path) as unfinished:
-        picture.savefig(unfinished, dpi=_DPI)
+        picture.savefig(unfinished, dpi=200)
     return path

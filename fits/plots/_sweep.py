@@ -2,31 +2,24 @@
 
 import itertools
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from fits.io._errors import AnyPath
 from fits.plots._style import WIDE_in, figure, label, save, verbatim
 from fits.sweeps._show import open_sweep, readable, summarise
 from fits.sweeps._store import about_of
 from fits.sweeps._types import DONE
 
 _CELLS = 12
-# Axes are logarithmic where values span more than this factor, and most lie near its lower end.
-_DECADE = 10.0
-# More lines than this do not show.
-_LINES = 400
 _HIGH_in = 2.6
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """Values of the swept parameters by name, of rows that are done, and of the output that is drawn.
-
-    Words are 0, 1, 2 and so on in `swept`, and are themselves in `words`.
-    """
+    """Swept parameters and the output that is drawn, of rows that are done; a word is its number in `words`."""
 
     swept: dict[str, np.ndarray]
     words: dict[str, np.ndarray]
@@ -34,7 +27,7 @@ class _Rows:
     values: np.ndarray
 
 
-def plot_sweep(folder: str | os.PathLike[str], out: Path, by: str | None = None) -> list[Path]:
+def plot_sweep(folder: AnyPath, out: Path, by: str | None = None) -> list[Path]:
     """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back."""
     names, data = about_of(folder)["parameters"], open_sweep(folder)
     with readable(folder):
@@ -57,7 +50,7 @@ def plot_sweep(folder: str | os.PathLike[str], out: Path, by: str | None = None)
 
 
 def _parallel(path: Path, rows: _Rows) -> Path:
-    every = max(1, -(-len(rows.values) // _LINES))
+    every = max(1, -(-len(rows.values) // 400))  # more lines do not show
     columns = np.stack([*rows.swept.values(), rows.values], axis=1)[::every]
     low, high = columns.min(axis=0), columns.max(axis=0)
     scaled = (columns - low) / np.where(high > low, high - low, 1)
@@ -98,7 +91,7 @@ def _heat(path: Path, rows: _Rows, pair: tuple[str, str]) -> Path:
 def _logarithmic(found: np.ndarray) -> bool:
     """Whether values lie evenly by their logarithms rather than by themselves."""
     low, middle, high = float(found.min()), float(np.median(np.unique(found))), float(found.max())
-    return low > 0 and high > _DECADE * low and middle < (low + high) / 3
+    return low > 0 and high > 10.0 * low and middle < (low + high) / 3
 
 
 def _edges(found: np.ndarray) -> np.ndarray:

@@ -14,8 +14,6 @@ from fits.control._tune_result import Tuning
 from fits.report._json import strict
 from microid import ControlledRun, StepMetrics, step_metrics, tracking_errors
 
-SCHEMA = "microid.control/1"
-
 
 def control_json(
     loop: Loop, made: Made, run: ControlledRun, about: Mapping[str, Any], remarks: Sequence[str]
@@ -38,7 +36,7 @@ def control_json(
     every = loop.margins(made.controller)
     gains = printed_gains(made.controller, made.pid)
     found: dict[str, Any] = {
-        "schema": SCHEMA,
+        "schema": "microid.control/1",
         **about,
         "samples": len(wanted),
         "interval_s": loop.ready.interval_s,

@@ -28,10 +28,7 @@ _KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexp
 
 
 def report_html(diagnosis: Diagnosis) -> str:
-    """Write a diagnosis as an HTML page for people, on a screen, a phone or paper, with style and pictures in it.
-
-    The same diagnosis gives the same text.
-    """
+    """Write a diagnosis as an HTML page for screen, phone and paper, all in one; the same one gives the same text."""
     length, causes, ahead = Lengths(diagnosis), diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]
     sources = list(dict.fromkeys(run.source for run in diagnosis.runs if run.source))
@@ -39,64 +36,51 @@ def report_html(diagnosis: Diagnosis) -> str:
     asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
     gain = diagnosis.gain
     driven = gain.feedforward_before_um, gain.feedforward_after_um
-    return (
-        _environment()
-        .get_template("diagnosis.html")
-        .render(
-            diagnosis=diagnosis,
-            length=length,
-            ahead=ahead,
-            style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
-            kind=_KINDS[diagnosis.verdict],
-            sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
-            tiles=_tiles(diagnosis, length),
-            residuals=residuals(diagnosis, length.per_um, length.unit),
-            some_aside=any((~run.fitted).any() for run in diagnosis.runs),
-            left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
-            views=[fingerprint(diagnosis, name, k, length.per_um, length.unit) for k, name in enumerate(named)],
-            gained=_gained(diagnosis, length),
-            bars=_bars(diagnosis),
-            further=[
-                *_arrow(
-                    "Largest error, before → after", gain.heldout_max_before_um, gain.heldout_max_after_um, length
-                ),
-                *_arrow("Error under feedforward, rms, before → after", *driven, length),
-            ],
-            bounds=[
-                (
-                    plain(one.name).capitalize(),
-                    sigmas(one.z),
-                    percent(one.absorbed_fraction),
-                    length.bare(one.bound_um),
-                )
-                for one in asked
-            ],
-            tests=[
-                (plain(one.name).capitalize(), sigmas(one.statistic), chance(one.p), percent(one.share), one.sentence)
-                for one in diagnosis.tests
-            ],
-            program=None if ahead is None else program(ahead),
-            ahead_facts=() if ahead is None else _facts(ahead),
-            extremes=[
-                (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
-                for one in (ahead.extremes if ahead is not None else ())
-            ],
-            weakest=max((cause.p_family for cause in causes), default=math.nan),
-            written_by=written_by(),
-        )
+    bounds = [
+        (plain(one.name).capitalize(), sigmas(one.z), percent(one.absorbed_fraction), length.bare(one.bound_um))
+        for one in asked
+    ]
+    tests = [
+        (plain(one.name).capitalize(), sigmas(one.statistic), chance(one.p), percent(one.share), one.sentence)
+        for one in diagnosis.tests
+    ]
+    extremes = [
+        (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
+        for one in (ahead.extremes if ahead is not None else ())
+    ]
+    largest = gain.heldout_max_before_um, gain.heldout_max_after_um
+    further = _arrow("Largest error, before → after", *largest, length)
+    further += _arrow("Error under feedforward, rms, before → after", *driven, length)
+    template = _environment().get_template("diagnosis.html")
+    return template.render(
+        diagnosis=diagnosis,
+        length=length,
+        ahead=ahead,
+        style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
+        kind=_KINDS[diagnosis.verdict],
+        sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
+        tiles=_tiles(diagnosis, length),
+        residuals=residuals(diagnosis, length.per_um, length.unit),
+        some_aside=any((~run.fitted).any() for run in diagnosis.runs),
+        left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
+        views=[fingerprint(diagnosis, name, k, length.per_um, length.unit) for k, name in enumerate(named)],
+        gained=_gained(diagnosis, length),
+        bars=_bars(diagnosis),
+        further=further,
+        bounds=bounds,
+        tests=tests,
+        program=None if ahead is None else program(ahead),
+        ahead_facts=() if ahead is None else _facts(ahead),
+        extremes=extremes,
+        weakest=max((cause.p_family for cause in causes), default=math.nan),
+        written_by=written_by(),
     )
 
 
 def _environment() -> Environment:
     """Templates of this room, which escape whatever they are given."""
-    made = Environment(
-        loader=PackageLoader("fits.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    blocks: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    made = Environment(loader=PackageLoader("fits.report"), autoescape=True, undefined=StrictUndefined, **blocks)
     for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number"):
         made.filters[name] = getattr(_words, name)
     made.filters["without_dot"] = lambda text: text.rstrip(".")

@@ -54,6 +54,7 @@ def _cause(cause: FoundCause) -> dict[str, Any]:
 def _experiment(ahead: Experiment) -> dict[str, Any]:
     known = ahead.time_s.size > 0
     kept = ("kind", "purpose", "separates", "predicted_z", "present_z", "extra_column")
+    ends = ("low", "high", "lowest", "highest")
     return {
         **{name: getattr(ahead, name) for name in kept},
         "samples": int(ahead.time_s.size),
@@ -61,11 +62,7 @@ def _experiment(ahead: Experiment) -> dict[str, Any]:
         "lowest_V": ahead.voltage_V.min() if known else None,
         "highest_V": ahead.voltage_V.max() if known else None,
         "extremes": [
-            {
-                "quantity": one.name,
-                "unit": one.unit,
-                **{key: getattr(one, key) for key in ("low", "high", "lowest", "highest")},
-            }
+            {"quantity": one.name, "unit": one.unit, **{key: getattr(one, key) for key in ends}}
             for one in ahead.extremes
         ],
     }

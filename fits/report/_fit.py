@@ -1,6 +1,6 @@
 """The fit of a hysteresis or a stage in JSON values and in words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import combinations
 from typing import Any
 
@@ -10,30 +10,22 @@ from fits.io._limits import ranges_json
 from fits.loop._misfit import Misfit
 from fits.loop._result import FitResult, RunReport
 from fits.report._json import columns, strict
-from fits.stage._run import place_of_hysteresis
+from fits.stage._run import hysteresis_of
 from fits.stats._metrics import Errors
 from fits.stats._noise import WHITE
 from microid import Preisach, Stage
 
 # Held-out errors up to this many times the fitted ones count as equal.
 _EQUAL = 1.1
-# Correlations between parameters from here on are worth a line.
-_WORTH_SAYING = 0.5
-# Of each run of a stage; None where it was not fitted.
-_OF_FITTED = ("noise_um", "correlation_samples", "substeps")
 
 
 def fit_report(result: FitResult[Any]) -> dict[str, Any]:
-    """Put what is known of a fit into JSON values, which a model file keeps under `fit`.
-
-    Errors and limits that do not exist are None.
-    """
+    """Put what is known of a fit into JSON values, kept under `fit` in model files; what does not exist is None."""
     model = result.model
     law: Any = model
     parts: dict[str, Any] = {}
     if isinstance(model, Stage):
-        place = place_of_hysteresis(model)
-        law = None if place is None else model.parts[place]
+        law = hysteresis_of(model)
         named = zip(model.names, model.parts, strict=True)
         parts["parts"] = [{"name": name, "type": type(part).__name__} for name, part in named]
         known = {name: strict(getattr(result, name)) for name in ("parameters", "correlation", "unseen")}
@@ -53,7 +45,7 @@ def fit_report(result: FitResult[Any]) -> dict[str, Any]:
         "discrepancy_um": float(result.uncertainty.discrepancy_um),
         "in_sample": _errors(result.in_sample),
         "held_out": _errors(result.held_out),
-        "runs": [_run(run, _OF_FITTED if isinstance(model, Stage) else ()) for run in result.runs],
+        "runs": [_run(run, isinstance(model, Stage)) for run in result.runs],
         "remarks": [remark for remark in result.remarks if remark not in result.unseen],
     }
 
@@ -71,7 +63,9 @@ def _errors(errors: Errors | None) -> dict[str, Any] | None:
     return {**vars(errors), "e_rms_pct": errors.e_rms_pct, "e_max_pct": errors.e_max_pct}
 
 
-def _run(run: RunReport, more: Sequence[str]) -> dict[str, Any]:
+def _run(run: RunReport, of_stage: bool) -> dict[str, Any]:
+    # Of a run of a stage; None where it was not fitted.
+    more = ("noise_um", "correlation_samples", "substeps") if of_stage else ()
     return {
         "source": run.source,
         "offset_um": run.offset_um,
@@ -194,7 +188,7 @@ def _parameters(report: Mapping[str, Any]) -> list[str]:
     names = [each["name"] for each in report["parameters"]]
     for i, j in combinations(range(len(names)), 2):
         value = report["correlation"][i][j]
-        if value is not None and abs(value) > _WORTH_SAYING:
+        if value is not None and abs(value) > 0.5:
             lines.append(f"correlated     {names[i]} and {names[j]}: {value:+.2f}")
     return lines
 

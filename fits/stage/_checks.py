@@ -13,27 +13,14 @@ from fits.stage._solve import Solved, marginal_information
 from fits.stats._noise import correlation_samples
 from microid import Driver, Mechanics, Stage
 
-# Gains that differ by more than this are not those of one rig, and by more than that are worth a remark.
-_REFUSED, _REMARKED = 0.1, 0.05
+# Gains that differ by more than this are not those of one rig.
+_REFUSED = 0.1
 # A resonance above this fraction of the sampling rate is hardly told from its mirror image.
 _HIGHEST_RESONANCE = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
-UNSEEN, _LOST = 0.5, 5.0
-# Poles must make the runs likelier by this much, twice its logarithm: noise alone rarely pretends more.
-_WORTH = 40.0
-# A run that leaves so many times what the quietest leaves moves in ways that its samples do not show.
-_LARGEST_NOISE_RATIO = 3.0
-# Ranges of voltage that differ by less than this, as a fraction, are alike.
-_SAME_RANGE = 0.05
-# And speeds that differ by less than this factor.
-_SAME_SPEED = 1.5
-# Rates beyond so many times the resonance show it well.
-_FINELY = 5.0
-# Share of a command's speed in the upper half of the band from which on it is not sampled finely.
-_UPPER = 0.1
+UNSEEN = 0.5
 # Poles that piezo stages have, from slow macro stages and weak amplifiers to small ones with strong ones.
 _USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
-_POLES = ("time_constant_s", "natural_frequency_Hz")
 # Remedies.
 _BEYOND = "add a run with steps, a chirp or a multisine that goes beyond the resonance"
 _FASTER, _OR_ALONE = "sample at 5 times the resonance or more", "or fit the hysteresis alone with --model loop"
@@ -47,13 +34,11 @@ def refuse_slopes(records: Sequence[Record]) -> None:
         if record.displacement_um is not None
     ]
     widest = max(span for span, _, _, _ in spans)
-    full = [
-        (moved / span, speed, source) for span, moved, speed, source in spans if span > (1 - _SAME_RANGE) * widest
-    ]
+    full = [(moved / span, speed, source) for span, moved, speed, source in spans if span > 0.95 * widest]
     for high, fast, one in full:
         for low, slow, other in full:
             # What is faster may move less far because of the dynamics, which are not known yet.
-            if high > (1 + _REFUSED) * low and max(fast, slow) < _SAME_SPEED * min(fast, slow):
+            if high > (1 + _REFUSED) * low and max(fast, slow) < 1.5 * min(fast, slow):
                 raise DataError(_not_one_rig(one, other, high / low))
 
 
@@ -89,12 +74,12 @@ def refuse_unidentifiable(
     named, value, derivative = solved.parameters()
     slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
     names = [name for name, _ in named]
-    poles = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _POLES]
+    poles = [k for k, name in enumerate(names) if name.endswith((".time_constant_s", ".natural_frequency_Hz"))]
     if not poles:
         return None
     spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     # At a bound the slope vanishes, however far the coordinate may run.
-    unidentified = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > _LOST]
+    unidentified = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > 5]
     sources = ", ".join(run.record.source for run in solved.runs)
     fastest = max(solved.runs, key=lambda run: run.rate_Hz)
     mechanics = [(name, float(part.natural_frequency_Hz)) for name, part in named_parts(stage, Mechanics)]
@@ -111,7 +96,7 @@ def refuse_unidentifiable(
     if len(unidentified) == len(poles) or not seen:
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
-        if noise[loudest] > _LARGEST_NOISE_RATIO * min(noise):
+        if noise[loudest] > 3.0 * min(noise):  # it moves in ways that its samples do not show
             check_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
             what = (
@@ -148,7 +133,7 @@ def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit
         for run, one in zip(runs, left, strict=True):
             blind = _HIGHEST_RESONANCE * finest < resonance
             where = "far beyond" if resonance > 2 * run.rate_Hz else f"near {resonance:.3g} Hz"
-            if one.far and (blind or (run.rate_Hz < _FINELY * resonance and not _resolved(run))):
+            if one.far and (blind or (run.rate_Hz < 5.0 * resonance and not _resolved(run))):
                 raise DataError(
                     f"{one.source}: sampled at {run.rate_Hz:.4g} Hz, which is too slow for what moves in it: "
                     f"{one.share_pct:.3g} % of its stroke stay unexplained, {one.times_noise:.3g} times the sensor's "
@@ -162,7 +147,7 @@ def _resolved(run: Run) -> bool:
     # By differences, so that a slow motion of large amplitude does not hide what is fast.
     change = np.diff(voltage)
     power = np.abs(np.fft.rfft((change - change.mean()) * np.hanning(len(change)))) ** 2
-    return float(power[len(power) // 2 :].sum()) < _UPPER * float(power.sum())
+    return float(power[len(power) // 2 :].sum()) < 0.1 * float(power.sum())
 
 
 def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> tuple[str, float] | None:
@@ -194,7 +179,7 @@ def shows_poles(solved: Solved, drives: Sequence[np.ndarray]) -> bool:
         x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
         left = y - y.mean() - x * (x @ y / (x @ x))
         ratios.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
-    return max(ratios) >= _WORTH
+    return max(ratios) >= 40.0  # twice the logarithm: noise rarely pretends more
 
 
 def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
@@ -204,7 +189,7 @@ def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list
     one, other = runs[high].record.source, runs[low].record.source
     if refuse and ratio > 1 + _REFUSED:
         raise DataError(_not_one_rig(one, other, ratio))
-    if ratio > 1 + _REMARKED:
+    if ratio > 1.05:
         return [
             f"under the same voltage {one} moves {ratio:.3g} times as far as {other}: "
             "if both are of one rig, its gain depends on amplitude or rate more than the hysteresis explains"

@@ -20,26 +20,10 @@ from fits.stage._uncertainty import NO_PRECISION, Precision, sandwich
 from fits.stats._metrics import TWO_SIDED_95
 from microid import Preisach, Stage
 
-# What pulls a fit ruins it where it moves a parameter by more than this part of it.
-_RUINED = 0.5
-# A delay counts from so many standard deviations, and so many samples, on.
-_SURE_Z, _LEAST_SAMPLES = 5.0, 0.02
 # It must move a parameter by so many of that one's standard deviations, too.
 _MOVED_SD = 0.5
-# It is followed for so many rounds at most, until it changes by less than this part of its standard deviation.
-_ROUNDS, _SETTLED = 10, 0.3
-# A step is halved so often where it leaves more of its run.
-_HALVED, _NO_WORSE = 4, 1.01
-# Part of a sample by which a command is shifted to see what a delay does.
-_STEP = 0.25
-# Runs that leave so many times the noise are searched for delays.
-_SEARCHED_NOISE = 1.5
-# The search goes so many samples either way, and so many of the delays are tried.
-_FARTHEST_SAMPLES, _MOST_TRIED = 64, 3
-# What is as much likelier as leaving this part of a run's residual is a better answer.
-_BETTER = 0.7
-# Where more than so many times the noise is left, a delay counts if it takes all but this part away.
-_NEAR_NOISE, _LEFT_SHARE = 2.0, 0.4
+# The search for delays goes so many samples either way.
+_FARTHEST_SAMPLES = 64
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
 _REMEDY = (
@@ -74,7 +58,7 @@ class Alternative:
         return [
             f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
             for p, v in zip(fit.parameters, self.values, strict=True)
-            if abs(v - p.value) > _RUINED * min(abs(v), abs(p.value))
+            if abs(v - p.value) > 0.5 * min(abs(v), abs(p.value))
         ]
 
     def widen(self, fit: FitResult[Stage], said: str, remedy: str = "") -> FitResult[Stage]:
@@ -119,7 +103,7 @@ class Delay:
     @property
     def seen(self) -> bool:
         """Whether it is no chance."""
-        return abs(self.delay_s) > _SURE_Z * self.sd_s and abs(self.samples) > _LEAST_SAMPLES
+        return abs(self.delay_s) > 5.0 * self.sd_s and abs(self.samples) > 0.02
 
     def words(self) -> str:
         """Say what the columns look like."""
@@ -176,7 +160,7 @@ def fit_without_delays(
         gross = max(one.share_pct for one in left) > GROSS_PCT
         return fit_without_delays(plan, start.full, None, left) if gross and start.full is not None else None
     shifts = np.zeros(len(plan.records))
-    far = [k for k, one in enumerate(left) if one.times_noise > _SEARCHED_NOISE]
+    far = [k for k, one in enumerate(left) if one.times_noise > 1.5]
     searched = _search(plan, solved, far)
     found: Solved | None = solved
     if searched is not None:
@@ -187,22 +171,22 @@ def fit_without_delays(
     if found is None:
         return None
     known: list[Delay] = []
-    for _ in range(_ROUNDS):
+    for _ in range(10):
         more = _scores(plan, found, shifts)
         known = [replace(one, delay_s=one.delay_s + shift) for one, shift in zip(more, shifts, strict=True)]
         # One at a time, the surest first: the parameters bend to a delay, which makes other runs look late, too.
         steps = [one.delay_s / one.sd_s if total.seen else 0.0 for one, total in zip(more, known, strict=True)]
         first = int(np.argmax(np.abs(steps)))
-        if abs(steps[first]) <= _SETTLED:
+        if abs(steps[first]) <= 0.3:  # standard deviations
             break
         step = np.zeros(len(shifts))
         step[first] = more[first].delay_s
         # Where a parameter is at its bound, a line goes too far.
-        for _ in range(_HALVED):
+        for _ in range(4):  # halvings
             plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts + step)} ms")
             start = replace(start, z=found.z, columns_um=found.columns_um)
             again = _solved_with(plan, start, solved.runs[0].stride, shifts + step)
-            if again is not None and again.weighing.noise_um[first] <= _NO_WORSE * found.weighing.noise_um[first]:
+            if again is not None and again.weighing.noise_um[first] <= 1.01 * found.weighing.noise_um[first]:
                 break
             step /= 2
         else:
@@ -215,7 +199,7 @@ def fit_without_delays(
             known, shifts, left, solved.weighing.noise_um, found.weighing.noise_um, strict=True
         )
         # Where much is left with it as without it, it is something else.
-        if one.seen and shift and after < (_LEFT_SHARE if after > miss.noise_um * _NEAR_NOISE else 1.0) * before
+        if one.seen and shift and after < (0.4 if after > miss.noise_um * 2.0 else 1.0) * before
     )
     if not seen:
         return None
@@ -239,7 +223,7 @@ def _scores(plan: Plan, solved: Solved, shifts: np.ndarray) -> list[Delay]:
     whole = whole + NO_PRECISION * np.eye(len(whole))
     out = []
     for k, (run, one) in enumerate(zip(solved.runs, solved.sums, strict=True)):
-        n, step, weight = len(run.record), _STEP / run.rate_Hz, run.fit_weight
+        n, step, weight = len(run.record), 0.25 / run.rate_Hz, run.fit_weight
         late, early = (simulate_stage(stage, plan.run(k, run.stride, shifts[k] + sign * step)) for sign in (1, -1))
         full = np.zeros(run.samples.weight.shape[0])
         full[:n] = (late - early) / (2 * step)
@@ -279,7 +263,7 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
             continue
         step = min(1.0 / run.rate_Hz, 0.1 / response.frequency_Hz.max())
         tried = best_shifts(stage, response, step * np.arange(-_FARTHEST_SAMPLES, _FARTHEST_SAMPLES + 1))
-        for shift in filter(None, tried[:_MOST_TRIED]):
+        for shift in filter(None, tried[:3]):
             there = shifts.copy()
             there[k] = shift
             plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
@@ -289,6 +273,7 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
                 z = np.asarray(problem.chain.coordinates.of(candidate))
                 start = replace(problem, z=z, columns_um=columns_um, hyper=None)
                 found = try_chain(start, runs, plan.loss, plan.progress, rough=True)
-                if found is not None and found.cost < best.cost + float(run.fitted.sum()) * np.log(_BETTER):
+                # As likely as if it left 0.7 of the run's residual.
+                if found is not None and found.cost < best.cost + float(run.fitted.sum()) * np.log(0.7):
                     best, shifts = found, there
     return (shifts, replace(problem, z=best.z, columns_um=columns_um)) if np.any(shifts) else None

@@ -193,11 +193,8 @@ def _decode_network(item: dict[str, Any], where: str, spec: ParameterSpec | None
             f"{where}: an MLP has in_size, out_size, two layers or more with weight and bias, and an activation "
             f"out of {', '.join(_ACTIVATIONS)}"
         )
-    arrays = [
-        decode(layer[key], f"{where}.layers[{number}].{key}", spec)
-        for number, layer in enumerate(layers)
-        for key in ("weight", "bias")
-    ]
+    slots_of = [(number, key) for number in range(len(layers)) for key in ("weight", "bias")]
+    arrays = [decode(layers[n][key], f"{where}.layers[{n}].{key}", spec) for n, key in slots_of]
     if not all(isinstance(array, jax.Array) and array.ndim for array in arrays):
         raise DataError(f"{where}: expected arrays in the layers of the network")
 

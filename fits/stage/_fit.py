@@ -1,6 +1,6 @@
 """From slow and fast records to a whole fitted stage, in the terms of its user."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
 from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate, RunReport
-from fits.loop._run import Run, prepare_run, refuse_many_steps
+from fits.loop._run import Progress, Run, prepare_run, refuse_many_steps
 from fits.stage._checks import check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simulate_stage
@@ -24,15 +24,6 @@ from fits.stage._uncertainty import Precision
 from fits.stats._metrics import TWO_SIDED_95
 from fits.stats._noise import WHITE
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
-
-# A coordinate, of the order of 1, that is known no better than this is hardly seen.
-_UNSEEN_SD = 0.5
-# A coordinate, which is scaled to be of the order of 1, that is known no better than this is not known.
-_UNKNOWN = 1.0
-# Entries of a direction below this share of its largest are left out of its name.
-_FAINT = 0.15
-# Exponents this close to 1 or -1 are taken for them.
-_WHOLE = 0.1
 
 
 def default_stage(hold: Hold = "first") -> Stage:
@@ -46,12 +37,8 @@ def default_stage(hold: Hold = "first") -> Stage:
         Reversible(jnp.ones(4), jnp.asarray(0.0), jnp.asarray(1.0)),
         jnp.asarray(0.0),
     )
-    stage = Stage.of(
-        hold=hold,
-        driver=Driver(jnp.asarray(1e-3)),
-        hysteresis=flat,
-        mechanics=Mechanics(jnp.asarray(100.0), jnp.asarray(0.1)),
-    )
+    mechanics = Mechanics(jnp.asarray(100.0), jnp.asarray(0.1))
+    stage = Stage.of(hold=hold, driver=Driver(jnp.asarray(1e-3)), hysteresis=flat, mechanics=mechanics)
     return stage.freeze("driver.gain", "mechanics.gain")
 
 
@@ -63,13 +50,16 @@ def fit_stage(
     holdout: float | Sequence[Record] = 0.2,
     initial: str | Sequence[str] = "unknown",
     loss: str = "squares",
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> FitResult[Stage]:
     """Fit driver, hysteresis and mechanics jointly to slow and fast runs of one rig.
 
     The slow runs give a first hysteresis, what the fast ones make of it a frequency response, and that the poles to
     start from. Then all runs are fitted together: the hysteresis is a smooth non-negative regression as in `fit`,
     solved for exactly while the other parameters follow damped Gauss-Newton steps.
+
+    A `DataError` says that the records cannot be fitted, do not show the dynamics, or are not of one rig; other
+    errors are those of `fit`.
 
     Parameters
     ----------
@@ -86,13 +76,6 @@ def fit_stage(
         that are held out, too; theirs is unknown where each fitted run has its own.
     holdout, loss, progress
         See `fit`, as for what is returned.
-
-    Raises
-    ------
-    DataError
-        If the records cannot be fitted, do not show the dynamics, or are not of one rig.
-    FitError, RuntimeError
-        If a solver fails, or JAX computes in single precision.
     """
     found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
     solved, runs = found.solved, found.solved.runs
@@ -153,7 +136,7 @@ def solve_stage(
     holdout: float | Sequence[Record],
     initial: str | Sequence[str],
     loss: str,
-    progress: Callable[[str], None],
+    progress: Progress,
     finest: int = LADDER[-1],
     accept_best: bool = False,
     estimated: bool = False,
@@ -209,7 +192,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     names, value, slope = solved.parameters()
     ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * TWO_SIDED_95 * sd))) for sign in (-1, 1)]
     # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
-    width = np.where(sd > _UNSEEN_SD, np.abs(ends[1] - ends[0]) / (2 * TWO_SIDED_95), np.abs(slope) * sd)
+    width = np.where(sd > 0.5, np.abs(ends[1] - ends[0]) / (2 * TWO_SIDED_95), np.abs(slope) * sd)
     parameters = tuple(
         ParameterEstimate(name, unit, *map(float, figures))
         for (name, unit), *figures in zip(names, value, width, *ends, strict=True)
@@ -261,7 +244,7 @@ def unseen_directions(information: np.ndarray, names: Sequence[str], relative: n
     values, vectors = np.linalg.eigh(information)
     sentences = []
     for value, vector in zip(values, vectors.T, strict=True):
-        if value * _UNKNOWN**2 > 1:
+        if value > 1:  # coordinates are scaled to be of the order of 1
             break
         sentences.append(_sentence(vector * relative, names))
     return tuple(sentences)
@@ -271,13 +254,13 @@ def _sentence(direction: np.ndarray, names: Sequence[str]) -> str:
     # A parameter at its bound does not move with its coordinate.
     direction = np.where(np.isfinite(direction), direction, 0.0)
     size = np.abs(direction)
-    moved = [k for k in np.argsort(-size, kind="stable") if size[k] > _FAINT * size.max()]
+    moved = [k for k in np.argsort(-size, kind="stable") if size[k] > 0.15 * size.max()]  # others are faint
     if not moved:
         return f"some combination of {', '.join(names)} is not seen in these runs"
     if len(moved) == 1:
         return f"{names[moved[0]]} is not seen in these runs"
     exponents = direction[moved] / direction[moved[0]]
-    if len(moved) == 2 and abs(abs(exponents[1]) - 1) < _WHOLE:
+    if len(moved) == 2 and abs(abs(exponents[1]) - 1) < 0.1:
         one, other = names[moved[0]], names[moved[1]]
         # Along the direction one rises as the other falls, or with it: their product, or ratio, stays.
         joint = f"{one} * {other}" if exponents[1] < 0 else f"{one} / {other}"

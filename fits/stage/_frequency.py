@@ -8,27 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from fits.io._errors import DataError
+from fits.io._errors import AnyPath, DataError
 from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._table import Table, open_table
 
-# A line is excited if the input reaches this share of its largest.
-_EXCITED = 0.01
-# Variances are averaged over this many neighbouring lines: few realizations alone make poor weights.
-_SMOOTH = 9
 _REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
 _MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"
 # What a unit is checked by, of each column.
-_UNITS = {
-    "frequency_Hz": "Hz",
-    _REAL: "um/V",
-    _IMAGINARY: "um/V",
-    _VARIANCE: "um^2/V^2",
-    _MAGNITUDE: "um/V",
-    _DECIBEL: "dB",
-    _DEGREES: "deg",
-    _RADIANS: "rad",
-}
+_UNITS = {"frequency_Hz": "Hz"} | dict.fromkeys((_REAL, _IMAGINARY, _MAGNITUDE), "um/V")
+_UNITS |= {_VARIANCE: "um^2/V^2", _DECIBEL: "dB", _DEGREES: "deg", _RADIANS: "rad"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +43,8 @@ class Multisine:
 
     def take(self, realizations: slice) -> "Multisine":
         """Some of the realizations, so that the others can be held out."""
-        return Multisine(
-            self.interval_s, self.voltage_V[realizations], self.displacement_um[realizations], self.source
-        )
+        u, y = self.voltage_V[realizations], self.displacement_um[realizations]
+        return Multisine(self.interval_s, u, y, self.source)
 
     def spectra(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
         """Excited lines in Hz, shape `(f,)`, and spectra of all periods, `(f, r, q, m)` and `(f, r, q, p)`."""
@@ -65,7 +52,7 @@ class Multisine:
         u, y = (np.moveaxis(np.fft.rfft(x, axis=2), 2, 0) / samples for x in (self.voltage_V, self.displacement_um))
         size = np.sqrt(np.mean(np.abs(u) ** 2, axis=(1, 2, 3)))
         size[0] = 0
-        lines = np.flatnonzero(size > _EXCITED * np.max(size))
+        lines = np.flatnonzero(size > 0.01 * np.max(size))
         if not len(lines):
             raise DataError(
                 f"{self.source}: expected periodic voltages, found none that change; choose other columns."
@@ -104,7 +91,7 @@ class ResponseData:
                 )
 
 
-def read_multisine(path: str | os.PathLike[str]) -> Multisine:
+def read_multisine(path: AnyPath) -> Multisine:
     """Read `time_s, realization, period, u1_V, u2_V, ..., y1_um, y2_um, ...` from a CSV file.
 
     Rows are ordered by realization, then period, then time, which may start anew with each realization. A `DataError`
@@ -124,11 +111,8 @@ def read_multisine(path: str | os.PathLike[str]) -> Multisine:
     starts = np.flatnonzero(np.append(True, np.any(np.diff(group) != 0, axis=0)))
     lengths, periods = np.diff(np.append(starts, group.shape[1])), len(np.unique(group[1]))
     order = np.lexsort(group[::-1, starts])
-    if (
-        len(set(lengths)) != 1
-        or np.any(order != np.arange(len(starts)))
-        or len(starts) != periods * len(np.unique(group[0]))
-    ):
+    whole = len(set(lengths)) == 1 and len(starts) == periods * len(np.unique(group[0]))
+    if not whole or np.any(order != np.arange(len(starts))):
         raise table.error(
             "expected every realization with the same periods of the same length, in order; cut or sort the rows",
             column="period",
@@ -183,12 +167,12 @@ def approximate(record: Multisine, u: NDArray[Any], y: NDArray[Any]) -> tuple[ND
 
 
 def smooth(variance: NDArray[Any]) -> NDArray[Any]:
-    """Mean over neighbouring lines, shape `(f, p)`."""
-    width = 2 * (min(_SMOOTH, len(variance) - 1 | 1) // 2) + 1
+    """Mean over nine neighbouring lines, shape `(f, p)`: few realizations alone make poor weights."""
+    width = 2 * (min(9, len(variance) - 1 | 1) // 2) + 1
     return convolve1d(variance, np.full(width, 1 / width), axis=0, mode="mirror")
 
 
-def read_response(path: str | os.PathLike[str]) -> ResponseData:
+def read_response(path: AnyPath) -> ResponseData:
     """Read a frequency response as an analyser writes it: a row per line, frequencies increasing.
 
     The columns are `frequency_Hz`, then `real_um_per_V` and `imag_um_per_V`, or a magnitude (`magnitude_um_per_V`, or
@@ -226,9 +210,8 @@ def read_response(path: str | os.PathLike[str]) -> ResponseData:
     else:
         size = 10 ** (first / 20) if magnitude == _DECIBEL else first
         response = size * np.exp(1j * (np.deg2rad(second) if phase == _DEGREES else second))
-    return ResponseData(
-        values["frequency_Hz"], response[:, None, None], values[_VARIANCE][:, None, None] if known else None
-    )
+    variance = values[_VARIANCE][:, None, None] if known else None
+    return ResponseData(values["frequency_Hz"], response[:, None, None], variance)
 
 
 def _one_of(table: Table, *names: str) -> str:

@@ -22,12 +22,7 @@ from microid import Coordinates, HystereticModes, Modes, with_plays
 
 _M = TypeVar("_M", Modes, HystereticModes)
 _Band = tuple[float, float] | None
-# The rest of the way to the optimum, in standard deviations, that still counts as having arrived.
-_ARRIVED = 1e-2
-_STEPS = 500
 _GAINS = ("gain_um_per_V", "quadrature_um_per_V", "residual_um_per_V")
-# Peaks lower than this, in the logarithm of a singular value, may be noise.
-_PROMINENCE = 0.3
 _FEW_LINES = 5
 
 
@@ -35,17 +30,11 @@ _FEW_LINES = 5
 class ModalFit(Generic[_M]):
     """Fitted modes and how far to trust them.
 
-    Attributes
-    ----------
-    model, sd
-        The model, and standard deviations in its place; zero for what was not fitted.
-    covariance
-        Of the fitted parameters in the order of `parameter_table(model)`, in their units.
-    misfit
-        Residual over what noise and distortion explain, root mean square: 1 if the model is right. Where it is
-        larger, and where the variance is not known, standard deviations were multiplied by it.
-    band_Hz
-        First and last frequency that was fitted.
+    Standard deviations are in the places of a model, zero for what was not fitted; the `covariance` is that of the
+    fitted parameters in the order of `parameter_table(model)`, in their units. The `misfit` is the residual over what
+    noise and distortion explain, root mean square: 1 if the model is right. Where it is larger, and where the
+    variance is not known, standard deviations were multiplied by it. `band_Hz` has the first and last frequency that
+    was fitted.
     """
 
     model: _M
@@ -61,22 +50,11 @@ def fit_response(data: ResponseData, modes: int = 2, band_Hz: _Band = None, coup
     Starts at the peaks of the singular values (complex mode indicator function); where there are fewer than modes,
     where the least is explained. Gains are eliminated (variable projection, Kaufman's Jacobian).
 
-    Parameters
-    ----------
-    data
-        One input and output or several.
-    modes, coupled
-        Number of modes, of which one more than the band shows stands for the next one above it; and whether damping
-        may couple them, by `quadrature_um_per_V`, zero otherwise.
-    band_Hz
-        Lowest and highest frequency to fit; all by default.
+    Of the number of `modes` one more than the band shows stands for the next one above it; damping may couple them,
+    by `quadrature_um_per_V`, if `coupled`. `band_Hz` is the lowest and highest frequency to fit; all by default.
 
-    Raises
-    ------
-    DataError
-        If the band is too narrow for so many parameters, or leaves some of them open.
-    FitError
-        If the solver does not arrive at an optimum.
+    A `DataError` says that the band is too narrow for so many parameters, or leaves some of them open, and a
+    `FitError` that the solver does not arrive at an optimum.
     """
     band = _in_band(data.frequency_Hz, band_Hz, modes)
     frequency, gain = data.frequency_Hz[band], data.response_um_per_V[band]
@@ -105,15 +83,9 @@ def fit_hysteresis(
     Under known periodic voltages plays of given thresholds are known too, so they are inputs like the voltages, and
     displacements are linear in all gains; everything is fitted together as in `fit_response`, to each realization.
 
-    Parameters
-    ----------
-    record
-        More realizations than inputs: they tell how much of the spectra is distortion, which the weights are made of.
-    start, threshold_V
-        Modes to start from, usually of `fit_response`, and thresholds of the plays, shape `(K,)`, not zero, where a
-        play is the voltage itself.
-    band_Hz, coupled
-        See `fit_response`, as for what is raised.
+    The record needs more realizations than inputs: they tell how much of the spectra is distortion, which the weights
+    are made of. Modes to start from are usually of `fit_response`; the thresholds of the plays have shape `(K,)` and
+    are not zero, where a play is the voltage itself. For the others, and what is raised, see `fit_response`.
     """
     frequency, u, y = record.spectra()
     modes = start if isinstance(start, Modes) else start.model
@@ -226,7 +198,7 @@ def _solve(model: _M, spectra: _Spectra) -> tuple[_M, Any]:
     size = jnp.sqrt(jnp.sum(jax.jacfwd(residual)(start) ** 2, axis=(0, 1)))
     solver: Any = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-6)
     solution: Any = optx.least_squares(
-        lambda x, _: residual(start + x / size), solver, jnp.zeros_like(start), max_steps=_STEPS, throw=False
+        lambda x, _: residual(start + x / size), solver, jnp.zeros_like(start), max_steps=500, throw=False
     )
     found = coordinates(start + solution.value / size)
     return _with_gains(found, spectra.eliminated(found)[1], spectra.coupled), solution.result
@@ -259,7 +231,8 @@ def _fit(start: _M, spectra: _Spectra, known: bool) -> ModalFit[_M]:
             "fit fewer modes or a wider band."
         )
     misfit = float(np.linalg.norm(residual) / math.sqrt(len(residual) - len(left)))
-    if not np.linalg.norm(left) <= _ARRIVED * misfit * math.sqrt(len(left)) + 1e-6:
+    # The rest of the way to the optimum, in standard deviations.
+    if not np.linalg.norm(left) <= 1e-2 * misfit * math.sqrt(len(left)) + 1e-6:
         slow = result == RESULTS.nonlinear_max_steps_reached
         raise FitError(FitStatus.MAX_STEPS if slow else FitStatus.NOT_STATIONARY)
     inverse = np.linalg.inv(root) * (max(1.0, misfit) if known else misfit)
@@ -275,9 +248,7 @@ def _fit(start: _M, spectra: _Spectra, known: bool) -> ModalFit[_M]:
 def _moved(coordinates: Coordinates[_M], z: Float[Array, " n"], by: Float[Array, " n"]) -> _M:
     """Change of the model per change of the coordinates, zero where nothing moves."""
     model, change = eqx.filter_jvp(coordinates, (z,), (by,))
-    return jax.tree_util.tree_map(
-        lambda value, moved: jnp.zeros_like(value) if moved is None else moved, model, change
-    )
+    return jax.tree.map(lambda value, moved: jnp.zeros_like(value) if moved is None else moved, model, change)
 
 
 def _start(spectra: _Spectra, response: NDArray[Any], count: int) -> Modes:
@@ -287,7 +258,7 @@ def _start(spectra: _Spectra, response: NDArray[Any], count: int) -> Modes:
     average = np.full(_FEW_LINES, 1 / _FEW_LINES)
     for curve in np.linalg.svd(response, compute_uv=False).T:
         level = convolve1d(np.log(np.maximum(curve, 1e-12 * np.max(np.abs(response)))), average, mode="nearest")
-        peaks, about = find_peaks(level, prominence=_PROMINENCE)
+        peaks, about = find_peaks(level, prominence=0.3)  # lower ones may be noise
         width = peak_widths(np.exp(2 * level), peaks)[0] * np.mean(np.diff(frequency))
         found += zip(about["prominences"], frequency[peaks], width / (2 * frequency[peaks]), strict=True)
     at: list[tuple[float, float]] = []

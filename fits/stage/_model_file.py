@@ -2,18 +2,12 @@
 
 A model file is one JSON object (UTF-8; no NaN or infinity) with six keys:
 
-`schema`
-    `"microid.model/1"`. Another number means another format.
-`sha256`
-    Of the object without this key, as `json.dumps(rest, sort_keys=True, separators=(",", ":"))` in ASCII.
-`written_by`
-    Name and version of the program.
-`model`
-    The model. Every part is an object whose `type` is the name of a class in `microid`, with one key per field.
-`uncertainty`
-    `fits.Uncertainty`, or for a whole stage `fits.StageUncertainty`, in the same form.
-`fit`
-    The report of the fit, as `microid fit --json` prints it.
+- `schema`: `"microid.model/1"`. Another number means another format.
+- `sha256`: of the object without this key, as `json.dumps(rest, sort_keys=True, separators=(",", ":"))` in ASCII.
+- `written_by`: name and version of the program.
+- `model`: every part is an object whose `type` is the name of a class in `microid`, with one key per field.
+- `uncertainty`: `fits.Uncertainty`, or for a whole stage `fits.StageUncertainty`, in the same form.
+- `fit`: the report of the fit, as `microid fit --json` prints it.
 
 A field that holds numbers is `{"unit": "um", "value": 1.5}`, where the value is one number or nested lists of them
 (float64, written with as many digits as reading it back exactly takes; another type is named by the key `dtype`). The
@@ -48,7 +42,7 @@ import equinox as eqx
 import jax
 
 from fits.io._atomic import atomic_write_text
-from fits.io._errors import DataError, shown
+from fits.io._errors import AnyPath, DataError, shown
 from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
 from fits.io._version import written_by
 from fits.loop._design import Grid
@@ -79,10 +73,7 @@ class ModelFile:
 
 
 def save_model(
-    path: str | os.PathLike[str],
-    model: eqx.Module,
-    uncertainty: Uncertainty | StageUncertainty | None,
-    report: Mapping[str, Any],
+    path: AnyPath, model: eqx.Module, uncertainty: Uncertainty | StageUncertainty | None, report: Mapping[str, Any]
 ) -> None:
     """Write a model file, whole or not at all; the same model gives the same bytes.
 
@@ -122,15 +113,11 @@ def model_text(
     return _pretty(content) + "\n"
 
 
-def load_model(path: str | os.PathLike[str]) -> ModelFile:
+def load_model(path: AnyPath) -> ModelFile:
     """Read a model file that `save_model` wrote: every number is bit by bit what was written.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, is of another version, was changed after it was written, or makes no sense.
-    RuntimeError
-        If JAX computes in single precision.
+    A `DataError` says that the file cannot be read, is of another version, was changed after it was written, or makes
+    no sense, and a `RuntimeError` that JAX computes in single precision.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('model files hold float64: jax.config.update("jax_enable_x64", True)')

@@ -148,9 +148,8 @@ def run_sums(
         used[:, :size], used[:, size:known], used[:, known:] = columns, slope[piece], nuisance[piece]
         target = root[piece] * (residual[piece] + columns @ np.asarray(columns_um)[:size])
         used *= root[piece, None]
-        sums = sums + Moments(
-            used.T @ used, used.T @ target, np.asarray(target @ target), np.asarray(weight[piece].sum())
-        )
+        energy, count = np.asarray(target @ target), np.asarray(weight[piece].sum())
+        sums = sums + Moments(used.T @ used, used.T @ target, energy, count)
     reduced, _, _ = split_moments(sums, known, 0.0)
     off = np.asarray(_project_out(jnp.asarray(nuisance), samples.weight, jnp.asarray(residual)))
     return RunSums(reduced, np.asarray(sums.gram)[:known, known] / weight.sum(), off[: len(run.record)])

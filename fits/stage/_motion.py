@@ -14,11 +14,6 @@ from fits.loop._run import Run, prepare_run
 from fits.stage._run import as_stage, place_of_hysteresis, range_of
 from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
 
-# Steps in a period of the resonance: a sampled sine misses less than 2 % of its peak.
-_PER_PERIOD = 16
-# Samples of a run in all steps, at most: what rings between samples that are this far apart has died away.
-_MOST_SAMPLES = 1 << 18
-
 
 @dataclass(frozen=True)
 class Prepared:
@@ -74,9 +69,11 @@ def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
 def fine_steps(stage: Stage, interval_s: float, count: int) -> int:
     """Steps between samples that show how a stage rings."""
     resonances = [float(p.natural_frequency_Hz) for p in map(innermost, stage.parts) if isinstance(p, Mechanics)]
-    wanted = max((interval_s * _PER_PERIOD * f for f in resonances), default=1.0)
-    # In powers of two, so that few programs are compiled.
-    return int(2 ** math.ceil(math.log2(min(max(wanted, 1.0), max(_MOST_SAMPLES / count, 1.0)))))
+    # Of 16 steps in a period a sampled sine misses less than 2 % of its peak.
+    wanted = max((interval_s * 16 * f for f in resonances), default=1.0)
+    # In powers of two, so that few programs are compiled; what rings between samples that are so far apart that the
+    # run has more steps in all has died away.
+    return int(2 ** math.ceil(math.log2(min(max(wanted, 1.0), max((1 << 18) / count, 1.0)))))
 
 
 def motion(

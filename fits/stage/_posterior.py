@@ -1,6 +1,6 @@
 """For those who do not trust a standard deviation: draws from a posterior by NUTS, and the profile likelihood."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
-from fits.loop._run import Run, Samples
+from fits.loop._run import Progress, Run, Samples
 from fits.stage._moments import offsets_out
 from fits.stage._run import free_grid, nuisance_columns, prepare_again, project_out, residual_of, respond
 from fits.stage._solve import Problem, Solved, Weighing, prior_precision, solve_chain
@@ -62,19 +62,9 @@ def sample_posterior(
 ) -> Draws:
     """Draw from the posterior of the parameters, flat in the solver's coordinates, the hysteresis as it was fitted.
 
-    Needs numpyro: `pip install -c constraints.txt ".[posterior]"`.
-
-    Parameters
-    ----------
-    result, records, holdout, initial
-        From `fit_stage`, where the sampler starts, and what was given there.
-    draws, warmup, seed
-        Number of draws, of steps to adapt before, and the seed of the sampler.
-
-    Raises
-    ------
-    DataError
-        If numpyro is not installed.
+    Needs numpyro: `pip install -c constraints.txt ".[posterior]"`; a `DataError` says that it is not installed. The
+    sampler starts from a result of `fit_stage`; records, holdout and initial memory are those that were given there.
+    `warmup` steps adapt it before the draws.
     """
     try:
         from numpyro.infer import MCMC, NUTS
@@ -89,12 +79,8 @@ def sample_posterior(
     ]
     coordinates = offsets_out(stage, True)
     data = coordinates, [run.samples for run in runs], precision
-    sampler = MCMC(
-        NUTS(potential_fn=eqx.Partial(_potential, data), dense_mass=True),
-        num_warmup=warmup,
-        num_samples=draws,
-        progress_bar=False,
-    )
+    kernel = NUTS(potential_fn=eqx.Partial(_potential, data), dense_mass=True)
+    sampler = MCMC(kernel, num_warmup=warmup, num_samples=draws, progress_bar=False)
     # The sampler's own arithmetic mixes precisions.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         sampler.run(jax.random.key(seed), init_params=coordinates.of(stage), extra_fields=("diverging",))
@@ -108,13 +94,9 @@ def sample_posterior(
 class Profile:
     """Profile of one parameter.
 
-    Attributes
-    ----------
-    values, deviance
-        Where it was held, and twice the loss of log likelihood there, shape `(k,)`; a parabola where the standard
-        deviation says all.
-    lower, upper
-        Ends of the 95 % interval; the last value looked at where the deviance stays below its bound.
+    The `deviance` is twice the loss of log likelihood at the `values` where it was held, shape `(k,)` both: a
+    parabola where the standard deviation says all. `lower` and `upper` are the ends of the 95 % interval, or the last
+    value looked at where the deviance stays below its bound.
     """
 
     name: str
@@ -133,26 +115,15 @@ def profile_stage(
     points: int = 9,
     holdout: float = 0.2,
     initial: str = "unknown",
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> Profile:
     """Hold one parameter of a fitted stage at several values and fit all others again.
 
-    Parameters
-    ----------
-    result, records, holdout, initial
-        From `fit_stage`, with the squares as loss, and what was given there.
-    name, points
-        Of the parameter, such as `mechanics.damping_ratio`, and number of values: evenly spread over seven standard
-        deviations, less where a bound comes before.
-    progress
-        Told what is being done.
+    The result is from `fit_stage`, with the squares as loss; records, holdout and initial memory are those that were
+    given there. The values of the parameter, such as `mechanics.damping_ratio`, are evenly spread over seven standard
+    deviations, less where a bound comes before. `progress` is told what is being done.
 
-    Raises
-    ------
-    DataError
-        If no such parameter was fitted.
-    FitError
-        If one of the fits fails.
+    A `DataError` says that no such parameter was fitted, a `FitError` that one of the fits failed.
     """
     names = [parameter.name for parameter in result.parameters]
     if name not in names or name.endswith("]"):
@@ -184,7 +155,7 @@ def profile_stage(
     return Profile(name, at.unit, values, found, lower, upper)
 
 
-def _solved(stage: Stage, runs: Sequence[Run], hyper: Hyper | None, stroke_um: float) -> Solved:
+def _solved(stage: Stage, runs: list[Run], hyper: Hyper | None, stroke_um: float) -> Solved:
     """Fit what is free of a stage; a `ValueError` where nothing is."""
     fitted = free_grid(stage)
     if fitted is None:

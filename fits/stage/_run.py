@@ -11,38 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+import microid as m
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._past import past_columns
 from fits.loop._run import Run, Samples, command_range_V, known_samples, prepare_run
 from fits.loop._uncertainty import refuse_outside
-from microid import (
-    AbstractEffect,
-    AbstractHysteresis,
-    AbstractLinear,
-    GridDensity,
-    LinearSystem,
-    Preisach,
-    Signal,
-    Stage,
-    Start,
-    innermost,
-)
 
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
-# Where a lag has come this close, as a fraction of the range, it no longer knows from where.
-_FORGOTTEN = 1e-3
 
 
-def respond(stage: Stage, samples: Samples) -> Float[Array, " n"]:
+def respond(stage: m.Stage, samples: Samples) -> Float[Array, " n"]:
     """Simulate a run, in um, shape `(n,)`."""
-    start = samples.start if any(isinstance(innermost(part), Preisach) for part in stage.parts) else Start()
+    start = samples.start if any(isinstance(m.innermost(part), m.Preisach) for part in stage.parts) else m.Start()
     return stage(samples.time_s, samples.voltage_V, start, samples.beside)[:: samples.stride]
 
 
-def nuisance_columns(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
+def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, `(n, k)`: an offset in um, its past, and how the stage moved before.
 
     The latter are free motions of what follows the hysteresis, or of the whole chain without one. What still settles
@@ -59,7 +46,7 @@ def nuisance_columns(stage: Stage, samples: Samples) -> Float[Array, "n k"]:
     nothing = jnp.zeros_like(samples.voltage_V)
 
     def free(state: Float[Array, " s"]) -> Float[Array, " n"]:
-        alone = LinearSystem(system.rate_per_s, state, system.read, jnp.zeros(()), jnp.zeros(()))
+        alone = m.LinearSystem(system.rate_per_s, state, system.read, jnp.zeros(()), jnp.zeros(()))
         return alone.respond(samples.time_s, nothing, jnp.ones(()))[:: samples.stride]
 
     return jnp.concatenate([offset, jax.vmap(free)(jnp.eye(system.order)).T], axis=1)
@@ -77,56 +64,56 @@ def project_out(
 
 
 @eqx.filter_jit
-def _compare(stage: Stage, samples: Samples) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def _compare(stage: m.Stage, samples: Samples) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     out = respond(stage, samples)
     return out, project_out(nuisance_columns(stage, samples), samples.weight, samples.displacement_um - out)
 
 
-def simulate_stage(stage: Stage, run: Run) -> np.ndarray:
+def simulate_stage(stage: m.Stage, run: Run) -> np.ndarray:
     """Predict the displacement of a run, in um, shape `(n,)`."""
     return np.asarray(_compare(stage, run.samples)[0])[: len(run.record)]
 
 
-def residual_of(stage: Stage, run: Run) -> np.ndarray:
+def residual_of(stage: m.Stage, run: Run) -> np.ndarray:
     """Measurement less prediction, the run's nuisance parameters taken off, in um, shape `(n,)`."""
     return np.asarray(_compare(stage, run.samples)[1])[: len(run.record)]
 
 
-def place_of_hysteresis(stage: Stage) -> int | None:
+def place_of_hysteresis(stage: m.Stage) -> int | None:
     """Where in the chain the hysteresis stands; None where there is none."""
-    places = [n for n, part in enumerate(stage.parts) if isinstance(innermost(part), AbstractHysteresis)]
+    places = [n for n, part in enumerate(stage.parts) if isinstance(m.innermost(part), m.AbstractHysteresis)]
     return places[0] if places else None
 
 
-def named_parts(stage: Stage, *kinds: type) -> list[tuple[str, Any]]:
+def named_parts(stage: m.Stage, *kinds: type) -> list[tuple[str, Any]]:
     """Names and parts of some kinds, in the order of the signal."""
     return [pair for pair in zip(stage.names, stage.parts, strict=True) if isinstance(pair[1], kinds)]
 
 
-def as_stage(model: Preisach | Stage) -> Stage:
+def as_stage(model: m.Preisach | m.Stage) -> m.Stage:
     """A model as a stage: a hysteresis alone is one of a single part."""
-    return model if isinstance(model, Stage) else Stage.of(hysteresis=model)
+    return model if isinstance(model, m.Stage) else m.Stage.of(hysteresis=model)
 
 
-def hysteresis_of(stage: Stage) -> Any:
+def hysteresis_of(stage: m.Stage) -> Any:
     """The part of a stage that holds its hysteresis, with what is around it; None where there is none."""
     place = place_of_hysteresis(stage)
     return None if place is None else stage.parts[place]
 
 
-def free_grid(stage: Stage) -> tuple[str, Preisach] | None:
+def free_grid(stage: m.Stage) -> tuple[str, m.Preisach] | None:
     """Name and Preisach operator of a stage that is fitted on a grid; None where it is frozen, or of another kind."""
     law, name = hysteresis_of(stage), stage.names[place_of_hysteresis(stage) or 0]
-    on_grid = isinstance(law, Preisach) and isinstance(law.density, GridDensity)
+    on_grid = isinstance(law, m.Preisach) and isinstance(law.density, m.GridDensity)
     return (name, law) if on_grid and name not in stage.frozen else None
 
 
-def gain_ahead(stage: Stage) -> float | None:
+def gain_ahead(stage: m.Stage) -> float | None:
     """Voltage at the hysteresis per command, at rest; None without one, a `DataError` where it is not positive."""
     place = place_of_hysteresis(stage)
     if place is None:
         return None
-    gain = math.prod(float(part.static_gain) for part in stage.parts[:place] if isinstance(part, AbstractLinear))
+    gain = math.prod(float(part.static_gain) for part in stage.parts[:place] if isinstance(part, m.AbstractLinear))
     if not (math.isfinite(gain) and gain > 0):
         raise DataError(
             f"the static gain ahead of {stage.names[place]!r} is {gain:g}, expected a positive one: turn the sign of "
@@ -135,26 +122,26 @@ def gain_ahead(stage: Stage) -> float | None:
     return gain
 
 
-def joined(parts: Sequence[Any]) -> LinearSystem | None:
+def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
     """Linear parts as one system; None where there are none, or one of them is not linear."""
-    total: LinearSystem | None = None
+    total: m.LinearSystem | None = None
     for part in parts:
-        if not isinstance(part, AbstractLinear):
+        if not isinstance(part, m.AbstractLinear):
             return None
         total = part.system() if total is None else total.then(part.system())
     return total
 
 
-def ahead(stage: Stage, place: int, samples: Samples, rest_V: float | None = None) -> Float[Array, " m"]:
+def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: float | None = None) -> Float[Array, " m"]:
     """Voltage at a part after a rest at the first command, or at another, at the refined times, in V, `(m,)`."""
     rest = samples.voltage_V[0] if rest_V is None else jnp.asarray(rest_V)
-    signal = Signal(samples.voltage_V, rest, stage.hold)
+    signal = m.Signal(samples.voltage_V, rest, stage.hold)
     for part in stage.parts[:place]:
         signal = part.run(samples.time_s, signal)
     return signal.values
 
 
-def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
+def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
     """Mark what no longer depends on a past that is `initial`, behind the lag ahead of the hysteresis.
 
     All of them, where less than half of those that are fitted would be left.
@@ -166,22 +153,22 @@ def settled_samples(stage: Stage, run: Run, initial: str) -> np.ndarray:
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.
     rests_V = run.lower_V / run.gain, run.upper_V / run.gain
     low_V, high_V = (np.asarray(ahead(stage, place, run.samples, rest))[:: run.stride][:n] for rest in rests_V)
-    begun = int(np.argmax(np.abs(high_V - low_V) < _FORGOTTEN * (run.upper_V - run.lower_V)))
+    begun = int(np.argmax(np.abs(high_V - low_V) < 1e-3 * (run.upper_V - run.lower_V)))
     settled = np.arange(n) >= begun
     settled[begun:] = known_samples(low_V[begun:], run.lower_V, run.upper_V, initial)
     return settled if 2 * (settled & run.fitted).sum() > run.fitted.sum() else everything
 
 
-def range_of(stage: Stage) -> tuple[float, float]:
+def range_of(stage: m.Stage) -> tuple[float, float]:
     """Commands that a stage was fitted on, in V; unlimited without a Preisach operator."""
     law, gain = hysteresis_of(stage), gain_ahead(stage)
-    law = None if law is None else innermost(law)
-    if gain is None or not isinstance(law, Preisach):
+    law = None if law is None else m.innermost(law)
+    if gain is None or not isinstance(law, m.Preisach):
         return -np.inf, np.inf
     return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
 
 
-def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout: float) -> list[Run]:
+def prepare_again(stage: m.Stage, records: Sequence[Record], initial: str, holdout: float) -> list[Run]:
     """Make the records ready on which a stage was fitted; without a Preisach operator they give the range."""
     range_V = range_of(stage)
     if not np.isfinite(range_V[0]):
@@ -190,14 +177,14 @@ def prepare_again(stage: Stage, records: Sequence[Record], initial: str, holdout
     return [prepare_run(record, range_V, *settings) for record in records]
 
 
-def prepare_program(stage: Stage, record: Record, initial: str) -> tuple[Stage, Run]:
+def prepare_program(stage: m.Stage, record: Record, initial: str) -> tuple[m.Stage, Run]:
     """Make a voltage program ready for a stage, and the stage for intervals that are divided already.
 
     A `DataError` if it leaves the range that the stage was fitted on, or lacks a column that the stage depends on.
     """
     range_V = range_of(stage)
     refuse_outside(record, *range_V)
-    needed = {name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs}
+    needed = {name for part in stage.parts if isinstance(part, m.AbstractEffect) for name in part.needs}
     needed -= {name for name, column in COLUMNS.items() if column.optional}
     program = replace(record, displacement_um=None)
     missing = sorted(needed - set(columns_beside(program)))

@@ -1,7 +1,7 @@
 """Fitting a whole stage: damped Gauss-Newton steps, the columns of the hysteresis solved for exactly in each."""
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
@@ -15,19 +15,17 @@ from fits.loop._grid import solve_grid
 from fits.loop._moments import Data, Moments
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import Run
+from fits.loop._run import Progress, Run
 from fits.stage._moments import Chain, RunSums, run_sums, split_moments
 from fits.stage._run import residual_of
 from fits.stats._noise import correlation_samples, huber_weight
 from microid import Hold, Stage
 
 _ROUNDS, _ROUGH = 40, 12
-# Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
-_DAMPING, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
+# What a step that fails multiplies Marquardt's damping by, and where it gives up.
+_FACTOR, _HIGHEST = 10.0, 1e6
 # A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
 _STATIONARY = 0.02
-# Variance of the noise below which, in squares of the stroke, all is rounding.
-_ROUNDING = 1e-20
 
 
 @dataclass(frozen=True)
@@ -165,12 +163,7 @@ class Solved:
 
 
 def solve_chain(
-    problem: Problem,
-    runs: Sequence[Run],
-    loss: str,
-    progress: Callable[[str], None],
-    rough: bool = False,
-    accept_best: bool = False,
+    problem: Problem, runs: list[Run], loss: str, progress: Progress, rough: bool = False, accept_best: bool = False
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
@@ -184,10 +177,10 @@ def solve_chain(
     """
     chain, stroke_um = problem.chain, problem.stroke_um
     z, columns_um, hyper = problem.z, problem.columns_um, problem.hyper
-    damping = _DAMPING
+    damping = 1e-4
     counted: tuple[float, ...] = ()
     for number in range(_ROUGH if rough else _ROUNDS):
-        runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
+        runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
@@ -197,18 +190,16 @@ def solve_chain(
         here = weights.cost_um2(runs, [one.residual_um for one in sums])
         while True:
             try:
-                step, columns, better, variance, distance = _step(
-                    chain, total, columns_um, hyper, weights, stroke_um, damping
-                )
+                found = _step(problem, total, columns_um, hyper, weights, damping)
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
                 if damping > _HIGHEST and not (accept_best and number):
                     raise
                 if damping > _HIGHEST:
-                    return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
+                    return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
                 continue
-            hyper = better
+            step, columns, hyper, variance, distance = found
             prior = prior_precision(chain, hyper, stroke_um)
             there = weights.cost_um2(runs, _residuals(chain, z + step, columns, runs))
             old = here / variance + columns_um @ prior @ columns_um
@@ -231,14 +222,14 @@ def solve_chain(
             counted = weighing.correlation
             continue
         if distance < _STATIONARY:
-            runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, hyper is not None, counted)
-            return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
+            runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
+            return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
     if rough or accept_best:
-        return Solved(problem, z, columns_um, hyper, list(runs), sums, weighing)
+        return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
     raise FitError(FitStatus.MAX_STEPS)
 
 
-def try_chain(problem: Problem, runs: Sequence[Run], *settings: Any, **further: Any) -> Solved | None:
+def try_chain(problem: Problem, runs: list[Run], *settings: Any, **further: Any) -> Solved | None:
     """Fit as `solve_chain` does; None where that fails."""
     try:
         return solve_chain(problem, runs, *settings, **further)
@@ -260,21 +251,13 @@ def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
 
 
 def _gather(
-    problem: Problem,
-    z: np.ndarray,
-    columns_um: np.ndarray,
-    runs: Sequence[Run],
-    loss: str,
-    free: bool,
-    counted: tuple[float, ...],
-) -> tuple[Sequence[Run], list[RunSums], Weighing]:
-    chain = problem.chain
+    problem: Problem, z: np.ndarray, columns_um: np.ndarray, runs: list[Run], loss: str, counted: Sequence[float]
+) -> tuple[list[Run], list[RunSums], Weighing]:
+    chain, free = problem.chain, problem.hyper is not None
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
         # Outliers count linearly (Huber).
-        runs = [
-            replace(run, weight=huber_weight(residual, run.fitted)) for run, residual in zip(runs, left, strict=True)
-        ]
+        runs = [replace(run, weight=huber_weight(one, run.fitted)) for run, one in zip(runs, left, strict=True)]
     sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
     weighing = Weighing.of(runs, [one.residual_um for one in sums], *counted)
     return runs, sums, replace(weighing, least_noise_share=problem.least_noise_share)
@@ -286,15 +269,10 @@ def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequen
 
 
 def _step(
-    chain: Chain,
-    total: Moments,
-    columns_um: np.ndarray,
-    hyper: Hyper | None,
-    weighing: Weighing,
-    stroke_um: float,
-    damping: float,
+    problem: Problem, total: Moments, columns_um: np.ndarray, hyper: Hyper | None, weighing: Weighing, damping: float
 ) -> tuple[np.ndarray, np.ndarray, Hyper | None, float, float]:
     """Change of coordinates, columns, their smoothness, noise variance in um^2, and standard deviations moved."""
+    chain, stroke_um = problem.chain, problem.stroke_um
     columns, variance, prior = columns_um, weighing.least_um**2, None
     size = 0 if hyper is None else chain.size
     reduced, step, follow = split_moments(total, size, damping)
@@ -303,7 +281,7 @@ def _step(
         columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
         step = step - follow @ columns
         variance = float(jnp.exp(hyper.log_variance)) * stroke_um**2
-        if not variance > _ROUNDING * stroke_um**2:
+        if not variance > 1e-20 * stroke_um**2:  # all is rounding below
             # The search for the noise went astray.
             raise FitError(FitStatus.NONFINITE)
         prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)

@@ -14,22 +14,9 @@ from fits.loop._run import Run
 from fits.stage._run import named_parts
 from microid import AbstractLinear, Driver, Mechanics, Stage
 
-# Segments whose spectra are averaged.
-_SEGMENTS = 8
-_LEAST = 64
-# Lines at which less than this of the displacement's power follows the input say nothing; noise alone seems to follow
-# by a third at many of them, so that less than the first counts only where there is nothing better.
-_COHERENT, _HARDLY = 0.7, 0.3
 _LINES = 6
-# However coherent a line is, the estimate leaks from its neighbours.
-_SHARPEST = 30.0
-_DAMPING_RATIOS = (0.005, 0.03, 0.15, 0.7)
-_FREQUENCIES, _TIMES, _PEAKS = 24, 8, 3
 # Lines of a response that are kept, spread evenly over the logarithm of the frequency and around the largest.
 _MOST_LINES = 240
-# Candidates, in logarithms of the poles, that are too alike to refine both, or to keep both.
-_COARSE, _SAME = 0.5, 0.05
-_LEADING, _REFINED, _KEPT = 200, 4, 3
 
 
 @dataclass(frozen=True)
@@ -48,7 +35,7 @@ def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
     time = run.record.time_s[piece]
     even = np.linspace(time[0], time[-1], len(time))
     x, y = (np.interp(even, time, values[piece]) for values in (drive, run.displacement_um))
-    rate, length = (len(time) - 1) / (time[-1] - time[0]), max(_LEAST, 2 * len(time) // (_SEGMENTS + 1))
+    rate, length = (len(time) - 1) / (time[-1] - time[0]), max(64, 2 * len(time) // 9)  # eight segments
     settings: dict[str, Any] = {"fs": rate, "nperseg": min(length, len(time)), "detrend": "linear"}
     frequency, cross = signal.csd(x, y, **settings)
     power, out = signal.welch(x, **settings)[1], signal.welch(y, **settings)[1]
@@ -56,9 +43,10 @@ def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
         response, coherence = cross / power, np.abs(cross) ** 2 / (power * out)
     # The lines next to zero hold what the trend leaves.
     usable = (np.arange(len(frequency)) >= 2) & np.isfinite(coherence) & (response != 0)
-    seen = usable & (coherence > _COHERENT)
+    # Noise alone seems to follow by a third at many lines: less counts only where there is nothing better.
+    seen = usable & (coherence > 0.7)
     if seen.sum() < _LINES:
-        seen = usable & (coherence > _HARDLY)
+        seen = usable & (coherence > 0.3)
     kept = _thinned(frequency, np.abs(response), np.flatnonzero(seen))
     return MeasuredResponse(frequency[kept], response[kept], np.minimum(coherence[kept], 1 - 1e-9))
 
@@ -86,12 +74,13 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
     fixed = [part for name, part in named_parts(stage, AbstractLinear) if name not in moved]
     problem = _LogResponse.of(responses, [isinstance(part, Driver) for _, part in free], fixed)
     found: list[tuple[float, np.ndarray]] = []
-    for x in _distinct(problem.ranked()[1][:_LEADING], _COARSE)[:_REFINED]:
+    # Candidates may be too alike, in the logarithms of their poles, to refine both, or to keep both.
+    for x in _distinct(problem.ranked()[1][:200], 0.5)[:4]:
         low, high = problem.bounds()
         end: Any = least_squares(problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200)
         found.append((float(end.cost), end.x))
     found.sort(key=lambda item: item[0])
-    ends = _distinct([x for _, x in found], _SAME)[:_KEPT]
+    ends = _distinct([x for _, x in found], 0.05)[:3]
     best = [other for x in ends[:1] for other in problem.exchanged(x)]
     return [problem.applied(stage, moved, x) for x in [*ends, *best]]
 
@@ -143,7 +132,8 @@ class _LogResponse:
             response = np.asarray(part.frequency_response(jnp.asarray(frequency)))
             measured = measured * float(part.static_gain) / response
         # The variance of the logarithm of a response is proportional to (1 - coherence) / coherence.
-        weight = np.minimum(np.sqrt(coherence / (1 - coherence)), _SHARPEST)
+        # However coherent a line is, the estimate leaks from its neighbours.
+        weight = np.minimum(np.sqrt(coherence / (1 - coherence)), 30.0)
         run = np.repeat(np.arange(len(responses)), [len(one.frequency_Hz) for one in responses])
         return cls(frequency, measured, weight, run, drivers)
 
@@ -187,10 +177,10 @@ class _LogResponse:
         low, high = float(self.frequency_Hz.min()), float(self.frequency_Hz.max())
         size = np.abs(self.measured) * np.minimum(self.weight, 1)
         peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] > size[2:])) + 1
-        highest = self.frequency_Hz[peaks[np.argsort(-size[peaks])][:_PEAKS]]
-        natural = np.concatenate([highest, np.geomspace(max(low, high / 100), 2 * high, _FREQUENCIES)])
-        constants = np.log(np.geomspace(0.02, 50, _TIMES) / (2 * np.pi * high))[:, None]
-        poles = np.log(list(product(natural, _DAMPING_RATIOS)))
+        highest = self.frequency_Hz[peaks[np.argsort(-size[peaks])][:3]]
+        natural = np.concatenate([highest, np.geomspace(max(low, high / 100), 2 * high, 24)])
+        constants = np.log(np.geomspace(0.02, 50, 8) / (2 * np.pi * high))[:, None]
+        poles = np.log(list(product(natural, (0.005, 0.03, 0.15, 0.7))))
         points, inverse = np.zeros((1, 0)), np.ones((1, len(self.frequency_Hz)), dtype=complex)
         for driver in self.drivers:
             more = constants if driver else poles

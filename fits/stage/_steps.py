@@ -1,7 +1,7 @@
 """The two halves of fitting a stage: a place to begin, read off the runs, and the joint fit from there."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid
 from fits.loop._misfit import without_impulses
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import Run, prepare_run, simulate_run
+from fits.loop._run import Progress, Run, prepare_run, simulate_run
 from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
 from fits.stage._moments import offsets_out
 from fits.stage._run import free_grid, hysteresis_of, named_parts, settled_samples, simulate_stage
@@ -21,19 +21,8 @@ from fits.stage._start import measure_response, start_stages
 from fits.stage._uncertainty import Precision
 from microid import Driver, Hold, Mechanics, Preisach, Stage
 
-# Runs whose voltage moves less than this many times faster than that of the slowest are slow.
-_SLOW = 4.0
-# Intervals are divided until the error of the finite step moves no parameter by this many standard deviations.
-_BIAS = 0.15
-_FINEST = 16
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
 _EVEN = 1.0
-# Samples that a driver lags by where its search begins.
-_LAG = 3.0
-# Parts of the sampling interval below which a driver has no time constant, and from which it may find one again.
-_VANISHED, _RESTARTED = 1e-2, 0.3
-# Samples of a run, as a part of those fitted, that are not worth another fit where an unknown past reaches them.
-_HARDLY_ANY = 0.01
 
 
 @dataclass(frozen=True)
@@ -48,7 +37,7 @@ class Plan:
     fraction: float
     range_V: tuple[float, float]
     loss: str
-    progress: Callable[[str], None]
+    progress: Progress
     gain: float | None
     hold: Hold
     accept_best: bool
@@ -79,10 +68,6 @@ class Plan:
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
         return prepare_run(record, *settings, usable, self.estimated)
 
-    def smoothed(self) -> "Plan":
-        """The same without readings that jump out and back, of which a start must not be read off."""
-        return replace(self, records=tuple(map(without_impulses, self.records)))
-
     def behind(self, solved: Solved) -> "Plan | None":
         """The same without what an unknown past reaches behind the lag that was found; None where that is hardly any.
 
@@ -92,7 +77,7 @@ class Plan:
             return None
         settled = [settled_samples(solved.stage, *each) for each in zip(solved.runs, self.states, strict=True)]
         lost = [np.sum(run.fitted & ~own) / run.fitted.sum() for run, own in zip(solved.runs, settled, strict=True)]
-        if max(lost) < _HARDLY_ANY:
+        if max(lost) < 0.01:  # not worth another fit
             return None
         return replace(self, settled=tuple(settled))
 
@@ -103,9 +88,10 @@ class Plan:
 
 def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> Problem:
     """Read a hysteresis off the slow runs and poles off the others."""
-    plan, asked = plan.smoothed(), stage
+    # Readings that jump out and back are left out, as a start must not be read off them.
+    plan, asked = replace(plan, records=tuple(map(without_impulses, plan.records))), stage
     speed = [speed_Hz(record) for record in plan.records]
-    slow = [k for k, one in enumerate(speed) if one <= _SLOW * min(speed)]
+    slow = [k for k, one in enumerate(speed) if one <= 4.0 * min(speed)]  # all others are fast
     fitted = free_grid(stage)
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
     runs = plan.runs(1)
@@ -165,14 +151,14 @@ def _no_resonance(plan: Plan, name: str) -> str:
     )
 
 
-def _lagging(plan: Plan, problem: Problem, runs: Sequence[Run], drives: Sequence[np.ndarray]) -> Problem | None:
+def _lagging(plan: Plan, problem: Problem, runs: list[Run], drives: Sequence[np.ndarray]) -> Problem | None:
     """Fit hysteresis and driver together, without mechanics; None where the driver's lag does not show."""
     stage, grid = problem.stage, problem.chain.grid
     drivers, mechanics = (named_parts(stage, kind) for kind in (Driver, Mechanics))
     if len(drivers) != 1 or len(mechanics) != 1 or grid is None or problem.hyper is None:
         return None
     (name, old), (dropped, _) = drivers[0], mechanics[0]
-    simple = stage.without(dropped).swap(name, Driver(jnp.asarray(_LAG * plan.interval_s), old.gain))
+    simple = stage.without(dropped).swap(name, Driver(jnp.asarray(3.0 * plan.interval_s), old.gain))
     simpler = Problem.of(simple, grid, problem.columns_um, problem.hyper, problem.stroke_um)
     simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, dropped),))
     plan.progress("a lag without a resonance")
@@ -204,11 +190,12 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         sd = np.sqrt(np.diagonal(precision.covariance(influence)))
         off = [simulate_stage(stage, a) - simulate_stage(stage, b) for a, b in zip(runs, plan.runs(2), strict=True)]
         moved = [own @ (o - o[run.fitted].mean()) for own, o, run in zip(influence, off, runs, strict=True)]
-        # Halving the step takes three quarters of its error off, which falls with its square.
-        excess = float(np.max(np.abs(np.sum(moved, axis=0)) / sd)) / (0.75 * _BIAS)
+        # Halving the step takes three quarters of its error off, which falls with its square; it may move a parameter
+        # by 0.15 standard deviations.
+        excess = float(np.max(np.abs(np.sum(moved, axis=0)) / sd)) / (0.75 * 0.15)
         if excess <= 1:
             return solved, precision
-        stride = min(_FINEST, 2 ** math.ceil(math.log2(excess) / 2))
+        stride = min(16, 2 ** math.ceil(math.log2(excess) / 2))
         plan.progress(f"{stride} steps per sample")
         problem = replace(solved.onward, z=_restart_driver(plan, solved))
 
@@ -222,8 +209,8 @@ def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     stage = solved.stage
     changed = False
     for name, part in named_parts(stage, Driver):
-        if float(part.time_constant_s) < _VANISHED * plan.interval_s:
-            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(_RESTARTED * plan.interval_s)))
+        if float(part.time_constant_s) < 1e-2 * plan.interval_s:
+            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(0.3 * plan.interval_s)))
             changed = True
     if plan.hold != "zero" or not changed:
         return solved.z

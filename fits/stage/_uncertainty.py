@@ -21,8 +21,6 @@ from microid import Preisach, Stage
 
 # Levels on which predictions are perturbed; finer ones move no displacement.
 _LEVELS = 16
-# Autocovariances are trusted up to so many correlation times.
-_LAGS = 6.0
 # Precision, in scaled coordinates, that stands in for none.
 NO_PRECISION = 1e-8
 
@@ -111,11 +109,9 @@ class Precision:
         autocovariances (the sandwich of Newey & West 1987), to which comes what is not known of the columns.
         """
         size, answer = self.chain.size, self.answer()
+        columns, rest = answer[:size], answer[size:]
         # What nothing is known of stays unknown, whatever the residual.
-        held = (
-            answer[:size].T @ self.prior[:size, :size] @ answer[:size]
-            + NO_PRECISION * answer[size:].T @ answer[size:]
-        )
+        held = columns.T @ self.prior[:size, :size] @ columns + NO_PRECISION * rest.T @ rest
         for own, (one, run) in zip(influence, self._pairs(), strict=True):
             held = held + sandwich(own, np.sqrt(run.fit_weight) * one.residual_um, run.fitted)
         return held
@@ -157,7 +153,7 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
     size = fft.next_fast_len(2 * n)
     auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[:n] / fitted.sum()
     correlation = correlation_samples([residual_um[fitted]])
-    lags = 0 if correlation <= WHITE else min(n - 1, int(np.ceil(_LAGS * correlation)))
+    lags = 0 if correlation <= WHITE else min(n - 1, int(np.ceil(6.0 * correlation)))
     window = np.zeros(n)
     window[: lags + 1] = 1 - np.arange(lags + 1) / (lags + 1)
     kernel = np.zeros(size)
@@ -173,19 +169,12 @@ def predict(
 ) -> Prediction:
     """Predict the displacement of a voltage program, with its uncertainty.
 
-    Parameters
-    ----------
-    model, uncertainty
-        From a fit or a model file; without an uncertainty the standard deviations are NaN.
-    record, initial
-        The program, whose displacement, if any, is not looked at; and the memory before its first sample: `negative`,
-        `positive` or `demagnetised`.
+    Model and uncertainty are from a fit or a model file; without an uncertainty the standard deviations are NaN. The
+    displacement of the program, if any, is not looked at; the memory before its first sample is `negative`,
+    `positive` or `demagnetised`.
 
-    Raises
-    ------
-    DataError
-        If the voltage leaves the range that the model was fitted on, a stage has an effect of another column that the
-        program lacks, or the uncertainty is that of another kind of model.
+    A `DataError` says that the voltage leaves the range that the model was fitted on, that a stage has an effect of
+    another column, which the program lacks, or that the uncertainty is that of another kind of model.
     """
     if uncertainty is not None:
         return uncertainty.predict(model, record, initial)
@@ -198,23 +187,10 @@ def draw_plants(
 ) -> tuple[Stage, ...]:
     """Draw stages from the covariance of a fit.
 
-    Parameters
-    ----------
-    model, uncertainty
-        From a fit or a model file.
-    count, seed
-        How many stages in all, 1 or more, of which the first is the fitted one; and the seed of the draws.
-
-    Returns
-    -------
-    tuple of Stage
-        All of one structure; a hysteresis alone becomes a stage of one part. Weights and slopes that a draw would
-        make negative are zero. The model's own error (`discrepancy_um`) is not in them.
-
-    Raises
-    ------
-    DataError
-        If there is no uncertainty to draw from, or it is not that of the model.
+    Model and uncertainty are from a fit or a model file. Of `count` stages, 1 or more, the first is the fitted one.
+    All are of one structure; a hysteresis alone becomes a stage of one part. Weights and slopes that a draw would
+    make negative are zero. The model's own error (`discrepancy_um`) is not in them. A `DataError` says that there is
+    no uncertainty to draw from, or that it is not that of the model.
     """
     if count < 1:
         raise ValueError(f"count must be 1 or more, got {count}")

@@ -13,10 +13,7 @@ _SPAN = 0.95
 
 @dataclass(frozen=True)
 class Errors:
-    """How far a prediction is from a measurement: root mean square and largest absolute error over some samples.
-
-    Percentages refer to the range of the measurement.
-    """
+    """Root mean square and largest absolute error of a prediction; percentages are of the measurement's range."""
 
     samples: int
     rms_um: float

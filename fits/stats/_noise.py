@@ -13,18 +13,12 @@ _HUBER = 1.345
 # A residual less correlated than this counts as white.
 WHITE = 1.2
 LOSSES = ("squares", "huber")
-# Sokal's window: sum the correlations up to this many correlation times.
-_WINDOW = 5.0
-# Neighbours this close share an error of the model, but not white noise.
-_NEIGHBOURS = 10
-# A command that rests for this many samples is idle from a third of the rest on.
-_FEWEST_AT_REST = 24
 
 
 def shared_square(residual: np.ndarray) -> float:
     """Mean autocovariance at lags 1 to 10: about zero for white noise, which may make it negative."""
     centred = residual - residual.mean()
-    furthest = min(_NEIGHBOURS, len(residual) - 1)
+    furthest = min(10, len(residual) - 1)
     products = [float(np.mean(centred[lag:] * centred[:-lag])) for lag in range(1, furthest + 1)]
     return float(np.mean(products)) if products else 0.0
 
@@ -43,7 +37,7 @@ def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     if total[0] <= 0:
         return 1.0
     time = 1 + 2 * np.cumsum(total[1:] / total[0])
-    inside = np.flatnonzero(np.arange(1, len(total)) >= _WINDOW * time)
+    inside = np.flatnonzero(np.arange(1, len(total)) >= 5.0 * time)  # Sokal's window
     return float(max(1.0, time[inside[0]] if len(inside) else time.max(initial=1.0)))
 
 
@@ -130,7 +124,7 @@ def idle_stretches(voltage_V: np.ndarray, settling: int) -> list[slice]:
     found = []
     for first, stop in stretches(np.diff(voltage_V) == 0):
         begin = max(first + (stop - first) // 3, first + settling)
-        if stop - begin >= 2 * _FEWEST_AT_REST // 3:
+        if stop - begin >= 16:
             found.append(slice(begin, stop))
     return found
 

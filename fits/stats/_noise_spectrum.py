@@ -15,23 +15,12 @@ _STRIDE = 3
 # Most neighbours on either side that the floor is taken from: enough to tell it, and narrow enough for a resonance
 # of some 50 bins to pass as floor.
 _SIDE = 12
-_MIN_CYCLES = 20  # of a line within the record
-_CHUNK = 1 << 16
-_AVERAGINGS = 60
 # Mains, and the part by which they drift.
 MAINS_Hz, DRIFT = (50.0, 60.0), 0.002
 # A narrow band lies within this part of its frequency on either side.
 _WIDE = 0.2
-# Bins that a band may have.
-_WIDTHS = (1, 4, 16, 64)
-# No line has so many bins.
-_BROAD = 16
 # The room that a band needs, in bins of its width.
 _ROOM = 12
-# A broad band must have so many times the evidence of a narrow one.
-_LEAST_GAIN = 3.0
-# Nearly every eighth of a record has at least this share of the mean power.
-_WEAKEST = 0.25
 
 
 @dataclass(frozen=True)
@@ -95,7 +84,7 @@ def _compare(power: FloatArray) -> tuple[FloatArray, FloatArray]:
     # Near 0 Hz and half the rate a lobe meets its own mirror image.
     reach = np.minimum(bins // 2, len(power) - 1 - _LOBE - bins)
     sides = np.clip((reach - _LOBE - 1) // _STRIDE + 1, 0, _SIDE)
-    sides[:_MIN_CYCLES] = 0
+    sides[:20] = 0  # cycles within the record
     chance, floor = np.ones(len(power)), np.zeros(len(power))
     for side in range(1, _SIDE + 1):
         # The median of 2 * side powers is the side-th smallest; these many are left as each is passed.
@@ -103,7 +92,7 @@ def _compare(power: FloatArray) -> tuple[FloatArray, FloatArray]:
         offsets = _LOBE + 1 + _STRIDE * np.arange(side)
         offsets = np.concatenate([-offsets, offsets])
         members = np.flatnonzero(sides == side)
-        for some in np.array_split(members, len(members) // _CHUNK + 1):
+        for some in np.array_split(members, len(members) // (1 << 16) + 1):
             median = np.partition(power[some[:, None] + offsets], side - 1, axis=1)[:, side - 1]
             ratio = power[some] / np.maximum(median, np.finfo(float).tiny)
             chance[some] = np.exp(-np.sum(np.log1p(ratio[:, None] / left), axis=1))
@@ -132,7 +121,7 @@ def allan_deviation(readings_um: FloatArray, interval_s: float) -> tuple[FloatAr
     """Overlapping Allan deviation, up to a third of the record, and its approximate standard error."""
     n = len(readings_um)
     sums = np.concatenate([[0.0], np.cumsum(readings_um - readings_um.mean())])
-    lengths = np.unique(np.geomspace(1, n // 3, _AVERAGINGS).astype(int))
+    lengths = np.unique(np.geomspace(1, n // 3, 60).astype(int))
     differences = (sums[2 * m :] - 2 * sums[m:-m] + sums[: -2 * m] for m in lengths)
     deviation = np.array([np.sqrt(np.mean(d**2) / 2) for d in differences]) / lengths
     return lengths * interval_s, deviation, deviation / np.sqrt(2 * (n / lengths - 1))
@@ -154,7 +143,7 @@ class Band:
     def mains(self) -> bool:
         """Whether it is near a line of mains, or near what sampling makes of one, or is nothing at all."""
         rate, own = self.rate_Hz, DRIFT * 4
-        if self.bins >= _BROAD:
+        if self.bins >= 16:  # no line has so many
             return False
         return rate == 0 or any(
             abs(self.frequency_Hz - abs((k * line + rate / 2) % rate - rate / 2))
@@ -215,7 +204,7 @@ def _strongest(power: np.ndarray, inside: np.ndarray) -> tuple[int, int, float, 
     A band wider than a bin counts where its mean is stronger by far: noise may be low in the very middle of a band.
     """
     found = []
-    for wide in _WIDTHS:
+    for wide in (1, 4, 16, 64):  # bins
         if _ROOM * wide > inside.sum():
             break
         reach = max(len(power) // 16, _ROOM * wide // 2)
@@ -227,7 +216,7 @@ def _strongest(power: np.ndarray, inside: np.ndarray) -> tuple[int, int, float, 
         above = high if wide == 1 else wide / 2 * (high - 1 - np.log(high))
         found.append((best, wide, float(np.log(inside.sum() / wide)) - above, around))
     narrow, broad = found[0], min(found, key=lambda one: one[2])
-    return broad if broad[2] < _LEAST_GAIN * min(narrow[2], -1.0) else narrow
+    return broad if broad[2] < 3.0 * min(narrow[2], -1.0) else narrow
 
 
 def _steady(values: np.ndarray, middle: float, width: float) -> bool:
@@ -236,4 +225,4 @@ def _steady(values: np.ndarray, middle: float, width: float) -> bool:
     frequency = np.fft.rfftfreq(len(values))
     part = np.fft.irfft(np.where(np.abs(frequency - middle) < width / 2, spectrum, 0.0), len(values))
     blocks = np.sort([float(block @ block) for block in np.array_split(part, 8)])
-    return bool(blocks[1] > _WEAKEST * blocks.mean())
+    return bool(blocks[1] > 0.25 * blocks.mean())  # as nearly every eighth of a record has

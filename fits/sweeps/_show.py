@@ -112,7 +112,7 @@ def _best(data: Any, about: dict[str, Any], done: np.ndarray, by: str | None, la
     return [{"row": int(row)} | values for row, values in zip(order, plain, strict=True)]
 
 
-def describe(summary: dict[str, Any]) -> str:
+def describe_sweep(summary: dict[str, Any]) -> str:
     """Put a summary into words."""
     lines = [
         f"{summary['kind']}: {summary['done']:,} of {summary['rows']:,} rows done, {summary['failed']:,} failed, "

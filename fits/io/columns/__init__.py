@@ -1,7 +1,4 @@
-"""Further columns of a record, one file each: what effects may ask for by name.
-
-Importing the package imports every sibling whose name does not start with an underscore; each registers its column.
-"""
+"""Further columns of a record, one file each, which registers it when the package is imported."""
 
 from fits.io.columns._base import COLUMNS as COLUMNS
 from fits.io.columns._base import Column as Column

@@ -6,18 +6,13 @@ from fits.io._quantity import LENGTH, FloatArray, Quantity
 from fits.io._record import Record
 from fits.io.columns._base import Column, register
 
-# Correlation beyond which a column is another reading of the same.
-_SAME_READING = 0.99
-
 
 def _recognised(name: str, values: FloatArray, record: Record) -> bool:
     """Whether a column is a length, and goes with neither the time, the voltage nor the displacement."""
     if not name.lower().endswith(("_um", "_nm", "_mm", "_m")) or name.lower().startswith("temp"):
         return False
     own = [record.time_s, record.voltage_V, record.displacement_um]
-    return not any(
-        abs(np.corrcoef(values, one)[0, 1]) > _SAME_READING for one in own if one is not None and np.ptp(one) > 0
-    )
+    return not any(abs(np.corrcoef(values, one)[0, 1]) > 0.99 for one in own if one is not None and np.ptp(one) > 0)
 
 
 register(

@@ -6,9 +6,6 @@ from fits.io._quantity import FloatArray, Quantity
 from fits.io._record import Record
 from fits.io.columns._base import Column, register
 
-# Part of a record through which a temperature hardly bends.
-_BEGINNING = 0.02
-
 
 def _recognised(name: str, values: FloatArray, record: Record) -> bool:
     return name.lower().startswith("temp") or name.lower().endswith(("_degc", "_temperature_k", "_temperature_c"))
@@ -16,7 +13,7 @@ def _recognised(name: str, values: FloatArray, record: Record) -> bool:
 
 def _first_smoothed(values: FloatArray, record: Record) -> FloatArray:
     """Replace the first value by that of a line through the first readings: what lags behind begins at rest there."""
-    count = int(_BEGINNING * len(values))
+    count = int(0.02 * len(values))
     if count < 3:
         return values
     line = np.polynomial.Polynomial.fit(record.time_s[:count], values[:count], 1)

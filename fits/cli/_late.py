@@ -1,0 +1,56 @@
+"""What the commands use of other rooms, imported when it is first used, so that help does not wait for JAX."""
+# ruff: noqa: F401
+
+from typing import TYPE_CHECKING
+
+from fits.io._late import late
+
+if TYPE_CHECKING:
+    from fits.control._compensate import compensate
+    from fits.control._compensate_stage import static_equivalent
+    from fits.control._export_c import export_c
+    from fits.control._gains import read_gains
+    from fits.control._make import Loop, Maker
+    from fits.control._setup import held, setup
+    from fits.control._tune_problem import Goal
+    from fits.control._tune_result import passed_limits
+    from fits.diagnosis._diagnose import diagnose
+    from fits.diagnosis._result import Diagnosis, Step
+    from fits.io._atomic import finite_json, refuse_nonfinite, write_csv
+    from fits.io._jax_setup import start_jax
+    from fits.io._limits import allowed, check_command, joined, parse_limits, ranges_json, reached_in
+    from fits.io._quantity import Quantity
+    from fits.io._read_csv import read_csv, read_reference, read_runs
+    from fits.io._record import Record
+    from fits.io._units import parse_columns
+    from fits.loop._fit import fit
+    from fits.loop._result import FitError
+    from fits.loop._uncertainty import Prediction
+    from fits.machining._budget import budget
+    from fits.machining._claims import describe_claims, paper_claims
+    from fits.machining._design import Design, paper_design
+    from fits.machining._design_file import design_text, read_design
+    from fits.machining._idle import idle_noise, read_idle
+    from fits.machining._sensitivity import sensitivities
+    from fits.paper._regenerate import paper_result
+    from fits.plots._control import plot_compensation, plot_control
+    from fits.plots._loop import plot_fit
+    from fits.plots._machining import plot_budget, plot_sensitivity
+    from fits.plots._stage import plot_stage
+    from fits.plots._sweep import plot_sweep
+    from fits.report._control import control_json, describe_control
+    from fits.report._diagnosis import report_html
+    from fits.report._diagnosis_json import diagnosis_json
+    from fits.report._fit import describe, fit_report
+    from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
+    from fits.stage._fit import default_stage, fit_stage
+    from fits.stage._model_file import ModelFile, load_model, model_text
+    from fits.stage._motion import predicted_ranges
+    from fits.stage._uncertainty import draw_plants, predict
+    from fits.sweeps._run import run_sweep
+    from fits.sweeps._show import describe_sweep, summarise
+    from fits.sweeps._spec import read_sweep
+    from fits.sweeps._store import RESULTS, TABLE
+    from microid import AXES, CONTROLLERS, MOTIONS, Hold, Preisach, Stage, parameter_table
+else:
+    __getattr__ = late(__name__, __file__)[1]
