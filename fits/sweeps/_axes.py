@@ -1,6 +1,5 @@
 """The rows of a sweep: grids, drawn designs and lists, crossed and zipped, made as they are needed."""
 
-import abc
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -46,21 +45,8 @@ class Axis:
         return np.clip(self.first + (self.second - self.first) * chance, self.first, self.second)
 
 
-class AbstractGroup(abc.ABC):
-    """Axes that run together; groups are crossed."""
-
-    axes: tuple[Axis, ...]
-
-    @abc.abstractmethod
-    def __len__(self) -> int: ...
-
-    @abc.abstractmethod
-    def at(self, place: NDArray[np.int64]) -> FloatArray:
-        """Values at some places of the group, shape `(axes, n)`."""
-
-
 @dataclass(frozen=True)
-class Listed(AbstractGroup):
+class Listed:
     """Axes with stated values, shape `(axes, n)`: one axis of a grid, zipped axes, or the columns of a CSV."""
 
     axes: tuple[Axis, ...]
@@ -70,11 +56,12 @@ class Listed(AbstractGroup):
         return self.table.shape[1]
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
+        """Values at some places of the group, shape `(axes, n)`."""
         return np.asarray(self.table[:, place])
 
 
 @dataclass(frozen=True)
-class Drawn(AbstractGroup):
+class Drawn:
     """Axes that are drawn together: at random, in a Latin hypercube or as a Sobol sequence, one of `SAMPLERS`.
 
     A `DataError` refuses a design that is larger than its method can be.
@@ -100,6 +87,7 @@ class Drawn(AbstractGroup):
         return self.rows
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
+        """Values at some places of the group, shape `(axes, n)`."""
         chance = np.empty((len(place), len(self.axes)))
         if self.method == "latin_hypercube":
             chance[:] = _hypercube(len(self.axes), self.rows, self.seed)[place]
@@ -110,14 +98,12 @@ class Drawn(AbstractGroup):
         return np.stack([axis.quantile(chance[:, k]) for k, axis in enumerate(self.axes)])
 
     def _piece(self, piece: int) -> FloatArray:
-        dimensions = len(self.axes)
-        if self.method == "sobol":
-            sampler = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(self.seed))
-            if piece:
-                sampler.fast_forward(piece * _PIECE)
-            return np.asarray(sampler.random(_PIECE))
-        rng = np.random.default_rng([self.seed, piece])
-        return rng.random((_PIECE, dimensions))
+        if self.method == "random":
+            return np.random.default_rng([self.seed, piece]).random((_PIECE, len(self.axes)))
+        sampler = qmc.Sobol(len(self.axes), scramble=True, rng=np.random.default_rng(self.seed))
+        if piece:
+            sampler.fast_forward(piece * _PIECE)
+        return np.asarray(sampler.random(_PIECE))
 
 
 @lru_cache(maxsize=1)
@@ -129,7 +115,7 @@ def _hypercube(dimensions: int, rows: int, seed: int) -> FloatArray:
 class Plan:
     """All rows: groups crossed with each other, the last running fastest, repeated for each source such as a file."""
 
-    groups: tuple[AbstractGroup, ...]
+    groups: tuple[Listed | Drawn, ...]
     repeats: int = 1
 
     @property

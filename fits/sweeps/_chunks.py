@@ -80,11 +80,14 @@ def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
     inside, refused = outside(sweep, values) if values else (values, [""] * len(padded))
     relative = tuple(axis.parameter for axis in sweep.plan.axes if axis.relative)
     found = sweep.job.compute(Block(inside, relative, padded, sweep.plan.repeat_of(padded), sweep.seed))
-    reasons = tuple((why or reason)[:_REASON_LENGTH] for why, reason in zip(refused, found.reasons, strict=True))[
-        : len(rows)
-    ]
+    both = zip(refused, found.reasons, strict=True)
+    reasons = tuple((why or reason)[:_REASON_LENGTH] for why, reason in both)[: len(rows)]
     failed = np.array([bool(reason) for reason in reasons])
-    outputs = {output.name: _kept(found, output, failed, len(rows)) for output in sweep.facts.outputs}
+    outputs: dict[str, NDArray[np.generic]] = {}
+    for output in sweep.facts.outputs:
+        outputs[output.name] = np.asarray(found.outputs[output.name])[: len(rows)].astype(output.dtype)
+        if outputs[output.name].dtype.kind == "f":
+            outputs[output.name][failed] = np.nan
     known = {parameter.name: parameter for parameter in sweep.facts.parameters}
     for name, value in values.items():
         words = np.array(known[name].words)
@@ -94,11 +97,3 @@ def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
         outputs["source"] = np.array(names, dtype=source_of(sweep).dtype)
     outputs["status"] = np.where(failed, FAILED, DONE).astype("i1")
     return Rows(outputs, reasons)
-
-
-def _kept(found: Rows, output: Output, failed: NDArray[np.bool_], count: int) -> NDArray[np.generic]:
-    value = np.asarray(found.outputs[output.name])[:count].astype(output.dtype)
-    if value.dtype.kind == "f":
-        value = value.copy()
-        value[failed] = np.nan
-    return value

@@ -4,6 +4,7 @@ import importlib.util
 import logging
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -65,13 +66,10 @@ def connected(address: str) -> Iterator[Any]:
             if count != address:
                 own = distributed.LocalCluster(
                     n_workers=int(count),
-                    # XLA would have as many threads as there are cores in each worker, and they would be in each
-                    # other's way.
-                    env={"NPROC": "1"},
+                    env={"NPROC": "1"},  # one thread of XLA in each worker, so that none is in another's way
                     threads_per_worker=1,
                     processes=True,
-                    # Any port that is free: another cluster may have the usual one.
-                    dashboard_address="127.0.0.1:0",
+                    dashboard_address="127.0.0.1:0",  # any free port: another cluster may have the usual one
                     memory_limit=0,
                 )
                 where = stack.enter_context(own).scheduler_address
@@ -93,8 +91,6 @@ def on_cluster(
     lost, has no workers, or none with the versions of this process.
     """
     distributed = need("distributed")
-    if not chunks:
-        return
     try:
         yield from _all(distributed, client, sweep, chunks, progress)
     except (OSError, distributed.client.FuturesCancelledError, distributed.CancelledError) as error:
@@ -122,8 +118,8 @@ class _Workers:
             answers = self._client.run(
                 lambda: importlib.util.find_spec("fits") is not None, workers=new, on_error="return"
             )
-            for address in new:
-                if answers.get(address) is False:
+            for address, answer in answers.items():
+                if answer is False:
                     self.ban(address, f"worker {found[address].get('name', address)} at {address} has no microid")
             self._known |= set(new)
         usable = {address: about["nthreads"] for address, about in found.items() if address not in self.banned}
@@ -154,7 +150,7 @@ def _all(
     payload = _Payload(
         sweep.text, sweep.name, sweep.inputs, str(Path(sweep.name).resolve().parent), sweep.digest, versions()
     )
-    waiting, losses = list(reversed(chunks)), dict[int, int]()
+    waiting, losses = list(reversed(chunks)), Counter[int]()
     futures: dict[Any, int] = {}
     results, workers = distributed.as_completed(loop=client.loop), _Workers(client, progress)
     while waiting or futures:
@@ -174,7 +170,7 @@ def _all(
             try:
                 answer: _Answer = future.result()
             except (distributed.KilledWorker, ImportError) as error:
-                losses[chunk] = losses.get(chunk, 0) + 1
+                losses[chunk] += 1
                 if losses[chunk] > _MOST_LOSSES:
                     raise DataError(_often(chunk, error)) from None
                 waiting.append(chunk)
@@ -206,8 +202,7 @@ def work(payload: _Payload, chunk: int) -> _Answer:
     mine = versions()
     for package, version in payload.versions.items():
         if mine.get(package) != version:
-            reason = f"{name} has {package} {mine.get(package)}, and {version} is needed"
-            return _Answer(worker.address, None, reason)
+            return _Answer(worker.address, None, f"{name} has {package} {mine.get(package)}, and {version} is needed")
     try:
         return _Answer(worker.address, compute_chunk(_sweep(payload), chunk))
     except (DataError, OSError, ImportError) as error:

@@ -69,10 +69,8 @@ def _one(
     weight: Float[Array, " t"],
     smoothness: Float[Array, ""],
 ) -> tuple[Array, ...]:
-    count = jnp.maximum(jnp.sum(weight), 1.0)
-    stroke = jnp.max(jnp.where(weight > 0, displacement, -jnp.inf)) - jnp.min(
-        jnp.where(weight > 0, displacement, jnp.inf)
-    )
+    count, used = jnp.maximum(jnp.sum(weight), 1.0), weight > 0
+    stroke = jnp.max(displacement, where=used, initial=-jnp.inf) - jnp.min(displacement, where=used, initial=jnp.inf)
     mean_column, mean = weight @ columns / count, weight @ displacement / count
     left, right = (columns - mean_column[None, :]) * weight[:, None], (displacement - mean) * weight / stroke
     moments = Moments(left.T @ left, left.T @ right, right @ right, count)
@@ -90,5 +88,4 @@ def _one(
     solution, success = minimise_nonnegative(precision, -(precision @ mode), jnp.maximum(mode, 0), _ATOL, _STEPS)
     found = solution / scale * stroke
     offset = mean - mean_column @ found
-    noise = jnp.exp(hyper.log_variance / 2) * stroke
-    return found, offset, noise, columns @ found + offset, success
+    return found, offset, jnp.exp(hyper.log_variance / 2) * stroke, columns @ found + offset, success

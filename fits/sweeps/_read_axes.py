@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from fits.io._errors import DataError, shown
 from fits.io._typed import typed
-from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
+from fits.sweeps._axes import SAMPLERS, Axis, Drawn, Listed, Plan
 from fits.sweeps._types import Parameter, check_plain, code_of, number
 
 _PREFIXES = {"k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
@@ -70,7 +70,7 @@ def read_plan(
         else:
             label = entry.get("zip")
             listed.setdefault(f"{k}" if label is None else f"zip {label}", []).append((axis, values))
-    groups: list[AbstractGroup] = []
+    groups: list[Listed | Drawn] = []
     for label, members in listed.items():
         lengths = {len(values) for _, values in members}
         if len(lengths) > 1:
@@ -95,10 +95,9 @@ def read_plan(
             raise DataError(f"axis.parameter: {name} is varied twice; keep one of the two.")
     if not groups and repeats == 1:
         raise DataError("axis: expected at least one axis, found none; add [[axis]].")
-    plan = Plan(tuple(groups), repeats)
     if math.prod(len(group) for group in groups) * repeats > _MOST_ROWS:
         raise DataError("axis: these are more rows than can be counted; leave out some.")
-    return plan
+    return Plan(tuple(groups), repeats)
 
 
 def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) -> tuple[Axis, np.ndarray | None]:
@@ -124,14 +123,15 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
         found = found * nominal if isinstance(found, np.ndarray) else _scaled(*found, nominal)
     lower, upper = parameter.lower, parameter.upper
     if isinstance(found, np.ndarray):
-        outside = bool(np.all((found < lower) | (found > upper)))
+        axis, values, outside = Axis(name, relative), found, bool(np.all((found < lower) | (found > upper)))
     else:
+        axis, values = Axis(name, relative, *found), None
         outside = found[0] != "normal" and (min(found[1:]) > upper or max(found[1:]) < lower)
     if outside and not relative:
         raise DataError(
             f"{place}: all values lie outside the bounds of {name}, {parameter.range_words}; correct them."
         )
-    return (Axis(name, relative), found) if isinstance(found, np.ndarray) else (Axis(name, relative, *found), None)
+    return axis, values
 
 
 def _values(
@@ -163,25 +163,25 @@ def _values(
         if parameter.words:
             return np.array([code_of(value, parameter, f"{place}.values") for value in values])
         return factor * np.array([number(value, f"{place}.values") for value in values])
+    keys = ("mean", "sd") if ways[0] == "mean" else ("low", "high")
+    low, high = (number(entry.get(key), f"{place}.{key}") * factor for key in keys)
     if ways[0] == "mean":
-        mean, sd = (number(entry.get(key), f"{place}.{key}") * factor for key in ("mean", "sd"))
-        if not sd > 0:
-            raise DataError(f"{place}.sd: expected a standard deviation above 0, found {sd:g}; correct it.")
-        return "normal", mean, sd
-    low, high = (number(entry.get(key), f"{place}.{key}") * factor for key in ("low", "high"))
-    spacing, count = table.spacing, table.count
-    if not low <= high or (spacing == "log" and not low > 0):
-        above = " above 0" if spacing == "log" else ""
+        if not high > 0:
+            raise DataError(f"{place}.sd: expected a standard deviation above 0, found {high:g}; correct it.")
+        return "normal", low, high
+    log, count = table.spacing == "log", table.count
+    if not low <= high or (log and not low > 0):
+        above = " above 0" if log else ""
         raise DataError(f"{place}: expected low{above} and no higher than high, found {low:g} and {high:g}.")
     if count is None:
-        return ("log" if spacing == "log" else "uniform"), low, high
+        return ("log" if log else "uniform"), low, high
     if count < 1:
         raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {shown(count)}.")
     if count > _LONGEST:
         raise DataError(
             f"{place}.count: expected up to {_LONGEST:,} values, found more; leave out count and add [design]."
         )
-    return np.geomspace(low, high, count) if spacing == "log" else np.linspace(low, high, count)
+    return np.geomspace(low, high, count) if log else np.linspace(low, high, count)
 
 
 def _scaled(distribution: str, first: float, second: float, nominal: float) -> tuple[str, float, float]:
@@ -209,47 +209,44 @@ def _split(unit: str) -> tuple[int, str]:
     return (_PREFIXES[unit[0]], unit[1:]) if prefixed else (0, unit)
 
 
-def read_list(content: bytes, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Names in the header of a CSV, and the cells of each row with the number of its line, but blank ones."""
-    reader = csv.reader(io.StringIO(content.decode("utf-8-sig", errors="replace"), newline=""))
-    try:
-        lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
-    except csv.Error as error:
-        raise DataError(f"{name}, line {reader.line_num}: expected CSV ({error}); correct it.") from None
-    return [cell.strip() for cell in lines[0][1]] if lines else [], lines[1:]
-
-
 def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], bytes]) -> Listed:
     if not isinstance(entry, dict) or set(entry) != {"file"} or not isinstance(entry["file"], str):
         raise DataError("list: expected the one key file, the name of a CSV with a column per parameter.")
     name = entry["file"]
-    header, lines = read_list(load(name), name)
-    if not lines:
+    reader = csv.reader(io.StringIO(load(name).decode("utf-8-sig", errors="replace"), newline=""))
+    try:
+        lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
+    except csv.Error as error:
+        raise DataError(f"{name}, line {reader.line_num}: expected CSV ({error}); correct it.") from None
+    if len(lines) < 2:
         raise DataError(f"{name}: the list is empty: expected a header and at least one row.")
-    for k, column in enumerate(header, 1):
-        if column not in known:
-            # What stands in a file that is no list is not ours to show.
-            raise DataError(f"{name}: cell {k} of its header is no parameter; use some of {', '.join(known)}.")
-    axes = tuple(Axis(column) for column in header)
-    for axis in axes:
-        if math.isnan(known[axis.parameter].nominal):
-            raise DataError(f"{name}: {axis.parameter} is an array; vary it by [[axis]] with relative = true.")
-    table = np.empty((len(axes), len(lines)))
-    columns = [known[axis.parameter] for axis in axes]
-    kind = "values" if any(parameter.words for parameter in columns) else "numbers"
-    for k, (line, cells) in enumerate(lines):
-        place = f"{name}, line {line}"
-        numbers: list[float] = []
-        if len(cells) == len(axes):
-            numbers = [_cell(cell, parameter, place) for cell, parameter in zip(cells, columns, strict=True)]
-        if not numbers or any(map(math.isnan, numbers)):
-            raise DataError(f"{place}: expected {len(axes)} {kind}, found {shown(', '.join(cells))}; correct it.")
-        table[:, k] = numbers
+    columns = [known.get(cell.strip()) for cell in lines.pop(0)[1]]
+    if None in columns:
+        # What stands in a file that is no list is not ours to show.
+        raise DataError(
+            f"{name}: cell {columns.index(None) + 1} of its header is no parameter; use some of {', '.join(known)}."
+        )
+    parameters = [column for column in columns if column is not None]
+    for parameter in parameters:
+        if math.isnan(parameter.nominal):
+            raise DataError(f"{name}: {parameter.name} is an array; vary it by [[axis]] with relative = true.")
+    rows = []
+    kind = "values" if any(parameter.words for parameter in parameters) else "numbers"
+    for line, cells in lines:
+        place, row = f"{name}, line {line}", [math.nan]
+        if len(cells) == len(parameters):
+            row = [_cell(cell, parameter, place) for cell, parameter in zip(cells, parameters, strict=True)]
+        if any(map(math.isnan, row)):
+            raise DataError(
+                f"{place}: expected {len(parameters)} {kind}, found {shown(', '.join(cells))}; correct it."
+            )
+        rows.append(row)
+    table = np.array(rows).T
     if not np.all(np.isfinite(table)):
         raise DataError(f"{name}: expected finite numbers, found others; correct them.")
-    for parameter, values in zip(columns, table, strict=True):
+    for parameter, values in zip(parameters, table, strict=True):
         check_plain(parameter, values, False, name)
-    return Listed(axes, table)
+    return Listed(tuple(Axis(parameter.name) for parameter in parameters), table)
 
 
 def _cell(cell: str, parameter: Parameter, place: str) -> float:

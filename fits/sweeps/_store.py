@@ -66,70 +66,67 @@ class Store:
 
     def create(self) -> None:
         """Write the empty store and what is known of the sweep."""
-        zarr = need("zarr")
+        zarr, sweep = need("zarr"), self.sweep
+        rows, size, names = len(sweep.plan), chunk_rows(sweep), [axis.parameter for axis in sweep.plan.axes]
+        about = {
+            "schema": SCHEMA,
+            "kind": sweep.kind,
+            "rows": rows,
+            "chunk_rows": size,
+            "chunks": chunk_count(sweep),
+            "seed": sweep.seed,
+            "parameters": names,
+            "relative": [axis.parameter for axis in sweep.plan.axes if axis.relative],
+            "outputs": [output.name for output in sweep.facts.outputs],
+            "digest": sweep.digest,
+            "versions": versions(),
+            "sweep": sweep.text,
+        }
         with _sentences(self.folder):
             (self.folder / LEDGER).mkdir(parents=True, exist_ok=True)
             group = zarr.open_group(str(self.folder / RESULTS), mode="w", zarr_format=2)
-            rows, size = len(self.sweep.plan), chunk_rows(self.sweep)
             for variable in self.variables:
-                kind = np.dtype(variable.dtype).kind
                 array = group.create_array(
                     variable.name,
                     shape=(rows, *variable.shape),
                     chunks=(size, *variable.shape),
                     dtype=variable.dtype,
                     # Without one xarray leaves whole numbers and texts as they are.
-                    fill_value=float("nan") if kind == "f" else None,
+                    fill_value=float("nan") if np.dtype(variable.dtype).kind == "f" else None,
                 )
                 attributes: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
                 if variable is _STATUS:
                     attributes |= {"flag_values": [0, 1, 2], "flag_meanings": " ".join(STATUS_WORDS)}
                 array.attrs.update(attributes | {"_ARRAY_DIMENSIONS": ["row", *(name for name, _ in variable.dims)]})
-            for name, (axis, unit, values) in self.sweep.facts.coordinates.items():
+            for name, (axis, unit, values) in sweep.facts.coordinates.items():
                 array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype)
                 array[:] = values
                 array.attrs.update({"units": unit, "_ARRAY_DIMENSIONS": [axis]})
-            swept = [axis.parameter for axis in self.sweep.plan.axes]
-            about = self._about()
-            group.attrs.update(about | ({"coordinates": " ".join(swept)} if swept else {}))
+            group.attrs.update(about | ({"coordinates": " ".join(names)} if names else {}))
             zarr.consolidate_metadata(group.store)
-            atomic_write_text(self.folder / TEXT, self.sweep.text)
+            atomic_write_text(self.folder / TEXT, sweep.text)
             # Last: a folder without it holds no sweep yet.
             atomic_write_text(self.folder / ABOUT, json.dumps(about, indent=1) + "\n")
-
-    def _about(self) -> dict[str, Any]:
-        return {
-            "schema": SCHEMA,
-            "kind": self.sweep.kind,
-            "rows": len(self.sweep.plan),
-            "chunk_rows": chunk_rows(self.sweep),
-            "chunks": chunk_count(self.sweep),
-            "seed": self.sweep.seed,
-            "parameters": [axis.parameter for axis in self.sweep.plan.axes],
-            "relative": [axis.parameter for axis in self.sweep.plan.axes if axis.relative],
-            "outputs": [output.name for output in self.sweep.facts.outputs],
-            "digest": self.sweep.digest,
-            "versions": versions(),
-            "sweep": self.sweep.text,
-        }
 
     def _open(self) -> Any:
         if self._group is None:
             self._group = need("zarr").open_group(str(self.folder / RESULTS), mode="r+", zarr_format=2)
         return self._group
 
+    def _entry(self, chunk: int) -> Path:
+        return self.folder / LEDGER / f"{chunk:08d}.json"
+
     def sound(self) -> bool:
         """Whether the store is there, with all variables as they should be."""
-        size = chunk_rows(self.sweep)
+        rows, size = len(self.sweep.plan), chunk_rows(self.sweep)
         try:
             json.loads((self.folder / RESULTS / ".zmetadata").read_text(encoding="utf-8"))
-            arrays = {variable: self._open()[variable.name] for variable in self.variables}
-            rows = len(self.sweep.plan)
-            return (self.folder / LEDGER).is_dir() and all(
-                (array.shape, array.chunks) == ((rows, *variable.shape), (size, *variable.shape))
-                and array.dtype == np.dtype(variable.dtype)
-                for variable, array in arrays.items()
-            )
+            for variable in self.variables:
+                array, shape = self._open()[variable.name], variable.shape
+                expected = (rows, *shape), (size, *shape), np.dtype(variable.dtype)
+                if (array.shape, array.chunks, array.dtype) != expected:
+                    return False
+            return (self.folder / LEDGER).is_dir()
         except Exception:
             # Whatever a broken file makes a decoder say, the store is not sound.
             return False
@@ -145,42 +142,33 @@ class Store:
         """Keep a chunk, then say so in the ledger; a `DataError` says that the disk does not take it."""
         arrays = dict(rows.outputs) | {"reason": np.array(rows.reasons, dtype=REASON.dtype)}
         with _sentences(self.folder):
-            group = self._open()
             start = chunk * chunk_rows(self.sweep)
             for variable in self.variables:
                 array = np.ascontiguousarray(arrays[variable.name], dtype=variable.dtype)
-                group[variable.name][start : start + len(array)] = array
-            self._flush(chunk)
+                self._open()[variable.name][start : start + len(array)] = array
+                path = self.folder / RESULTS / variable.name / f"{chunk}{'.0' * len(variable.shape)}"
+                # A chunk of nothing but fill values has no file; others are on the disk before the ledger says so.
+                if path.exists():
+                    flush(path)
             entry = {"sha256": self._sum(arrays), "failed": sum(map(bool, rows.reasons)), "rows": len(rows.reasons)}
-            atomic_write_text(self.folder / LEDGER / f"{chunk:08d}.json", json.dumps(entry) + "\n")
-
-    def _flush(self, chunk: int) -> None:
-        """Have a chunk on the disk before the ledger says that it is there."""
-        for variable in self.variables:
-            file = ".".join(map(str, (chunk, *(0 for _ in variable.shape))))
-            path = self.folder / RESULTS / variable.name / file
-            # A chunk of nothing but fill values has no file.
-            if path.exists():
-                flush(path)
+            atomic_write_text(self._entry(chunk), json.dumps(entry) + "\n")
 
     def read(self, chunk: int) -> dict[str, np.ndarray]:
         rows, group = rows_of(self.sweep, chunk), self._open()
-        return {
-            variable.name: np.asarray(group[variable.name][int(rows[0]) : int(rows[-1]) + 1])
-            for variable in self.variables
-        }
+        place = slice(int(rows[0]), int(rows[-1]) + 1)
+        return {variable.name: np.asarray(group[variable.name][place]) for variable in self.variables}
 
     def whole(self, chunk: int) -> bool:
         """Whether a chunk is in the ledger and what is kept of it has the sum that is written there."""
         try:
-            entry = json.loads((self.folder / LEDGER / f"{chunk:08d}.json").read_text(encoding="utf-8"))
+            entry = json.loads(self._entry(chunk).read_text(encoding="utf-8"))
             return bool(entry["sha256"] == self._sum(self.read(chunk)))
         except Exception:
             # Whatever a broken file makes a decoder say, the chunk is not whole.
             return False
 
     def noted(self, chunk: int) -> bool:
-        return (self.folder / LEDGER / f"{chunk:08d}.json").exists()
+        return self._entry(chunk).exists()
 
     def _sum(self, arrays: dict[str, np.ndarray]) -> str:
         total = hashlib.sha256()
@@ -219,7 +207,14 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
     own = (RESULTS, LEDGER, TEXT, ".lock")
     if folder.exists() and any(path.name not in own and not is_temporary(path.name) for path in folder.iterdir()):
         raise DataError(f"{out}: the folder holds other files; choose another for --out.")
-    _check_size(sweep, out, anchor)
+    # The table holds all but the traces once more.
+    needed = len(sweep.plan) * 2 * bytes_per_row(sweep)
+    free = shutil.disk_usage(anchor).free
+    if needed > _USABLE_SHARE * free:
+        raise DataError(
+            f"{out}: {len(sweep.plan):,} rows would take about {needed / 1e9:.3g} GB, and the disk has "
+            f"{free / 1e9:.3g} GB; keep fewer rows or no traces, or choose another disk."
+        )
 
 
 @contextmanager
@@ -247,27 +242,16 @@ def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
         yield store
 
 
-def _check_size(sweep: Sweep, out: str, anchor: Path) -> None:
-    # The table holds all but the traces once more.
-    needed = len(sweep.plan) * 2 * bytes_per_row(sweep)
-    free = shutil.disk_usage(anchor).free
-    if needed > _USABLE_SHARE * free:
-        raise DataError(
-            f"{out}: {len(sweep.plan):,} rows would take about {needed / 1e9:.3g} GB, and the disk has "
-            f"{free / 1e9:.3g} GB; keep fewer rows or no traces, or choose another disk."
-        )
-
-
 def _check_same(sweep: Sweep, out: str) -> None:
     about = about_of(out)
-    digest, before, size = about["digest"], about["versions"], about["chunk_rows"]
+    before = about["versions"]
     for name, version in versions().items():
         if before.get(name) != version:
             raise DataError(
                 f"{out}: the sweep was begun with {name} {before.get(name)}, and this is {version}; go on with that "
                 "version, or begin anew in another folder."
             )
-    if digest != sweep.digest or size != chunk_rows(sweep):
+    if about["digest"] != sweep.digest or about["chunk_rows"] != chunk_rows(sweep):
         raise DataError(
             f"{out}: the folder holds the results of another sweep or other files; give the one that is in its "
             f"{TEXT}, or choose another folder for --out."

@@ -66,13 +66,12 @@ class ControlJob(AbstractJob):
         wanted = drive(self.reference, block, values)
         found = _control(self.stage, self.controllers, values, block.relative, wanted, self.start, step)
         outputs = {name: np.asarray(value) for name, value in found.items()}
-        outputs["pole_radius"] = in_turn(
-            lambda rows, values: _radius(self.stage, self.controllers, rows, values, block.relative),
-            block.rows,
-            block.values,
-        )
-        moved = np.ptp(np.asarray(wanted), axis=1)
-        way = np.maximum(moved, np.abs(outputs.pop("from_um")))
+
+        def radius(rows: Array, values: Mapping[str, Array]) -> Array:
+            return _radius(self.stage, self.controllers, rows, values, block.relative)
+
+        outputs["pole_radius"] = in_turn(radius, block.rows, block.values)
+        way = np.maximum(np.ptp(np.asarray(wanted), axis=1), np.abs(outputs.pop("from_um")))
         return Rows(outputs, tuple(map(_why_not, way, outputs["pole_radius"], outputs["e_max_pct"])))
 
 

@@ -94,23 +94,15 @@ class FitJob(AbstractJob):
         records, holdout = self.records.records(block), block.numbers("fit.holdout", self.options.holdout)
         initial = block.words("fit.initial", INITIAL_STATES, self.initial)
         if self._batch:
-            levels = block.numbers("fit.levels", self.options.levels or _DEFAULT_LEVELS).astype(int)
-            return self._together(
-                records, holdout, initial, levels, block.numbers("fit.smoothness", self.options.smoothness)
-            )
+            return self._together(block, records, holdout, initial)
         swept = block.values.get("fit.levels")
         numbers = [self.options.levels] * len(records) if swept is None else swept.astype(int).tolist()
         found = [_alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
         return Rows.one_by_one(self.facts.outputs, found)
 
-    def _together(
-        self,
-        records: list[Record | str],
-        holdout: FloatArray,
-        initial: list[str],
-        levels: NDArray[np.int64],
-        smoothness: FloatArray,
-    ) -> Rows:
+    def _together(self, block: Block, records: list[Record | str], holdout: FloatArray, initial: list[str]) -> Rows:
+        levels = block.numbers("fit.levels", self.options.levels or _DEFAULT_LEVELS).astype(int)
+        smoothness = block.numbers("fit.smoothness", self.options.smoothness)
         count, samples = len(records), self.options.samples
         voltage, displacement = np.zeros((count, samples)), np.zeros((count, samples))
         fitted, known = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
@@ -182,8 +174,7 @@ def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[An
     table, rough = jnp.asarray(branch_table(levels)), roughness(levels)
 
     def regress(*rows: Array) -> BatchFit:
-        fits: BatchFit = fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
-        return fits
+        return fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
 
     found = in_turn(regress, *rows) if jax.default_backend() == "cpu" else regress(*map(place, rows))
     packed = _packed(levels)
@@ -227,6 +218,5 @@ def make(request: Request) -> FitJob:
     if isinstance(records, Simulated):
         if "samples" in table:
             raise DataError("fit.samples: simulated records have the samples of their program; leave it out.")
-        samples = {"samples": records.program.samples}
-        options.samples = typed(samples, _Options, "fit").samples
+        options.samples = typed({"samples": records.program.samples}, _Options, "fit").samples
     return FitJob(records, options, options.initial or assumed_initial(request, records))
