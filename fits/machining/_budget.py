@@ -45,23 +45,13 @@ class Driving:
 
 @dataclass(frozen=True)
 class AxisBudget:
-    """The errors of one axis at the full elongation of its piezo, in um or urad.
+    """The errors of one axis at the full elongation of its piezo, all in `output_unit`: `um` or `urad`.
 
-    Attributes
-    ----------
-    output_unit
-        `um` or `urad`, of all that follows but the sensitivity.
-    stroke, piezo_sensitivity
-        Output at full elongation, and output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
-    driving_highest, driving_lowest
-        Largest driving errors to either side, with their signs.
-    machining_signed, machining_worst_case, machining_root_sum_square
-        Of all dimensions, each at plus one tolerance, the elongation being imposed (Eq. 4): the sum, the sum of the
-        sizes, and the root of the sum of squares with the design's correlations.
-    machining_voltage_worst_case, machining_voltage_root_sum_square
-        The same with the voltage being imposed, which the paper leaves out: the input stiffness then acts too.
-    measuring
-        Of the sensor; None where it is not known.
+    The stroke is the output there, and `piezo_sensitivity` the output per um of the piezo (Eq. 3). Driving errors are
+    the largest to either side, with their signs. Those of machining are of all dimensions, each at plus one
+    tolerance, the elongation being imposed (Eq. 4): the sum, the sum of the sizes, and the root of the sum of squares
+    with the design's correlations; with `voltage` the same with the voltage being imposed, which the paper leaves
+    out: the input stiffness then acts too. The measuring error of the sensor is None where it is not known.
     """
 
     axis: m.Axis
@@ -82,21 +72,23 @@ class AxisBudget:
         """The larger driving error by size, with its sign."""
         return max(self.driving_highest, self.driving_lowest, key=abs)
 
+    def _total(self, machining: float) -> m.TotalError:
+        return m.total_error(self.driving, machining, self.measuring or 0.0)
+
     @property
     def signed(self) -> float:
         """Sum with signs (Eq. 1): `driving`, all dimensions at plus one tolerance, and a reading that is too high."""
-        return float(m.total_error(self.driving, self.machining_signed, self.measuring or 0.0).signed)
+        return float(self._total(self.machining_signed).signed)
 
     @property
     def worst_case(self) -> float:
         """Sum of sizes: no signs within the tolerances are worse."""
-        return float(m.total_error(self.driving, self.machining_worst_case, self.measuring or 0.0).worst_case)
+        return float(self._total(self.machining_worst_case).worst_case)
 
     @property
     def root_sum_square(self) -> float:
         """For parts, and dimensions, that are independent."""
-        parts = self.driving, self.machining_root_sum_square, self.measuring or 0.0
-        return float(m.total_error(*parts).root_sum_square)
+        return float(self._total(self.machining_root_sum_square).root_sum_square)
 
     @property
     def shares(self) -> dict[str, float]:
@@ -111,18 +103,10 @@ class AxisBudget:
 class Budget:
     """The error budgets of some axes by name, and what they rest on.
 
-    Attributes
-    ----------
-    axes, driving
-        Budgets by name, and the driving error of the piezo.
-    measures
-        What the displacement of the model was: the piezo's elongation (`pzt`), or the output of an axis.
-    noise_um, zeroed
-        Measuring error of the sensor, and whether its offset is left out of that.
-    arm_mm, level
-        Distance from the axis of rotation at which the sensor reads, or None; and level of the motion functions.
-    remarks
-        What a reader must know, one sentence each.
+    These are the driving error of the piezo; what the displacement of the model was, the piezo's elongation (`pzt`)
+    or the output of an axis; the measuring error of the sensor, and whether its offset is left out of that; the
+    distance from the axis of rotation at which it reads, or None; and the level of the motion functions. Remarks are
+    what a reader must know, one sentence each.
     """
 
     axes: dict[m.Axis, AxisBudget]
@@ -151,27 +135,14 @@ def budget(
 ) -> Budget:
     """Put driving, machining and measuring errors together (Eq. 1), each axis being driven over its whole range.
 
-    Parameters
-    ----------
-    design, idle
-        Dimensions, tolerances and constants; and the noise of the sensor, from `idle_noise`.
-    model
-        The fitted hysteresis of a piezo; of a stage, what slow commands see. All piezos are taken to be like it.
-    measures
-        What the displacement of the model is: the piezo's elongation, or the output of an axis, which is then divided
-        by its gain.
-    arm_mm
-        Distance from the axis of rotation at which a displacement sensor reads a rotation. Without it rotations have
-        no measuring error, and none can be what the model measures.
-    zeroed
-        Whether the sensor is zeroed at rest, which removes its offset.
+    The model is the fitted hysteresis of a piezo, of a stage what slow commands see, and all piezos are taken to be
+    like it; its displacement `measures` the piezo's elongation, or the output of an axis, which is then divided by
+    its gain. The noise of the sensor is from `idle_noise`; zeroed at rest, the sensor has no offset. It reads a
+    rotation at a distance of `arm_mm` from the axis: without that rotations have no measuring error, and none can be
+    what the model measures.
 
-    Raises
-    ------
-    DataError
-        If the model does not move, is a stage without hysteresis, or measures a rotation at no arm.
-    RuntimeError
-        If JAX is not in double precision.
+    A `DataError` says that the model does not move, is a stage without hysteresis, or measures a rotation at no arm,
+    a `RuntimeError` that JAX is not in double precision.
     """
     require_float64("budgets")
     if arm_mm is not None and not (math.isfinite(arm_mm) and arm_mm > 0):
@@ -192,17 +163,13 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
     rise = np.linspace(lower_V, upper_V, _STEPS + 1)
     error, highest_um = _loop(law, jnp.asarray(np.concatenate([rise, rise[-2::-1]])))
     # What the model calls a um is this many of the piezo.
-    scale = 1.0
-    if measures != "pzt":
-        # The model's um per unit of the output, which is a rotation at an arm where it is in rad.
-        per_unit = 1.0
-        if m.MOTIONS[measures].unit == "rad":
-            if arm_mm is None:
-                raise DataError(
-                    f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
-                )
-            per_unit = 1e3 * arm_mm
-        scale = 1 / (per_unit * float(derivatives_of(design, measures).gain))
+    scale = 1.0 if measures == "pzt" else 1 / float(derivatives_of(design, measures).gain)
+    if measures != "pzt" and m.MOTIONS[measures].unit == "rad":
+        if arm_mm is None:
+            raise DataError(
+                f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
+            )
+        scale /= 1e3 * arm_mm
     stroke_um = scale * float(highest_um)
     if not stroke_um > 0:
         raise DataError(

@@ -39,24 +39,13 @@ class Together:
 class Design:
     """A stage as it is designed: what a machining error is counted from.
 
-    Attributes
-    ----------
-    tolerance
-        Largest error to either side of every dimension by name, in the dimension's unit. It stands for three standard
-        deviations of a normal distribution, or for the half-width of a uniform or a triangular one.
-    level
-        0 for Euler-Bernoulli leaves between rigid blocks, 1 with elastic roots, shear and links.
-    guides, youngs_modulus_GPa
-        Guiding legs of a translation in x or y; and the modulus of all flexures.
-    actuation
-        Piezos and moving masses.
-    together
-        Dimensions with correlated errors; all others are independent.
+    The tolerance of every dimension by name is the largest error to either side, in the dimension's unit: three
+    standard deviations of a normal distribution, or the half-width of a uniform or a triangular one. The level is 0
+    for Euler-Bernoulli leaves between rigid blocks, 1 with elastic roots, shear and links. `guides` are the guiding
+    legs of a translation in x or y, the modulus is that of all flexures, the actuation are piezos and moving masses,
+    and errors of dimensions are independent but for those that go `together`.
 
-    Raises
-    ------
-    DataError
-        If anything in it is impossible; the sentence begins with its place, such as `geometry.t2`.
+    A `DataError` says that anything in it is impossible, beginning with its place, such as `geometry.t2`.
     """
 
     geometry: m.Geometry
@@ -114,7 +103,7 @@ def lever_mm(geometry: m.Geometry, name: str) -> float:
 def _faults(design: Design) -> Iterator[str]:
     """Sentences on what is impossible, each beginning with its place."""
     yield from _faults_of_sizes(design)
-    if isinstance(design.level, bool) or not isinstance(design.level, int) or design.level not in (0, 1):
+    if type(design.level) is not int or design.level not in (0, 1):
         yield f"level: expected 0 or 1, found {design.level!r}; give one of them."
     if not 0 <= design.guides <= _MOST_GUIDES:
         yield f"material.guides: expected 0 to {_MOST_GUIDES} legs, found {design.guides:g}; correct it."
