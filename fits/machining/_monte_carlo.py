@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Array
 
 from fits.io._errors import DataError
 from fits.machining._design import Design
@@ -32,17 +31,11 @@ _AGREE, _STANDARD_ERRORS = 0.02, 3.0
 class SecondOrder:
     """Spread of the gain of an axis as a quadratic function of the errors of the `k` dimensions that it depends on.
 
-    Attributes
-    ----------
-    unit
-        Of the gain: `um/um` or `rad/um`; per um of free elongation with `voltage`.
-    gain, gradient, hessian
-        At the nominal dimensions, and derivatives per mm or rad, shapes `(k,)` and `(k, k)`.
-    first_order_sd, mean_shift
-        Standard deviation from the gradient alone, and mean less the gain at the nominal dimensions.
-    pairs
-        What each pair adds to the variance at second order, shape `(k, k)`; the sum of all counts, and two equal
-        halves of a pair stand at either side of the diagonal.
+    The unit of the gain is `um/um` or `rad/um`; per um of free elongation with `voltage`. It is that at the nominal
+    dimensions, with its derivatives per mm or rad, shapes `(k,)` and `(k, k)`. The standard deviation of first order
+    is from the gradient alone; the mean is shifted against the gain at the nominal dimensions. `pairs` is what each
+    pair adds to the variance at second order, shape `(k, k)`; the sum of all counts, and two equal halves of a pair
+    stand at either side of the diagonal.
     """
 
     axis: Axis
@@ -83,12 +76,7 @@ def second_order(
     for independent dimensions of any symmetric distribution with fourth moments :math:`\mu_4`, and for correlated
     normal ones. Correlated dimensions that are not normal have joint fourth moments that this leaves out. Third
     derivatives add to the variance at the same power of the tolerances unless the gradient vanishes; they are left
-    out, too.
-
-    Raises
-    ------
-    DataError
-        If there is no such axis or distribution, or a tolerance is as large as its dimension.
+    out, too. A `DataError` says that there is no such axis or distribution, or a tolerance as large as its dimension.
     """
     check(design, (axis,), distribution)
     names = inputs_of(axis, voltage)
@@ -116,14 +104,9 @@ def second_order(
 class AxisSpread:
     """How the gain of an axis spreads, in um/um or rad/um; per um of free elongation with a fixed voltage.
 
-    Attributes
-    ----------
-    nominal, mean, sd, skewness
-        Gain at the nominal dimensions, and statistics of the draws.
-    sd_error, quantiles
-        Standard error of `sd`, from the fourth moment; and quantiles by percentage: 0.135, 2.5, 50, 97.5 and 99.865.
-    first_order_sd, second
-        Standard deviation from the gradient, and the expansion to second order where `flagged`, else `None`.
+    After the gain at the nominal dimensions come statistics of the draws: the standard error of `sd` is from the
+    fourth moment, and quantiles are by percentage: 0.135, 2.5, 50, 97.5 and 99.865. The standard deviation of first
+    order is from the gradient, and the expansion to second order is there where `flagged`, else `None`.
     """
 
     axis: Axis
@@ -180,26 +163,14 @@ def monte_carlo(
 ) -> MonteCarlo:
     """Draw the dimensions within their tolerances and evaluate the gains.
 
-    Parameters
-    ----------
-    design
-        Dimensions, tolerances and which of them go together. The correlation of those is that of the dimensions,
-        whatever their distribution: a Gaussian copula joins them, and each keeps its own distribution.
-    samples, seed
-        Number of stages drawn, from 1000 to 30 million, and the seed of the draws.
-    distribution
-        Of each dimension: `normal` with the tolerance as three standard deviations; `uniform` or `triangular` over
-        the tolerance.
-    voltage
-        Impose the voltage of the piezos instead of their elongation.
-    progress
-        Called with a sentence now and then.
+    Each dimension is `normal`, with the tolerance as three standard deviations, or `uniform` or `triangular` over the
+    tolerance. The correlation of those that go together is that of the dimensions, whatever their distribution: a
+    Gaussian copula joins them, and each keeps its own distribution. From 1000 to 30 million stages are drawn, by the
+    seed; with `voltage` the voltage of the piezos is imposed instead of their elongation. `progress` is called with a
+    sentence now and then.
 
-    Raises
-    ------
-    DataError
-        If there is no such axis or distribution, a tolerance is as large as its dimension, or the number of samples
-        is out of bounds.
+    A `DataError` says that there is no such axis or distribution, that a tolerance is as large as its dimension, or
+    that the number of samples is out of bounds.
     """
     check(design, axes, distribution)
     if not _FEWEST_SAMPLES <= samples <= _MOST_SAMPLES:
@@ -207,9 +178,8 @@ def monte_carlo(
     different = tuple(dict.fromkeys(twin(axis) for axis in axes))
     gains = _gains_of_draws(design, different, samples, distribution, seed, voltage, progress)
     progress("summing up")
-    spreads = once_per_function(
-        axes, lambda axis: _spread(gains[different.index(twin(axis))], design, axis, distribution, voltage)
-    )
+    gains_of = dict(zip(different, gains, strict=True))
+    spreads = once_per_function(axes, lambda axis: _spread(gains_of[twin(axis)], design, axis, distribution, voltage))
     for axis, spread in spreads.items():
         if spread.flagged:
             spreads[axis] = replace(spread, second=second_order(design, axis, distribution, voltage=voltage))
@@ -230,25 +200,17 @@ def _gains_of_draws(
     model, scale = gain_model(design, voltage), tolerances(design, names)[:, None]
     root = copula_root(design, names, distribution)
     rng = np.random.Generator(np.random.SFC64(seed))
-    gains = np.empty((len(axes), samples))
-
-    def keep(begin: int, found: Array) -> None:
-        part = gains[:, begin : begin + _CHUNK]
-        part[:] = np.asarray(found)[:, : part.shape[1]]
-
-    before: tuple[int, Array] | None = None
+    gains, coming = np.empty((len(axes), samples)), None
     for begin in range(0, samples, _CHUNK):
         standard = rng.standard_normal((len(names), _CHUNK))
         errors = scale * from_normal(root @ standard if design.together else standard, distribution)
         # Computed while the next are drawn.
-        coming = begin, gains_of_many(model, errors, axes, names)
-        if before is not None:
-            keep(*before)
-        before = coming
+        before, coming = coming, gains_of_many(model, errors, axes, names)
+        if begin:
+            gains[:, begin - _CHUNK : begin] = before
         if begin * 10 // samples != (begin + _CHUNK) * 10 // samples:
             progress(f"{min(samples, begin + _CHUNK):,} of {samples:,} samples")
-    assert before is not None
-    keep(*before)
+    gains[:, begin:] = np.asarray(coming)[:, : samples - begin]
     if not np.isfinite(gains).all():
         raise DataError("some of the stages drawn cannot be built: lower the tolerances")
     return gains
