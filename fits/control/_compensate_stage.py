@@ -1,7 +1,5 @@
 """A whole stage in feedforward: what its driver and mechanics ask for beyond the inverse of the hysteresis."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -18,17 +16,6 @@ _FEWEST = 16
 _ROUNDING = 1e-13
 
 
-class Gains(NamedTuple):
-    """Static gains of a stage: piezo voltage per command, measured displacement per displacement of the piezo.
-
-    The offset is the measured displacement where the piezo's is zero.
-    """
-
-    ahead: float
-    behind: float
-    offset_um: float
-
-
 def plain_of(stage: Stage) -> Stage:
     """The same stage without effects of `microid.EFFECTS`; itself where it has none."""
     if not any(isinstance(part, AbstractEffect) for part in stage.parts):
@@ -43,17 +30,20 @@ def plain_of(stage: Stage) -> Stage:
 
 def hysteresis_of(stage: Stage) -> Preisach:
     """Find the one Preisach hysteresis of a stage."""
-    found = [innermost(part) for part in stage.parts if isinstance(innermost(part), Preisach)]
-    if not found:
-        parts = ", ".join(f"{n} ({type(p).__name__})" for n, p in zip(stage.names, stage.parts, strict=True))
-        raise DataError(
-            f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.", of_model=True
-        )
-    return found[0]
+    for part in stage.parts:
+        if isinstance(innermost(part), Preisach):
+            return innermost(part)
+    parts = ", ".join(f"{n} ({type(p).__name__})" for n, p in zip(stage.names, stage.parts, strict=True))
+    raise DataError(
+        f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.", of_model=True
+    )
 
 
-def gains_of(stage: Stage) -> Gains:
-    """Static gains of a stage ahead of its hysteresis and behind it; they must be positive."""
+def gains_of(stage: Stage) -> tuple[float, float, float]:
+    """Static gains of a stage: piezo voltage per command, and measured displacement per displacement of the piezo.
+
+    They must be positive. Third is the measured displacement in um where the piezo's is zero.
+    """
     law = stage.parts.index(hysteresis_of(stage))
     ahead, behind, offset = 1.0, 1.0, 0.0
     for k, part in enumerate(stage.parts):
@@ -70,7 +60,7 @@ def gains_of(stage: Stage) -> Gains:
             ahead *= gain
         else:
             behind, offset = behind * gain, gain * offset + float(part.system().offset)
-    return Gains(ahead, behind, offset)
+    return ahead, behind, offset
 
 
 def static_equivalent(stage: Stage) -> Preisach:
@@ -79,13 +69,13 @@ def static_equivalent(stage: Stage) -> Preisach:
     A `DataError` refuses a stage without a Preisach hysteresis, or with a static gain that is not positive.
     """
     stage = plain_of(stage)
-    law, gains = hysteresis_of(stage), gains_of(stage)
-    lower, upper = law.density.lower_V / gains.ahead, law.density.upper_V / gains.ahead
+    law, (ahead, behind, offset_um) = hysteresis_of(stage), gains_of(stage)
+    lower, upper = law.density.lower_V / ahead, law.density.upper_V / ahead
     weights = law.weights_um[np.tril_indices(law.density.levels)]
     return Preisach(
-        GridDensity(gains.behind * weights, lower, upper),
-        Reversible(gains.behind * gains.ahead * law.reversible.slope_um_per_V, lower, upper),
-        gains.offset_um + gains.behind * law.offset_um,
+        GridDensity(behind * weights, lower, upper),
+        Reversible(behind * ahead * law.reversible.slope_um_per_V, lower, upper),
+        offset_um + behind * law.offset_um,
     )
 
 
@@ -100,10 +90,10 @@ def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: s
             f"{source}: expected {_FEWEST} samples or more for --dynamic, found {len(time_s)}; sample the reference "
             "more finely, or use --static."
         )
-    gains = gains_of(stage)
+    _, behind, offset_um = gains_of(stage)
     every, other = (
-        gains.offset_um + gains.behind * np.asarray(_demand(stage, jnp.asarray(t), jnp.asarray(r)))
-        for t, r in ((time_s, reference_um), (time_s[::2], reference_um[::2]))
+        offset_um + behind * np.asarray(_demand(stage, jnp.asarray(time_s[::n]), jnp.asarray(reference_um[::n])))
+        for n in (1, 2)
     )
     # Away from the ends, where splines are less sure than the reference is.
     return every, float(np.max(np.abs(every[::2] - other)[2:-2]) / 3)
@@ -132,8 +122,8 @@ def begins_in_motion(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: 
 
 def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarray:
     """Compensate the driver's lag: the command that gives the piezo a static voltage, shape `(n,)`."""
-    gain = gains_of(stage).ahead
-    return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(gain * static_V)))
+    ahead, _, _ = gains_of(stage)
+    return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(ahead * static_V)))
 
 
 def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.ndarray:

@@ -65,23 +65,12 @@ def allocate(
     relative derivatives s, are convex, so that the minimum is the only one. Where a slope nearly vanishes the first
     order would let a tolerance grow without a price; `curvature_share` stops it.
 
-    Parameters
-    ----------
-    design
-        Dimensions and present tolerances.
-    budget_pct
-        Largest error of the output by axis, in percent of the output.
-    cost
-        By dimension, at the present tolerance; one for those not named.
-    limit
-        What keeps to the budget: `three_sigma` of independent normal errors, whose tolerances are three standard
-        deviations, or the `worst_case`, all errors at their tolerances with the worst signs.
-    bounds_mm
-        Smallest and largest tolerance of a length; of an angle, at the end of its leg.
-    voltage
-        Impose the voltage of the piezos instead of their elongation.
-    curvature_share
-        No tolerance goes beyond where the second order of its dimension alone takes this share of a budget.
+    The budget is the largest error of the output by axis, in percent of the output; the cost is by dimension, at the
+    present tolerance, and one for those not named. What keeps to the budget are `three_sigma` of independent normal
+    errors, whose tolerances are three standard deviations, or the `worst_case`, all errors at their tolerances with
+    the worst signs. Bounds are the smallest and largest tolerance of a length; of an angle, at the end of its leg.
+    With `voltage` the voltage of the piezos is imposed instead of their elongation. No tolerance goes beyond where
+    the second order of its dimension alone takes `curvature_share` of a budget.
 
     A `DataError` says that a budget, cost or bound makes no sense, that dimensions go together and three standard
     deviations are asked for, or that a budget is out of reach, with the smallest error within reach; an

@@ -24,7 +24,6 @@ _NEGLIGIBLE = 0.05
 # From this part on, it is severe.
 _SEVERE = 0.5
 _STEPS = 41
-_WIDTH, _INDENT = 110, " " * 12
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def describe_claims(claims: Sequence[Claim]) -> str:
     lines = ["The paper on its Fig. 7, and this stage:"]
     for claim in claims:
         lines.append(f"  {claim.verdict:8}  {', '.join(claim.axes)}: {claim.statement}")
-        lines += textwrap.wrap(claim.reason, _WIDTH, initial_indent=_INDENT, subsequent_indent=_INDENT)
+        lines.append(textwrap.indent(textwrap.fill(claim.reason, 98), " " * 12))
     return "\n".join(lines)
 
 
