@@ -210,8 +210,7 @@ class Maker:
             if all(bool(one.stable) and float(one.sensitivity_peak) < _MOST_PEAK for one in every):
                 break
             values = parameter_values(controller)
-            halves = {name: values[name] / 2 for name in controller.own if name in values}
-            controller = replaced(controller, halves)
+            controller = replaced(controller, {name: values[name] / 2 for name in controller.own if name in values})
         return controller
 
     def _stated(

@@ -11,7 +11,7 @@ from fits.control._compensate import compensate
 from fits.io._errors import DataError
 from fits.io._record import Reference
 from fits.loop._run import initial_state
-from fits.stage._run import place_of_hysteresis, range_of
+from fits.stage._run import as_stage, place_of_hysteresis, range_of
 from microid import Preisach, SampledStage, Stage, Start, two_degrees
 
 Feedforward = Literal["none", "static", "dynamic"]
@@ -58,7 +58,7 @@ def setup(
     those of the model. A `DataError` says that the times are uneven or too few, that the stage cannot be stepped or
     inverted, or that the limits are not within the model's range.
     """
-    stage = held(model if isinstance(model, Stage) else Stage.of(hysteresis=model))
+    stage = held(as_stage(model))
     interval = _interval_s(reference)
     try:
         sampled = SampledStage(stage, interval)

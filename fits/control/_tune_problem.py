@@ -29,23 +29,13 @@ class Goal:
 
     .. math:: J = \mathrm{rms}(e) + w_u\, \mathrm{rms}(u - u_{ff}) + w_{\Delta}\, \mathrm{rms}(u_k - u_{k-1})
 
-    in um, each over all plants, references and samples that count. A limit of None is none.
+    in um, each over all plants, references and samples that count. `effort_um_per_V` is the weight `w_u` of what the
+    feedback adds to the feedforward, or to the command before the first sample, `rate_um_per_V` the weight `w_Δ` of
+    the change of the command between samples, whose largest is limited by `command_step_max_V`.
 
-    Attributes
-    ----------
-    effort_um_per_V
-        Weight `w_u` of what the feedback adds to the feedforward, or to the command before the first sample.
-    rate_um_per_V
-        Weight `w_Δ` of the change of the command between samples.
-    gain_margin_min, phase_margin_min_deg, sensitivity_peak_max
-        Of the linearised loop of every plant; see `microid.Margins`.
-    overshoot_max_pct
-        Displacement beyond the range that the reference and the rest before it span, in percent of that range; none
-        where they span nothing.
-    command_max_V, command_min_V
-        Limits of the command, short of where the controller cuts it off.
-    command_step_max_V
-        Largest change of the command between two samples.
+    A limit of None is none. Margins and peak are those of the linearised loop of every plant; see `microid.Margins`.
+    The overshoot is the displacement beyond the range that the reference and the rest before it span, in percent of
+    that range; none where they span nothing. Limits of the command are short of where the controller cuts it off.
     """
 
     effort_um_per_V: float = 0.0
@@ -60,17 +50,10 @@ class Goal:
 
     def limits(self) -> dict[str, float]:
         """All limits by name, far away where there is none: so one program does for all of them."""
-        none = {
-            "gain_margin_min": 0.0,
-            "phase_margin_min_deg": 1e-3,
-            "sensitivity_peak_max": _UNLIMITED,
-            "overshoot_max_pct": _UNLIMITED,
-            "command_min_V": -_UNLIMITED,
-            "command_max_V": _UNLIMITED,
-            "command_step_max_V": _UNLIMITED,
-        }
+        limits = {name: limit for name, limit in vars(self).items() if not name.endswith("_um_per_V")}
+        nearer = {"gain_margin_min": 0.0, "phase_margin_min_deg": 1e-3, "command_min_V": -_UNLIMITED}
         return {
-            name: far if getattr(self, name) is None else float(getattr(self, name)) for name, far in none.items()
+            name: nearer.get(name, _UNLIMITED) if limit is None else float(limit) for name, limit in limits.items()
         }
 
     def command_width_V(self) -> float:
@@ -171,14 +154,9 @@ def _run(
     rate = jnp.diff(run.command_V, prepend=before)
     count = jnp.sum(problem.counts)
     squares = (jnp.sum(problem.counts * x**2) / count for x in (run.error_um, effort, rate))
-    extremes = (
-        jnp.max(problem.counts * jnp.abs(run.error_um)),
-        overshoot_pct(run),
-        jnp.min(run.command_V),
-        jnp.max(run.command_V),
-        jnp.max(jnp.abs(rate)),
-    )
-    return (*squares, *extremes)
+    largest, passed = jnp.max(problem.counts * jnp.abs(run.error_um)), overshoot_pct(run)
+    commands = jnp.min(run.command_V), jnp.max(run.command_V), jnp.max(jnp.abs(rate))
+    return (*squares, largest, passed, *commands)
 
 
 def overshoot_pct(run: ControlledRun) -> Float[Array, ""]:
@@ -193,10 +171,9 @@ def overshoot_pct(run: ControlledRun) -> Float[Array, ""]:
 
 def cost_um(problem: Problem, found: Figures) -> Float[Array, ""]:
     """The cost that `Goal` states."""
-    effort, rate = problem.weights_um_per_V
-    each = (found.error_um2, found.effort_V2, found.rate_V2)
-    roots = [jnp.sqrt(jnp.mean(x) + _TINY_um2) for x in each]
-    return roots[0] + effort * roots[1] + rate * roots[2]
+    squares = found.error_um2, found.effort_V2, found.rate_V2
+    error, effort, rate = (jnp.sqrt(jnp.mean(x) + _TINY_um2) for x in squares)
+    return error + problem.weights_um_per_V[0] * effort + problem.weights_um_per_V[1] * rate
 
 
 def excess(problem: Problem, found: Figures) -> dict[str, Float[Array, "..."]]:

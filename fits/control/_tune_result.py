@@ -37,20 +37,12 @@ class LoopReport:
 
 @dataclass(frozen=True)
 class Tuning(Generic[_Controller]):
-    """A tuned controller, and what it is worth.
+    """A tuned controller, stable with every plant and within all limits, and what it is worth.
 
-    Attributes
-    ----------
-    controller
-        Stable with every plant, and within all limits.
-    cost_before_um, cost_after_um
-        Of the controller it began with, and of this one; see `Goal`.
-    converged
-        Whether nothing is left to gain nearby: the slope of the cost is small, or balanced by limits.
-    plants, remarks
-        One report per plant, the nominal one first; and what the user should know, one sentence each.
-    gains
-        Before and after, in their units, by their path in the controller.
+    Costs are those of the controller it began with, and of this one; see `Goal`. It is converged where nothing is
+    left to gain nearby: the slope of the cost is small, or balanced by limits. There is one report per plant, the
+    nominal one first; gains are before and after, in their units, by their path in the controller; remarks are what
+    the user should know, one sentence each.
     """
 
     controller: _Controller
