@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.control._compensate_stage import (
-    begins_in_motion,
     command,
     demand,
+    demand_remarks,
     plain_of,
     simulate_model,
     static_equivalent,
-    turns,
 )
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
@@ -31,8 +30,6 @@ _PIECE = 8192
 _SLACK = 1e-9
 # What can be reached depends on the past, so it is found again until it stays; two or three times are usual.
 _PASSES = 50
-# Rounds of fixed-point iteration for effects; each reduces the error to a few percent of what it was.
-_ROUNDS, _DONE = 12, 1e-9
 # At an end of the range what a stage needs may overshoot by this fraction of it, and is cut, before that is refused.
 _TOLERABLE = 0.01
 # What is cut off a command by less than this fraction of the limits' width does not show.
@@ -90,8 +87,8 @@ def compensate(
         needed, doubt_um = demand(model, time_s, wanted, reference.source)
     elif way != "static":
         raise ValueError(f"way must be 'static' or 'dynamic', got {way!r}")
-    turning = turns(wanted, doubt_um)
-    remarks = turning + begins_in_motion(wanted, needed, doubt_um)
+    turning, moving = demand_remarks(wanted, needed, doubt_um)
+    remarks = turning + moving
     lower, upper = float(law.density.lower_V), float(law.density.upper_V)
     limits = within_range(law, limits_V)
     bind = f"the voltage is limited to {limits[0]:g} to {limits[1]:g} V"
@@ -134,13 +131,14 @@ def _beside_effects(
         )
     time_s, wanted = reference.time_s, np.asarray(reference.displacement_um)
     asked, before = wanted, np.inf
-    for _ in range(_ROUNDS):
+    # Each round reduces the error to a few percent of what it was.
+    for _ in range(12):
         found = invert(Reference(time_s, asked, reference.source))
         program = Record(time_s, found.voltage_V, None, source=reference.source)
         played = simulate_model(stage, program, initial)
         change = played - simulate_model(plain, program, initial)
         moved = float(np.max(np.abs(wanted - change - asked)))
-        if moved <= _DONE * float(np.ptp(wanted)) or moved > 0.9 * before:
+        if moved <= 1e-9 * float(np.ptp(wanted)) or moved > 0.9 * before:
             break
         asked, before = wanted - change, moved
     return Compensation(found.voltage_V, played, wanted, found.clipped, found.remarks)

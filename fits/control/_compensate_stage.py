@@ -99,25 +99,18 @@ def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: s
     return every, float(np.max(np.abs(every[::2] - other)[2:-2]) / 3)
 
 
-def turns(reference_um: np.ndarray, doubt_um: float) -> list[str]:
-    """Remark that the reference turns faster than its samples show, if the doubt from `demand` is that large."""
-    if doubt_um <= _WORTH_SAYING * float(np.ptp(reference_um)):
-        return []
-    return [
+def demand_remarks(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: float) -> tuple[list[str], list[str]]:
+    """Remarks that a reference turns faster than its samples show, and that it moves at first, from `demand`."""
+    start_um, little_um = abs(float(needed_um[0] - reference_um[0])), _WORTH_SAYING * float(np.ptp(reference_um))
+    turning = (
         "the reference turns within a sample, so that the displacement its acceleration asks for is uncertain by "
         f"{doubt_um:.3g} um; smooth it, sample it more finely, or use --static."
-    ]
-
-
-def begins_in_motion(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: float) -> list[str]:
-    """Remark that a stage at rest cannot take up a reference that moves; needed and doubt are from `demand`."""
-    start_um = abs(float(needed_um[0] - reference_um[0]))
-    if start_um <= max(_WORTH_SAYING * float(np.ptp(reference_um)), doubt_um):
-        return []
-    return [
+    )
+    moving = (
         f"the reference begins in motion and the stage at rest, {start_um:.3g} um away from what it would need; "
         "begin with a rest and a smooth start."
-    ]
+    )
+    return [turning] if doubt_um > little_um else [], [moving] if start_um > max(little_um, doubt_um) else []
 
 
 def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarray:
@@ -145,13 +138,11 @@ def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.
     return respond(model, time_s, record.voltage_V, start)
 
 
-_demand = eqx.filter_jit(microid.piezo_demand)
-_command = eqx.filter_jit(microid.driver_command)
-
-
 def respond(stage: Stage, time_s: np.ndarray | float, voltage_V: np.ndarray, start: Start) -> np.ndarray:
     """Displacement of a stage in um, shape `(n,)` as the voltage has; the time may be one interval."""
     return np.asarray(_respond(stage, jnp.asarray(time_s), jnp.asarray(voltage_V), start))
 
 
+_demand = eqx.filter_jit(microid.piezo_demand)
+_command = eqx.filter_jit(microid.driver_command)
 _respond = eqx.filter_jit(lambda stage, time_s, voltage_V, start: stage(time_s, voltage_V, start))

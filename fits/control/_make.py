@@ -35,21 +35,20 @@ def with_defaults(
     Settings that the controller itself finds by its plant are left out. `place` names a setting as the user does, in
     the sentence of the `DataError` that is raised where no default is found.
     """
-    found: dict[str, Any] = {}
+    found = {setting.name: stated[setting.name] for setting in settings if setting.name in stated}
     said = []
     for setting in settings:
         name, default = setting.name, setting.default
-        if name in stated:
-            found[name] = stated[name]
-        elif default is not None:
-            try:
-                found[name] = default(task) if callable(default) else default
-            except DataError as error:
-                raise DataError(f"{place(name)}: no default is found ({error}); state it.") from error
-            except ValueError as error:
-                raise DataError(f"{place(name)}: {error}; state it.") from error
-            if setting.said:
-                said.append(setting.said.format(found[name]))
+        if name in found or default is None:
+            continue
+        try:
+            found[name] = default(task) if callable(default) else default
+        except DataError as error:
+            raise DataError(f"{place(name)}: no default is found ({error}); state it.") from error
+        except ValueError as error:
+            raise DataError(f"{place(name)}: {error}; state it.") from error
+        if setting.said:
+            said.append(setting.said.format(found[name]))
     return found, said
 
 
@@ -156,11 +155,11 @@ class Maker:
         if kind.learns:
             which = "margins are" if tuning is None else "what was tuned, and margins, are"
             said.append(f"{which} those of its PID controller, before it learns")
-        stated = {"seed": self.seed} | own
-        places = {"frequency_Hz": "--frequency"}
-        numbers, more = with_defaults(
-            own_settings(kind), stated, self._task(), lambda x: places.get(x, f"--controller {name}: {x}")
-        )
+
+        def place(setting: str) -> str:
+            return "--frequency" if setting == "frequency_Hz" else f"--controller {name}: {setting}"
+
+        numbers, more = with_defaults(own_settings(kind), {"seed": self.seed} | own, self._task(), place)
         remarks += [*said, *more]
         if "frequency_Hz" in numbers:
             self._check_frequencies(np.atleast_1d(numbers["frequency_Hz"]))
