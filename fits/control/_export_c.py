@@ -17,11 +17,6 @@ from fits.io._file_set import file_set
 from fits.io._version import written_by
 from microid import Everett, Preisach
 
-# That of a demagnetised staircase in `microid`.
-_SWINGS = 31
-_SMALLEST, _LARGEST = 8, 65_536
-_LINE = 118
-
 
 def export_c(
     model: Preisach,
@@ -48,10 +43,8 @@ def export_c(
         raise DataError(
             f"--name: expected a letter and then up to 30 letters, digits or underscores, found '{name}'; rename it."
         )
-    if not _SMALLEST <= size <= _LARGEST:
-        raise DataError(
-            f"--memory: expected {_SMALLEST} to {_LARGEST} extremes, found {size}; 128 suit most references."
-        )
+    if not 8 <= size <= 65_536:
+        raise DataError(f"--memory: expected 8 to 65536 extremes, found {size}; 128 suit most references.")
     fields = _fields(model, name, size, within_range(model, limits_V))
     with file_set() as files:
         place = files.folder(folder, "--out")
@@ -87,7 +80,7 @@ def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]
         "highest_um": repr(offset + stroke_um),
         "rounding_um": repr(2 * float(np.finfo(float).eps) * max(abs(offset), abs(offset + stroke_um))),
         "size": str(size),
-        "swings": str(min(_SWINGS, (size - 4) // 2)),
+        "swings": str(min(31, (size - 4) // 2)),  # at most those of a demagnetised staircase in `microid`
         "intervals": str(n),
         "per_V": repr(n / (upper - lower)),
         "window_um": _lines(window, 4),
@@ -99,7 +92,7 @@ def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]
 def _lines(values: Iterable[float], indent: int) -> str:
     """Write constants with as many digits as reading them back exactly takes."""
     text = ", ".join(repr(float(value)) for value in values)
-    return textwrap.indent(textwrap.fill(f"{text},", _LINE - indent, break_on_hyphens=False), " " * indent)
+    return textwrap.indent(textwrap.fill(f"{text},", 118 - indent, break_on_hyphens=False), " " * indent)
 
 
 def _rows(cubics: np.ndarray) -> str:

@@ -27,10 +27,6 @@ class Given:
     pid: Mapping[str, float]
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
 
-    def make_pid(self, interval_s: float) -> PID:
-        """The PID controller, without limits."""
-        return PID(**{name: jnp.asarray(x) for name, x in self.pid.items()}, interval_s=jnp.asarray(interval_s))
-
 
 def replaced(controller: _Controller, values: Mapping[str, np.ndarray]) -> _Controller:
     """A controller with other values of some fields, by path; a `DataError` says which has a wrong shape or size."""

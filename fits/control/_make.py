@@ -17,10 +17,6 @@ from fits.control._tune_result import Tuning
 from fits.control._tune_start import relay_start, slope_array, steepest_slope
 from fits.io._errors import DataError
 
-_MOST_PEAK, _HALVINGS = 4.0, 20
-# Resonators that are nearer to each other than this share of their frequency fight.
-_SAME_FREQUENCY = 1e-3
-
 
 def own_settings(controller: type[m.AbstractController]) -> list[m.Setting]:
     """Settings of a controller beside the fields of its PID controller."""
@@ -143,11 +139,15 @@ class Maker:
         tuning: Tuning[Any] | None = None
         if given is None:
             self.progress("start by Ziegler and Nichols")
-            begin = relay_start(loop.plants, loop.ready.interval_s, delay=loop.delay)
-            tuning = self._tuned(_limited(begin, loop.ready.limits_V))
-            pid = tuning.controller
+            pid = relay_start(loop.plants, loop.ready.interval_s, delay=loop.delay)
         else:
-            pid = _limited(given.make_pid(loop.ready.interval_s), loop.ready.limits_V)
+            fields = {**given.pid, "interval_s": loop.ready.interval_s}
+            pid = m.PID(**{field: jnp.asarray(value) for field, value in fields.items()})
+        limits_V = tuple(jnp.asarray(limit) for limit in loop.ready.limits_V)
+        pid = eqx.tree_at(lambda pid: (pid.lower_V, pid.upper_V), pid, limits_V)
+        if given is None:
+            tuning = self._tuned(pid)
+            pid = tuning.controller
         remarks = [] if tuning is None else list(tuning.remarks)
         if kind is m.PID:
             return Made(pid, pid, tuning, remarks)
@@ -204,9 +204,9 @@ class Maker:
 
     def _with_margin(self, controller: Any) -> Any:
         """Halve a controller's own gains until the loop is stable with some margin, so that it can be tuned."""
-        for _ in range(_HALVINGS):
+        for _ in range(20):
             every = self.loop.margins(controller)
-            if all(bool(one.stable) and float(one.sensitivity_peak) < _MOST_PEAK for one in every):
+            if all(bool(one.stable) and float(one.sensitivity_peak) < 4 for one in every):
                 break
             values = parameter_values(controller)
             controller = replaced(controller, {name: values[name] / 2 for name in controller.own if name in values})
@@ -237,9 +237,6 @@ class Maker:
         if len(bad):
             raise DataError(f"--frequency: expected one between 0 and {highest:g} Hz, found {bad[0]:g} Hz.")
         near = np.sort(frequency_Hz)
-        if np.any(np.diff(near) <= _SAME_FREQUENCY * near[1:]):
+        # Resonators that are nearer to each other fight.
+        if np.any(np.diff(near) <= 1e-3 * near[1:]):
             raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
-
-
-def _limited(pid: m.PID, limits_V: tuple[float, float]) -> m.PID:
-    return eqx.tree_at(lambda p: (p.lower_V, p.upper_V), pid, tuple(jnp.asarray(x) for x in limits_V))

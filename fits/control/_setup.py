@@ -17,8 +17,6 @@ from microid import Preisach, SampledStage, Stage, Start, two_degrees
 Feedforward = Literal["none", "static", "dynamic"]
 
 _FEWEST = 16
-# Intervals that differ by less than this from their mean, as a fraction of it, count as even.
-_EVEN_WITHIN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ def _interval_s(reference: Reference) -> float:
     steps = np.diff(reference.time_s)
     interval = float(steps.mean())
     worst = int(np.argmax(np.abs(steps - interval)))
-    if abs(steps[worst] - interval) > _EVEN_WITHIN * interval:
+    if abs(steps[worst] - interval) > 1e-3 * interval:
         raise DataError(
             f"{reference.source}: expected even times, as of a controller, found a step of {steps[worst]:.6g} s "
             f"at sample {worst + 2} where the mean is {interval:.6g} s; resample the reference"

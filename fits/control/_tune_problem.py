@@ -12,15 +12,7 @@ from microid import ControlledRun, Coordinates, Margins, Stage, Start, margins, 
 
 # Every gain is searched for within `exp` of this of its start, to either side.
 REACH = 6.0
-# What stands for the cost of a loop that overflows.
-_ABSURD = 1e9
-# Roots have no derivative at zero; a picometre is nothing.
-_TINY_um2 = 1e-12
-# A reference that covers less than this stands still.
-NO_RANGE_um = 1e-6
-_RTOL = _ATOL = 1e-4
 _UNLIMITED = 1e9
-_STEPS = 80
 
 
 @dataclass(frozen=True)
@@ -123,9 +115,8 @@ def figures(problem: Problem, controller: Any) -> Figures:
         return margins(linear, plant, delay=problem.delay, slope_um_per_V=slope), found
 
     slopes = problem.slope_um_per_V
-    found, runs = eqx.filter_vmap(around, in_axes=(eqx.if_array(0), None if slopes is None else 0))(
-        problem.plants, slopes
-    )
+    axes = eqx.if_array(0), None if slopes is None else 0
+    found, runs = eqx.filter_vmap(around, in_axes=axes)(problem.plants, slopes)
     return Figures(found, *runs)
 
 
@@ -164,7 +155,8 @@ def overshoot_pct(run: ControlledRun) -> Float[Array, ""]:
     low = jnp.minimum(jnp.min(run.reference_um), run.displacement_um[0])
     high = jnp.maximum(jnp.max(run.reference_um), run.displacement_um[0])
     beyond = jnp.maximum(run.displacement_um - high, low - run.displacement_um)
-    moves = high - low > NO_RANGE_um
+    # A reference that covers less stands still.
+    moves = high - low > 1e-6
     # Both arms are finite: a quotient by zero would leave no derivative, whichever arm is taken.
     return jnp.where(moves, 100 * jnp.maximum(jnp.max(beyond), 0) / jnp.where(moves, high - low, 1), 0)
 
@@ -172,7 +164,8 @@ def overshoot_pct(run: ControlledRun) -> Float[Array, ""]:
 def cost_um(problem: Problem, found: Figures) -> Float[Array, ""]:
     """The cost that `Goal` states."""
     squares = found.error_um2, found.effort_V2, found.rate_V2
-    error, effort, rate = (jnp.sqrt(jnp.mean(x) + _TINY_um2) for x in squares)
+    # Roots have no derivative at zero; a picometre is nothing.
+    error, effort, rate = (jnp.sqrt(jnp.mean(x) + 1e-12) for x in squares)
     return error + problem.weights_um_per_V[0] * effort + problem.weights_um_per_V[1] * rate
 
 
@@ -190,13 +183,10 @@ def excess(problem: Problem, found: Figures) -> dict[str, Float[Array, "..."]]:
         "command_max_V": lambda most: (found.command_max_V - most) / problem.command_width_V,
         "command_step_max_V": lambda most: found.command_step_V / most - 1,
     }
-    for name, limit in limits.items():
-        share = shares[name](limit)
-        if name in ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max"):
-            # Of an unstable loop the margins mean nothing.
-            share = jnp.where(m.stable, share, 1)
-        out[name] = share
-    return out
+    out |= {name: shares[name](limit) for name, limit in limits.items()}
+    # Of an unstable loop the margins mean nothing.
+    margins = "gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max"
+    return out | {name: jnp.where(m.stable, out[name], 1) for name in margins}
 
 
 def _merit(
@@ -212,7 +202,7 @@ def _merit(
         push = jnp.maximum(share + multipliers[name] / weight, 0)
         total = total + jnp.sum(weight / 2 * push**2 - multipliers[name] ** 2 / (2 * weight))
     # Where nothing is finite, only the value is looked at: no line search stops there.
-    return scale * jnp.where(jnp.isfinite(total), total, _ABSURD)
+    return scale * jnp.where(jnp.isfinite(total), total, 1e9)
 
 
 @eqx.filter_jit
@@ -234,15 +224,9 @@ def descend(
     # The first step is as long as the gradient: where limits are far passed, it must not leap over everything.
     pushed = [jnp.sum(jnp.maximum(weight * over[name] + multipliers[name], 0)) for name in over]
     scale = 1 / (1 + sum(pushed, start=jnp.zeros(())))
-    solver: Any = optx.BFGS(rtol=_RTOL, atol=_ATOL)
-    solution: Any = optx.minimise(
-        _merit,
-        solver,
-        y,
-        args=(problem, multipliers, weight, scale),
-        # A handful of gains and thousands of samples: forwards nothing has to be kept.
-        options={"autodiff_mode": "fwd"},
-        max_steps=_STEPS,
-        throw=False,
-    )
+    solver: Any = optx.BFGS(rtol=1e-4, atol=1e-4)
+    given = problem, multipliers, weight, scale
+    # A handful of gains and thousands of samples: forwards nothing has to be kept.
+    options = {"autodiff_mode": "fwd"}
+    solution: Any = optx.minimise(_merit, solver, y, args=given, options=options, max_steps=80, throw=False)
     return solution.value, solution.state.f_info.grad / scale

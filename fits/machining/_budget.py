@@ -20,8 +20,6 @@ from fits.machining._sensitivity import derivatives_of, output_scale, refuse_inf
 
 Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
 MEASURES: tuple[Measures, ...] = ("pzt", *m.AXES)
-# The largest error is a maximum, where a step this small changes it by a millionth of the loop.
-_STEPS = 1000
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,8 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
     """Driving error in um of the piezo."""
     law = static_equivalent(model) if isinstance(model, m.Stage) else model
     lower_V, upper_V = float(law.density.lower_V), float(law.density.upper_V)
-    rise = np.linspace(lower_V, upper_V, _STEPS + 1)
+    # The largest error is a maximum, where a step this small changes it by a millionth of the loop.
+    rise = np.linspace(lower_V, upper_V, 1001)
     error, highest_um = _loop(law, jnp.asarray(np.concatenate([rise, rise[-2::-1]])))
     # What the model calls a um is this many of the piezo.
     scale = 1.0 if measures == "pzt" else 1 / float(derivatives_of(design, measures).gain)
@@ -200,20 +199,9 @@ def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | 
     signed, worst, squares = _combined(design, derived.slopes_at_full_stroke, scale)
     _, voltage_worst, voltage_squares = _combined(design, derived.by_voltage.dimensions, scale)
     refuse_infinite(axis, (stroke, slope, worst, voltage_worst))
-    return AxisBudget(
-        axis=axis,
-        output_unit=unit,
-        stroke=stroke,
-        piezo_sensitivity=slope,
-        driving_highest=slope * driving.highest_um,
-        driving_lowest=slope * driving.lowest_um,
-        machining_signed=signed,
-        machining_worst_case=worst,
-        machining_root_sum_square=squares,
-        machining_voltage_worst_case=voltage_worst,
-        machining_voltage_root_sum_square=voltage_squares,
-        measuring=measuring,
-    )
+    highest, lowest = slope * driving.highest_um, slope * driving.lowest_um
+    machining = signed, worst, squares, voltage_worst, voltage_squares
+    return AxisBudget(axis, unit, stroke, slope, highest, lowest, *machining, measuring)
 
 
 def _combined(design: Design, slopes: Mapping[str, Array], scale: float) -> tuple[float, float, float]:

@@ -19,11 +19,8 @@ Verdict = Literal["agree", "partly", "disagree"]
 # Verdict, number, unit and reason of a claim.
 _Judgement = tuple[Verdict, float, str, str]
 _AXES: tuple[m.Axis, ...] = ("x", "z", "alpha", "gamma")
-# Below this part of the largest effect of an axis, one can be neglected.
-_NEGLIGIBLE = 0.05
-# From this part on, it is severe.
-_SEVERE = 0.5
-_STEPS = 41
+# Below this part of the largest effect of an axis, one can be neglected; from the other on, it is severe.
+_NEGLIGIBLE, _SEVERE = 0.05, 0.5
 
 
 @dataclass(frozen=True)
@@ -53,30 +50,20 @@ def paper_claims(design: Design) -> tuple[Claim, ...]:
     longer += " The first-order differential that the paper draws is straight and can do neither."
     severe, share = _leaders(gamma, ("t6", "t7", "l6"))
     leading = f"Among the lengths {_changes(_lengths(gamma))}; the three named make up {share:.1f} % of the variance."
+    growth, curve = (z["t4"].relative_change_exact_pct, "%", thicker), (bend, "%", longer)
+    contradiction = "t4 affects z most, and can be neglected in the rotations about x and y"
     xy: tuple[m.Axis, ...] = ("x", "y")
     tilts: tuple[m.Axis, ...] = ("alpha", "beta")
     return (
         Claim(xy, "t1, t2, l1 and la1 have a great influence", *_leaders_of_x(x)),
         Claim(xy, "t1 has a great influence", *_t1(design, x)),
         Claim(("z",), "t4 affects the error most", *_t4_of_z(z)),
-        Claim(
-            ("z",),
-            "the effect of t4 grows gradually with the machining error",
-            *(_verdict(grows), z["t4"].relative_change_exact_pct, "%", thicker),
-        ),
-        Claim(
-            ("z",),
-            "the effect of la2 rises sharply, then falls and flattens",
-            *(_verdict(not one_way), bend, "%", longer),
-        ),
+        Claim(("z",), "the effect of t4 grows gradually with the machining error", _verdict(grows), *growth),
+        Claim(("z",), "the effect of la2 rises sharply, then falls and flattens", _verdict(not one_way), *curve),
         Claim(tilts, "l is among the most severe", *_l(alpha)),
         Claim(tilts, "l5 can be neglected", *_negligible(alpha, "l5")),
         Claim(tilts, "t4 can be neglected", *_negligible(alpha, "t4")),
-        Claim(
-            ("z", *tilts),
-            "t4 affects z most, and can be neglected in the rotations about x and y",
-            *_same_amplifiers(z, alpha),
-        ),
+        Claim(("z", *tilts), contradiction, *_same_amplifiers(z, alpha)),
         Claim(("gamma",), "t6, t7 and l6 are the most severe", severe, share, "%", leading),
     )
 
@@ -98,7 +85,7 @@ def sign_change_guides(design: Design) -> float | None:
     design's own number of guides plays no role.
     """
     guides = float(_sign_change(design.geometry, design.constants))
-    return guides if np.isfinite(guides) and guides > 0 else None
+    return guides if 0 < guides < np.inf else None
 
 
 @quick_jit
@@ -210,15 +197,13 @@ def _shape_of_curve(design: Design, effect: DimensionEffect) -> tuple[float, boo
     """How far the output in z over errors of a dimension is off a line, in %; whether it goes one way; in words."""
     names = m.MOTIONS["z"].dimensions
     width = effect.tolerance or TOLERANCE_MM
-    errors = np.zeros((_STEPS, len(names)))
-    errors[:, names.index(effect.name)] = np.linspace(-width, width, _STEPS)
+    errors = np.zeros((41, len(names)))
+    errors[:, names.index(effect.name)] = np.linspace(-width, width, len(errors))
     gains = gains_at(design, "z", errors)
-    steps = np.diff(gains)
-    bend = 100 * float(np.max(np.abs(gains - np.linspace(gains[0], gains[-1], _STEPS))) / gains[_STEPS // 2])
-    one_way = bool(np.all(steps > 0) or np.all(steps < 0))
-    return (
-        bend,
-        one_way,
+    bend = 100 * float(np.max(np.abs(gains - np.linspace(gains[0], gains[-1], len(gains)))) / gains[20])
+    one_way = bool(np.all(np.diff(gains) > 0) or np.all(np.diff(gains) < 0))
+    words = (
         f"{effect.relative_change_exact_pct:+.3f} % at plus one tolerance; over all of it the curve "
-        f"{'goes one way' if one_way else 'turns'} and is off a straight line by {bend:.2g} % of the output.",
+        f"{'goes one way' if one_way else 'turns'} and is off a straight line by {bend:.2g} % of the output."
     )
+    return bend, one_way, words

@@ -17,27 +17,30 @@ from fits.io._typed import typed
 from fits.machining._design import TOLERANCE_MM, Design, Together, lever_mm
 
 SCHEMA = "microid.stage/1"
-_DEGREE = math.pi / 180
 # What to multiply by, or to divide by where that is exact.
 _LENGTH = {"mm": (1.0, 1.0), "um": (1.0, 1e3), "m": (1e3, 1.0)}
 _STROKE = {"um": (1.0, 1.0), "mm": (1e3, 1.0), "m": (1e6, 1.0)}
-_ANGLE = {"rad": (1.0, 1.0), "mrad": (1.0, 1e3), "deg": (_DEGREE, 1.0)}
+_ANGLE = {"rad": (1.0, 1.0), "mrad": (1.0, 1e3), "deg": (math.pi / 180, 1.0)}
 _INERTIA = {"kg mm^2": (1.0, 1.0), "kg m^2": (1e6, 1.0)}
 _MASS = {"kg": (1.0, 1.0), "g": (1.0, 1e3)}
 _MODULUS = {"GPa": (1.0, 1.0), "MPa": (1.0, 1e3)}
-_NO_UNIT: dict[str, tuple[float, float]] = {}
 _Units = Mapping[str, tuple[float, float]]
 
 # Key, units (the first is the one written), field of `microid.Actuation`, and meaning.
 _ACTUATION: tuple[tuple[str, _Units, str, str], ...] = (
     ("piezo_stiffness", {"N/um": (1.0, 1.0), "N/m": (1.0, 1e6)}, "piezo_N_per_um", "of a piezo, small signal"),
-    ("free_stroke", _STROKE, "free_stroke_um", "elongation of a piezo without a load at the highest voltage"),
+    (
+        "free_stroke",
+        {"um": (1.0, 1.0), "mm": (1e3, 1.0), "m": (1e6, 1.0)},
+        "free_stroke_um",
+        "elongation of a piezo without a load at the highest voltage",
+    ),
     ("voltage", {"V": (1.0, 1.0)}, "voltage_V", "the highest"),
     ("mass_xy", _MASS, "mass_xy_kg", "moved along x or y"),
     ("mass_z", _MASS, "mass_z_kg", "moved along z"),
     ("inertia_tilt", _INERTIA, "inertia_tilt_kg_mm2", "turned about x or y"),
     ("inertia_rotor", _INERTIA, "inertia_rotor_kg_mm2", "turned about z"),
-    ("damping_ratio", _NO_UNIT, "damping_ratio", "of all axes"),
+    ("damping_ratio", {}, "damping_ratio", "of all axes"),
 )
 
 

@@ -48,10 +48,9 @@ def check_axes(axes: Iterable[str]) -> None:
 def quick_jit(function: Callable[..., _Result]) -> Callable[..., _Result]:
     """Compile fast: a call takes microseconds however it is compiled, and compiling with optimisation seconds."""
     # Without its fusion emitters, which a user's flags may switch off, XLA compiles what is not fused wrongly.
-    emitters = {"xla_cpu_use_fusion_emitters": True}
-    quick = {"xla_backend_optimization_level": 0, "xla_disable_hlo_passes": "fusion", **emitters}
-    compiled: Callable[..., _Result] = eqx.filter_jit(function, compiler_options=quick)  # type: ignore[call-overload]
-    return compiled
+    options = {"xla_disable_hlo_passes": "fusion", "xla_cpu_use_fusion_emitters": True}
+    options |= {"xla_backend_optimization_level": 0}
+    return eqx.filter_jit(function, compiler_options=options)  # type: ignore[call-overload]
 
 
 class GainModel(eqx.Module):

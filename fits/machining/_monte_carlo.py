@@ -23,8 +23,6 @@ from microid import AXES, MOTIONS, Axis
 _CHUNK = 65536
 _QUANTILES_PCT = (0.135, 2.5, 50.0, 97.5, 99.865)
 _FEWEST_SAMPLES, _MOST_SAMPLES = 1000, 30_000_000
-# First order counts as right within this, and this many standard errors.
-_AGREE, _STANDARD_ERRORS = 0.02, 3.0
 
 
 @dataclass(frozen=True)
@@ -85,19 +83,10 @@ def second_order(
     sigma = covariance(design, names, distribution)
     bent = bends @ sigma
     tails = np.diag(bends) ** 2 * excess_fourth_moment(distribution) * tolerances(design, names) ** 4 / 4
-    return SecondOrder(
-        axis=axis,
-        unit=f"{MOTIONS[axis].unit}/um",
-        distribution=distribution,
-        voltage=voltage,
-        names=names,
-        gain=float(value),
-        gradient=slopes,
-        hessian=bends,
-        first_order_sd=float(np.sqrt(slopes @ sigma @ slopes)),
-        mean_shift=float(np.trace(bent) / 2),
-        pairs=bent * bent.T / 2 + np.diag(tails),
-    )
+    first_order_sd, mean_shift = float(np.sqrt(slopes @ sigma @ slopes)), float(np.trace(bent) / 2)
+    pairs, unit = bent * bent.T / 2 + np.diag(tails), f"{MOTIONS[axis].unit}/um"
+    at_nominal = float(value), slopes, bends
+    return SecondOrder(axis, unit, distribution, voltage, names, *at_nominal, first_order_sd, mean_shift, pairs)
 
 
 @dataclass(frozen=True)
@@ -137,7 +126,7 @@ class AxisSpread:
 
     def agrees(self, sd: float) -> bool:
         """Whether a standard deviation is within 2 % and three standard errors of that of the draws."""
-        return abs(sd - self.sd) <= _AGREE * self.sd + _STANDARD_ERRORS * self.sd_error
+        return abs(sd - self.sd) <= 0.02 * self.sd + 3 * self.sd_error
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from fits.machining._gains import (
 )
 from fits.machining._tolerances import tolerances
 
-_TEN_UM_MM = 0.01
 # So short a stroke that all motions are in proportion to it, to the last digit.
 SHORT_um = 1e-6
 
@@ -141,14 +140,10 @@ def _differentiate(
     full_um = m.loaded_um(axis, geometry, *piezo)
     strokes_um = jnp.stack([jnp.full_like(full_um, SHORT_um), full_um])
     found = jax.vmap(lambda stroke_um: m.sensitivity(axis, geometry, stroke_um, constants))(strokes_um)
-    return AxisDerivatives(
-        gain=found.piezo[0],
-        slopes={name: slope[0] / SHORT_um for name, slope in found.dimensions.items()},
-        loaded_stroke_um=full_um,
-        stroke=found.output[1],
-        slopes_at_full_stroke={name: slope[1] for name, slope in found.dimensions.items()},
-        by_voltage=m.voltage_sensitivity(axis, geometry, *piezo),
-    )
+    slopes = {name: slope[0] / SHORT_um for name, slope in found.dimensions.items()}
+    at_full_stroke = {name: slope[1] for name, slope in found.dimensions.items()}
+    by_voltage = m.voltage_sensitivity(axis, geometry, *piezo)
+    return AxisDerivatives(found.piezo[0], slopes, full_um, found.output[1], at_full_stroke, by_voltage)
 
 
 def gains_at(design: Design, axis: m.Axis, errors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -186,7 +181,7 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
     scale, unit = output_scale(axis)
     parts = changes * (design.correlation(names) @ changes)
     variance = float(parts.sum())
-    ten_um = uniform_tolerance(design.geometry, _TEN_UM_MM)
+    ten_um = uniform_tolerance(design.geometry, length_mm=0.01)
     effects = [
         DimensionEffect(
             name=name,
@@ -201,14 +196,8 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
         )
         for i, name in enumerate(names)
     ]
-    return AxisSensitivity(
-        axis=axis,
-        output_unit=unit,
-        gain=scale * gain,
-        loaded_stroke_um=float(derived.loaded_stroke_um),
-        stroke=scale * stroke,
-        dimensions=tuple(sorted(effects, key=lambda effect: -abs(effect.relative_change_pct))),
-        rss_pct=100 * math.sqrt(max(variance, 0.0)),
-        worst_case_pct=100 * float(np.abs(changes).sum()),
-        voltage_change_pct=dict(sorted(by_voltage.items(), key=lambda item: -abs(item[1]))),
-    )
+    effects.sort(key=lambda effect: -abs(effect.relative_change_pct))
+    by_voltage = dict(sorted(by_voltage.items(), key=lambda item: -abs(item[1])))
+    rss_pct, worst_case_pct = 100 * math.sqrt(max(variance, 0.0)), 100 * float(np.abs(changes).sum())
+    motion = scale * gain, float(derived.loaded_stroke_um), scale * stroke
+    return AxisSensitivity(axis, unit, *motion, tuple(effects), rss_pct, worst_case_pct, by_voltage)

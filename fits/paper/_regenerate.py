@@ -79,19 +79,16 @@ def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], 
         "fig9": _of_loops("fig9", [(loop_width_pct(um, end), errors(um, end)) for um, _, end in loops_um]),
     }
     loop, inverse = _draw_loops(identified[0], piezo, folder)
+    other_axes = {title: tracks[name] for name, title in AXIS_TITLES.items()}
     pictures = [
         ("Fig. 6: the hysteresis and its model", loop),
         *_draw_errors(idle, folder),
         ("Fig. 9: the inverse model", inverse),
         ("Fig. 10: a step by scheme", _draw_steps(steps, folder)),
         ("Fig. 11: tracking along X, Y", _draw_tracks({"X, Y": tracks["x"]}, folder / "fig11.png")),
-        (
-            "Fig. 12: tracking along and about the other axes",
-            _draw_tracks({AXIS_TITLES[name]: tracks[name] for name in AXIS_TITLES}, folder / "fig12.png"),
-        ),
+        ("Fig. 12: tracking along and about the other axes", _draw_tracks(other_axes, folder / "fig12.png")),
     ]
-    text = finite_json(paper_json(result))
-    (folder / "paper.json").write_text(f"{text}\n", encoding="utf-8")
+    (folder / "paper.json").write_text(f"{finite_json(paper_json(result))}\n", encoding="utf-8")
     page = paper_page(result, [(caption, path.name) for caption, path in pictures])
     (folder / "paper.md").write_text(page, encoding="utf-8")
     return result
@@ -102,12 +99,11 @@ _tracking_errors = eqx.filter_jit(tracking_errors)
 
 
 def _steps(run: PaperRun, noisy: PaperRun, said: dict[str, float]) -> dict[str, Measured]:
-    time_s = jnp.asarray(np.arange(len(run.reference_um)) * INTERVAL_s)
-    target_um = jnp.asarray(run.reference_um[-1])
+    time_s, way_um = jnp.asarray(np.arange(len(run.reference_um)) * INTERVAL_s), float(run.reference_um[-1])
     ours, beside = (
-        [_step_metrics(time_s, jnp.asarray(one), target_um) for one in each.displacement_um] for each in (run, noisy)
+        [_step_metrics(time_s, jnp.asarray(one), jnp.asarray(way_um)) for one in each.displacement_um]
+        for each in (run, noisy)
     )
-    way_um = float(target_um)
 
     def distance_um(name: str, values: np.ndarray) -> np.ndarray | None:
         if name == "settling_time_s":

@@ -9,11 +9,6 @@ from numpy.typing import NDArray
 from fits.sweeps._spec import Sweep, outside
 from fits.sweeps._types import DONE, FAILED, Block, Output, Rows
 
-# A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
-# Rows that go one by one are slow ones, of which few are to be lost.
-_PARTS, _LARGEST, _LARGEST_SLOW = 16, 65536, 4
-# More of one variable no codec takes at once.
-_LARGEST_BYTES = 2_000_000_000
 _REASON_LENGTH = 120
 REASON = Output("reason", "1", "why the row failed", dtype=f"U{_REASON_LENGTH}")
 
@@ -22,12 +17,15 @@ def chunk_rows(sweep: Sweep) -> int:
     """Rows of a chunk: whole blocks, as many as the memory and the codec allow."""
     block, rows = sweep.facts.block, len(sweep.plan)
     widest = max(output.bytes_per_row for output in (*sweep.facts.outputs, REASON))
-    most = max(1, min(-(-rows // block), _LARGEST_BYTES // (widest * block)))
+    # No codec takes more of one variable at once than 2 GB.
+    most = max(1, min(-(-rows // block), 2_000_000_000 // (widest * block)))
     if sweep.chunk_rows is not None:
         return min(sweep.chunk_rows, block * most)
     fit = int(sweep.memory_MB * 1e6 / (bytes_per_row(sweep) + REASON.bytes_per_row))
-    wanted = min(fit, most * block, _LARGEST if block > 1 else _LARGEST_SLOW, max(1, rows // _PARTS))
-    return block * max(1, min(wanted, rows) // block if wanted >= block else 1)
+    # A sixteenth of all rows, so that there is progress to see and little to do again, and not too large. Rows that
+    # go one by one are slow ones, of which few are to be lost.
+    wanted = min(fit, most * block, 65536 if block > 1 else 4, max(1, rows // 16))
+    return block * max(1, min(wanted, rows) // block)
 
 
 def bytes_per_row(sweep: Sweep) -> int:

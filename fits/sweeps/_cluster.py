@@ -17,10 +17,7 @@ from fits.sweeps._packages import need, versions
 from fits.sweeps._spec import Sweep, parse_sweep
 from fits.sweeps._types import Rows
 
-# Chunks that wait per thread of the workers, so that none is idle; and how often a chunk may lose its worker.
-_WAITING_PER_THREAD, _MOST_LOSSES = 2, 5
-_CONNECT_s = 20
-_MOST_LOCAL = 1024
+_MOST_LOSSES = 5
 # How long a scheduler without workers is waited for, without a word and at all; how often workers are looked for.
 _SILENT_s, _GIVE_UP_s, _LOOK_s, _PAUSE_s = 5, 600, 1.0, 0.005
 # What a worker has read stays with it.
@@ -58,7 +55,7 @@ def connected(address: str) -> Iterator[Any]:
     # What it tells of a lost scheduler is told here in a sentence.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     count = address.removeprefix("local:")
-    if count != address and (not count.isdecimal() or not 1 <= int(count) <= _MOST_LOCAL):
+    if count != address and (not count.isdecimal() or not 1 <= int(count) <= 1024):
         raise DataError(f"--cluster: expected local:N with a number of processes, found {shown(address)}; give one.")
     with ExitStack() as stack:
         try:
@@ -73,7 +70,7 @@ def connected(address: str) -> Iterator[Any]:
                     memory_limit=0,
                 )
                 where = stack.enter_context(own).scheduler_address
-            client = stack.enter_context(distributed.Client(where, timeout=_CONNECT_s, set_as_default=False))
+            client = stack.enter_context(distributed.Client(where, timeout=20, set_as_default=False))
         except (OSError, TimeoutError, ValueError) as error:
             raise DataError(
                 f"--cluster: {address} does not answer ({error}); give the address of a Dask scheduler, such as "
@@ -155,7 +152,8 @@ def _all(
     results, workers = distributed.as_completed(loop=client.loop), _Workers(client, progress)
     while waiting or futures:
         usable = workers.usable()
-        while waiting and len(futures) < _WAITING_PER_THREAD * sum(usable.values()):
+        # Two chunks wait per thread of the workers, so that none is idle.
+        while waiting and len(futures) < 2 * sum(usable.values()):
             chunk = waiting.pop()
             # Should all of them die, others may have it: those that are refused give it back.
             chosen = {"workers": [*usable], "allow_other_workers": True} if workers.banned else {}

@@ -17,9 +17,6 @@ from fits.sweeps._spec import Sweep
 from fits.sweeps._store import TABLE, Store, check_folder, opened
 from fits.sweeps._types import FAILED
 
-_EVERY_s = 1.0
-_BAR = 24
-
 
 @dataclass(frozen=True)
 class Outcome:
@@ -45,11 +42,11 @@ class _Progress:
     def __call__(self, rows: int) -> None:
         self._done, self._new = self._done + rows, self._new + rows
         now = time.monotonic()
-        if now - self._told >= _EVERY_s or self._done == self._rows:
+        if now - self._told >= 1 or self._done == self._rows:
             self._told = now
             rate = self._new / max(now - self._began, 1e-9)
             left = _duration((self._rows - self._done) / rate)
-            bar = ("#" * (_BAR * self._done // self._rows)).ljust(_BAR, ".")
+            bar = ("#" * (24 * self._done // self._rows)).ljust(24, ".")
             self._progress(f"[{bar}] {self._done:,} of {self._rows:,} rows, {rate:.3g} rows/s, {left} left")
 
 

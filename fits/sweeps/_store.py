@@ -31,11 +31,9 @@ from fits.sweeps._types import STATUS_WORDS, Output, Rows
 SCHEMA = "microid.sweep.results/1"
 ABOUT, RESULTS, LEDGER, TEXT, TABLE = "about.json", "results.zarr", "ledger", "sweep.toml", "results.parquet"
 _STATUS = Output("status", "1", "of the row: 0 pending, 1 done, 2 failed", dtype="i1")
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
-# A disk that is nearly full is full for others.
-_USABLE_SHARE = 0.9
-# What zarr calls a file before it is whole.
-_PARTIAL = "**/*.partial"
+# What the user can do something about: a full or a broken disk, permissions, and folders that are gone.
+_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+_TROUBLE |= {errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR}
 
 
 class _About(TypedDict):
@@ -134,8 +132,9 @@ class Store:
     def clear(self) -> None:
         """Delete what processes that were killed have left of files; the lock says that no other is at work."""
         left = [path for folder in (self.folder, self.folder / LEDGER) for path in folder.glob(".*")]
-        left = [path for path in left if is_temporary(path.name)] + [*(self.folder / RESULTS).glob(_PARTIAL)]
-        for path in left:
+        left = [path for path in left if is_temporary(path.name)]
+        # What zarr calls a file before it is whole.
+        for path in (*left, *(self.folder / RESULTS).glob("**/*.partial")):
             path.unlink(missing_ok=True)
 
     def write(self, chunk: int, rows: Rows) -> None:
@@ -179,18 +178,18 @@ class Store:
 
 def about_of(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Read what is known of a sweep; a `DataError` says why it cannot be read."""
-    shown, again = os.fspath(folder), "run the sweep again in another folder."
     if not (Path(folder) / ABOUT).exists():
-        raise DataError(f"{shown}: there is no sweep in this folder; give what --out named.")
+        raise DataError(f"{folder}: there is no sweep in this folder; give what --out named.")
     try:
         what = "what is known of a sweep"
         about: Any = parse_json(read_text(Path(folder) / ABOUT, what, MOST_JSON_BYTES), ABOUT, what)
         if isinstance(about, dict) and about.get("schema") == SCHEMA:
             msgspec.convert(about, _About)
             return about
+        fault = f"expected results of the format {SCHEMA}"
     except (DataError, msgspec.ValidationError) as error:
-        raise DataError(f"{shown}: {ABOUT} is broken ({error}); {again}") from None
-    raise DataError(f"{shown}: expected results of the format {SCHEMA}; {again}")
+        fault = f"{ABOUT} is broken ({error})"
+    raise DataError(f"{folder}: {fault}; run the sweep again in another folder.")
 
 
 def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
@@ -207,10 +206,10 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
     own = (RESULTS, LEDGER, TEXT, ".lock")
     if folder.exists() and any(path.name not in own and not is_temporary(path.name) for path in folder.iterdir()):
         raise DataError(f"{out}: the folder holds other files; choose another for --out.")
-    # The table holds all but the traces once more.
+    # The table holds all but the traces once more, and a disk that is nearly full is full for others.
     needed = len(sweep.plan) * 2 * bytes_per_row(sweep)
     free = shutil.disk_usage(anchor).free
-    if needed > _USABLE_SHARE * free:
+    if needed > 0.9 * free:
         raise DataError(
             f"{out}: {len(sweep.plan):,} rows would take about {needed / 1e9:.3g} GB, and the disk has "
             f"{free / 1e9:.3g} GB; keep fewer rows or no traces, or choose another disk."
@@ -280,7 +279,7 @@ def _sentences(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in _FULL | {errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR}:
+        if error.errno not in _TROUBLE:
             raise
         raise DataError(
             f"{folder}: cannot be written ({error.strerror or error}); what was done before is kept: free the disk "

@@ -36,12 +36,6 @@ _STEP = (
     Output("settling_time_s", "s", "from the step until the displacement stays within 2 %; inf if it does not"),
     Output("overshoot_pct", "%", "beyond the final value, of the way; of the target where it has not settled"),
 )
-# A loop whose error grows beyond this share of the reference's range is not a loop that anybody wants.
-_LOST_PCT = 1e4
-# References that move by less stand still.
-_STILL_um = 1e-9
-# Voltages per level at which the slope of a hysteresis is looked at.
-_FINE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +70,12 @@ class ControlJob(AbstractJob):
 
 
 def _why_not(way_um: float, radius: float, error_pct: float) -> str:
-    if not way_um > _STILL_um:
+    if not way_um > 1e-9:
         return "the reference does not move"
     if radius >= 1:
         return f"the loop is unstable where the hysteresis is steepest: modulus of its largest pole = {radius:.6g}"
-    if not error_pct < _LOST_PCT:
+    # An error of a hundred times the reference's range is not of a loop that anybody wants.
+    if not error_pct < 1e4:
         return "the loop is unstable: its error grows without end"
     return ""
 
@@ -141,7 +136,7 @@ def _radius(
 
     def one(values: Mapping[str, Float[Array, ""]]) -> Float[Array, ""]:
         changed = varied(stage, values, relative)
-        slopes = [major_loop_slope(part, _FINE) for part in changed.parts if isinstance(part, Preisach)]
+        slopes = [major_loop_slope(part, fine=8) for part in changed.parts if isinstance(part, Preisach)]
         linear, slope = controllers.at(values).linear(), slopes[0] if slopes else None
         return margins(linear, changed, delay=controllers.delay, slope_um_per_V=slope).radius
 

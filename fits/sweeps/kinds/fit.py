@@ -104,9 +104,9 @@ class FitJob(AbstractJob):
         levels = block.numbers("fit.levels", self.options.levels or _DEFAULT_LEVELS).astype(int)
         smoothness = block.numbers("fit.smoothness", self.options.smoothness)
         count, samples = len(records), self.options.samples
-        voltage, displacement = np.zeros((count, samples)), np.zeros((count, samples))
-        fitted, known = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
-        limits, extremes, used = np.tile([0.0, 1.0], (count, 1)), np.zeros((count, _PLACES)), np.ones(count, "i4")
+        voltage, displacement, fitted = np.zeros((3, count, samples))
+        known, limits = np.zeros((count, samples), dtype=bool), np.tile([0.0, 1.0], (count, 1))
+        extremes, used = np.zeros((count, _PLACES)), np.ones(count, "i4")
         reasons = [""] * count
         for k, record in enumerate(records):
             reasons[k] = record if isinstance(record, str) else self._why_not(record)
