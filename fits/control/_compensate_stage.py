@@ -120,10 +120,7 @@ def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarra
 
 
 def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.ndarray:
-    """Displacement of a hysteresis or a whole stage under a voltage, in um, shape `(n,)`.
-
-    The memory before the first sample is `negative`, `positive` or `demagnetised`.
-    """
+    """Displacement of a hysteresis or a whole stage under a voltage, in um, shape `(n,)`; see `compensate`."""
     law = model if isinstance(model, Preisach) else hysteresis_of(model)
     lower, upper = float(law.density.lower_V), float(law.density.upper_V)
     if isinstance(model, Preisach):

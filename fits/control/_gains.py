@@ -57,10 +57,7 @@ def printed_gains(controller: AbstractController, pid: PID) -> dict[str, np.ndar
 
 
 def read_gains(text: str) -> Given:
-    """Gains from the command line: three numbers, or a file as `--json` printed it, or with `gains` alone.
-
-    A `DataError` says that it is neither, or that a value is missing, unknown, negative or no number.
-    """
+    """Gains from the command line: three numbers, or a file as `--json` printed it, or with `gains` alone."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:

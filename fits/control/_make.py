@@ -49,10 +49,7 @@ def with_defaults(
 
 
 def strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float | None:
-    """Frequency of the strongest line of a reference, shape `(t,)`, by a parabola through its transform.
-
-    None for a reference that stands still.
-    """
+    """Frequency of the strongest line of a reference, shape `(t,)`; None for one that stands still."""
     n = len(reference_um)
     size = np.abs(np.fft.rfft((reference_um - reference_um.mean()) * np.hanning(n), 8 * n))
     k = int(np.clip(np.argmax(size), 1, len(size) - 2))
@@ -65,10 +62,7 @@ def strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float | None:
 
 @dataclass(frozen=True)
 class Loop:
-    """All that stays the same while controllers change: the plants, the one to be run first, and the readings.
-
-    Noise is a standard deviation, the delay a number of samples; the first `skip` samples do not count.
-    """
+    """What stays the same while controllers change: plants, noise, and `skip`, how many samples do not count."""
 
     ready: Setup
     plants: list[m.Stage]
@@ -107,10 +101,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Made:
-    """A controller that was made, and the PID controller that it is or was made around.
-
-    There is no tuning where gains were given.
-    """
+    """A controller, the PID controller that it is or was made around, and the tuning if no gains were given."""
 
     controller: m.AbstractController
     pid: m.PID

@@ -71,10 +71,7 @@ def reports(found: Figures) -> tuple[LoopReport, ...]:
 
 
 def passed_limits(goal: Goal, every: Sequence[Margins], runs: Sequence[ControlledRun]) -> dict[str, str]:
-    """Find which limits a loop is beyond, with what was expected and found, by the option of the command.
-
-    There are margins of each plant, and runs of those whose overshoot counts.
-    """
+    """Find which limits a loop is beyond in its margins by plant, or in some runs, by the option of the command."""
     gain, phase = min(float(one.gain_margin) for one in every), min(float(one.phase_margin_deg) for one in every)
     peak, overshoot = max(float(one.sensitivity_peak) for one in every), max(map(float, map(overshoot_pct, runs)))
     worst = {

@@ -29,12 +29,7 @@ _Units = Mapping[str, tuple[float, float]]
 # Key, units (the first is the one written), field of `microid.Actuation`, and meaning.
 _ACTUATION: tuple[tuple[str, _Units, str, str], ...] = (
     ("piezo_stiffness", {"N/um": (1.0, 1.0), "N/m": (1.0, 1e6)}, "piezo_N_per_um", "of a piezo, small signal"),
-    (
-        "free_stroke",
-        {"um": (1.0, 1.0), "mm": (1e3, 1.0), "m": (1e6, 1.0)},
-        "free_stroke_um",
-        "elongation of a piezo without a load at the highest voltage",
-    ),
+    ("free_stroke", _STROKE, "free_stroke_um", "elongation of a piezo without a load at the highest voltage"),
     ("voltage", {"V": (1.0, 1.0)}, "voltage_V", "the highest"),
     ("mass_xy", _MASS, "mass_xy_kg", "moved along x or y"),
     ("mass_z", _MASS, "mass_z_kg", "moved along z"),

@@ -193,10 +193,7 @@ def _find_fault(time_s: FloatArray, displacement_um: FloatArray) -> tuple[str, i
 
 
 def _correlation_samples(residual_um: FloatArray) -> float:
-    """Samples that are worth one independent one, from autocorrelation or from batch means, whichever is more.
-
-    Slow noise that hides below white noise shows in the means of 32 batches, and not in the first autocorrelations.
-    """
+    """Samples that are worth one independent one; means of batches show slow noise that hides below white noise."""
     length = len(residual_um) // _BATCHES
     means = residual_um[: _BATCHES * length].reshape(_BATCHES, length).mean(axis=1)
     square = float(residual_um @ residual_um) / len(residual_um)

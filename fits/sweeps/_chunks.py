@@ -58,10 +58,7 @@ def rows_of(sweep: Sweep, chunk: int) -> NDArray[np.int64]:
 
 
 def compute_chunk(sweep: Sweep, chunk: int, tell: Callable[[int], None] = lambda _: None) -> Rows:
-    """Compute a chunk, as many blocks at a time as there are devices, the last ones filled up with the last row.
-
-    The rows have the swept values beside the outputs, and `status`; `tell` is called with the number that is added.
-    """
+    """Compute a chunk, its last blocks filled up; `tell` is called with the number of rows that is added."""
     rows, facts = rows_of(sweep, chunk), sweep.facts
     together = facts.block * (1 if facts.alone else jax.local_device_count())
     parts = []

@@ -47,10 +47,7 @@ class _Answer:
 
 @contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """Connect to a scheduler by its address, or to N processes of this machine by `local:N`, and give its client.
-
-    A `DataError` says that there is no scheduler.
-    """
+    """Connect to a scheduler by its address, or to N processes of this machine by `local:N`, and give its client."""
     distributed = need("distributed")
     # What it tells of a lost scheduler is told here in a sentence.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)

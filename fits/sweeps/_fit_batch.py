@@ -1,7 +1,4 @@
-"""Many small loop fits at once: the regression of `fits.fit` on one grid, for all rows of a block.
-
-The smoothness is stated, not found from the data as `fits.fit` does; the noise level is found.
-"""
+"""Many small loop fits at once, as `fits.fit` does them on one grid: the smoothness is stated, the noise is found."""
 
 import equinox as eqx
 import jax
@@ -22,10 +19,7 @@ _NOISE, _ROUNDS = 1e-6, 4
 
 
 class BatchFit(eqx.Module):
-    """What a batch of fits gives, one row each: densities and slopes as in `Grid`, and the offset of the sensor.
-
-    The noise is a standard deviation; success is whether the regression met its conditions.
-    """
+    """What a batch of fits gives, one row each, as in `Grid`: the noise is a standard deviation."""
 
     columns_um: Float[Array, "n D"]
     offset_um: Float[Array, " n"]

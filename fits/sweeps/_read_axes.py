@@ -53,10 +53,7 @@ class _Design(msgspec.Struct):
 def read_plan(
     table: Mapping[str, Any], parameters: Sequence[Parameter], repeats: int, seed: int, load: Callable[[str], bytes]
 ) -> Plan:
-    """Read `[[axis]]`, `[design]` and `[list]` of a sweep, whose rows are repeated for each of so many sources.
-
-    The seed is that of random draws, and `load` gives the content of a file. A `DataError` says what is wrong.
-    """
+    """Read `[[axis]]`, `[design]` and `[list]` of a sweep, whose rows are repeated for each of so many sources."""
     known = {parameter.name: parameter for parameter in parameters}
     listed: dict[str, list[tuple[Axis, np.ndarray]]] = {}
     drawn: list[Axis] = []
@@ -113,31 +110,32 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
             f"{place}.parameter: {parameter.name} is an array, varied relative to itself; add relative = true."
         )
     factor = _factor(table.unit, "1" if relative else parameter.unit, f"{place}.unit", name)
-    found = _values(entry, table, place, factor, parameter)
-    check_plain(parameter, found if isinstance(found, np.ndarray) else None, relative, place)
+    way, values = _values(entry, table, place, factor, parameter)
+    check_plain(parameter, values if way == "listed" else None, relative, place)
     if relative and math.isfinite(parameter.nominal):
         # Factors of single numbers become values at once; only those of arrays stay factors.
-        if parameter.nominal == 0:
-            raise DataError(f"{place}.relative: {parameter.name} is 0, which no factor changes; give values.")
         relative, nominal = False, parameter.nominal
-        found = found * nominal if isinstance(found, np.ndarray) else _scaled(*found, nominal)
-    lower, upper = parameter.lower, parameter.upper
-    if isinstance(found, np.ndarray):
-        axis, values, outside = Axis(name, relative), found, bool(np.all((found < lower) | (found > upper)))
-    else:
-        axis, values = Axis(name, relative, *found), None
-        outside = found[0] != "normal" and (min(found[1:]) > upper or max(found[1:]) < lower)
+        if nominal == 0:
+            raise DataError(f"{place}.relative: {parameter.name} is 0, which no factor changes; give values.")
+        if nominal < 0 and way == "log":
+            raise DataError(f"axis.relative: a logarithmic axis needs a positive parameter, found {nominal:g}.")
+        values = values * (np.array([nominal, abs(nominal)]) if way == "normal" else nominal)
+        values = np.sort(values) if way in ("uniform", "log") else values
+    below, above = values < parameter.lower, values > parameter.upper
+    outside = np.all(below | above) if way == "listed" else way != "normal" and (np.all(below) or np.all(above))
     if outside and not relative:
         raise DataError(
             f"{place}: all values lie outside the bounds of {name}, {parameter.range_words}; correct them."
         )
-    return axis, values
+    if way == "listed":
+        return Axis(name, relative), values
+    return Axis(name, relative, way, *values.tolist()), None
 
 
 def _values(
     entry: Mapping[str, Any], table: _Axis, place: str, factor: float, parameter: Parameter
-) -> np.ndarray | tuple[str, float, float]:
-    """Values of a list or grid, or the distribution to draw from with its two numbers."""
+) -> tuple[str, np.ndarray]:
+    """Values that are `listed`, also by a grid, or the distribution to draw from with its two numbers."""
     ways = [way for way in ("values", "low", "mean") if way in entry]
     if len(ways) != 1:
         raise DataError(
@@ -161,36 +159,27 @@ def _values(
         if not values:
             raise DataError(f"{place}.values: the axis is empty; give at least one value.")
         if parameter.words:
-            return np.array([code_of(value, parameter, f"{place}.values") for value in values])
-        return factor * np.array([number(value, f"{place}.values") for value in values])
+            return "listed", np.array([code_of(value, parameter, f"{place}.values") for value in values])
+        return "listed", factor * np.array([number(value, f"{place}.values") for value in values])
     keys = ("mean", "sd") if ways[0] == "mean" else ("low", "high")
-    low, high = (number(entry.get(key), f"{place}.{key}") * factor for key in keys)
+    low, high = both = np.array([number(entry.get(key), f"{place}.{key}") * factor for key in keys])
     if ways[0] == "mean":
         if not high > 0:
             raise DataError(f"{place}.sd: expected a standard deviation above 0, found {high:g}; correct it.")
-        return "normal", low, high
+        return "normal", both
     log, count = table.spacing == "log", table.count
     if not low <= high or (log and not low > 0):
         above = " above 0" if log else ""
         raise DataError(f"{place}: expected low{above} and no higher than high, found {low:g} and {high:g}.")
     if count is None:
-        return ("log" if log else "uniform"), low, high
+        return "log" if log else "uniform", both
     if count < 1:
         raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {shown(count)}.")
     if count > _LONGEST:
         raise DataError(
             f"{place}.count: expected up to {_LONGEST:,} values, found more; leave out count and add [design]."
         )
-    return np.geomspace(low, high, count) if log else np.linspace(low, high, count)
-
-
-def _scaled(distribution: str, first: float, second: float, nominal: float) -> tuple[str, float, float]:
-    if distribution == "normal":
-        return distribution, first * nominal, second * abs(nominal)
-    if nominal < 0 and distribution == "log":
-        raise DataError(f"axis.relative: a logarithmic axis needs a positive parameter, found {nominal:g}.")
-    ends = sorted((first * nominal, second * nominal))
-    return distribution, ends[0], ends[1]
+    return "listed", np.geomspace(low, high, count) if log else np.linspace(low, high, count)
 
 
 def _factor(unit: str | None, wanted: str, place: str, name: str) -> float:

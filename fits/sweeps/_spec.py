@@ -35,10 +35,7 @@ class _Run(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that can run: its TOML and where that is from, the files it names, its rows and what is done with each.
-
-    `memory_MB` is what a chunk may take, `chunk_rows` its rows if they are stated; sources are in `folder`.
-    """
+    """A sweep that can run: its TOML and its place, the files it names, its rows and what is done with each."""
 
     text: str
     name: str
@@ -54,10 +51,7 @@ class Sweep:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the text, all files, and the names and contents of all sources: what the rows depend on.
-
-        It is made anew each time, as sources may have changed; one that cannot be read counts as such.
-        """
+        """SHA-256 of the text, all files, and the names and contents of all sources as they are now."""
         parts = [self.text.encode()]
         for source in self.facts.sources:
             parts += [source.encode(), _sum_of((self.folder or Path()) / source).encode()]

@@ -218,11 +218,7 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
 
 @contextmanager
 def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
-    """Open the folder of a sweep, new or to go on with, and keep other processes out of it.
-
-    A `DataError` says that it cannot be written to, holds another sweep or one that was begun with other versions, or
-    that the results would not fit on the disk.
-    """
+    """Open the folder of a sweep, new or to go on with, and keep others out; refusals are those of `check_folder`."""
     check_folder(sweep, out, resume)
     folder = Path(os.path.realpath(out))
     begun = (folder / ABOUT).exists()

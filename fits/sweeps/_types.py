@@ -76,11 +76,7 @@ def check_plain(parameter: Parameter, values: FloatArray | None, relative: bool,
 
 @dataclass(frozen=True)
 class Output:
-    """One number, text or trace per row, whose name ends in its unit.
-
-    It may have axes beside that of the rows, by name and length, and is `"f8"`, `"i4"`, or a text of fixed width such
-    as `"U80"`.
-    """
+    """One number, text (such as `'U80'`) or trace per row, named with its unit; `dims` are axes beside the rows."""
 
     name: str
     unit: str
@@ -170,10 +166,7 @@ class Request:
 
 
 class AbstractJob(abc.ABC):
-    """What is done with each row. Rows go through in blocks of one size, the last one filled up.
-
-    With several local devices as many blocks go through at once, one on each device.
-    """
+    """What is done with each row. Rows go through in blocks of one size, one on each local device at once."""
 
     @property
     @abc.abstractmethod

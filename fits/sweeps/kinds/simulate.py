@@ -41,10 +41,7 @@ class _Options(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class SimulateJob(AbstractJob):
-    """Simulations of a stage under a voltage, from a memory before each row.
-
-    Figures count from `from_s` on; traces are kept at every so many samples, not at all if that is 0.
-    """
+    """Simulations of a stage under a voltage; traces are kept at every so many samples, not at all if that is 0."""
 
     stage: Stage
     program: Program
