@@ -150,11 +150,19 @@ class Maker:
         def place(setting: str) -> str:
             return "--frequency" if setting == "frequency_Hz" else f"--controller {name}: {setting}"
 
-        numbers, more = with_defaults(own_settings(kind), {"seed": self.seed} | own, self._task(), place)
+        ready, stage = loop.ready, loop.plants[0]
+        task = m.ControlTask(
+            stage,
+            ready.interval_s,
+            lambda: ready.reference_um,
+            lambda: ready.static_V,
+            lambda: steepest_slope(stage),
+            lambda: strongest_Hz(ready.reference_um, ready.interval_s),
+        )
+        numbers, more = with_defaults(own_settings(kind), {"seed": self.seed} | own, task, place)
         remarks += [*said, *more]
         if "frequency_Hz" in numbers:
             self._check_frequencies(np.atleast_1d(numbers["frequency_Hz"]))
-        stage = loop.plants[0]
         try:
             made = kind.of(pid, numbers, m.ControlledPlant(stage, slope_array(stage), loop.delay))
         except ValueError as error:
@@ -163,17 +171,6 @@ class Maker:
             return Made(replaced(made, own), pid, tuning, remarks)
         tuning = self._tuned(self._with_margin(made))
         return Made(tuning.controller, pid, tuning, [*remarks, *(x for x in tuning.remarks if x not in remarks)])
-
-    def _task(self) -> m.ControlTask:
-        ready, stage = self.loop.ready, self.loop.plants[0]
-        return m.ControlTask(
-            stage,
-            ready.interval_s,
-            lambda: ready.reference_um,
-            lambda: ready.static_V,
-            lambda: steepest_slope(stage),
-            lambda: strongest_Hz(ready.reference_um, ready.interval_s),
-        )
 
     def _tuned(self, controller: Any) -> Tuning[Any]:
         ready = self.loop.ready

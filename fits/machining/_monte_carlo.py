@@ -165,36 +165,16 @@ def monte_carlo(
     if not _FEWEST_SAMPLES <= samples <= _MOST_SAMPLES:
         raise DataError(f"between {_FEWEST_SAMPLES:,} and {_MOST_SAMPLES:,} samples are needed, got {samples:,}")
     different = tuple(dict.fromkeys(twin(axis) for axis in axes))
-    gains = _gains_of_draws(design, different, samples, distribution, seed, voltage, progress)
-    progress("summing up")
-    gains_of = dict(zip(different, gains, strict=True))
-    spreads = once_per_function(axes, lambda axis: _spread(gains_of[twin(axis)], design, axis, distribution, voltage))
-    for axis, spread in spreads.items():
-        if spread.flagged:
-            spreads[axis] = replace(spread, second=second_order(design, axis, distribution, voltage=voltage))
-    return MonteCarlo(spreads, samples, distribution, seed, voltage)
-
-
-def _gains_of_draws(
-    design: Design,
-    axes: tuple[Axis, ...],
-    samples: int,
-    distribution: Distribution,
-    seed: int,
-    voltage: bool,
-    progress: Callable[[str], None],
-) -> np.ndarray:
-    """Gains of the axes, shape `(axes, samples)`."""
-    names = tuple(dict.fromkeys(name for axis in axes for name in inputs_of(axis, voltage)))
+    names = tuple(dict.fromkeys(name for axis in different for name in inputs_of(axis, voltage)))
     model, scale = gain_model(design, voltage), tolerances(design, names)[:, None]
     root = copula_root(design, names, distribution)
     rng = np.random.Generator(np.random.SFC64(seed))
-    gains, coming = np.empty((len(axes), samples)), None
+    gains, coming = np.empty((len(different), samples)), None
     for begin in range(0, samples, _CHUNK):
         standard = rng.standard_normal((len(names), _CHUNK))
         errors = scale * from_normal(root @ standard if design.together else standard, distribution)
         # Computed while the next are drawn.
-        before, coming = coming, gains_of_many(model, errors, axes, names)
+        before, coming = coming, gains_of_many(model, errors, different, names)
         if begin:
             gains[:, begin - _CHUNK : begin] = before
         if begin * 10 // samples != (begin + _CHUNK) * 10 // samples:
@@ -202,7 +182,13 @@ def _gains_of_draws(
     gains[:, begin:] = np.asarray(coming)[:, : samples - begin]
     if not np.isfinite(gains).all():
         raise DataError("some of the stages drawn cannot be built: lower the tolerances")
-    return gains
+    progress("summing up")
+    gains_of = dict(zip(different, gains, strict=True))
+    spreads = once_per_function(axes, lambda axis: _spread(gains_of[twin(axis)], design, axis, distribution, voltage))
+    for axis, spread in spreads.items():
+        if spread.flagged:
+            spreads[axis] = replace(spread, second=second_order(design, axis, distribution, voltage=voltage))
+    return MonteCarlo(spreads, samples, distribution, seed, voltage)
 
 
 def _spread(values: np.ndarray, design: Design, axis: Axis, distribution: Distribution, voltage: bool) -> AxisSpread:

@@ -92,18 +92,15 @@ class Drawn:
         if self.method == "latin_hypercube":
             chance[:] = _hypercube(len(self.axes), self.rows, self.seed)[place]
         else:
-            for piece in np.unique(place // _PIECE):
+            for piece in np.unique(place // _PIECE).tolist():
+                if self.method == "random":
+                    drawn = np.random.default_rng([self.seed, piece]).random((_PIECE, len(self.axes)))
+                else:
+                    sampler = qmc.Sobol(len(self.axes), scramble=True, rng=np.random.default_rng(self.seed))
+                    drawn = (sampler.fast_forward(piece * _PIECE) if piece else sampler).random(_PIECE)
                 here = place // _PIECE == piece
-                chance[here] = self._piece(int(piece))[place[here] - piece * _PIECE]
+                chance[here] = drawn[place[here] - piece * _PIECE]
         return np.stack([axis.quantile(chance[:, k]) for k, axis in enumerate(self.axes)])
-
-    def _piece(self, piece: int) -> FloatArray:
-        if self.method == "random":
-            return np.random.default_rng([self.seed, piece]).random((_PIECE, len(self.axes)))
-        sampler = qmc.Sobol(len(self.axes), scramble=True, rng=np.random.default_rng(self.seed))
-        if piece:
-            sampler.fast_forward(piece * _PIECE)
-        return np.asarray(sampler.random(_PIECE))
 
 
 @lru_cache(maxsize=1)

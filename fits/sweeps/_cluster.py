@@ -85,8 +85,43 @@ def on_cluster(
     lost, has no workers, or none with the versions of this process.
     """
     distributed = need("distributed")
+    payload = _Payload(
+        sweep.text, sweep.name, sweep.inputs, str(Path(sweep.name).resolve().parent), sweep.digest, versions()
+    )
     try:
-        yield from _all(distributed, client, sweep, chunks, progress)
+        waiting, losses = list(reversed(chunks)), Counter[int]()
+        futures: dict[Any, int] = {}
+        results, workers = distributed.as_completed(loop=client.loop), _Workers(client, progress)
+        while waiting or futures:
+            usable = workers.usable()
+            # Two chunks wait per thread of the workers, so that none is idle.
+            while waiting and len(futures) < 2 * sum(usable.values()):
+                chunk = waiting.pop()
+                # Should all of them die, others may have it: those that are refused give it back.
+                chosen = {"workers": [*usable], "allow_other_workers": True} if workers.banned else {}
+                future = client.submit(work, payload, chunk, pure=False, retries=0, **chosen)
+                futures[future] = chunk
+                results.add(future)
+            asked = time.monotonic()
+            while not (ready := results.next_batch(block=False)) and time.monotonic() - asked < _LOOK_s:
+                time.sleep(_PAUSE_s)
+            for future in ready:
+                chunk = futures.pop(future)
+                try:
+                    answer: _Answer = future.result()
+                except (distributed.KilledWorker, ImportError) as error:
+                    losses[chunk] += 1
+                    if losses[chunk] > _MOST_LOSSES:
+                        raise DataError(_often(chunk, error)) from None
+                    waiting.append(chunk)
+                    continue
+                finally:
+                    future.release()
+                if answer.rows is None:
+                    workers.ban(answer.worker, answer.refused)
+                    waiting.append(chunk)
+                    continue
+                yield chunk, answer.rows
     except (OSError, distributed.client.FuturesCancelledError, distributed.CancelledError) as error:
         raise DataError(
             f"--cluster: the scheduler was lost ({type(error).__name__}); what was computed is kept: start it again, "
@@ -136,47 +171,6 @@ class _Workers:
         if address not in self.banned:
             self.banned[address] = reason
             self._progress(f"refused: {reason}")
-
-
-def _all(
-    distributed: Any, client: Any, sweep: Sweep, chunks: list[int], progress: Callable[[str], None]
-) -> Iterator[tuple[int, Rows]]:
-    payload = _Payload(
-        sweep.text, sweep.name, sweep.inputs, str(Path(sweep.name).resolve().parent), sweep.digest, versions()
-    )
-    waiting, losses = list(reversed(chunks)), Counter[int]()
-    futures: dict[Any, int] = {}
-    results, workers = distributed.as_completed(loop=client.loop), _Workers(client, progress)
-    while waiting or futures:
-        usable = workers.usable()
-        # Two chunks wait per thread of the workers, so that none is idle.
-        while waiting and len(futures) < 2 * sum(usable.values()):
-            chunk = waiting.pop()
-            # Should all of them die, others may have it: those that are refused give it back.
-            chosen = {"workers": [*usable], "allow_other_workers": True} if workers.banned else {}
-            future = client.submit(work, payload, chunk, pure=False, retries=0, **chosen)
-            futures[future] = chunk
-            results.add(future)
-        asked = time.monotonic()
-        while not (ready := results.next_batch(block=False)) and time.monotonic() - asked < _LOOK_s:
-            time.sleep(_PAUSE_s)
-        for future in ready:
-            chunk = futures.pop(future)
-            try:
-                answer: _Answer = future.result()
-            except (distributed.KilledWorker, ImportError) as error:
-                losses[chunk] += 1
-                if losses[chunk] > _MOST_LOSSES:
-                    raise DataError(_often(chunk, error)) from None
-                waiting.append(chunk)
-                continue
-            finally:
-                future.release()
-            if answer.rows is None:
-                workers.ban(answer.worker, answer.refused)
-                waiting.append(chunk)
-                continue
-            yield chunk, answer.rows
 
 
 def _often(chunk: int, error: Exception) -> str:

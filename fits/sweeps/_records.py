@@ -1,9 +1,10 @@
 """The records that a sweep fits or diagnoses: files that a pattern finds, or simulations with noise."""
 
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +17,12 @@ from fits.io._read_csv import read_csv
 from fits.io._record import Record
 from fits.io._typed import typed
 from fits.io._units import parse_columns
+from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES
 from fits.sweeps._devices import place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
-from fits.sweeps._types import Block, Parameter, Request
+from fits.sweeps._types import Block, Output, Parameter, Request, Rows
 from microid import Stage
 
 _NOISE = "records.noise_um"
@@ -118,6 +120,19 @@ def requested_records(request: Request) -> Files | Simulated:
     if not names:
         raise DataError(f"records.files: the axis is empty: no file matches {pattern}; correct the pattern.")
     return Files(request.folder, names, parse_columns(table.columns))
+
+
+def each_alone(
+    outputs: Sequence[Output], records: Sequence[Record | str], find: Callable[..., dict[str, Any]], *options: Any
+) -> Rows:
+    """Rows of what is found in one record after the other, each with its options, or why nothing is."""
+    found: list[dict[str, Any] | str] = []
+    for record, *own in zip(records, *options, strict=True):
+        try:
+            found.append(record if isinstance(record, str) else find(record, *own))
+        except (DataError, FitError) as error:
+            found.append(" ".join(str(error).split()))
+    return Rows.one_by_one(outputs, found)
 
 
 def assumed_initial(request: Request, records: Files | Simulated) -> str:

@@ -17,12 +17,11 @@ from fits.io._typed import typed
 from fits.loop._design import branch_table
 from fits.loop._fit import fit
 from fits.loop._prior import roughness
-from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES, initial_state, known_samples
 from fits.stats._metrics import errors
 from fits.sweeps._devices import in_turn, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch
-from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
+from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, each_alone, requested_records
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
 from microid import Staircase, node_areas
 
@@ -97,8 +96,7 @@ class FitJob(AbstractJob):
             return self._together(block, records, holdout, initial)
         swept = block.values.get("fit.levels")
         numbers = [self.options.levels] * len(records) if swept is None else swept.astype(int).tolist()
-        found = [_alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
-        return Rows.one_by_one(self.facts.outputs, found)
+        return each_alone(self.facts.outputs, records, _alone, numbers, holdout.tolist(), initial)
 
     def _together(self, block: Block, records: list[Record | str], holdout: FloatArray, initial: list[str]) -> Rows:
         levels = block.numbers("fit.levels", self.options.levels or _DEFAULT_LEVELS).astype(int)
@@ -146,16 +144,9 @@ class FitJob(AbstractJob):
         return ""
 
 
-def _alone(record: Record | str, levels: int | None, holdout: float, initial: str) -> dict[str, Any] | str:
-    """What comes of the fit of one record, or why there is none."""
-    if isinstance(record, str):
-        return record
-    try:
-        result = fit([record], levels=levels, holdout=holdout, initial=initial)
-    except (DataError, FitError) as error:
-        return " ".join(str(error).split())
-    run = result.runs[0]
-    weights = np.asarray(result.weights_um)
+def _alone(record: Record, levels: int | None, holdout: float, initial: str) -> dict[str, Any]:
+    result = fit([record], levels=levels, holdout=holdout, initial=initial)
+    run, weights = result.runs[0], np.asarray(result.weights_um)
     found: dict[str, Any] = {
         "offset_um": run.offset_um,
         "noise_um": result.noise_um,
