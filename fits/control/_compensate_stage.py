@@ -40,10 +40,7 @@ def hysteresis_of(stage: Stage) -> Preisach:
 
 
 def gains_of(stage: Stage) -> tuple[float, float, float]:
-    """Static gains of a stage: piezo voltage per command, and measured displacement per displacement of the piezo.
-
-    They must be positive. Third is the measured displacement in um where the piezo's is zero.
-    """
+    """Static gains of a stage ahead of its hysteresis and behind it, and the reading where the piezo's is zero."""
     law = stage.parts.index(hysteresis_of(stage))
     ahead, behind, offset = 1.0, 1.0, 0.0
     for k, part in enumerate(stage.parts):

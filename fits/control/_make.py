@@ -26,11 +26,7 @@ def own_settings(controller: type[m.AbstractController]) -> list[m.Setting]:
 def with_defaults(
     settings: Collection[m.Setting], stated: Mapping[str, Any], task: m.ControlTask, place: Callable[[str], str]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Settings as they are stated, or else their defaults, and what is to be said of these.
-
-    Settings that the controller itself finds by its plant are left out. `place` names a setting as the user does, in
-    the sentence of the `DataError` that is raised where no default is found.
-    """
+    """Settings as stated, or else their defaults, with what is to be said of these; `place` names one to the user."""
     found = {setting.name: stated[setting.name] for setting in settings if setting.name in stated}
     said = []
     for setting in settings:
@@ -121,11 +117,7 @@ class Maker:
     progress: Callable[[str], None]
 
     def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
-        """Make a controller by the name of its kind, and tune it if no gains are given.
-
-        Frequencies are those of resonators; without them those of the gains, or the strongest in the reference. A
-        `DataError` says that reference or gains do not suit the controller; of a `FitError` see `tune_controller`.
-        """
+        """Make a controller by its kind, tuned if no gains are given; frequencies are those of resonators."""
         loop, kind = self.loop, m.CONTROLLERS[name]
         tuning: Tuning[Any] | None = None
         if given is None:

@@ -16,10 +16,7 @@ from microid import PID, PrandtlIshlinskii, Preisach, Stage, loop_gain, margins
 
 @dataclass(frozen=True)
 class UltimatePoint:
-    """Where a loop under a proportional controller oscillates for ever; about where one with a relay does.
-
-    The gain is that of the controller, and the period that of the oscillation.
-    """
+    """The gain of a proportional controller with which a loop oscillates for ever, and the period of that."""
 
     gain_V_per_um: float
     period_s: float

@@ -1,9 +1,8 @@
 """The error budget: driving, machining and measuring error of each axis, and their total (Eq. 1)."""
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import jax.numpy as jnp
@@ -192,7 +191,7 @@ def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | 
     # The load takes a fixed part of any free elongation.
     loaded_um = derivatives_of(design, axis).loaded_stroke_um
     free_um = driving.stroke_um * float(design.actuation.free_stroke_um / loaded_um)
-    actuation = dataclasses.replace(design.actuation, free_stroke_um=jnp.asarray(free_um))
+    actuation = replace(design.actuation, free_stroke_um=jnp.asarray(free_um))
     derived = derivatives_of(design, axis, actuation)
     stroke = scale * float(derived.stroke)
     slope = scale * float(derived.by_voltage.piezo) * free_um / driving.stroke_um

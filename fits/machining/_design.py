@@ -1,10 +1,9 @@
 """A stage as it is designed: dimensions with their tolerances, material, piezos and moving masses."""
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +52,7 @@ class Design:
     level: int = 1
     guides: float = 4.0
     youngs_modulus_GPa: float = 206.0
-    actuation: m.Actuation = dataclasses.field(default_factory=m.Actuation)
+    actuation: m.Actuation = field(default_factory=m.Actuation)
     together: tuple[Together, ...] = ()
 
     def __post_init__(self) -> None:
@@ -67,7 +66,7 @@ class Design:
 
     def with_tolerance(self, length_mm: float) -> "Design":
         """Give every length this tolerance, and every angle what an error of that size makes of it at its leg."""
-        return dataclasses.replace(self, tolerance=uniform_tolerance(self.geometry, length_mm))
+        return replace(self, tolerance=uniform_tolerance(self.geometry, length_mm))
 
     def correlation(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Correlation of the errors of some dimensions, shape `(n, n)`."""

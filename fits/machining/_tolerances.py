@@ -22,11 +22,7 @@ _NODES = 80
 
 
 def check(design: Design, axes: tuple[Axis, ...], distribution: str) -> None:
-    """Refuse, in a `DataError`, what cannot be drawn; float64 must be on.
-
-    These are an axis or a distribution that is unknown, an axis without tolerances, and draws that reach a dimension
-    of zero.
-    """
+    """Refuse unknown axes and distributions, no tolerances at all, and draws that reach a dimension of zero."""
     require_float64("tolerances")
     if distribution not in _MOMENTS:
         raise DataError(f"there is no distribution {distribution!r}: choose one of {', '.join(_MOMENTS)}")

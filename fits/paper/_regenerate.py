@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import data_synth
+from fits.control._compensate_stage import simulate_model
 from fits.io._atomic import finite_json
 from fits.io._record import Reference
 from fits.machining._design import paper_design
@@ -148,7 +149,8 @@ def _of_loops(figure: str, found: list[tuple[float | None, Any]]) -> dict[str, M
 def _draw_loops(one: Identified, piezo: data_synth.PaperPiezo, folder: Path) -> tuple[Path, Path]:
     voltage_V, measured_um = one.record.voltage_V, one.record.displacement_um
     assert measured_um is not None
-    fitted = plot_loop(voltage_V, measured_um, one.model_um(), folder / "fig6.png")
+    fitted_um = simulate_model(one.fit.model, one.record, "negative")
+    fitted = plot_loop(voltage_V, measured_um, fitted_um, folder / "fig6.png")
     # Up to the end of the second full loop.
     end = 1 + int(np.flatnonzero(voltage_V == voltage_V.min())[2])
     return fitted, plot_inverse(voltage_V[:end], measured_um[:end], *compensated(one, piezo), folder / "fig9.png")

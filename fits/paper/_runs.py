@@ -14,7 +14,6 @@ import numpy as np
 import data_synth
 from data_synth import PaperBench
 from fits.control._compensate import compensate
-from fits.control._compensate_stage import simulate_model
 from fits.io._atomic import write_csv
 from fits.io._read_csv import read_csv
 from fits.io._record import Record, Reference
@@ -76,11 +75,7 @@ def run_feedback(
     feedforward_V: np.ndarray,
     shown_um: np.ndarray | None = None,
 ) -> PaperRun:
-    """Run closed loops on benches side by side; the controllers come from `stacked`.
-
-    The reference has shape `(n,)`; feedforward, and the reference as the controllers are shown it if that differs,
-    have shape `(benches, n)`.
-    """
+    """Run closed loops with `stacked` controllers side by side; what leads and what is shown are `(benches, n)`."""
     shown = np.broadcast_to(reference_um, feedforward_V.shape) if shown_um is None else shown_um
     states, form = jax.tree.flatten(eqx.filter_jit(eqx.filter_vmap(lambda one: one.init()))(controllers))
     held, kind = jax.tree.flatten(controllers)
@@ -106,10 +101,6 @@ class Identified:
     rest_um: float
     # The straight line of the open loop: stroke over range.
     slope_um_per_V: float
-
-    def model_um(self) -> np.ndarray:
-        """What the fit says of the record, shape `(n,)`."""
-        return simulate_model(self.fit.model, self.record, "negative")
 
     def feedforward_V(self, axis: data_synth.PaperAxis, reference_um: np.ndarray) -> np.ndarray:
         """Voltage of the inverse hysteresis at the nominal amplification, shape `(n,)` as the reference has."""

@@ -62,10 +62,7 @@ class Listed:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Axes that are drawn together: at random, in a Latin hypercube or as a Sobol sequence, one of `SAMPLERS`.
-
-    A `DataError` refuses a design that is larger than its method can be.
-    """
+    """Axes that are drawn together by one of `SAMPLERS`; a `DataError` refuses a design that is too large for it."""
 
     axes: tuple[Axis, ...]
     method: str

@@ -50,11 +50,7 @@ class _Times(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Program:
-    """A signal over evenly spaced times, of one of `SHAPES`; one that decays is a sine that ends at nothing.
-
-    The table is `program`, in V, or `reference`, in um. Nominal values have their names without it; a file gives the
-    signal, shape `(samples,)`.
-    """
+    """A signal over even times, of one of `SHAPES` or of a file; `nominal` values are by name within its table."""
 
     table: str
     unit: str

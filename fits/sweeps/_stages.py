@@ -63,10 +63,7 @@ def stage_parameters(stage: m.Stage) -> tuple[Parameter, ...]:
 
 
 def varied(stage: m.Stage, values: Mapping[str, Float[Array, "..."]], relative: Sequence[str]) -> m.Stage:
-    """Return a stage with other values of some parameters; those that are relative are multiplied by theirs.
-
-    Values may have rows, if all arrays of the stage have an axis for them in front.
-    """
+    """Return a stage, perhaps of rows, with other values of some parameters; relative ones are factors."""
     names = {info.path: stage.named(info.path) for info in m.parameter_table(stage)}
 
     def changed(path: Any, leaf: Any) -> Any:

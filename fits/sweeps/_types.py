@@ -155,10 +155,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Request:
-    """What a job is made from: the sweep as TOML gives it, and what gives the content of a file by its name in it.
-
-    Patterns of file names start in the folder; it is None where there are none.
-    """
+    """What a job is made from: the sweep as TOML gives it, what gives a file's content by its name, and a folder."""
 
     table: Mapping[str, Any]
     load: Callable[[str], bytes]
