@@ -104,8 +104,7 @@ def control(given: Given) -> None:
     from fits.control._gains import read_gains
     from fits.control._make import Loop, Maker
     from fits.control._setup import held, setup
-    from fits.control._tune_problem import Goal
-    from fits.control._tune_result import passed_limits
+    from fits.control._tune_problem import Goal, passed_limits
     from fits.io._atomic import finite_json, write_csv
     from fits.io._jax_setup import start_jax
     from fits.io._limits import check_command, joined, reached_in

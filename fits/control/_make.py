@@ -12,8 +12,7 @@ import microid as m
 from fits.control._gains import PID_SETTINGS, Given, replaced
 from fits.control._setup import Setup
 from fits.control._tune import parameter_values, tune_controller
-from fits.control._tune_problem import Goal
-from fits.control._tune_result import Tuning
+from fits.control._tune_problem import Goal, Tuning
 from fits.control._tune_start import relay_start, slope_array, steepest_slope
 from fits.io._errors import DataError
 

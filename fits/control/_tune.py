@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fits.control._tune_problem import REACH, Figures, Goal, Problem, descend, judge
-from fits.control._tune_result import Tuning, reports
+from fits.control._tune_problem import REACH, Figures, Goal, Problem, Tuning, descend, judge, reports
 from fits.control._tune_start import steepest_slope
 from fits.io._errors import DataError
 from fits.loop._result import FitError, FitStatus

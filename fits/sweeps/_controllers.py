@@ -19,7 +19,7 @@ from fits.io._record import Reference
 from fits.io._typed import nearest
 from fits.sweeps._programs import Program
 from fits.sweeps._stages import memory_before, range_of
-from fits.sweeps._types import FloatArray, Parameter, check_plain, number
+from fits.sweeps._types import FloatArray, Parameter, check_plain, number, one_of
 
 _LIMITS = (m.Setting("lower_V", "V", varies=False), m.Setting("upper_V", "V", varies=False))
 
@@ -64,12 +64,7 @@ def _parameter(setting: m.Setting, nominal: float, interval_s: float) -> Paramet
 
 def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, reference: Program) -> Controllers:
     """Read the table `[controller]` of a sweep, for the nominal stage, its memory, and what it is to follow."""
-    name = given.get("kind", "pid")
-    if not isinstance(name, str) or name not in m.CONTROLLERS:
-        raise DataError(
-            f"controller.kind: expected one of {', '.join(m.CONTROLLERS)}, found {shown(name)}; "
-            f"{nearest(str(name), [*m.CONTROLLERS])}"
-        )
+    name = one_of(m.CONTROLLERS, given.get("kind", "pid"), "controller.kind")
     kind = m.CONTROLLERS[name]
     settings = {setting.name: setting for setting in (*m.settings_of(kind), *_LIMITS)}
     known = (*settings, "kind", "delay_samples")

@@ -20,7 +20,7 @@ from fits.io._table import open_table
 from fits.io._typed import check_keys, typed
 from fits.io._units import recognise
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._types import Block, FloatArray, Parameter, in_a_file, number
+from fits.sweeps._types import Block, FloatArray, Parameter, in_a_file, number, one_of
 
 # Parameters of each shape beside offset and amplitude, with their defaults.
 _WAVE = {"frequency_Hz": 10.0, "phase_rad": 0.0}
@@ -104,9 +104,7 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
     """Read the table `[program]` or `[reference]` of a sweep; a `DataError` says what is wrong with it."""
     if not isinstance(table, dict):
         raise DataError(f"{name}: expected a table, found {shown(table)}; write [{name}] and its keys below.")
-    shape = table.get("shape", "file" if "file" in table else None)
-    if not isinstance(shape, str) or shape not in SHAPES:
-        raise DataError(f"{name}.shape: expected one of {', '.join(SHAPES)}, found {shown(shape)}; choose one.")
+    shape = one_of(SHAPES, table.get("shape", "file" if "file" in table else None), f"{name}.shape", "choose one.")
     nominal = {f"offset_{unit}": 0.0, "gain": 1.0}
     if shape != "file":
         nominal = {f"offset_{unit}": 0.0, f"amplitude_{unit}": 1.0} | SHAPES[shape]

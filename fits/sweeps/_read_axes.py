@@ -14,7 +14,7 @@ from msgspec import Meta
 from fits.io._errors import DataError, shown
 from fits.io._typed import typed
 from fits.sweeps._axes import SAMPLERS, Axis, Drawn, Listed, Plan
-from fits.sweeps._types import Parameter, check_plain, code_of, number
+from fits.sweeps._types import Parameter, check_plain, number, one_of
 
 _PREFIXES = {"k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
 _BASES = ("s", "V", "m", "Hz", "Pa", "rad")
@@ -159,7 +159,8 @@ def _values(
         if not values:
             raise DataError(f"{place}.values: the axis is empty; give at least one value.")
         if parameter.words:
-            return "listed", np.array([code_of(value, parameter, f"{place}.values") for value in values])
+            words = parameter.words
+            return "listed", np.array([float(words.index(one_of(words, x, f"{place}.values"))) for x in values])
         return "listed", factor * np.array([number(value, f"{place}.values") for value in values])
     keys = ("mean", "sd") if ways[0] == "mean" else ("low", "high")
     low, high = both = np.array([number(entry.get(key), f"{place}.{key}") * factor for key in keys])
@@ -241,7 +242,7 @@ def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], byte
 def _cell(cell: str, parameter: Parameter, place: str) -> float:
     """The number of a cell, or of its word; NaN where it is none."""
     if parameter.words:
-        return code_of(cell.strip(), parameter, place)
+        return float(parameter.words.index(one_of(parameter.words, cell.strip(), place)))
     try:
         return float(cell)
     except ValueError:

@@ -18,7 +18,7 @@ from fits.io._typed import check_keys, typed
 from fits.sweeps import kinds
 from fits.sweeps._axes import Plan
 from fits.sweeps._read_axes import read_plan
-from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request
+from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request, one_of
 
 _COMMON = ("schema", "kind", "title", "seed", "axis", "design", "list", "run")
 _MOST_MB = 1_000_000_000
@@ -88,9 +88,7 @@ def parse_sweep(text: str, name: str, load: Callable[[str], bytes], folder: Path
     try:
         if table.get("schema") != SCHEMA:
             raise DataError(f'schema: expected "{SCHEMA}", found {shown(table.get("schema"))}; give that.')
-        kind = table.get("kind")
-        if not isinstance(kind, str) or kind not in kinds.names():
-            raise DataError(f"kind: expected one of {', '.join(kinds.names())}, found {shown(kind)}; choose one.")
+        kind = one_of(kinds.names(), table.get("kind"), "kind", "choose one.")
         made_by = kinds.kind(kind)
         tables = made_by.KEYS
         check_keys(table, [*_COMMON, *tables], "")

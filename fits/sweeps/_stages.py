@@ -15,7 +15,7 @@ from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
 from fits.stage._run import as_stage
 from fits.sweeps._devices import by_rows
-from fits.sweeps._types import Parameter, Request, in_a_file
+from fits.sweeps._types import Parameter, Request, in_a_file, one_of
 
 NOMINAL = "nominal"
 INITIAL = ("negative", "positive", "demagnetised")
@@ -43,8 +43,7 @@ def requested_stage(request: Request) -> tuple[m.Stage, str]:
     name, initial = request.table.get("model", NOMINAL), request.table.get("initial", INITIAL[0])
     if not isinstance(name, str):
         raise DataError(f'model: expected "{NOMINAL}" or the name of a model file, found {shown(name)}; give one.')
-    if initial not in INITIAL:
-        raise DataError(f"initial: expected one of {', '.join(INITIAL)}, found {shown(initial)}; choose one.")
+    initial = one_of(INITIAL, initial, "initial", "choose one.")
     model = nominal_stage() if name == NOMINAL else in_a_file(request.load(name), name, load_model).model
     if not isinstance(model, m.Preisach | m.Stage):
         raise DataError(

@@ -4,7 +4,7 @@ import abc
 import math
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,14 +50,12 @@ def choice(name: str, words: Sequence[str], nominal: str) -> Parameter:
     return Parameter(name, "1", float(words.index(nominal)), 0.0, len(words) - 1.0, tuple(words))
 
 
-def code_of(found: Any, parameter: Parameter, place: str) -> float:
-    """Place of a word among those of its parameter, or a `DataError` that begins with its place in the sweep."""
-    if not isinstance(found, str) or found not in parameter.words:
-        raise DataError(
-            f"{place}: expected one of {', '.join(parameter.words)}, found {shown(found)}; "
-            f"{nearest(str(found), parameter.words)}"
-        )
-    return float(parameter.words.index(found))
+def one_of(words: Iterable[str], found: Any, place: str, what_to_do: str = "") -> str:
+    """What was found, if it is one of some words, or a `DataError` that begins with its place in the sweep."""
+    if not isinstance(found, str) or found not in words:
+        what_to_do = what_to_do or nearest(str(found), [*words])
+        raise DataError(f"{place}: expected one of {', '.join(words)}, found {shown(found)}; {what_to_do}")
+    return found
 
 
 def check_plain(parameter: Parameter, values: FloatArray | None, relative: bool, place: str) -> None:
