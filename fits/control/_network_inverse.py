@@ -41,6 +41,7 @@ class NetworkInverse(eqx.Module):
         """Voltage in V for a displacement that came up from below its range, shape `(n,)`."""
         return self.middle_V + self.half_V * jax.vmap(self.network)(self.features(displacement_um))
 
+    @eqx.filter_jit
     def features(self, displacement_um: Float[Array, " n"]) -> Float[Array, "n k"]:
         """What the network sees of a displacement, shape `(n, 2 + extremes)`."""
 
@@ -91,13 +92,12 @@ def fit_network_inverse(
     lowest_um, span_um, middle_V, half_V, dead_um = map(jnp.asarray, numbers)
     inverse = NetworkInverse(network, lowest_um, span_um, middle_V, half_V, dead_um, extremes)
     chosen = np.linspace(0, len(record) - 1, min(samples, len(record))).astype(int)
-    seen = _features(inverse, jnp.asarray(displacement))[chosen]
+    seen = inverse.features(jnp.asarray(displacement))[chosen]
     trained = _train(network, seen, jnp.asarray((voltage[chosen] - middle) / half), steps)
     return eqx.tree_at(lambda inverse: inverse.network, inverse, trained)
 
 
 _network = eqx.filter_jit(eqx.nn.MLP)
-_features = eqx.filter_jit(lambda inverse, displacement_um: inverse.features(displacement_um))
 
 
 @eqx.filter_jit

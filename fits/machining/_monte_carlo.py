@@ -201,15 +201,8 @@ def _spread(values: np.ndarray, design: Design, axis: Axis, distribution: Distri
     off = (values - mean) / sd
     squares = off * off
     kurtosis = float(squares @ squares) / len(off)
-    return AxisSpread(
-        axis=axis,
-        unit=f"{MOTIONS[axis].unit}/um",
-        nominal=float(value),
-        mean=mean,
-        sd=sd,
-        skewness=float(squares @ off) / len(off),
-        sd_error=sd * float(np.sqrt((kurtosis - 1) / (4 * len(values)))),
-        quantiles=dict(zip(_QUANTILES_PCT, quantiles.tolist(), strict=True)),
-        first_order_sd=float(np.sqrt(slopes @ covariance(design, names, distribution) @ slopes)),
-        second=None,
-    )
+    skewness = float(squares @ off) / len(off)
+    sd_error = sd * float(np.sqrt((kurtosis - 1) / (4 * len(values))))
+    first_order_sd = float(np.sqrt(slopes @ covariance(design, names, distribution) @ slopes))
+    by_pct, unit = dict(zip(_QUANTILES_PCT, quantiles.tolist(), strict=True)), f"{MOTIONS[axis].unit}/um"
+    return AxisSpread(axis, unit, float(value), mean, sd, skewness, sd_error, by_pct, first_order_sd, None)

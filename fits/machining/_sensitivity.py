@@ -182,20 +182,12 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
     parts = changes * (design.correlation(names) @ changes)
     variance = float(parts.sum())
     ten_um = uniform_tolerance(design.geometry, length_mm=0.01)
-    effects = [
-        DimensionEffect(
-            name=name,
-            unit=m.DIMENSIONS[name].unit,
-            value=float(design.geometry[name]),
-            tolerance=float(tolerance[i]),
-            derivative=scale * float(slopes[i]),
-            relative_change_pct=100 * float(changes[i]),
-            relative_change_exact_pct=100 * float(exact[i]),
-            share_of_variance=float(parts[i]) / variance if variance > 0 else 0.0,
-            output_change_per_10um=scale * float(derived.slopes_at_full_stroke[name]) * ten_um[name],
-        )
-        for i, name in enumerate(names)
-    ]
+    shares = parts / variance if variance > 0 else np.zeros_like(parts)
+    sizes = [float(design.geometry[name]) for name in names]
+    per_10um = [scale * float(derived.slopes_at_full_stroke[name]) * ten_um[name] for name in names]
+    columns = sizes, tolerance, scale * slopes, 100 * changes, 100 * exact, shares, per_10um
+    rows = zip(names, np.stack(columns, axis=1).tolist(), strict=True)
+    effects = [DimensionEffect(name, m.DIMENSIONS[name].unit, *row) for name, row in rows]
     effects.sort(key=lambda effect: -abs(effect.relative_change_pct))
     by_voltage = dict(sorted(by_voltage.items(), key=lambda item: -abs(item[1])))
     rss_pct, worst_case_pct = 100 * math.sqrt(max(variance, 0.0)), 100 * float(np.abs(changes).sum())

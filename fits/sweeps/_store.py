@@ -201,7 +201,19 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
             raise DataError(
                 f"{out}: there is a sweep in this folder; add --resume to go on, or choose another for --out."
             )
-        _check_same(sweep, out)
+        about = about_of(out)
+        for name, version in versions().items():
+            before = about["versions"].get(name)
+            if before != version:
+                raise DataError(
+                    f"{out}: the sweep was begun with {name} {before}, and this is {version}; go on with that "
+                    "version, or begin anew in another folder."
+                )
+        if about["digest"] != sweep.digest or about["chunk_rows"] != chunk_rows(sweep):
+            raise DataError(
+                f"{out}: the folder holds the results of another sweep or other files; give the one that is in its "
+                f"{TEXT}, or choose another folder for --out."
+            )
         return
     own = (RESULTS, LEDGER, TEXT, ".lock")
     if folder.exists() and any(path.name not in own and not is_temporary(path.name) for path in folder.iterdir()):
@@ -235,22 +247,6 @@ def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
             store = Store(sweep, folder)
             store.create()
         yield store
-
-
-def _check_same(sweep: Sweep, out: str) -> None:
-    about = about_of(out)
-    before = about["versions"]
-    for name, version in versions().items():
-        if before.get(name) != version:
-            raise DataError(
-                f"{out}: the sweep was begun with {name} {before.get(name)}, and this is {version}; go on with that "
-                "version, or begin anew in another folder."
-            )
-    if about["digest"] != sweep.digest or about["chunk_rows"] != chunk_rows(sweep):
-        raise DataError(
-            f"{out}: the folder holds the results of another sweep or other files; give the one that is in its "
-            f"{TEXT}, or choose another folder for --out."
-        )
 
 
 @contextmanager
