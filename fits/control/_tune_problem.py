@@ -108,11 +108,19 @@ class Figures(eqx.Module):
 
 
 def figures(problem: Problem, controller: Any) -> Figures:
-    linear = controller.linear()
+    linear, count = controller.linear(), jnp.sum(problem.counts)
+    common: dict[str, Any] = {"delay": problem.delay, "resolution_um": problem.resolution_um, "start": problem.start}
 
     def around(plant: Stage, slope: Float[Array, ""] | None) -> tuple[Margins, tuple[Array, ...]]:
         def along(reference: Array, ahead: Array | None, noise: Array | None) -> tuple[Array, ...]:
-            return _run(problem, controller, plant, reference, ahead, noise)
+            run = simulate_loop(controller, plant, reference, feedforward_V=ahead, noise_um=noise, **common)
+            rest = jnp.zeros((), reference.dtype) if problem.start.rest_V is None else problem.start.rest_V
+            effort = run.command_V - (rest if ahead is None else ahead)
+            # The first change is from the command before.
+            rate = jnp.diff(run.command_V, prepend=rest if ahead is None else ahead[0])
+            squares = (jnp.sum(problem.counts * x**2) / count for x in (run.error_um, effort, rate))
+            largest, passed = jnp.max(problem.counts * jnp.abs(run.error_um)), overshoot_pct(run)
+            return *squares, largest, passed, jnp.min(run.command_V), jnp.max(run.command_V), jnp.max(jnp.abs(rate))
 
         given = problem.reference_um, problem.feedforward_V, problem.noise_um
         found = eqx.filter_vmap(along, in_axes=(0, *(None if x is None else 0 for x in given[1:])))(*given)
@@ -122,36 +130,6 @@ def figures(problem: Problem, controller: Any) -> Figures:
     axes = eqx.if_array(0), None if slopes is None else 0
     found, runs = eqx.filter_vmap(around, in_axes=axes)(problem.plants, slopes)
     return Figures(found, *runs)
-
-
-def _run(
-    problem: Problem,
-    controller: Any,
-    plant: Stage,
-    reference: Float[Array, " t"],
-    ahead: Float[Array, " t"] | None,
-    noise: Float[Array, " t"] | None,
-) -> tuple[Array, ...]:
-    run = simulate_loop(
-        controller,
-        plant,
-        reference,
-        feedforward_V=ahead,
-        noise_um=noise,
-        delay=problem.delay,
-        resolution_um=problem.resolution_um,
-        start=problem.start,
-    )
-    rest = jnp.zeros((), reference.dtype) if problem.start.rest_V is None else problem.start.rest_V
-    effort = run.command_V - (rest if ahead is None else ahead)
-    # The first change is from the command before.
-    before = rest if ahead is None else ahead[0]
-    rate = jnp.diff(run.command_V, prepend=before)
-    count = jnp.sum(problem.counts)
-    squares = (jnp.sum(problem.counts * x**2) / count for x in (run.error_um, effort, rate))
-    largest, passed = jnp.max(problem.counts * jnp.abs(run.error_um)), overshoot_pct(run)
-    commands = jnp.min(run.command_V), jnp.max(run.command_V), jnp.max(jnp.abs(rate))
-    return (*squares, largest, passed, *commands)
 
 
 def overshoot_pct(run: ControlledRun) -> Float[Array, ""]:
