@@ -13,7 +13,6 @@ from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Rever
 # Doubt about the displacement needed, or a start in motion, that is worth a remark: a fraction of the span.
 _WORTH_SAYING = 0.01
 _FEWEST = 16
-_ROUNDING = 1e-13
 
 
 def plain_of(stage: Stage) -> Stage:
@@ -112,8 +111,7 @@ def demand_remarks(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: fl
 
 def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarray:
     """Compensate the driver's lag: the command that gives the piezo a static voltage, shape `(n,)`."""
-    ahead, _, _ = gains_of(stage)
-    return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(ahead * static_V)))
+    return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(gains_of(stage)[0] * static_V)))
 
 
 def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.ndarray:
@@ -126,7 +124,7 @@ def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.
     step_s = record.duration_s / max(n - 1, 1) or 1.0
     # Even times are given as the one interval between them: that takes half as long to compile.
     uneven_s = np.abs(record.time_s - (record.time_s[0] + step_s * np.arange(n))).max()
-    even = uneven_s <= _ROUNDING * max(np.abs(record.time_s).max(), step_s)
+    even = uneven_s <= 1e-13 * max(np.abs(record.time_s).max(), step_s)
     time_s = step_s if even else record.time_s
     start = Start(memory=initial_state(initial, lower, upper))
     return respond(model, time_s, record.voltage_V, start)

@@ -26,20 +26,21 @@ def with_defaults(
     settings: Collection[m.Setting], stated: Mapping[str, Any], task: m.ControlTask, place: Callable[[str], str]
 ) -> tuple[dict[str, Any], list[str]]:
     """Settings as stated, or else their defaults, with what is to be said of these; `place` names one to the user."""
-    found = {setting.name: stated[setting.name] for setting in settings if setting.name in stated}
+    found: dict[str, Any] = {}
     said = []
     for setting in settings:
         name, default = setting.name, setting.default
-        if name in found or default is None:
-            continue
-        try:
-            found[name] = default(task) if callable(default) else default
-        except DataError as error:
-            raise DataError(f"{place(name)}: no default is found ({error}); state it.") from error
-        except ValueError as error:
-            raise DataError(f"{place(name)}: {error}; state it.") from error
-        if setting.said:
-            said.append(setting.said.format(found[name]))
+        if name in stated:
+            found[name] = stated[name]
+        elif default is not None:
+            try:
+                found[name] = default(task) if callable(default) else default
+            except DataError as error:
+                raise DataError(f"{place(name)}: no default is found ({error}); state it.") from error
+            except ValueError as error:
+                raise DataError(f"{place(name)}: {error}; state it.") from error
+            if setting.said:
+                said.append(setting.said.format(found[name]))
     return found, said
 
 

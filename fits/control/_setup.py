@@ -21,11 +21,7 @@ _FEWEST = 16
 
 @dataclass(frozen=True)
 class Setup:
-    """What a closed loop needs beside its controller.
-
-    The stage is under a held command, and at rest where the reference begins. Signals have the shape `(t,)`:
-    `static_V` would hold the stage at the reference.
-    """
+    """What a loop needs beside its controller: a held stage at rest where the reference begins; signals `(t,)`."""
 
     stage: Stage
     interval_s: float
@@ -33,7 +29,7 @@ class Setup:
     feedforward_V: np.ndarray | None
     limits_V: tuple[float, float]
     start: Start
-    static_V: np.ndarray
+    static_V: np.ndarray  # would hold the stage at the reference
     remarks: tuple[str, ...]
 
 

@@ -1,6 +1,6 @@
 """Controllers tuned by differentiating through the closed loop, for all plants that a fit leaves possible."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -17,11 +17,8 @@ from microid import AbstractController, Coordinates, ParameterInfo, Stage, Start
 
 _Controller = TypeVar("_Controller", bound=AbstractController)
 
-_FIRST_WEIGHT, _FACTOR, _MOST_WEIGHT = 10.0, 4.0, 1e6
 # Limits are kept to this share; the search stops where it moves no gain by more than this.
 _TOLERANCE, _SMALLEST_MOVE = 2e-3, 1e-2
-# Relative change of the cost per e-fold of a gain that counts as none.
-_FLAT = 2e-2
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,8 @@ class _End:
 
     @property
     def converged(self) -> bool:
-        return self.settled and bool(np.max(np.abs(self.gradient)) < _FLAT)
+        # Per e-fold of a gain, such a relative change of the cost counts as none.
+        return self.settled and bool(np.max(np.abs(self.gradient)) < 2e-2)
 
 
 def tune_controller(
@@ -202,7 +200,7 @@ def _stable_place(problem: Problem, rng: np.random.Generator) -> Any:
 def _search(problem: Problem, y: Any) -> _End:
     over = judge(problem, y)[1]
     multipliers = {name: jnp.zeros_like(share) for name, share in over.items()}
-    weight, worst, settled = _FIRST_WEIGHT, np.inf, False
+    weight, worst, settled = 10.0, np.inf, False
     for _ in range(12):
         moved, gradient = descend(problem, y, over, multipliers, jnp.asarray(weight))
         figures, over, cost = judge(problem, moved)
@@ -214,7 +212,7 @@ def _search(problem: Problem, y: Any) -> _End:
         if settled or not np.isfinite(now):
             break
         multipliers = {name: jnp.maximum(one + weight * over[name], 0) for name, one in multipliers.items()}
-        weight = min(weight * (_FACTOR if now > worst / 2 else 1.0), _MOST_WEIGHT)
+        weight = min(weight * (4.0 if now > worst / 2 else 1.0), 1e6)
         worst = max(now, 0.0)
     return _End(y, np.asarray(gradient), figures, {k: np.asarray(v) for k, v in over.items()}, float(cost), settled)
 
@@ -232,17 +230,15 @@ def _excess_in_words(over: dict[str, Any]) -> str:
     return "within all limits" if share <= _TOLERANCE else f"{name} passed by {100 * passed:.3g} %"
 
 
-def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> list[str]:
-    out = []
+def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> Iterator[str]:
     alike = sum(end.kept and end.cost_um <= 1.01 * best.cost_um for end in ends)
     if len(ends) > 1 and alike < len(ends):
-        out.append(f"{alike} of {len(ends)} searches ended within 1 % of the best cost: the others at worse optima")
+        yield f"{alike} of {len(ends)} searches ended within 1 % of the best cost: the others at worse optima"
     rows = problem.coordinates.table
     ends_of_rows = np.cumsum([int(np.prod(row.shape)) for row in rows])
     for row, moved in zip(rows, np.split(np.abs(np.asarray(best.y)), ends_of_rows[:-1]), strict=True):
         if np.any(moved > 0.8 * REACH):
-            out.append(f"{row.path} is at the edge of what is searched: it hardly matters, or the start was far off")
+            yield f"{row.path} is at the edge of what is searched: it hardly matters, or the start was far off"
     pressing = [name for name, share in best.over.items() if np.max(share) > -_TOLERANCE]
     if pressing:
-        out.append(f"at its limit: {', '.join(pressing)}")
-    return out
+        yield f"at its limit: {', '.join(pressing)}"

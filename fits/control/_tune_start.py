@@ -68,8 +68,7 @@ def ultimate_point(stage: Stage, interval_s: float, *, delay: int = 0) -> Ultima
     unit, slope = PID.from_times(1.0, jnp.inf, 0.0, interval_s), slope_array(stage)
 
     def response(frequency_Hz: np.ndarray) -> np.ndarray:
-        found = loop_gain(unit, stage, jnp.asarray(frequency_Hz), delay=delay, slope_um_per_V=slope)
-        return np.asarray(found)
+        return np.asarray(loop_gain(unit, stage, jnp.asarray(frequency_Hz), delay=delay, slope_um_per_V=slope))
 
     nyquist = 0.5 / interval_s
     grid = nyquist * np.logspace(-5, 0, 4001)
@@ -106,10 +105,8 @@ def relay_start(plants: Stage | Sequence[Stage], interval_s: float, *, delay: in
     # Ever smaller gains reach the margin on any stage that is stable by itself.
     for _ in range(60):
         pid = PID.from_times(gain, integral_s, derivative_s, interval_s, filter_s=derivative_s / 10)
-        found = [
-            margins(pid, stage, delay=delay, slope_um_per_V=slope)
-            for stage, slope in zip(stages, slopes, strict=True)
-        ]
+        given = zip(stages, slopes, strict=True)
+        found = [margins(pid, stage, delay=delay, slope_um_per_V=slope) for stage, slope in given]
         if all(bool(one.stable) and float(one.gain_margin) >= 2 for one in found):
             return pid
         gain /= 2

@@ -16,10 +16,8 @@ from microid import DIMENSIONS, Axis
 
 Limit = Literal["three_sigma", "worst_case"]
 _POWERS: dict[Limit, int] = {"three_sigma": 2, "worst_case": 1}
-_LENGTHS_MM = (0.001, 0.1)
 # Of the logarithms of errors over budgets, and of the optimality conditions, whose terms are parts of the cost.
 _SLACK, _STATIONARY = 1e-7, 1e-5
-_STEPS = 500
 _Vector = NDArray[np.float64]
 
 
@@ -54,7 +52,7 @@ def allocate(
     cost: Mapping[str, float] | None = None,
     *,
     limit: Limit = "three_sigma",
-    bounds_mm: tuple[float, float] = _LENGTHS_MM,
+    bounds_mm: tuple[float, float] = (0.001, 0.1),
     voltage: bool = False,
     curvature_share: float = 0.05,
 ) -> Allocation:
@@ -174,7 +172,7 @@ class _Problem:
             method="SLSQP",
             bounds=list(zip(self.lower, self.upper, strict=True)),
             constraints=NonlinearConstraint(self.excess, -np.inf, 0.0, jac=self.shares),
-            options={"ftol": 1e-15, "maxiter": _STEPS},
+            options={"ftol": 1e-15, "maxiter": 500},
         )
         found = np.clip(solved.x, self.lower, self.upper)
         excess = self.excess(found)

@@ -1,7 +1,7 @@
 """The error budget: driving, machining and measuring error of each axis, and their total (Eq. 1)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -170,10 +170,8 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
         scale /= 1e3 * arm_mm
     stroke_um = scale * float(highest_um)
     if not stroke_um > 0:
-        raise DataError(
-            f"expected a model that moves between {lower_V:g} and {upper_V:g} V, found one that does not; fit it "
-            "again."
-        )
+        range_V = f"{lower_V:g} and {upper_V:g} V"
+        raise DataError(f"expected a model that moves between {range_V}, found one that does not; fit it again.")
     figures = error.slope_um_per_V, error.signed_um.max(), error.signed_um.min()
     return Driving(stroke_um, *(scale * float(figure) for figure in figures))
 
@@ -210,23 +208,21 @@ def _combined(design: Design, slopes: Mapping[str, Array], scale: float) -> tupl
     return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
 
 
-def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, arm_mm: float | None) -> list[str]:
-    remarks = []
+def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, arm_mm: float | None) -> Iterator[str]:
     turning = [axis for axis in axes if m.MOTIONS[axis].unit == "rad"]
     if turning and arm_mm is None:
-        remarks.append(
+        yield (
             f"The measuring error of {', '.join(turning)} is left out: a displacement sensor reads a rotation at an "
             "arm; give it."
         )
     loaded_um = max(float(derivatives_of(design, axis).loaded_stroke_um) for axis in axes)
     if driving.stroke_um > 1.05 * loaded_um:
-        remarks.append(
+        yield (
             f"The model elongates its piezo by {driving.stroke_um:.4g} um, but against the stage the piezos of this "
             f"design reach {loaded_um:.4g} um: if it was measured without the stage, scale its displacement or say "
             "what it measures."
         )
-    remarks.append(
+    yield (
         "The totals take machining at a fixed elongation of the piezo (Eq. 4); open loop the voltage is fixed, and "
         "the column beside it counts."
     )
-    return remarks

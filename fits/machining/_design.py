@@ -16,11 +16,7 @@ TOLERANCE_MM = 0.02
 LARGEST_ANGLE_RAD = 1.5
 # Hinges and the distance between the centres of the two of a leg, which they cannot exceed.
 _HINGES = (("l1", "la1", "alpha1"), ("l2", "l3", ""), ("l4", "la2", "alpha2"), ("l6", "la3", "alpha3"))
-# The paper's middle platform has hinges that are longer than their leg's run by 0.2 %.
-_OVERLAP = 0.01
 _MOST_GUIDES = 1000
-# What rounding may take from the smallest eigenvalue of a correlation matrix.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -143,7 +139,8 @@ def _faults_of_sizes(design: Design) -> Iterator[str]:
             )
     for hinge, leg, angle in _HINGES:
         run = sizes[leg] * math.cos(sizes[angle]) if angle else sizes[leg]
-        if sizes[hinge] > (1 + _OVERLAP) * run:
+        # The paper's middle platform has hinges that are longer than their leg's run by 0.2 %.
+        if sizes[hinge] > 1.01 * run:
             yield (
                 f"geometry.{hinge}: expected a hinge no longer than its leg, which runs {run:.4g} mm along it "
                 f"({leg} = {sizes[leg]:g} mm), found {sizes[hinge]:g} mm; shorten the hinge or lengthen the leg."
@@ -157,7 +154,7 @@ def _faults_of_groups(design: Design) -> Iterator[str]:
         for name in group.dimensions:
             if name not in m.DIMENSIONS:
                 yield f"{place}.dimensions: '{name}' is no dimension; {nearest(name, [*m.DIMENSIONS])}"
-        if len(set(group.dimensions)) < 2 or len(set(group.dimensions)) < len(group.dimensions):
+        if len(set(group.dimensions)) < max(2, len(group.dimensions)):
             yield f"{place}.dimensions: expected at least two different dimensions, found {list(group.dimensions)}."
         if not -1 <= group.correlation <= 1:
             yield (
@@ -171,7 +168,8 @@ def _faults_of_groups(design: Design) -> Iterator[str]:
                 )
             pairs[pair] = k
     names = sorted({name for group in design.together for name in group.dimensions})
-    if names and np.linalg.eigvalsh(design.correlation(names))[0] < -_ROUNDING:
+    # Rounding may take a little from the smallest eigenvalue of a correlation matrix.
+    if names and np.linalg.eigvalsh(design.correlation(names))[0] < -1e-9:
         yield (
             f"together[{len(design.together) - 1}].correlation: expected correlations that errors can have, found a "
             "matrix that is not positive semidefinite; n dimensions can all have -1 / (n - 1) at least, and two "

@@ -96,13 +96,8 @@ def write_design(design: Design, path: str | os.PathLike[str]) -> None:
 
 
 def design_text(design: Design) -> str:
-    lines = [
-        f'schema = "{SCHEMA}"',
-        "# 0: Euler-Bernoulli leaves between rigid blocks; 1: elastic roots, shear, links.",
-        f"level = {design.level}",
-        "",
-        "[geometry]",
-    ]
+    levels = "# 0: Euler-Bernoulli leaves between rigid blocks; 1: elastic roots, shear, links."
+    lines = [f'schema = "{SCHEMA}"', levels, f"level = {design.level}", "", "[geometry]"]
     platform = ""
     for name, dimension in m.DIMENSIONS.items():
         if dimension.platform != platform:

@@ -86,11 +86,8 @@ def _gains(
     model: GainModel, errors: Float[Array, "k n"], axes: tuple[m.Axis, ...], names: tuple[str, ...]
 ) -> Float[Array, "axes n"]:
     """Gains of some axes for many stages, whose errors of the named dimensions are in mm and rad."""
-
-    def one(error: Float[Array, " k"]) -> Float[Array, " axes"]:
-        return jnp.stack([model(error, axis, names) for axis in axes])
-
-    return jax.vmap(one, in_axes=1, out_axes=1)(errors)
+    of_one = jax.vmap(lambda error: jnp.stack([model(error, axis, names) for axis in axes]), in_axes=1, out_axes=1)
+    return of_one(errors)
 
 
 # For few stages what counts is the time to compile, for millions the time to run.

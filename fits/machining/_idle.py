@@ -20,7 +20,6 @@ FloatArray = NDArray[np.float64]
 MIN_IDLE_SAMPLES = 100
 # Share of a step by which steps may differ: spectra do not see less.
 _UNEVEN = 0.05
-_BATCHES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,10 +193,10 @@ def _find_fault(time_s: FloatArray, displacement_um: FloatArray) -> tuple[str, i
 
 def _correlation_samples(residual_um: FloatArray) -> float:
     """Samples that are worth one independent one; means of batches show slow noise that hides below white noise."""
-    length = len(residual_um) // _BATCHES
-    means = residual_um[: _BATCHES * length].reshape(_BATCHES, length).mean(axis=1)
+    length = len(residual_um) // 32
+    means = residual_um[: 32 * length].reshape(32, length).mean(axis=1)
     square = float(residual_um @ residual_um) / len(residual_um)
-    batch = length * float(means @ means) / (_BATCHES - 2) / square if square > 0 else 1.0
+    batch = length * float(means @ means) / 30 / square if square > 0 else 1.0
     return max(correlation_samples([residual_um]), batch)
 
 

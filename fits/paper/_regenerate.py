@@ -48,12 +48,10 @@ def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], 
         progress(f"identifying the hysteresis from {seeds} noisy CSVs")
         identified = identify(piezo, loops.spawn(seeds), Path(records))
         stands, noises = {}, {}
-        for (name, axis), modes_rng, runs_rng in zip(
-            data_synth.PAPER_AXES.items(), others[::2], others[1::2], strict=True
-        ):
+        for k, (name, axis) in enumerate(data_synth.PAPER_AXES.items()):
             progress(f"identifying the response of axis {name}")
-            modes = identify_modes(axis, piezo, seeds, modes_rng, Path(records))
-            stands[name], noises[name] = PaperStand(axis, piezo, identified, modes), runs_rng
+            modes = identify_modes(axis, piezo, seeds, others[2 * k], Path(records))
+            stands[name], noises[name] = PaperStand(axis, piezo, identified, modes), others[2 * k + 1]
     steps: dict[str, PaperRun] = {}
     for scheme in PAPER["table2"]:
         progress(f"step, {scheme}")

@@ -17,8 +17,6 @@ SAMPLERS = ("random", "latin_hypercube", "sobol")
 _PIECE = 4096
 # A Latin hypercube is one permutation per axis, which must be held at once.
 _LARGEST_HYPERCUBE = 10_000_000
-# Within these, a normal variable is never infinite.
-_TINY = 2.0**-54
 
 
 @dataclass(frozen=True)
@@ -38,11 +36,12 @@ class Axis:
     def quantile(self, chance: FloatArray) -> FloatArray:
         """Values at cumulative probabilities."""
         if self.distribution == "normal":
-            return np.asarray(self.first + self.second * ndtri(np.clip(chance, _TINY, 1 - _TINY)))
-        if self.distribution == "log":
-            low, high = math.log(self.first), math.log(self.second)
-            return np.clip(np.exp(low + (high - low) * chance), self.first, self.second)
-        return np.clip(self.first + (self.second - self.first) * chance, self.first, self.second)
+            # Within these chances it is never infinite.
+            return np.asarray(self.first + self.second * ndtri(np.clip(chance, 2.0**-54, 1 - 2.0**-54)))
+        log = self.distribution == "log"
+        low, high = (math.log(self.first), math.log(self.second)) if log else (self.first, self.second)
+        found = low + (high - low) * chance
+        return np.clip(np.exp(found) if log else found, self.first, self.second)
 
 
 @dataclass(frozen=True)
@@ -121,12 +120,12 @@ class Plan:
 
     def values(self, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
         """Values of all axes at some rows by parameter, shape `(n,)` each."""
-        found: dict[str, FloatArray] = {}
-        left = rows
+        names = [axis.parameter for axis in self.axes]
+        columns: list[FloatArray] = []
         for group in reversed(self.groups):
-            left, place = np.divmod(left, len(group))
-            found |= {axis.parameter: row for axis, row in zip(group.axes, group.at(place), strict=True)}
-        return {axis.parameter: found[axis.parameter] for axis in self.axes}
+            rows, place = np.divmod(rows, len(group))
+            columns = [*group.at(place), *columns]
+        return dict(zip(names, columns, strict=True))
 
     def repeat_of(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Index of the source of each row, shape `(n,)`."""

@@ -79,11 +79,7 @@ def connected(address: str) -> Iterator[Any]:
 def on_cluster(
     client: Any, sweep: Sweep, chunks: list[int], progress: Callable[[str], None]
 ) -> Iterator[tuple[int, Rows]]:
-    """Compute chunks on the workers of a scheduler and give them back as they come.
-
-    `progress` is told of workers that are refused, and if there is none. A `DataError` says that the scheduler is
-    lost, has no workers, or none with the versions of this process.
-    """
+    """Compute chunks on the workers of a scheduler; a `DataError` says that it is lost, or has none to be used."""
     distributed = need("distributed")
     payload = _Payload(
         sweep.text, sweep.name, sweep.inputs, str(Path(sweep.name).resolve().parent), sweep.digest, versions()
@@ -120,8 +116,8 @@ def on_cluster(
                 if answer.rows is None:
                     workers.ban(answer.worker, answer.refused)
                     waiting.append(chunk)
-                    continue
-                yield chunk, answer.rows
+                else:
+                    yield chunk, answer.rows
     except (OSError, distributed.client.FuturesCancelledError, distributed.CancelledError) as error:
         raise DataError(
             f"--cluster: the scheduler was lost ({type(error).__name__}); what was computed is kept: start it again, "

@@ -134,6 +134,5 @@ def _task(stage: m.Stage, initial: str, reference: Program) -> m.ControlTask:
             return nominal["frequency_Hz"]
         return None if reference.shape == "step" else strongest_Hz(reference.wanted(), reference.interval_s)
 
-    return m.ControlTask(
-        stage, reference.interval_s, from_rest_um, static_V, lambda: steepest_slope(stage), frequency_Hz
-    )
+    found = from_rest_um, static_V, lambda: steepest_slope(stage), frequency_Hz
+    return m.ControlTask(stage, reference.interval_s, *found)

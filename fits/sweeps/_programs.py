@@ -34,8 +34,6 @@ SHAPES: dict[str, dict[str, float]] = {
 }
 _UNITS = {"frequency_Hz": "Hz", "frequency_end_Hz": "Hz", "phase_rad": "rad", "step_s": "s", "gain": "1"}
 _SAMPLES, _LONGEST_s = 10_000_000, 1e4
-# Samples that differ by less from even intervals, as a fraction of one, count as even.
-_EVEN = 1e-3
 
 
 class _Times(msgspec.Struct):
@@ -142,7 +140,7 @@ def _read_signal(path: Any, name: str, unit: str, load: Callable[[str], bytes]) 
 
     time_s, given = in_a_file(load(path), path, read)
     interval = np.diff(time_s)
-    if np.ptp(interval) > _EVEN * np.mean(interval):
+    if np.ptp(interval) > 1e-3 * np.mean(interval):
         raise DataError(f"{name}.file: {path} is not sampled evenly, which a sweep needs; resample it.")
     return given, float(np.mean(interval))
 

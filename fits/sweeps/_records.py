@@ -76,8 +76,8 @@ class Simulated:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """What may be varied: the stage, the program and the noise."""
-        noise = Parameter(_NOISE, "um", self.noise_um, 0.0)
-        return (*stage_parameters(self.stage), *self.program.parameters, noise)
+        own = Parameter(_NOISE, "um", self.noise_um, 0.0)
+        return *stage_parameters(self.stage), *self.program.parameters, own
 
     def records(self, block: Block) -> list[Record | str]:
         """Simulate the record of each row; its noise depends on the seed and the row's number alone."""

@@ -20,10 +20,7 @@ from fits.sweeps._axes import Plan
 from fits.sweeps._read_axes import read_plan
 from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request, one_of
 
-_COMMON = ("schema", "kind", "title", "seed", "axis", "design", "list", "run")
 _MOST_MB = 1_000_000_000
-# Keys of kinds that are words; all others are tables.
-_NO_TABLES = ("model", "initial", "stage")
 
 
 class _Run(msgspec.Struct):
@@ -90,13 +87,12 @@ def parse_sweep(text: str, name: str, load: Callable[[str], bytes], folder: Path
             raise DataError(f'schema: expected "{SCHEMA}", found {shown(table.get("schema"))}; give that.')
         kind = one_of(kinds.names(), table.get("kind"), "kind", "choose one.")
         made_by = kinds.kind(kind)
-        tables = made_by.KEYS
-        check_keys(table, [*_COMMON, *tables], "")
-        for key in table:
-            if key in tables and key not in _NO_TABLES and not isinstance(table[key], dict):
-                raise DataError(
-                    f"{key}: expected a table, found {shown(table[key])}; write [{key}] and its keys below."
-                )
+        common = ["schema", "kind", "title", "seed", "axis", "design", "list", "run"]
+        check_keys(table, [*common, *made_by.KEYS], "")
+        for key, value in table.items():
+            # Some keys of kinds are words; all others are tables.
+            if key not in (*common, "model", "initial", "stage") and not isinstance(value, dict):
+                raise DataError(f"{key}: expected a table, found {shown(value)}; write [{key}] and its keys below.")
         seed = table.get("seed", 0)
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise DataError(f"seed: expected a whole number of 0 or more, found {shown(seed)}; correct it.")

@@ -131,10 +131,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Block:
-    """Rows that are computed together: values, numbers in the sweep, and places among the sources, shape `(n,)` each.
-
-    The values are by parameter, in their own units, but for those that are factors. Rows of filling are repeated.
-    """
+    """Rows that are computed together: values by parameter, numbers in the sweep, places of sources, `(n,)` each."""
 
     values: dict[str, FloatArray]
     relative: tuple[str, ...]

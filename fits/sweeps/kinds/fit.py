@@ -74,19 +74,16 @@ class FitJob(AbstractJob):
         if self.options.weights:
             size = len(_packed(self.options.levels or 0)[0])
             outputs.append(Output("weights_um", "um", "weights of Eq. 9, packed row by row", (("weight", size),)))
-        levels = float(self.options.levels or _DEFAULT_LEVELS)
-        parameters: tuple[Parameter, ...] = (
-            *self.records.parameters,
-            Parameter("fit.holdout", "1", self.options.holdout, 0.0, 0.9),
-            choice("fit.initial", INITIAL_STATES, self.initial),
-        )
+        parameters = [*self.records.parameters, Parameter("fit.holdout", "1", self.options.holdout, 0.0, 0.9)]
+        parameters.append(choice("fit.initial", INITIAL_STATES, self.initial))
         if not self.options.weights:
             # Rows of other levels have other weights.
-            parameters += (Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),)
+            levels = float(self.options.levels or _DEFAULT_LEVELS)
+            parameters.append(Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True))
         if self._batch:
-            parameters += (Parameter("fit.smoothness", "1", self.options.smoothness, 1e-12, 1e6),)
+            parameters.append(Parameter("fit.smoothness", "1", self.options.smoothness, 1e-12, 1e6))
         block = _BLOCK if self._batch else 1
-        return Facts(parameters, tuple(outputs), block, self.records.sources, alone=not self._batch)
+        return Facts(tuple(parameters), tuple(outputs), block, self.records.sources, alone=not self._batch)
 
     def compute(self, block: Block) -> Rows:
         """Fit the records of some blocks; see `AbstractJob.compute`."""
@@ -170,15 +167,9 @@ def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[An
     found = in_turn(regress, *rows) if jax.default_backend() == "cpu" else regress(*map(place, rows))
     packed = _packed(levels)
     weights = np.asarray(found.columns_um)[:, : len(packed[0])] * node_areas(levels)[packed]
-    return {
-        "offset_um": np.asarray(found.offset_um),
-        "noise_um": np.asarray(found.noise_um),
-        "loops_um": weights.sum(axis=1),
-        "levels": np.full(len(weights), float(levels)),
-        "weights_um": weights,
-        "predicted_um": np.asarray(found.predicted_um),
-        "success": np.asarray(found.success),
-    }
+    same = {name: np.asarray(getattr(found, name)) for name in ("offset_um", "noise_um", "predicted_um", "success")}
+    numbers = np.full(len(weights), float(levels))
+    return same | {"loops_um": weights.sum(axis=1), "levels": numbers, "weights_um": weights}
 
 
 def _packed(levels: int) -> tuple[NDArray[np.int64], ...]:

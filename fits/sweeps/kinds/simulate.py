@@ -88,8 +88,7 @@ def make(request: Request) -> SimulateJob:
     asked = typed(request.table.get("outputs", {}), _Options, "outputs")
     if not asked.from_s < program.last_s:
         raise DataError(f"outputs.from_s: expected a time within the program, found {asked.from_s:g}; correct it.")
-    every = asked.every if asked.traces else 0
-    return SimulateJob(stage, program, initial, asked.from_s, every)
+    return SimulateJob(stage, program, initial, asked.from_s, asked.every if asked.traces else 0)
 
 
 @by_rows("voltage", "displacement")
