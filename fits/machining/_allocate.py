@@ -123,16 +123,11 @@ def allocate(
     found = dict(zip(names, (tolerance * np.exp(logarithm)).tolist(), strict=True))
     shares = np.exp(problem.excess(logarithm)).tolist()
     reached = {twin(axis): share * budget_pct[axis] for axis, share in zip(axes, shares, strict=True)}
-    return Allocation(
-        replace(design, tolerance={**design.tolerance, **found}),
-        names,
-        float(price @ np.exp(-logarithm)),
-        float(price.sum()),
-        {axis: reached[twin(axis)] for axis in budget_pct},
-        tuple(axes[i] for i in weights),
-        {axes[i]: weight for i, weight in weights.items()},
-        limit,
-    )
+    chosen = replace(design, tolerance={**design.tolerance, **found})
+    costs = float(price @ np.exp(-logarithm)), float(price.sum())
+    error_pct = {axis: reached[twin(axis)] for axis in budget_pct}
+    multipliers = {axes[i]: weight for i, weight in weights.items()}
+    return Allocation(chosen, names, *costs, error_pct, tuple(multipliers), multipliers, limit)
 
 
 @dataclass(frozen=True)

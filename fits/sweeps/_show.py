@@ -37,9 +37,9 @@ def readable(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Turn the errors of decoders of a broken file into a `DataError`."""
     try:
         yield
-    except DataError:
-        raise
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, DataError):
+            raise
         why = " ".join(str(error).split()) or type(error).__name__
         raise DataError(
             f"{os.fspath(folder)}: {RESULTS} is missing or broken ({why[:200]}); run the sweep again with --resume, "
