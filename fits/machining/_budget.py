@@ -161,13 +161,14 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
     rise = np.linspace(lower_V, upper_V, 1001)
     error, highest_um = _loop(law, jnp.asarray(np.concatenate([rise, rise[-2::-1]])))
     # What the model calls a um is this many of the piezo.
-    scale = 1.0 if measures == "pzt" else 1 / float(derivatives_of(design, measures).gain)
+    per_unit = 1.0
     if measures != "pzt" and m.MOTIONS[measures].unit == "rad":
         if arm_mm is None:
             raise DataError(
                 f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
             )
-        scale /= 1e3 * arm_mm
+        per_unit = 1e3 * arm_mm
+    scale = 1.0 if measures == "pzt" else 1 / (per_unit * float(derivatives_of(design, measures).gain))
     stroke_um = scale * float(highest_um)
     if not stroke_um > 0:
         range_V = f"{lower_V:g} and {upper_V:g} V"
