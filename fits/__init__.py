@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from fits.control._export_c import export_c
     from fits.control._network_inverse import NetworkInverse, fit_network_inverse
     from fits.control._tune import tune_controller
-    from fits.control._tune_problem import Goal
-    from fits.control._tune_result import LoopReport, Tuning
+    from fits.control._tune_problem import Goal, LoopReport, Tuning
     from fits.control._tune_start import UltimatePoint, relay_start, steepest_slope, ultimate_point
     from fits.diagnosis._diagnose import diagnose
     from fits.diagnosis._result import Bound, Diagnosis, EffectParameter, Experiment, FoundCause, Gain

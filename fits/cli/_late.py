@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from fits.control._gains import read_gains
     from fits.control._make import Loop, Maker
     from fits.control._setup import held, setup
-    from fits.control._tune_problem import Goal
-    from fits.control._tune_result import passed_limits
+    from fits.control._tune_problem import Goal, passed_limits
     from fits.diagnosis._diagnose import diagnose
     from fits.diagnosis._result import Diagnosis, Step
     from fits.io._atomic import finite_json, refuse_nonfinite, write_csv

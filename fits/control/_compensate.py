@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.control._compensate_stage import (
-    begins_in_motion,
     command,
     demand,
+    demand_remarks,
     plain_of,
     simulate_model,
     static_equivalent,
-    turns,
 )
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
@@ -31,8 +30,6 @@ _PIECE = 8192
 _SLACK = 1e-9
 # What can be reached depends on the past, so it is found again until it stays; two or three times are usual.
 _PASSES = 50
-# Rounds of fixed-point iteration for effects; each reduces the error to a few percent of what it was.
-_ROUNDS, _DONE = 12, 1e-9
 # At an end of the range what a stage needs may overshoot by this fraction of it, and is cut, before that is refused.
 _TOLERABLE = 0.01
 # What is cut off a command by less than this fraction of the limits' width does not show.
@@ -43,16 +40,9 @@ _WORTH_SAYING = 1e-4
 class Compensation:
     """A voltage for a reference, and what the model does with it; all arrays have the shape `(n,)`.
 
-    Attributes
-    ----------
-    voltage_V, reference_um
-        Within the limits, and what was asked for.
-    displacement_um
-        Response of the whole model, sensor offset included.
-    clipped
-        Samples out of reach, where the nearest voltage or displacement that can be reached was taken.
-    remarks
-        What keeps a stage from following, one sentence each.
+    The voltage is within the limits, and the displacement the response of the whole model, sensor offset included.
+    Where samples are `clipped`, out of reach, the nearest voltage or displacement that can be reached was taken.
+    Remarks are what keeps a stage from following, one sentence each.
     """
 
     voltage_V: np.ndarray
@@ -72,30 +62,16 @@ def compensate(
 ) -> Compensation:
     """Find the voltage whose displacement is the reference.
 
-    Parameters
-    ----------
-    model
-        From a fit or a model file.
-    reference
-        Displacement wanted, as the sensor would read it: the model's `offset_um`, its reading at negative
-        saturation, is included.
-    initial
-        Memory before the first sample: `negative`, `positive` or `demagnetised`.
-    clip
-        Take the nearest that can be reached where the reference is out of reach, instead of refusing it.
-    limits_V
-        Lowest and highest voltage allowed; the range the model was fitted on by default. For a stage these are
-        commands, and its range is that of its hysteresis over the gain of its driver.
-    way
-        `"static"`: by the exact inverse of the hysteresis, with the static gains of a stage; its response then lags
-        and rings. `"dynamic"`: by the inverse of the whole stage, for references that are smooth and begin at rest;
-        see `microid.invert_stage`.
+    The reference is as the sensor would read it: the model's `offset_um`, its reading at negative saturation, is
+    included. The memory before the first sample is `negative`, `positive` or `demagnetised`. With `clip` the nearest
+    that can be reached is taken where the reference is out of reach, instead of refusing it. Limits are the lowest
+    and highest voltage allowed; the range the model was fitted on by default. For a stage these are commands, and its
+    range is that of its hysteresis over the gain of its driver.
 
-    Raises
-    ------
-    DataError
-        If the reference cannot be followed, the limits are not within the model's range, or the model has nothing
-        dynamic to compensate.
+    The way `"static"` is by the exact inverse of the hysteresis, with the static gains of a stage; its response then
+    lags and rings. `"dynamic"` is by the inverse of the whole stage, for references that are smooth and begin at
+    rest; see `microid.invert_stage`. A `DataError` says that the reference cannot be followed, that the limits are
+    not within the model's range, or that the model has nothing dynamic to compensate.
     """
     if reference.displacement_um is None:
         raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
@@ -111,12 +87,14 @@ def compensate(
         needed, doubt_um = demand(model, time_s, wanted, reference.source)
     elif way != "static":
         raise ValueError(f"way must be 'static' or 'dynamic', got {way!r}")
-    turning = turns(wanted, doubt_um)
-    remarks = turning + begins_in_motion(wanted, needed, doubt_um)
+    turning, moving = demand_remarks(wanted, needed, doubt_um)
+    remarks = turning + moving
     lower, upper = float(law.density.lower_V), float(law.density.upper_V)
     limits = within_range(law, limits_V)
-    start = initial_state(initial, lower, upper)
-    voltage, lowest, highest = _follow(law, needed, start, limits)
+    bind = f"the voltage is limited to {limits[0]:g} to {limits[1]:g} V"
+    if limits == (lower, upper):
+        bind = f"the model was fitted between {lower:g} and {upper:g} V"
+    voltage, lowest, highest = _follow(law, needed, initial_state(initial, lower, upper), limits)
     # Less than it is uncertain by is not out of reach: splines swing a little where a reference leaves an end.
     stroke = float(np.max(highest) - np.min(lowest))
     slack = max(_SLACK * stroke, min(doubt_um, _TOLERABLE * stroke))
@@ -130,13 +108,12 @@ def compensate(
             raise DataError(f"{reference.source}: sample {k + 1} (time {time_s[k]:g} s) {asked}, but {turning[0]}")
         raise DataError(
             f"{reference.source}: sample {k + 1} (time {time_s[k]:g} s) {asked}, but "
-            f"{lowest[k]:.6g} to {highest[k]:.6g} um can be reached there, sensor offset included, because "
-            f"{_bind(limits, (lower, upper))}; {int(clipped.sum())} of {len(wanted)} samples are out of reach: shift "
-            f"or shrink the reference,{' slow it down,' if way == 'dynamic' else ''} or take the nearest that can be "
-            "reached with --clip."
+            f"{lowest[k]:.6g} to {highest[k]:.6g} um can be reached there, sensor offset included, because {bind}; "
+            f"{int(clipped.sum())} of {len(wanted)} samples are out of reach: shift or shrink the reference,"
+            f"{' slow it down,' if way == 'dynamic' else ''} or take the nearest that can be reached with --clip."
         )
     if isinstance(model, Stage) and way == "dynamic":
-        voltage, cut, more = _led(model, reference, voltage, limits, clip, _bind(limits, (lower, upper)))
+        voltage, cut, more = _led(model, reference, voltage, limits, clip, bind)
         clipped, remarks = clipped | cut, remarks + more
     played = simulate_model(model, Record(time_s, voltage, None, source=reference.source), initial)
     return Compensation(voltage, played, wanted, clipped, tuple(remarks))
@@ -154,22 +131,17 @@ def _beside_effects(
         )
     time_s, wanted = reference.time_s, np.asarray(reference.displacement_um)
     asked, before = wanted, np.inf
-    for _ in range(_ROUNDS):
+    # Each round reduces the error to a few percent of what it was.
+    for _ in range(12):
         found = invert(Reference(time_s, asked, reference.source))
         program = Record(time_s, found.voltage_V, None, source=reference.source)
         played = simulate_model(stage, program, initial)
         change = played - simulate_model(plain, program, initial)
         moved = float(np.max(np.abs(wanted - change - asked)))
-        if moved <= _DONE * float(np.ptp(wanted)) or moved > 0.9 * before:
+        if moved <= 1e-9 * float(np.ptp(wanted)) or moved > 0.9 * before:
             break
         asked, before = wanted - change, moved
     return Compensation(found.voltage_V, played, wanted, found.clipped, found.remarks)
-
-
-def _bind(limits: tuple[float, float], whole: tuple[float, float]) -> str:
-    if limits == whole:
-        return f"the model was fitted between {whole[0]:g} and {whole[1]:g} V"
-    return f"the voltage is limited to {limits[0]:g} to {limits[1]:g} V"
 
 
 def _led(
@@ -195,10 +167,8 @@ def _led(
             "from the ends of the range, or cut the command there with --clip."
         )
     cut = excess_V > _WORTH_SAYING * width_V
-    said = [
-        f"the command was cut to the limits at {int(cut.sum())} of its samples, by at most {excess_V.max():.3g} V."
-    ]
-    return voltage_V, cut, said if cut.any() else []
+    said = f"the command was cut to the limits at {int(cut.sum())} of its samples, by at most {excess_V.max():.3g} V."
+    return voltage_V, cut, [said] if cut.any() else []
 
 
 def within_range(model: Preisach, limits_V: tuple[float, float] | None) -> tuple[float, float]:

@@ -1,7 +1,5 @@
 """A whole stage in feedforward: what its driver and mechanics ask for beyond the inverse of the hysteresis."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -15,18 +13,6 @@ from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Rever
 # Doubt about the displacement needed, or a start in motion, that is worth a remark: a fraction of the span.
 _WORTH_SAYING = 0.01
 _FEWEST = 16
-_ROUNDING = 1e-13
-
-
-class Gains(NamedTuple):
-    """Static gains of a stage: piezo voltage per command, measured displacement per displacement of the piezo.
-
-    The offset is the measured displacement where the piezo's is zero.
-    """
-
-    ahead: float
-    behind: float
-    offset_um: float
 
 
 def plain_of(stage: Stage) -> Stage:
@@ -43,17 +29,17 @@ def plain_of(stage: Stage) -> Stage:
 
 def hysteresis_of(stage: Stage) -> Preisach:
     """Find the one Preisach hysteresis of a stage."""
-    found = [innermost(part) for part in stage.parts if isinstance(innermost(part), Preisach)]
-    if not found:
-        parts = ", ".join(f"{n} ({type(p).__name__})" for n, p in zip(stage.names, stage.parts, strict=True))
-        raise DataError(
-            f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.", of_model=True
-        )
-    return found[0]
+    for part in stage.parts:
+        if isinstance(innermost(part), Preisach):
+            return innermost(part)
+    parts = ", ".join(f"{n} ({type(p).__name__})" for n, p in zip(stage.names, stage.parts, strict=True))
+    raise DataError(
+        f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.", of_model=True
+    )
 
 
-def gains_of(stage: Stage) -> Gains:
-    """Static gains of a stage ahead of its hysteresis and behind it; they must be positive."""
+def gains_of(stage: Stage) -> tuple[float, float, float]:
+    """Static gains of a stage ahead of its hysteresis and behind it, and the reading where the piezo's is zero."""
     law = stage.parts.index(hysteresis_of(stage))
     ahead, behind, offset = 1.0, 1.0, 0.0
     for k, part in enumerate(stage.parts):
@@ -70,7 +56,7 @@ def gains_of(stage: Stage) -> Gains:
             ahead *= gain
         else:
             behind, offset = behind * gain, gain * offset + float(part.system().offset)
-    return Gains(ahead, behind, offset)
+    return ahead, behind, offset
 
 
 def static_equivalent(stage: Stage) -> Preisach:
@@ -79,13 +65,13 @@ def static_equivalent(stage: Stage) -> Preisach:
     A `DataError` refuses a stage without a Preisach hysteresis, or with a static gain that is not positive.
     """
     stage = plain_of(stage)
-    law, gains = hysteresis_of(stage), gains_of(stage)
-    lower, upper = law.density.lower_V / gains.ahead, law.density.upper_V / gains.ahead
+    law, (ahead, behind, offset_um) = hysteresis_of(stage), gains_of(stage)
+    lower, upper = law.density.lower_V / ahead, law.density.upper_V / ahead
     weights = law.weights_um[np.tril_indices(law.density.levels)]
     return Preisach(
-        GridDensity(gains.behind * weights, lower, upper),
-        Reversible(gains.behind * gains.ahead * law.reversible.slope_um_per_V, lower, upper),
-        gains.offset_um + gains.behind * law.offset_um,
+        GridDensity(behind * weights, lower, upper),
+        Reversible(behind * ahead * law.reversible.slope_um_per_V, lower, upper),
+        offset_um + behind * law.offset_um,
     )
 
 
@@ -100,47 +86,36 @@ def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: s
             f"{source}: expected {_FEWEST} samples or more for --dynamic, found {len(time_s)}; sample the reference "
             "more finely, or use --static."
         )
-    gains = gains_of(stage)
+    _, behind, offset_um = gains_of(stage)
     every, other = (
-        gains.offset_um + gains.behind * np.asarray(_demand(stage, jnp.asarray(t), jnp.asarray(r)))
-        for t, r in ((time_s, reference_um), (time_s[::2], reference_um[::2]))
+        offset_um + behind * np.asarray(_demand(stage, jnp.asarray(time_s[::n]), jnp.asarray(reference_um[::n])))
+        for n in (1, 2)
     )
     # Away from the ends, where splines are less sure than the reference is.
     return every, float(np.max(np.abs(every[::2] - other)[2:-2]) / 3)
 
 
-def turns(reference_um: np.ndarray, doubt_um: float) -> list[str]:
-    """Remark that the reference turns faster than its samples show, if the doubt from `demand` is that large."""
-    if doubt_um <= _WORTH_SAYING * float(np.ptp(reference_um)):
-        return []
-    return [
+def demand_remarks(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: float) -> tuple[list[str], list[str]]:
+    """Remarks that a reference turns faster than its samples show, and that it moves at first, from `demand`."""
+    start_um, little_um = abs(float(needed_um[0] - reference_um[0])), _WORTH_SAYING * float(np.ptp(reference_um))
+    turning = (
         "the reference turns within a sample, so that the displacement its acceleration asks for is uncertain by "
         f"{doubt_um:.3g} um; smooth it, sample it more finely, or use --static."
-    ]
-
-
-def begins_in_motion(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: float) -> list[str]:
-    """Remark that a stage at rest cannot take up a reference that moves; needed and doubt are from `demand`."""
-    start_um = abs(float(needed_um[0] - reference_um[0]))
-    if start_um <= max(_WORTH_SAYING * float(np.ptp(reference_um)), doubt_um):
-        return []
-    return [
+    )
+    moving = (
         f"the reference begins in motion and the stage at rest, {start_um:.3g} um away from what it would need; "
         "begin with a rest and a smooth start."
-    ]
+    )
+    return [turning] if doubt_um > little_um else [], [moving] if start_um > max(little_um, doubt_um) else []
 
 
 def command(stage: Stage, time_s: np.ndarray, static_V: np.ndarray) -> np.ndarray:
     """Compensate the driver's lag: the command that gives the piezo a static voltage, shape `(n,)`."""
-    gain = gains_of(stage).ahead
-    return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(gain * static_V)))
+    return np.asarray(_command(stage, jnp.asarray(time_s), jnp.asarray(gains_of(stage)[0] * static_V)))
 
 
 def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.ndarray:
-    """Displacement of a hysteresis or a whole stage under a voltage, in um, shape `(n,)`.
-
-    The memory before the first sample is `negative`, `positive` or `demagnetised`.
-    """
+    """Displacement of a hysteresis or a whole stage under a voltage, in um, shape `(n,)`; see `compensate`."""
     law = model if isinstance(model, Preisach) else hysteresis_of(model)
     lower, upper = float(law.density.lower_V), float(law.density.upper_V)
     if isinstance(model, Preisach):
@@ -149,14 +124,10 @@ def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.
     step_s = record.duration_s / max(n - 1, 1) or 1.0
     # Even times are given as the one interval between them: that takes half as long to compile.
     uneven_s = np.abs(record.time_s - (record.time_s[0] + step_s * np.arange(n))).max()
-    even = uneven_s <= _ROUNDING * max(np.abs(record.time_s).max(), step_s)
+    even = uneven_s <= 1e-13 * max(np.abs(record.time_s).max(), step_s)
     time_s = step_s if even else record.time_s
     start = Start(memory=initial_state(initial, lower, upper))
     return respond(model, time_s, record.voltage_V, start)
-
-
-_demand = eqx.filter_jit(microid.piezo_demand)
-_command = eqx.filter_jit(microid.driver_command)
 
 
 def respond(stage: Stage, time_s: np.ndarray | float, voltage_V: np.ndarray, start: Start) -> np.ndarray:
@@ -164,4 +135,6 @@ def respond(stage: Stage, time_s: np.ndarray | float, voltage_V: np.ndarray, sta
     return np.asarray(_respond(stage, jnp.asarray(time_s), jnp.asarray(voltage_V), start))
 
 
+_demand = eqx.filter_jit(microid.piezo_demand)
+_command = eqx.filter_jit(microid.driver_command)
 _respond = eqx.filter_jit(lambda stage, time_s, voltage_V, start: stage(time_s, voltage_V, start))

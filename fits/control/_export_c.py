@@ -2,6 +2,7 @@
 
 import os
 import re
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from string import Template
@@ -16,11 +17,6 @@ from fits.io._file_set import file_set
 from fits.io._version import written_by
 from microid import Everett, Preisach
 
-# That of a demagnetised staircase in `microid`.
-_SWINGS = 31
-_SMALLEST, _LARGEST = 8, 65_536
-_LINE = 118
-
 
 def export_c(
     model: Preisach,
@@ -34,41 +30,29 @@ def export_c(
 
     The C needs no library, allocates nothing, loops a bounded number of times and computes in double precision. It
     holds `8 ((N + 1)**2 + 8 (N - 1))` bytes of constants for `N` levels; a state takes 16 bytes per extreme. The
-    paths of the two files come back.
+    paths of `name.h` and `name.c` come back; the folder is made if need be, and the name stands before every name.
 
-    Parameters
-    ----------
-    folder, name
-        Where `name.h` and `name.c` go; it is made if need be. The name also stands before every name in them.
-    size
-        Extremes that a state remembers, two per nested loop. Where more are needed the smallest swing is dropped
-        and the status says so: outputs are then off by no more than that swing until a wider loop wipes it out.
-    limits_V
-        Lowest and highest voltage that the inverse may give; the range of the model by default.
+    The size is the extremes that a state remembers, two per nested loop. Where more are needed the smallest swing is
+    dropped and the status says so: outputs are then off by no more than that swing until a wider loop wipes it out.
+    Limits are the lowest and highest voltage that the inverse may give; the range of the model by default.
 
-    Raises
-    ------
-    DataError
-        If the name is not one in C, the size is too small, the limits are not in the model's range, or a file cannot
-        be written.
+    A `DataError` says that the name is not one in C, the size is too small, the limits are not in the model's range,
+    or a file cannot be written.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,30}", name):
         raise DataError(
             f"--name: expected a letter and then up to 30 letters, digits or underscores, found '{name}'; rename it."
         )
-    if not _SMALLEST <= size <= _LARGEST:
-        raise DataError(
-            f"--memory: expected {_SMALLEST} to {_LARGEST} extremes, found {size}; 128 suit most references."
-        )
+    if not 8 <= size <= 65_536:
+        raise DataError(f"--memory: expected 8 to 65536 extremes, found {size}; 128 suit most references.")
     fields = _fields(model, name, size, within_range(model, limits_V))
-    written = [f"{name}.{ending}" for ending in ("h", "c")]
     with file_set() as files:
         place = files.folder(folder, "--out")
-        for file in written:
-            template = Path(__file__).with_name("templates") / f"controller{Path(file).suffix}"
+        for ending in ("h", "c"):
+            template = Path(__file__).with_name("templates") / f"controller.{ending}"
             text = Template(template.read_text(encoding="utf-8")).substitute(fields)
-            (place / file).write_bytes(text.encode())
-    return [Path(folder) / file for file in written]
+            (place / f"{name}.{ending}").write_bytes(text.encode())
+    return [Path(folder) / f"{name}.{ending}" for ending in ("h", "c")]
 
 
 @eqx.filter_jit
@@ -96,7 +80,7 @@ def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]
         "highest_um": repr(offset + stroke_um),
         "rounding_um": repr(2 * float(np.finfo(float).eps) * max(abs(offset), abs(offset + stroke_um))),
         "size": str(size),
-        "swings": str(min(_SWINGS, (size - 4) // 2)),
+        "swings": str(min(31, (size - 4) // 2)),  # at most those of a demagnetised staircase in `microid`
         "intervals": str(n),
         "per_V": repr(n / (upper - lower)),
         "window_um": _lines(window, 4),
@@ -107,13 +91,8 @@ def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]
 
 def _lines(values: Iterable[float], indent: int) -> str:
     """Write constants with as many digits as reading them back exactly takes."""
-    lines = [" " * (indent - 1)]
-    for value in values:
-        text = f" {float(value)!r},"
-        if len(lines[-1]) + len(text) > _LINE:
-            lines.append(" " * (indent - 1))
-        lines[-1] += text
-    return "\n".join(lines)
+    text = ", ".join(repr(float(value)) for value in values)
+    return textwrap.indent(textwrap.fill(f"{text},", 118 - indent, break_on_hyphens=False), " " * indent)
 
 
 def _rows(cubics: np.ndarray) -> str:

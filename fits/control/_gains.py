@@ -27,16 +27,10 @@ class Given:
     pid: Mapping[str, float]
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
 
-    def make_pid(self, interval_s: float) -> PID:
-        """The PID controller, without limits."""
-        return PID(**{name: jnp.asarray(x) for name, x in self.pid.items()}, interval_s=jnp.asarray(interval_s))
-
 
 def replaced(controller: _Controller, values: Mapping[str, np.ndarray]) -> _Controller:
     """A controller with other values of some fields, by path; a `DataError` says which has a wrong shape or size."""
-    for row in parameter_table(controller):
-        if row.path not in values:
-            continue
+    for row in (row for row in parameter_table(controller) if row.path in values):
         value, low, high = values[row.path], row.spec.lower, row.spec.upper
         if value.shape != tuple(row.shape):
             raise DataError(f"--gains: expected {row.path} of shape {row.shape}, found {value.shape}.")
@@ -63,20 +57,15 @@ def printed_gains(controller: AbstractController, pid: PID) -> dict[str, np.ndar
 
 
 def read_gains(text: str) -> Given:
-    """Gains from the command line: three numbers, or a file as `--json` printed it, or with `gains` alone.
-
-    A `DataError` says that it is neither, or that a value is missing, unknown, negative or no number.
-    """
+    """Gains from the command line: three numbers, or a file as `--json` printed it, or with `gains` alone."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
-        values = []
-    if len(values) == len(GAINS):
-        given = Given(dict(zip(GAINS, values, strict=True)))
-    elif values:
-        raise DataError(f"--gains: expected three numbers KP,KI,KD or a file, found {len(values)}: '{text}'.")
-    else:
         given = _read_file(text)
+    else:
+        if len(values) != len(GAINS):
+            raise DataError(f"--gains: expected three numbers KP,KI,KD or a file, found {len(values)}: '{text}'.")
+        given = Given(dict(zip(GAINS, values, strict=True)))
     for name, value in given.pid.items():
         if not (math.isfinite(value) and value >= PID_SETTINGS[name].lower):
             raise DataError(f"--gains: expected {name} of 0 or more, found {value:g}.")
@@ -90,8 +79,7 @@ def _read_file(path: str) -> Given:
     except DataError as error:
         raise DataError(f"--gains: {error}") from None
     content = content.get("gains", content) if isinstance(content, dict) else {}
-    if not isinstance(content, dict):
-        content = {}
+    content = content if isinstance(content, dict) else {}
     prefix = "pid." if any(name.startswith("pid.") for name in content) else ""
     fields = [f"{prefix}{name}" for name in PID_SETTINGS]
     for name in GAINS:

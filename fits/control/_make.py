@@ -12,14 +12,9 @@ import microid as m
 from fits.control._gains import PID_SETTINGS, Given, replaced
 from fits.control._setup import Setup
 from fits.control._tune import parameter_values, tune_controller
-from fits.control._tune_problem import Goal
-from fits.control._tune_result import Tuning
+from fits.control._tune_problem import Goal, Tuning
 from fits.control._tune_start import relay_start, slope_array, steepest_slope
 from fits.io._errors import DataError
-
-_MOST_PEAK, _HALVINGS = 4.0, 20
-# Resonators that are nearer to each other than this share of their frequency fight.
-_SAME_FREQUENCY = 1e-3
 
 
 def own_settings(controller: type[m.AbstractController]) -> list[m.Setting]:
@@ -30,11 +25,7 @@ def own_settings(controller: type[m.AbstractController]) -> list[m.Setting]:
 def with_defaults(
     settings: Collection[m.Setting], stated: Mapping[str, Any], task: m.ControlTask, place: Callable[[str], str]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Settings as they are stated, or else their defaults, and what is to be said of these.
-
-    Settings that the controller itself finds by its plant are left out. `place` names a setting as the user does, in
-    the sentence of the `DataError` that is raised where no default is found.
-    """
+    """Settings as stated, or else their defaults, with what is to be said of these; `place` names one to the user."""
     found: dict[str, Any] = {}
     said = []
     for setting in settings:
@@ -54,10 +45,7 @@ def with_defaults(
 
 
 def strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float | None:
-    """Frequency of the strongest line of a reference, shape `(t,)`, by a parabola through its transform.
-
-    None for a reference that stands still.
-    """
+    """Frequency of the strongest line of a reference, shape `(t,)`; None for one that stands still."""
     n = len(reference_um)
     size = np.abs(np.fft.rfft((reference_um - reference_um.mean()) * np.hanning(n), 8 * n))
     k = int(np.clip(np.argmax(size), 1, len(size) - 2))
@@ -70,10 +58,7 @@ def strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float | None:
 
 @dataclass(frozen=True)
 class Loop:
-    """All that stays the same while controllers change: the plants, the one to be run first, and the readings.
-
-    Noise is a standard deviation, the delay a number of samples; the first `skip` samples do not count.
-    """
+    """What stays the same while controllers change: plants, noise, and `skip`, how many samples do not count."""
 
     ready: Setup
     plants: list[m.Stage]
@@ -112,10 +97,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Made:
-    """A controller that was made, and the PID controller that it is or was made around.
-
-    There is no tuning where gains were given.
-    """
+    """A controller, the PID controller that it is or was made around, and the tuning if no gains were given."""
 
     controller: m.AbstractController
     pid: m.PID
@@ -135,20 +117,20 @@ class Maker:
     progress: Callable[[str], None]
 
     def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
-        """Make a controller by the name of its kind, and tune it if no gains are given.
-
-        Frequencies are those of resonators; without them those of the gains, or the strongest in the reference. A
-        `DataError` says that reference or gains do not suit the controller; of a `FitError` see `tune_controller`.
-        """
+        """Make a controller by its kind, tuned if no gains are given; frequencies are those of resonators."""
         loop, kind = self.loop, m.CONTROLLERS[name]
         tuning: Tuning[Any] | None = None
         if given is None:
             self.progress("start by Ziegler and Nichols")
-            begin = relay_start(loop.plants, loop.ready.interval_s, delay=loop.delay)
-            tuning = self._tuned(_limited(begin, loop.ready.limits_V))
-            pid = tuning.controller
+            pid = relay_start(loop.plants, loop.ready.interval_s, delay=loop.delay)
         else:
-            pid = _limited(given.make_pid(loop.ready.interval_s), loop.ready.limits_V)
+            fields = {**given.pid, "interval_s": loop.ready.interval_s}
+            pid = m.PID(**{field: jnp.asarray(value) for field, value in fields.items()})
+        limits_V = tuple(jnp.asarray(limit) for limit in loop.ready.limits_V)
+        pid = eqx.tree_at(lambda pid: (pid.lower_V, pid.upper_V), pid, limits_V)
+        if given is None:
+            tuning = self._tuned(pid)
+            pid = tuning.controller
         remarks = [] if tuning is None else list(tuning.remarks)
         if kind is m.PID:
             return Made(pid, pid, tuning, remarks)
@@ -156,15 +138,23 @@ class Maker:
         if kind.learns:
             which = "margins are" if tuning is None else "what was tuned, and margins, are"
             said.append(f"{which} those of its PID controller, before it learns")
-        stated = {"seed": self.seed} | own
-        places = {"frequency_Hz": "--frequency"}
-        numbers, more = with_defaults(
-            own_settings(kind), stated, self._task(), lambda x: places.get(x, f"--controller {name}: {x}")
+
+        def place(setting: str) -> str:
+            return "--frequency" if setting == "frequency_Hz" else f"--controller {name}: {setting}"
+
+        ready, stage = loop.ready, loop.plants[0]
+        task = m.ControlTask(
+            stage,
+            ready.interval_s,
+            lambda: ready.reference_um,
+            lambda: ready.static_V,
+            lambda: steepest_slope(stage),
+            lambda: strongest_Hz(ready.reference_um, ready.interval_s),
         )
+        numbers, more = with_defaults(own_settings(kind), {"seed": self.seed} | own, task, place)
         remarks += [*said, *more]
         if "frequency_Hz" in numbers:
             self._check_frequencies(np.atleast_1d(numbers["frequency_Hz"]))
-        stage = loop.plants[0]
         try:
             made = kind.of(pid, numbers, m.ControlledPlant(stage, slope_array(stage), loop.delay))
         except ValueError as error:
@@ -173,17 +163,6 @@ class Maker:
             return Made(replaced(made, own), pid, tuning, remarks)
         tuning = self._tuned(self._with_margin(made))
         return Made(tuning.controller, pid, tuning, [*remarks, *(x for x in tuning.remarks if x not in remarks)])
-
-    def _task(self) -> m.ControlTask:
-        ready, stage = self.loop.ready, self.loop.plants[0]
-        return m.ControlTask(
-            stage,
-            ready.interval_s,
-            lambda: ready.reference_um,
-            lambda: ready.static_V,
-            lambda: steepest_slope(stage),
-            lambda: strongest_Hz(ready.reference_um, ready.interval_s),
-        )
 
     def _tuned(self, controller: Any) -> Tuning[Any]:
         ready = self.loop.ready
@@ -205,13 +184,12 @@ class Maker:
 
     def _with_margin(self, controller: Any) -> Any:
         """Halve a controller's own gains until the loop is stable with some margin, so that it can be tuned."""
-        for _ in range(_HALVINGS):
+        for _ in range(20):
             every = self.loop.margins(controller)
-            if all(bool(one.stable) and float(one.sensitivity_peak) < _MOST_PEAK for one in every):
+            if all(bool(one.stable) and float(one.sensitivity_peak) < 4 for one in every):
                 break
             values = parameter_values(controller)
-            halves = {name: values[name] / 2 for name in controller.own if name in values}
-            controller = replaced(controller, halves)
+            controller = replaced(controller, {name: values[name] / 2 for name in controller.own if name in values})
         return controller
 
     def _stated(
@@ -239,9 +217,6 @@ class Maker:
         if len(bad):
             raise DataError(f"--frequency: expected one between 0 and {highest:g} Hz, found {bad[0]:g} Hz.")
         near = np.sort(frequency_Hz)
-        if np.any(np.diff(near) <= _SAME_FREQUENCY * near[1:]):
+        # Resonators that are nearer to each other fight.
+        if np.any(np.diff(near) <= 1e-3 * near[1:]):
             raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
-
-
-def _limited(pid: m.PID, limits_V: tuple[float, float]) -> m.PID:
-    return eqx.tree_at(lambda p: (p.lower_V, p.upper_V), pid, tuple(jnp.asarray(x) for x in limits_V))

@@ -24,15 +24,9 @@ class NetworkInverse(eqx.Module):
     Use `compensate`, or `microid.invert`, instead: they invert the model exactly, whatever the reference. This is
     what they are compared with. A network is sure of nothing beyond the loops that it has seen.
 
-    Attributes
-    ----------
-    network
-        Takes the displacement, its direction and the remembered extremes, newest first; all from -1 to 1.
-    lowest_um, span_um, middle_V, half_V
-        Range of the displacements it was trained on; middle and half-width of the voltages.
-    dead_um, extremes
-        Turns of the displacement by less than this are not remembered: they are noise; and how many extremes are
-        seen.
+    The network takes the displacement, its direction and so many remembered extremes, newest first; all from -1 to 1
+    over the range of the displacements it was trained on, as its voltage is about the middle of theirs, by half their
+    width. Turns by less than `dead_um` are not remembered: they are noise.
     """
 
     network: eqx.nn.MLP
@@ -47,6 +41,7 @@ class NetworkInverse(eqx.Module):
         """Voltage in V for a displacement that came up from below its range, shape `(n,)`."""
         return self.middle_V + self.half_V * jax.vmap(self.network)(self.features(displacement_um))
 
+    @eqx.filter_jit
     def features(self, displacement_um: Float[Array, " n"]) -> Float[Array, "n k"]:
         """What the network sees of a displacement, shape `(n, 2 + extremes)`."""
 
@@ -78,21 +73,10 @@ def fit_network_inverse(
 ) -> NetworkInverse:
     """Train a network to give the voltage of a measured displacement. For comparison: see `NetworkInverse`.
 
-    Parameters
-    ----------
-    record
-        Measured voltage and displacement, begun at negative saturation.
-    width, depth, extremes
-        Of the network's hidden layers, and how many remembered extremes it sees.
-    samples, steps
-        At most so many samples, evenly spaced, and steps of the Levenberg-Marquardt method.
-    noise_um, seed
-        Standard deviation of the sensor's noise, and the seed of the first weights.
-
-    Raises
-    ------
-    DataError
-        If the record has no displacement, or too little of it, or nothing moves in it.
+    The record begins at negative saturation. Width and depth are those of the network's hidden layers. It is trained
+    on at most so many samples, evenly spaced, in at most so many steps of the Levenberg-Marquardt method. The noise
+    is the standard deviation of the sensor's, the seed that of the first weights. A `DataError` says that the record
+    has no displacement, or too little of it, or nothing moves in it.
     """
     if record.displacement_um is None:
         raise DataError(f"{record.source}: a displacement column is needed here; name it with --columns.")
@@ -104,16 +88,16 @@ def fit_network_inverse(
         )
     network = _network(2 + extremes, "scalar", width, depth, activation=jnp.tanh, key=jax.random.key(seed))
     middle, half = (voltage.max() + voltage.min()) / 2, np.ptp(voltage) / 2
-    lowest, span, dead = (jnp.asarray(x) for x in (displacement.min(), np.ptp(displacement), 4.0 * noise_um))
-    inverse = NetworkInverse(network, lowest, span, jnp.asarray(middle), jnp.asarray(half), dead, extremes)
+    numbers = displacement.min(), np.ptp(displacement), middle, half, 4.0 * noise_um
+    lowest_um, span_um, middle_V, half_V, dead_um = map(jnp.asarray, numbers)
+    inverse = NetworkInverse(network, lowest_um, span_um, middle_V, half_V, dead_um, extremes)
     chosen = np.linspace(0, len(record) - 1, min(samples, len(record))).astype(int)
-    seen = _features(inverse, jnp.asarray(displacement))[chosen]
+    seen = inverse.features(jnp.asarray(displacement))[chosen]
     trained = _train(network, seen, jnp.asarray((voltage[chosen] - middle) / half), steps)
     return eqx.tree_at(lambda inverse: inverse.network, inverse, trained)
 
 
 _network = eqx.filter_jit(eqx.nn.MLP)
-_features = eqx.filter_jit(lambda inverse, displacement_um: inverse.features(displacement_um))
 
 
 @eqx.filter_jit

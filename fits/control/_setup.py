@@ -11,23 +11,17 @@ from fits.control._compensate import compensate
 from fits.io._errors import DataError
 from fits.io._record import Reference
 from fits.loop._run import initial_state
-from fits.stage._run import place_of_hysteresis, range_of
+from fits.stage._run import as_stage, place_of_hysteresis, range_of
 from microid import Preisach, SampledStage, Stage, Start, two_degrees
 
 Feedforward = Literal["none", "static", "dynamic"]
 
 _FEWEST = 16
-# Intervals that differ by less than this from their mean, as a fraction of it, count as even.
-_EVEN_WITHIN = 1e-3
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What a closed loop needs beside its controller.
-
-    The stage is under a held command, and at rest where the reference begins. Signals have the shape `(t,)`:
-    `static_V` would hold the stage at the reference.
-    """
+    """What a loop needs beside its controller: a held stage at rest where the reference begins; signals `(t,)`."""
 
     stage: Stage
     interval_s: float
@@ -35,7 +29,7 @@ class Setup:
     feedforward_V: np.ndarray | None
     limits_V: tuple[float, float]
     start: Start
-    static_V: np.ndarray
+    static_V: np.ndarray  # would hold the stage at the reference
     remarks: tuple[str, ...]
 
 
@@ -58,77 +52,56 @@ def setup(
     those of the model. A `DataError` says that the times are uneven or too few, that the stage cannot be stepped or
     inverted, or that the limits are not within the model's range.
     """
-    stage = held(model if isinstance(model, Stage) else Stage.of(hysteresis=model))
+    stage = held(as_stage(model))
     interval = _interval_s(reference)
     try:
         sampled = SampledStage(stage, interval)
     except ValueError as error:
         raise DataError(f"the model cannot be stepped from sample to sample: {error}", of_model=True) from error
+    wanted, remarks = np.asarray(reference.displacement_um), list[str]()
     place = place_of_hysteresis(stage)
     if place is None:
-        return _linear(stage, sampled, reference, interval, feedforward, limits_V)
-    law = stage.parts[place]
-    if not isinstance(law, Preisach):
-        raise DataError(
-            f"{stage.names[place]!r} is a {type(law).__name__}, expected a Preisach hysteresis; fit one",
-            of_model=True,
-        )
-    invert = partial(compensate, stage, reference, initial, clip=True, limits_V=limits_V)
-    found = invert(way="static")
-    remarks = []
-    if found.clipped.any():
-        remarks.append(f"{int(found.clipped.sum())} samples of the reference are out of reach within the limits")
-    ahead = found.voltage_V if feedforward == "static" else None
-    if feedforward == "dynamic":
-        if isinstance(model, Preisach) or len(stage.parts) == 1:
+        memory, limits = None, (-np.inf, np.inf) if limits_V is None else limits_V
+        gain, offset = float(stage.static_gain), float(sampled.init(Start(jnp.asarray(0.0)))[1])
+        if not (np.isfinite(gain) and gain > 0):
             raise DataError(
-                "expected a model with mechanics for --feedforward dynamic, found a hysteresis alone", of_model=True
+                f"the stage gives {gain:g} um/V at rest, expected a positive one; turn the sign of a column",
+                of_model=True,
             )
-        led = invert(way="dynamic")
-        ahead, remarks = led.voltage_V, [*remarks, *led.remarks]
-    memory = initial_state(initial, float(law.density.lower_V), float(law.density.upper_V))
-    rest_V = float(found.voltage_V[0] if ahead is None else ahead[0])
-    return Setup(
-        stage,
-        interval,
-        np.asarray(reference.displacement_um),
-        ahead,
-        range_of(stage) if limits_V is None else limits_V,
-        Start(jnp.asarray(rest_V), memory),
-        found.voltage_V,
-        tuple(remarks),
-    )
-
-
-def _linear(
-    stage: Stage,
-    sampled: SampledStage,
-    reference: Reference,
-    interval_s: float,
-    feedforward: Feedforward,
-    limits_V: tuple[float, float] | None,
-) -> Setup:
-    gain, offset = float(stage.static_gain), float(sampled.init(Start(jnp.asarray(0.0)))[1])
-    if not (np.isfinite(gain) and gain > 0):
-        raise DataError(
-            f"the stage gives {gain:g} um/V at rest, expected a positive one; turn the sign of a column",
-            of_model=True,
-        )
-    wanted = np.asarray(reference.displacement_um)
-    static = (wanted - offset) / gain
-    ahead = static if feedforward == "static" else None
-    if feedforward == "dynamic":
-        try:
-            ahead = np.asarray(two_degrees(stage, interval_s, jnp.asarray(wanted)).feedforward_V)
-        except ValueError as error:
-            raise DataError(f"the model has no dynamic inverse: {error}", of_model=True) from error
-    limits = (-np.inf, np.inf) if limits_V is None else limits_V
-    remarks = []
-    if ahead is not None and not np.array_equal(np.clip(ahead, *limits), ahead):
-        remarks.append("the feedforward was cut to the limits")
-        ahead = np.clip(ahead, *limits)
-    rest_V = float(np.clip(static[0] if ahead is None else ahead[0], *limits))
-    return Setup(stage, interval_s, wanted, ahead, limits, Start(jnp.asarray(rest_V)), static, tuple(remarks))
+        static_V = ahead_V = (wanted - offset) / gain
+        if feedforward == "dynamic":
+            try:
+                ahead_V = np.asarray(two_degrees(stage, interval, jnp.asarray(wanted)).feedforward_V)
+            except ValueError as error:
+                raise DataError(f"the model has no dynamic inverse: {error}", of_model=True) from error
+        if feedforward != "none" and not np.array_equal(np.clip(ahead_V, *limits), ahead_V):
+            remarks.append("the feedforward was cut to the limits")
+        ahead_V = np.clip(ahead_V, *limits)
+    else:
+        law = stage.parts[place]
+        if not isinstance(law, Preisach):
+            raise DataError(
+                f"{stage.names[place]!r} is a {type(law).__name__}, expected a Preisach hysteresis; fit one",
+                of_model=True,
+            )
+        invert = partial(compensate, stage, reference, initial, clip=True, limits_V=limits_V)
+        found = invert(way="static")
+        static_V = ahead_V = found.voltage_V
+        memory = initial_state(initial, float(law.density.lower_V), float(law.density.upper_V))
+        limits = range_of(stage) if limits_V is None else limits_V
+        if found.clipped.any():
+            remarks.append(f"{int(found.clipped.sum())} samples of the reference are out of reach within the limits")
+        if feedforward == "dynamic":
+            if isinstance(model, Preisach) or len(stage.parts) == 1:
+                raise DataError(
+                    "expected a model with mechanics for --feedforward dynamic, found a hysteresis alone",
+                    of_model=True,
+                )
+            led = invert(way="dynamic")
+            ahead_V, remarks = led.voltage_V, [*remarks, *led.remarks]
+    start = Start(jnp.asarray(float(ahead_V[0])), memory)
+    fed_V = None if feedforward == "none" else ahead_V
+    return Setup(stage, interval, wanted, fed_V, limits, start, static_V, tuple(remarks))
 
 
 def _interval_s(reference: Reference) -> float:
@@ -139,7 +112,7 @@ def _interval_s(reference: Reference) -> float:
     steps = np.diff(reference.time_s)
     interval = float(steps.mean())
     worst = int(np.argmax(np.abs(steps - interval)))
-    if abs(steps[worst] - interval) > _EVEN_WITHIN * interval:
+    if abs(steps[worst] - interval) > 1e-3 * interval:
         raise DataError(
             f"{reference.source}: expected even times, as of a controller, found a step of {steps[worst]:.6g} s "
             f"at sample {worst + 2} where the mean is {interval:.6g} s; resample the reference"

@@ -1,6 +1,6 @@
 """Controllers tuned by differentiating through the closed loop, for all plants that a fit leaves possible."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fits.control._tune_problem import REACH, Figures, Goal, Problem, descend, judge
-from fits.control._tune_result import Tuning, reports
+from fits.control._tune_problem import REACH, Figures, Goal, Problem, Tuning, descend, judge, reports
 from fits.control._tune_start import steepest_slope
 from fits.io._errors import DataError
 from fits.loop._result import FitError, FitStatus
@@ -18,17 +17,8 @@ from microid import AbstractController, Coordinates, ParameterInfo, Stage, Start
 
 _Controller = TypeVar("_Controller", bound=AbstractController)
 
-_ROUNDS = 12
-_FIRST_WEIGHT, _FACTOR, _MOST_WEIGHT = 10.0, 4.0, 1e6
 # Limits are kept to this share; the search stops where it moves no gain by more than this.
-_TOLERANCE = 2e-3
-_SMALLEST_MOVE = 1e-2
-# Relative change of the cost per e-fold of a gain that counts as none.
-_FLAT = 2e-2
-_SPREAD = 1.0
-_SHRINKS = 8
-_EDGE = 0.8 * REACH
-_SAME_COST = 0.01
+_TOLERANCE, _SMALLEST_MOVE = 2e-3, 1e-2
 
 
 @dataclass(frozen=True)
@@ -46,7 +36,8 @@ class _End:
 
     @property
     def converged(self) -> bool:
-        return self.settled and bool(np.max(np.abs(self.gradient)) < _FLAT)
+        # Per e-fold of a gain, such a relative change of the cost counts as none.
+        return self.settled and bool(np.max(np.abs(self.gradient)) < 2e-2)
 
 
 def tune_controller(
@@ -71,36 +62,20 @@ def tune_controller(
     Gains are searched for in their logarithm (a BFGS method within an augmented Lagrangian for the limits), from the
     controller that is given and from places drawn around it. The best that was found within all limits comes back.
 
-    Parameters
-    ----------
-    controller
-        Where the search begins: its loop must be stable with every plant; see `relay_start`. `BPPID` and `CMACPID`
-        have the margins of the PID controller that they are at first.
-    plants
-        One stage, or several of one structure, as from `draw_plants`; the first is the nominal one.
-    reference_um
-        One or several references, shape `(t,)` or `(r, t)`.
-    goal
-        Cost and limits; see `Goal` for the default.
-    feedforward_V, noise_um
-        Of each reference, or of all, in the shapes of references; none by default. The same noise is used throughout.
-    delay, resolution_um, start
-        See `microid.simulate_loop`.
-    skip
-        How many samples at the beginning do not count.
-    free
-        Paths of the parameters that move, such as `"pid"` or `"integral_V_per_um_s"`; by default gains: what
-        cannot be negative, is not zero and is no time.
-    starts, seed, progress
-        Number of places to search from, the seed of those that are drawn, and what is told of each.
+    The search begins with the controller, whose loop must be stable with every plant; see `relay_start`. `BPPID` and
+    `CMACPID` have the margins of the PID controller that they are at first. Plants are one stage, or several of one
+    structure, as from `draw_plants`; the first is the nominal one. There are one or several references, shape `(t,)`
+    or `(r, t)`, with the feedforward and the noise of each, or of all, in the same shapes; none by default. The same
+    noise is used throughout. See `Goal` for cost and limits, and `microid.simulate_loop` for delay, resolution and
+    start. The first `skip` samples do not count.
 
-    Raises
-    ------
-    DataError
-        If plants differ in structure, signals in shape, or there is nothing to tune.
-    FitError
-        If the loop is unstable at the start, no place within all limits was found, or none better than the start,
-        although that is not an optimum.
+    Parameters that move are those of the paths in `free`, such as `"pid"` or `"integral_V_per_um_s"`; by default
+    gains: what cannot be negative, is not zero and is no time. There are so many places to search from, drawn by the
+    seed, and `progress` is told of each.
+
+    A `DataError` says that plants differ in structure, signals in shape, or that there is nothing to tune; a
+    `FitError` that the loop is unstable at the start, that no place within all limits was found, or none better than
+    the start, although that is not an optimum.
     """
     stages = [plants] if isinstance(plants, Stage) else list(plants)
     goal, signals = goal or Goal(), {"feedforward_V": feedforward_V, "noise_um": noise_um}
@@ -117,11 +92,9 @@ def tune_controller(
     first = _worst(over)
     rng, ends = np.random.default_rng(seed), []
     for number in range(starts):
-        y = origin if number == 0 else _stable_place(problem, rng)
-        ends.append(_search(problem, y))
-        progress(
-            f"search {number + 1} of {starts}: cost {ends[-1].cost_um:.4g} um, {_excess_in_words(ends[-1].over)}"
-        )
+        end = _search(problem, origin if number == 0 else _stable_place(problem, rng))
+        progress(f"search {number + 1} of {starts}: cost {end.cost_um:.4g} um, {_excess_in_words(end.over)}")
+        ends.append(end)
     kept = [end for end in ends if end.kept]
     if not kept:
         nearest = min(ends, key=lambda end: _worst(end.over)[0])
@@ -160,14 +133,13 @@ def _problem(
     if len(kinds) != 1:
         raise DataError("expected one plant or more, all of the same parts in the same order")
     reference = np.atleast_2d(np.asarray(reference_um, dtype=float))
-    given: dict[str, Any] = {}
+    given: dict[str, Any] = dict.fromkeys(signals)
     for name, signal in signals.items():
         if signal is not None:
-            signal = np.asarray(signal, dtype=float)
-            if signal.shape not in (reference.shape, reference.shape[1:]):
-                raise DataError(f"{name} has shape {signal.shape}, expected {reference.shape} or one row of it")
-            signal = jnp.asarray(np.broadcast_to(signal, reference.shape))
-        given[name] = signal
+            row = np.asarray(signal, dtype=float)
+            if row.shape not in (reference.shape, reference.shape[1:]):
+                raise DataError(f"{name} has shape {row.shape}, expected {reference.shape} or one row of it")
+            given[name] = jnp.asarray(np.broadcast_to(row, reference.shape))
     if not 0 <= skip < reference.shape[1]:
         raise DataError(f"skip: expected a number of samples below {reference.shape[1]}, found {skip}")
     values = parameter_values(controller)
@@ -217,8 +189,8 @@ def _below(path: str, name: str) -> bool:
 
 def _stable_place(problem: Problem, rng: np.random.Generator) -> Any:
     """A place drawn around the start, drawn nearer until all loops are stable."""
-    y = jnp.asarray(rng.normal(0, _SPREAD, problem.origin.shape))
-    for _ in range(_SHRINKS):
+    y = jnp.asarray(rng.normal(0, 1.0, problem.origin.shape))
+    for _ in range(8):
         if np.all(np.asarray(judge(problem, y)[0].stable)):
             return y
         y = y / 2
@@ -228,8 +200,8 @@ def _stable_place(problem: Problem, rng: np.random.Generator) -> Any:
 def _search(problem: Problem, y: Any) -> _End:
     over = judge(problem, y)[1]
     multipliers = {name: jnp.zeros_like(share) for name, share in over.items()}
-    weight, worst, settled = _FIRST_WEIGHT, np.inf, False
-    for _ in range(_ROUNDS):
+    weight, worst, settled = 10.0, np.inf, False
+    for _ in range(12):
         moved, gradient = descend(problem, y, over, multipliers, jnp.asarray(weight))
         figures, over, cost = judge(problem, moved)
         distance, y = float(jnp.max(jnp.abs(moved - y))), moved
@@ -240,7 +212,7 @@ def _search(problem: Problem, y: Any) -> _End:
         if settled or not np.isfinite(now):
             break
         multipliers = {name: jnp.maximum(one + weight * over[name], 0) for name, one in multipliers.items()}
-        weight = min(weight * (_FACTOR if now > worst / 2 else 1.0), _MOST_WEIGHT)
+        weight = min(weight * (4.0 if now > worst / 2 else 1.0), 1e6)
         worst = max(now, 0.0)
     return _End(y, np.asarray(gradient), figures, {k: np.asarray(v) for k, v in over.items()}, float(cost), settled)
 
@@ -258,18 +230,15 @@ def _excess_in_words(over: dict[str, Any]) -> str:
     return "within all limits" if share <= _TOLERANCE else f"{name} passed by {100 * passed:.3g} %"
 
 
-def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> list[str]:
-    out = []
-    alike = sum(end.kept and end.cost_um <= best.cost_um * (1 + _SAME_COST) for end in ends)
+def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> Iterator[str]:
+    alike = sum(end.kept and end.cost_um <= 1.01 * best.cost_um for end in ends)
     if len(ends) > 1 and alike < len(ends):
-        out.append(f"{alike} of {len(ends)} searches ended within 1 % of the best cost: the others at worse optima")
-    place = 0
-    for row in problem.coordinates.table:
-        size = int(np.prod(row.shape))
-        if np.any(np.abs(np.asarray(best.y)[place : place + size]) > _EDGE):
-            out.append(f"{row.path} is at the edge of what is searched: it hardly matters, or the start was far off")
-        place += size
+        yield f"{alike} of {len(ends)} searches ended within 1 % of the best cost: the others at worse optima"
+    rows = problem.coordinates.table
+    ends_of_rows = np.cumsum([int(np.prod(row.shape)) for row in rows])
+    for row, moved in zip(rows, np.split(np.abs(np.asarray(best.y)), ends_of_rows[:-1]), strict=True):
+        if np.any(moved > 0.8 * REACH):
+            yield f"{row.path} is at the edge of what is searched: it hardly matters, or the start was far off"
     pressing = [name for name, share in best.over.items() if np.max(share) > -_TOLERANCE]
     if pressing:
-        out.append(f"at its limit: {', '.join(pressing)}")
-    return out
+        yield f"at its limit: {', '.join(pressing)}"

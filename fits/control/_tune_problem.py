@@ -1,26 +1,22 @@
-"""What tuning minimises: figures of many closed loops at once, their cost, and how far they are from their limits."""
+"""What tuning minimises, figures of many closed loops at once within their limits, and what it gives back."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from microid import ControlledRun, Coordinates, Margins, Stage, Start, margins, simulate_loop
+from microid import AbstractController, ControlledRun, Coordinates, Margins, Stage, Start, margins, simulate_loop
 
+_Controller = TypeVar("_Controller", bound=AbstractController)
 # Every gain is searched for within `exp` of this of its start, to either side.
 REACH = 6.0
-# What stands for the cost of a loop that overflows.
-_ABSURD = 1e9
-# Roots have no derivative at zero; a picometre is nothing.
-_TINY_um2 = 1e-12
-# A reference that covers less than this stands still.
-NO_RANGE_um = 1e-6
-_RTOL = _ATOL = 1e-4
 _UNLIMITED = 1e9
-_STEPS = 80
 
 
 @dataclass(frozen=True)
@@ -29,23 +25,13 @@ class Goal:
 
     .. math:: J = \mathrm{rms}(e) + w_u\, \mathrm{rms}(u - u_{ff}) + w_{\Delta}\, \mathrm{rms}(u_k - u_{k-1})
 
-    in um, each over all plants, references and samples that count. A limit of None is none.
+    in um, each over all plants, references and samples that count. `effort_um_per_V` is the weight `w_u` of what the
+    feedback adds to the feedforward, or to the command before the first sample, `rate_um_per_V` the weight `w_Δ` of
+    the change of the command between samples, whose largest is limited by `command_step_max_V`.
 
-    Attributes
-    ----------
-    effort_um_per_V
-        Weight `w_u` of what the feedback adds to the feedforward, or to the command before the first sample.
-    rate_um_per_V
-        Weight `w_Δ` of the change of the command between samples.
-    gain_margin_min, phase_margin_min_deg, sensitivity_peak_max
-        Of the linearised loop of every plant; see `microid.Margins`.
-    overshoot_max_pct
-        Displacement beyond the range that the reference and the rest before it span, in percent of that range; none
-        where they span nothing.
-    command_max_V, command_min_V
-        Limits of the command, short of where the controller cuts it off.
-    command_step_max_V
-        Largest change of the command between two samples.
+    A limit of None is none. Margins and peak are those of the linearised loop of every plant; see `microid.Margins`.
+    The overshoot is the displacement beyond the range that the reference and the rest before it span, in percent of
+    that range; none where they span nothing. Limits of the command are short of where the controller cuts it off.
     """
 
     effort_um_per_V: float = 0.0
@@ -60,17 +46,10 @@ class Goal:
 
     def limits(self) -> dict[str, float]:
         """All limits by name, far away where there is none: so one program does for all of them."""
-        none = {
-            "gain_margin_min": 0.0,
-            "phase_margin_min_deg": 1e-3,
-            "sensitivity_peak_max": _UNLIMITED,
-            "overshoot_max_pct": _UNLIMITED,
-            "command_min_V": -_UNLIMITED,
-            "command_max_V": _UNLIMITED,
-            "command_step_max_V": _UNLIMITED,
-        }
+        limits = {name: limit for name, limit in vars(self).items() if not name.endswith("_um_per_V")}
+        nearer = {"gain_margin_min": 0.0, "phase_margin_min_deg": 1e-3, "command_min_V": -_UNLIMITED}
         return {
-            name: far if getattr(self, name) is None else float(getattr(self, name)) for name, far in none.items()
+            name: nearer.get(name, _UNLIMITED) if limit is None else float(limit) for name, limit in limits.items()
         }
 
     def command_width_V(self) -> float:
@@ -129,56 +108,28 @@ class Figures(eqx.Module):
 
 
 def figures(problem: Problem, controller: Any) -> Figures:
-    linear = controller.linear()
+    linear, count = controller.linear(), jnp.sum(problem.counts)
+    common: dict[str, Any] = {"delay": problem.delay, "resolution_um": problem.resolution_um, "start": problem.start}
 
     def around(plant: Stage, slope: Float[Array, ""] | None) -> tuple[Margins, tuple[Array, ...]]:
         def along(reference: Array, ahead: Array | None, noise: Array | None) -> tuple[Array, ...]:
-            return _run(problem, controller, plant, reference, ahead, noise)
+            run = simulate_loop(controller, plant, reference, feedforward_V=ahead, noise_um=noise, **common)
+            rest = jnp.zeros((), reference.dtype) if problem.start.rest_V is None else problem.start.rest_V
+            effort = run.command_V - (rest if ahead is None else ahead)
+            # The first change is from the command before.
+            rate = jnp.diff(run.command_V, prepend=rest if ahead is None else ahead[0])
+            squares = (jnp.sum(problem.counts * x**2) / count for x in (run.error_um, effort, rate))
+            largest, passed = jnp.max(problem.counts * jnp.abs(run.error_um)), overshoot_pct(run)
+            return *squares, largest, passed, jnp.min(run.command_V), jnp.max(run.command_V), jnp.max(jnp.abs(rate))
 
         given = problem.reference_um, problem.feedforward_V, problem.noise_um
         found = eqx.filter_vmap(along, in_axes=(0, *(None if x is None else 0 for x in given[1:])))(*given)
         return margins(linear, plant, delay=problem.delay, slope_um_per_V=slope), found
 
     slopes = problem.slope_um_per_V
-    found, runs = eqx.filter_vmap(around, in_axes=(eqx.if_array(0), None if slopes is None else 0))(
-        problem.plants, slopes
-    )
+    axes = eqx.if_array(0), None if slopes is None else 0
+    found, runs = eqx.filter_vmap(around, in_axes=axes)(problem.plants, slopes)
     return Figures(found, *runs)
-
-
-def _run(
-    problem: Problem,
-    controller: Any,
-    plant: Stage,
-    reference: Float[Array, " t"],
-    ahead: Float[Array, " t"] | None,
-    noise: Float[Array, " t"] | None,
-) -> tuple[Array, ...]:
-    run = simulate_loop(
-        controller,
-        plant,
-        reference,
-        feedforward_V=ahead,
-        noise_um=noise,
-        delay=problem.delay,
-        resolution_um=problem.resolution_um,
-        start=problem.start,
-    )
-    rest = jnp.zeros((), reference.dtype) if problem.start.rest_V is None else problem.start.rest_V
-    effort = run.command_V - (rest if ahead is None else ahead)
-    # The first change is from the command before.
-    before = rest if ahead is None else ahead[0]
-    rate = jnp.diff(run.command_V, prepend=before)
-    count = jnp.sum(problem.counts)
-    squares = (jnp.sum(problem.counts * x**2) / count for x in (run.error_um, effort, rate))
-    extremes = (
-        jnp.max(problem.counts * jnp.abs(run.error_um)),
-        overshoot_pct(run),
-        jnp.min(run.command_V),
-        jnp.max(run.command_V),
-        jnp.max(jnp.abs(rate)),
-    )
-    return (*squares, *extremes)
 
 
 def overshoot_pct(run: ControlledRun) -> Float[Array, ""]:
@@ -186,17 +137,18 @@ def overshoot_pct(run: ControlledRun) -> Float[Array, ""]:
     low = jnp.minimum(jnp.min(run.reference_um), run.displacement_um[0])
     high = jnp.maximum(jnp.max(run.reference_um), run.displacement_um[0])
     beyond = jnp.maximum(run.displacement_um - high, low - run.displacement_um)
-    moves = high - low > NO_RANGE_um
+    # A reference that covers less stands still.
+    moves = high - low > 1e-6
     # Both arms are finite: a quotient by zero would leave no derivative, whichever arm is taken.
     return jnp.where(moves, 100 * jnp.maximum(jnp.max(beyond), 0) / jnp.where(moves, high - low, 1), 0)
 
 
 def cost_um(problem: Problem, found: Figures) -> Float[Array, ""]:
     """The cost that `Goal` states."""
-    effort, rate = problem.weights_um_per_V
-    each = (found.error_um2, found.effort_V2, found.rate_V2)
-    roots = [jnp.sqrt(jnp.mean(x) + _TINY_um2) for x in each]
-    return roots[0] + effort * roots[1] + rate * roots[2]
+    squares = found.error_um2, found.effort_V2, found.rate_V2
+    # Roots have no derivative at zero; a picometre is nothing.
+    error, effort, rate = (jnp.sqrt(jnp.mean(x) + 1e-12) for x in squares)
+    return error + problem.weights_um_per_V[0] * effort + problem.weights_um_per_V[1] * rate
 
 
 def excess(problem: Problem, found: Figures) -> dict[str, Float[Array, "..."]]:
@@ -213,13 +165,10 @@ def excess(problem: Problem, found: Figures) -> dict[str, Float[Array, "..."]]:
         "command_max_V": lambda most: (found.command_max_V - most) / problem.command_width_V,
         "command_step_max_V": lambda most: found.command_step_V / most - 1,
     }
-    for name, limit in limits.items():
-        share = shares[name](limit)
-        if name in ("gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max"):
-            # Of an unstable loop the margins mean nothing.
-            share = jnp.where(m.stable, share, 1)
-        out[name] = share
-    return out
+    out |= {name: shares[name](limit) for name, limit in limits.items()}
+    # Of an unstable loop the margins mean nothing.
+    margins = "gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max"
+    return out | {name: jnp.where(m.stable, out[name], 1) for name in margins}
 
 
 def _merit(
@@ -235,7 +184,7 @@ def _merit(
         push = jnp.maximum(share + multipliers[name] / weight, 0)
         total = total + jnp.sum(weight / 2 * push**2 - multipliers[name] ** 2 / (2 * weight))
     # Where nothing is finite, only the value is looked at: no line search stops there.
-    return scale * jnp.where(jnp.isfinite(total), total, _ABSURD)
+    return scale * jnp.where(jnp.isfinite(total), total, 1e9)
 
 
 @eqx.filter_jit
@@ -257,15 +206,83 @@ def descend(
     # The first step is as long as the gradient: where limits are far passed, it must not leap over everything.
     pushed = [jnp.sum(jnp.maximum(weight * over[name] + multipliers[name], 0)) for name in over]
     scale = 1 / (1 + sum(pushed, start=jnp.zeros(())))
-    solver: Any = optx.BFGS(rtol=_RTOL, atol=_ATOL)
-    solution: Any = optx.minimise(
-        _merit,
-        solver,
-        y,
-        args=(problem, multipliers, weight, scale),
-        # A handful of gains and thousands of samples: forwards nothing has to be kept.
-        options={"autodiff_mode": "fwd"},
-        max_steps=_STEPS,
-        throw=False,
-    )
+    solver: Any = optx.BFGS(rtol=1e-4, atol=1e-4)
+    given = problem, multipliers, weight, scale
+    # A handful of gains and thousands of samples: forwards nothing has to be kept.
+    options = {"autodiff_mode": "fwd"}
+    solution: Any = optx.minimise(_merit, solver, y, args=given, options=options, max_steps=80, throw=False)
     return solution.value, solution.state.f_info.grad / scale
+
+
+@dataclass(frozen=True)
+class LoopReport:
+    """One plant under a tuned controller; figures of several references are the worst.
+
+    The margins are those of the linearised loop, where the hysteresis is steepest; errors are over the samples that
+    count; see `Goal` for the overshoot, and `command_step_max_V` is the largest change between samples.
+    """
+
+    margins: Margins
+    error_rms_um: float
+    error_max_um: float
+    overshoot_pct: float
+    command_min_V: float
+    command_max_V: float
+    command_step_max_V: float
+
+
+@dataclass(frozen=True)
+class Tuning(Generic[_Controller]):
+    """A tuned controller, stable with every plant and within all limits, and what it is worth.
+
+    Costs are those of the controller it began with, and of this one; see `Goal`. It is converged where nothing is
+    left to gain nearby: the slope of the cost is small, or balanced by limits. There is one report per plant, the
+    nominal one first; gains are before and after, in their units, by their path in the controller; remarks are what
+    the user should know, one sentence each.
+    """
+
+    controller: _Controller
+    cost_before_um: float
+    cost_after_um: float
+    converged: bool
+    plants: tuple[LoopReport, ...]
+    gains: dict[str, tuple[np.ndarray, np.ndarray]]
+    remarks: tuple[str, ...]
+
+    @property
+    def worst(self) -> LoopReport:
+        """The plant with the largest error."""
+        return max(self.plants, key=lambda one: one.error_rms_um)
+
+
+def reports(found: Figures) -> tuple[LoopReport, ...]:
+    out = []
+    for k in range(found.error_um2.shape[0]):
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], found)
+        rms, lowest = float(jnp.max(one.error_um2)) ** 0.5, float(jnp.min(one.command_min_V))
+        largest, passed = float(jnp.max(one.error_max_um)), float(jnp.max(one.overshoot_pct))
+        highest, step = float(jnp.max(one.command_max_V)), float(jnp.max(one.command_step_V))
+        out.append(LoopReport(one.margins, rms, largest, passed, lowest, highest, step))
+    return tuple(out)
+
+
+def passed_limits(goal: Goal, every: Sequence[Margins], runs: Sequence[ControlledRun]) -> dict[str, str]:
+    """Find which limits a loop is beyond in its margins by plant, or in some runs, by the option of the command."""
+    gain, phase = min(float(one.gain_margin) for one in every), min(float(one.phase_margin_deg) for one in every)
+    peak, overshoot = max(float(one.sensitivity_peak) for one in every), max(map(float, map(overshoot_pct, runs)))
+    worst = {
+        "--gain-margin": (goal.gain_margin_min, gain, "a gain margin of {} or more", ""),
+        "--phase-margin": (goal.phase_margin_min_deg, phase, "a phase margin of {} degrees or more", " degrees"),
+        "--peak": (goal.sensitivity_peak_max, peak, "a peak of the sensitivity of {} or less", ""),
+        "--overshoot": (goal.overshoot_max_pct, overshoot, "an overshoot of {} % or less", " %"),
+    }
+    out = {}
+    for option, (limit, found, expected, unit) in worst.items():
+        if limit is None:
+            continue
+        # An overshoot of nothing has no share.
+        share = (found + 1) / (limit + 1) if option == "--overshoot" else found / limit
+        # Tuning keeps limits to a share of 2e-3.
+        if (1 - share if "margin" in option else share - 1) > 3e-3:
+            out[option] = f"expected {expected.format(f'{limit:g}')}, found {found:.4g}{unit}"
+    return out

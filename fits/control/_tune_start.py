@@ -13,21 +13,10 @@ from fits.io._errors import DataError
 from fits.stage._run import place_of_hysteresis
 from microid import PID, PrandtlIshlinskii, Preisach, Stage, loop_gain, margins
 
-_DECADES = 5
-_POINTS = 4001
-# Voltages per level on which the slope of a hysteresis is looked at.
-_FINE = 64
-# The start keeps at least this gain margin; ever smaller gains reach it on any stage that is stable by itself.
-_MARGIN = 2.0
-_HALVINGS = 60
-
 
 @dataclass(frozen=True)
 class UltimatePoint:
-    """Where a loop under a proportional controller oscillates for ever; about where one with a relay does.
-
-    The gain is that of the controller, and the period that of the oscillation.
-    """
+    """The gain of a proportional controller with which a loop oscillates for ever, and the period of that."""
 
     gain_V_per_um: float
     period_s: float
@@ -50,7 +39,7 @@ def steepest_slope(stage: Stage) -> float | None:
             f"{stage.names[place]!r} is a {type(law).__name__}, which has no form for single samples: "
             "control a stage with a Preisach or a PrandtlIshlinskii hysteresis"
         )
-    return float(_compiled_slope(law, _FINE))
+    return float(_compiled_slope(law, fine=64))
 
 
 def major_loop_slope(law: Preisach, fine: int) -> Float[Array, ""]:
@@ -79,11 +68,10 @@ def ultimate_point(stage: Stage, interval_s: float, *, delay: int = 0) -> Ultima
     unit, slope = PID.from_times(1.0, jnp.inf, 0.0, interval_s), slope_array(stage)
 
     def response(frequency_Hz: np.ndarray) -> np.ndarray:
-        found = loop_gain(unit, stage, jnp.asarray(frequency_Hz), delay=delay, slope_um_per_V=slope)
-        return np.asarray(found)
+        return np.asarray(loop_gain(unit, stage, jnp.asarray(frequency_Hz), delay=delay, slope_um_per_V=slope))
 
     nyquist = 0.5 / interval_s
-    grid = nyquist * np.logspace(-_DECADES, 0, _POINTS)
+    grid = nyquist * np.logspace(-5, 0, 4001)
     whole = response(grid)
     if not (np.all(np.isfinite(whole)) and whole[0].real > 0):
         raise DataError(
@@ -113,15 +101,13 @@ def relay_start(plants: Stage | Sequence[Stage], interval_s: float, *, delay: in
     stages = [plants] if isinstance(plants, Stage) else list(plants)
     point = ultimate_point(stages[0], interval_s, delay=delay)
     slopes = [slope_array(stage) for stage in stages]
-    gain = 0.6 * point.gain_V_per_um
-    for _ in range(_HALVINGS):
-        integral_s, derivative_s = point.period_s / 2, point.period_s / 8
+    gain, integral_s, derivative_s = 0.6 * point.gain_V_per_um, point.period_s / 2, point.period_s / 8
+    # Ever smaller gains reach the margin on any stage that is stable by itself.
+    for _ in range(60):
         pid = PID.from_times(gain, integral_s, derivative_s, interval_s, filter_s=derivative_s / 10)
-        found = [
-            margins(pid, stage, delay=delay, slope_um_per_V=slope)
-            for stage, slope in zip(stages, slopes, strict=True)
-        ]
-        if all(bool(one.stable) and float(one.gain_margin) >= _MARGIN for one in found):
+        given = zip(stages, slopes, strict=True)
+        found = [margins(pid, stage, delay=delay, slope_um_per_V=slope) for stage, slope in given]
+        if all(bool(one.stable) and float(one.gain_margin) >= 2 for one in found):
             return pid
         gain /= 2
     raise DataError("no gains were small enough for a stable loop: the stage itself is not stable")

@@ -16,10 +16,8 @@ from microid import DIMENSIONS, Axis
 
 Limit = Literal["three_sigma", "worst_case"]
 _POWERS: dict[Limit, int] = {"three_sigma": 2, "worst_case": 1}
-_LENGTHS_MM = (0.001, 0.1)
 # Of the logarithms of errors over budgets, and of the optimality conditions, whose terms are parts of the cost.
 _SLACK, _STATIONARY = 1e-7, 1e-5
-_STEPS = 500
 _Vector = NDArray[np.float64]
 
 
@@ -31,18 +29,11 @@ class AllocationError(RuntimeError):
 class Allocation:
     """The cheapest tolerances that keep to a budget.
 
-    Attributes
-    ----------
-    design, names
-        With the new tolerances, and the dimensions whose tolerances were chosen. Those on which no axis of the budget
-        depends keep theirs.
-    cost, cost_before
-        Sum over these, with the new tolerances and the old ones.
-    error_pct
-        First-order error of each axis of the budget, in percent of its output.
-    active, multipliers
-        Axes whose budget is used up, and by how many percent the cost falls when the budget grows by one percent. Of
-        two axes that are one function of the same dimensions, the one with the lower budget stands for both.
+    The design has the new tolerances; `names` are the dimensions whose tolerances were chosen, and those on which no
+    axis of the budget depends keep theirs. The costs are sums over the former, with the new tolerances and the old
+    ones; `error_pct` is the first-order error of each axis of the budget, in percent of its output. The budgets of
+    `active` axes are used up, and `multipliers` say by how many percent the cost falls when one grows by one percent.
+    Of two axes that are one function of the same dimensions, the one with the lower budget stands for both.
     """
 
     design: Design
@@ -61,7 +52,7 @@ def allocate(
     cost: Mapping[str, float] | None = None,
     *,
     limit: Limit = "three_sigma",
-    bounds_mm: tuple[float, float] = _LENGTHS_MM,
+    bounds_mm: tuple[float, float] = (0.001, 0.1),
     voltage: bool = False,
     curvature_share: float = 0.05,
 ) -> Allocation:
@@ -72,31 +63,16 @@ def allocate(
     relative derivatives s, are convex, so that the minimum is the only one. Where a slope nearly vanishes the first
     order would let a tolerance grow without a price; `curvature_share` stops it.
 
-    Parameters
-    ----------
-    design
-        Dimensions and present tolerances.
-    budget_pct
-        Largest error of the output by axis, in percent of the output.
-    cost
-        By dimension, at the present tolerance; one for those not named.
-    limit
-        What keeps to the budget: `three_sigma` of independent normal errors, whose tolerances are three standard
-        deviations, or the `worst_case`, all errors at their tolerances with the worst signs.
-    bounds_mm
-        Smallest and largest tolerance of a length; of an angle, at the end of its leg.
-    voltage
-        Impose the voltage of the piezos instead of their elongation.
-    curvature_share
-        No tolerance goes beyond where the second order of its dimension alone takes this share of a budget.
+    The budget is the largest error of the output by axis, in percent of the output; the cost is by dimension, at the
+    present tolerance, and one for those not named. What keeps to the budget are `three_sigma` of independent normal
+    errors, whose tolerances are three standard deviations, or the `worst_case`, all errors at their tolerances with
+    the worst signs. Bounds are the smallest and largest tolerance of a length; of an angle, at the end of its leg.
+    With `voltage` the voltage of the piezos is imposed instead of their elongation. No tolerance goes beyond where
+    the second order of its dimension alone takes `curvature_share` of a budget.
 
-    Raises
-    ------
-    DataError
-        If a budget, cost or bound makes no sense, dimensions go together and three standard deviations are asked
-        for, or a budget is out of reach; the sentence gives the smallest error within reach.
-    AllocationError
-        If the solver fails.
+    A `DataError` says that a budget, cost or bound makes no sense, that dimensions go together and three standard
+    deviations are asked for, or that a budget is out of reach, with the smallest error within reach; an
+    `AllocationError` that the solver fails.
     """
     cost = cost or {}
     check(design, tuple(budget_pct), "normal")
@@ -109,14 +85,15 @@ def allocate(
         for name, value in given.items():
             if not (np.isfinite(value) and value > 0):
                 raise DataError(f"the {what} of {name} is a positive number, got {value}")
-    unknown = [name for name in cost if name not in DIMENSIONS]
-    if unknown:
-        raise DataError(f"there is no dimension {unknown[0]!r}: choose some of {', '.join(DIMENSIONS)}")
-    if not 0 < bounds_mm[0] < bounds_mm[1] < np.inf:
-        raise DataError(
-            f"the bounds of tolerances are positive and in order, got {bounds_mm[0]:g} and {bounds_mm[1]:g} mm"
-        )
-    axes = _lowest_budgets(budget_pct)
+    for name in cost:
+        if name not in DIMENSIONS:
+            raise DataError(f"there is no dimension {name!r}: choose some of {', '.join(DIMENSIONS)}")
+    low_mm, high_mm = bounds_mm
+    if not 0 < low_mm < high_mm < np.inf:
+        raise DataError(f"the bounds of tolerances are positive and in order, got {low_mm:g} and {high_mm:g} mm")
+    # Of axes that are one function of the same dimensions, the one with the lower budget.
+    one_by_one = {twin(axis): [other for other in budget_pct if twin(other) == twin(axis)] for axis in budget_pct}
+    axes = tuple(min(alike, key=budget_pct.__getitem__) for alike in one_by_one.values())
     names = tuple(dict.fromkeys(name for axis in axes for name in inputs_of(axis, voltage)))
     tolerance = tolerances(design, names)
     if not np.all(tolerance > 0):
@@ -139,23 +116,18 @@ def allocate(
         if excess > 0:
             raise DataError(
                 f"{axis}: an error of {budget_pct[axis]:g} % is out of reach, the smallest is "
-                f"{budget_pct[axis] * np.exp(excess):.3g} % with tolerances of {bounds_mm[0]:g} mm: raise the budget "
-                "or allow smaller tolerances"
+                f"{budget_pct[axis] * np.exp(excess):.3g} % with tolerances of {low_mm:g} mm: raise the budget or "
+                "allow smaller tolerances"
             )
     logarithm, weights = problem.solve()
     found = dict(zip(names, (tolerance * np.exp(logarithm)).tolist(), strict=True))
-    share = dict(zip(axes, np.exp(problem.excess(logarithm)).tolist(), strict=True))
-    reached = {twin(axis): share[axis] * budget_pct[axis] for axis in axes}
-    return Allocation(
-        replace(design, tolerance={**design.tolerance, **found}),
-        names,
-        float(price @ np.exp(-logarithm)),
-        float(price.sum()),
-        {axis: reached[twin(axis)] for axis in budget_pct},
-        tuple(axes[i] for i in weights),
-        {axes[i]: weight for i, weight in weights.items()},
-        limit,
-    )
+    shares = np.exp(problem.excess(logarithm)).tolist()
+    reached = {twin(axis): share * budget_pct[axis] for axis, share in zip(axes, shares, strict=True)}
+    chosen = replace(design, tolerance={**design.tolerance, **found})
+    costs = float(price @ np.exp(-logarithm)), float(price.sum())
+    error_pct = {axis: reached[twin(axis)] for axis in budget_pct}
+    multipliers = {axes[i]: weight for i, weight in weights.items()}
+    return Allocation(chosen, names, *costs, error_pct, tuple(multipliers), multipliers, limit)
 
 
 @dataclass(frozen=True)
@@ -173,12 +145,12 @@ class _Problem:
 
     def excess(self, logarithm: _Vector) -> _Vector:
         """Logarithm of each error over its budget."""
-        return np.asarray(np.log(self.terms(logarithm).sum(axis=1)) / self.power)
+        return np.log(self.terms(logarithm).sum(axis=1)) / self.power
 
     def shares(self, logarithm: _Vector) -> _Vector:
         """Derivative of `excess`."""
         terms = self.terms(logarithm)
-        return np.asarray(terms / terms.sum(axis=1, keepdims=True))
+        return terms / terms.sum(axis=1, keepdims=True)
 
     def log_cost(self, logarithm: _Vector) -> tuple[float, _Vector]:
         each = self.price * np.exp(-logarithm)
@@ -187,17 +159,15 @@ class _Problem:
     def solve(self) -> tuple[_Vector, dict[int, float]]:
         """The minimum, and the multipliers of the constraints that hold it."""
         # All tolerances alike, as large as the worst error lets them be.
-        start = np.clip(
-            np.zeros_like(self.lower) - max(self.excess(np.zeros_like(self.lower))), self.lower, self.upper
-        )
+        start = np.full_like(self.lower, -max(self.excess(np.zeros_like(self.lower))))
         solved = minimize(
             self.log_cost,
-            start,
+            np.clip(start, self.lower, self.upper),
             jac=True,
             method="SLSQP",
             bounds=list(zip(self.lower, self.upper, strict=True)),
             constraints=NonlinearConstraint(self.excess, -np.inf, 0.0, jac=self.shares),
-            options={"ftol": 1e-15, "maxiter": _STEPS},
+            options={"ftol": 1e-15, "maxiter": 500},
         )
         found = np.clip(solved.x, self.lower, self.upper)
         excess = self.excess(found)
@@ -214,12 +184,3 @@ class _Problem:
                 f"the solver stopped before the cheapest tolerances: {residual:.1g} of the cost is not balanced"
             )
         return found, dict(zip(tight.tolist(), weights[: len(tight)].tolist(), strict=True))
-
-
-def _lowest_budgets(budget_pct: Mapping[Axis, float]) -> tuple[Axis, ...]:
-    """Of axes that are one function of the same dimensions, the one with the lower budget."""
-    found: dict[Axis, Axis] = {}
-    for axis, budget in budget_pct.items():
-        if twin(axis) not in found or budget < budget_pct[found[twin(axis)]]:
-            found[twin(axis)] = axis
-    return tuple(found.values())

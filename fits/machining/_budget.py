@@ -1,9 +1,8 @@
 """The error budget: driving, machining and measuring error of each axis, and their total (Eq. 1)."""
 
-import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import jax.numpy as jnp
@@ -20,8 +19,6 @@ from fits.machining._sensitivity import derivatives_of, output_scale, refuse_inf
 
 Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
 MEASURES: tuple[Measures, ...] = ("pzt", *m.AXES)
-# The largest error is a maximum, where a step this small changes it by a millionth of the loop.
-_STEPS = 1000
 
 
 @dataclass(frozen=True)
@@ -45,23 +42,13 @@ class Driving:
 
 @dataclass(frozen=True)
 class AxisBudget:
-    """The errors of one axis at the full elongation of its piezo, in um or urad.
+    """The errors of one axis at the full elongation of its piezo, all in `output_unit`: `um` or `urad`.
 
-    Attributes
-    ----------
-    output_unit
-        `um` or `urad`, of all that follows but the sensitivity.
-    stroke, piezo_sensitivity
-        Output at full elongation, and output per elongation of the piezo there, in `output_unit` per um (Eq. 3).
-    driving_highest, driving_lowest
-        Largest driving errors to either side, with their signs.
-    machining_signed, machining_worst_case, machining_root_sum_square
-        Of all dimensions, each at plus one tolerance, the elongation being imposed (Eq. 4): the sum, the sum of the
-        sizes, and the root of the sum of squares with the design's correlations.
-    machining_voltage_worst_case, machining_voltage_root_sum_square
-        The same with the voltage being imposed, which the paper leaves out: the input stiffness then acts too.
-    measuring
-        Of the sensor; None where it is not known.
+    The stroke is the output there, and `piezo_sensitivity` the output per um of the piezo (Eq. 3). Driving errors are
+    the largest to either side, with their signs. Those of machining are of all dimensions, each at plus one
+    tolerance, the elongation being imposed (Eq. 4): the sum, the sum of the sizes, and the root of the sum of squares
+    with the design's correlations; with `voltage` the same with the voltage being imposed, which the paper leaves
+    out: the input stiffness then acts too. The measuring error of the sensor is None where it is not known.
     """
 
     axis: m.Axis
@@ -82,21 +69,23 @@ class AxisBudget:
         """The larger driving error by size, with its sign."""
         return max(self.driving_highest, self.driving_lowest, key=abs)
 
+    def _total(self, machining: float) -> m.TotalError:
+        return m.total_error(self.driving, machining, self.measuring or 0.0)
+
     @property
     def signed(self) -> float:
         """Sum with signs (Eq. 1): `driving`, all dimensions at plus one tolerance, and a reading that is too high."""
-        return float(m.total_error(self.driving, self.machining_signed, self.measuring or 0.0).signed)
+        return float(self._total(self.machining_signed).signed)
 
     @property
     def worst_case(self) -> float:
         """Sum of sizes: no signs within the tolerances are worse."""
-        return float(m.total_error(self.driving, self.machining_worst_case, self.measuring or 0.0).worst_case)
+        return float(self._total(self.machining_worst_case).worst_case)
 
     @property
     def root_sum_square(self) -> float:
         """For parts, and dimensions, that are independent."""
-        parts = self.driving, self.machining_root_sum_square, self.measuring or 0.0
-        return float(m.total_error(*parts).root_sum_square)
+        return float(self._total(self.machining_root_sum_square).root_sum_square)
 
     @property
     def shares(self) -> dict[str, float]:
@@ -111,18 +100,10 @@ class AxisBudget:
 class Budget:
     """The error budgets of some axes by name, and what they rest on.
 
-    Attributes
-    ----------
-    axes, driving
-        Budgets by name, and the driving error of the piezo.
-    measures
-        What the displacement of the model was: the piezo's elongation (`pzt`), or the output of an axis.
-    noise_um, zeroed
-        Measuring error of the sensor, and whether its offset is left out of that.
-    arm_mm, level
-        Distance from the axis of rotation at which the sensor reads, or None; and level of the motion functions.
-    remarks
-        What a reader must know, one sentence each.
+    These are the driving error of the piezo; what the displacement of the model was, the piezo's elongation (`pzt`)
+    or the output of an axis; the measuring error of the sensor, and whether its offset is left out of that; the
+    distance from the axis of rotation at which it reads, or None; and the level of the motion functions. Remarks are
+    what a reader must know, one sentence each.
     """
 
     axes: dict[m.Axis, AxisBudget]
@@ -151,27 +132,14 @@ def budget(
 ) -> Budget:
     """Put driving, machining and measuring errors together (Eq. 1), each axis being driven over its whole range.
 
-    Parameters
-    ----------
-    design, idle
-        Dimensions, tolerances and constants; and the noise of the sensor, from `idle_noise`.
-    model
-        The fitted hysteresis of a piezo; of a stage, what slow commands see. All piezos are taken to be like it.
-    measures
-        What the displacement of the model is: the piezo's elongation, or the output of an axis, which is then divided
-        by its gain.
-    arm_mm
-        Distance from the axis of rotation at which a displacement sensor reads a rotation. Without it rotations have
-        no measuring error, and none can be what the model measures.
-    zeroed
-        Whether the sensor is zeroed at rest, which removes its offset.
+    The model is the fitted hysteresis of a piezo, of a stage what slow commands see, and all piezos are taken to be
+    like it; its displacement `measures` the piezo's elongation, or the output of an axis, which is then divided by
+    its gain. The noise of the sensor is from `idle_noise`; zeroed at rest, the sensor has no offset. It reads a
+    rotation at a distance of `arm_mm` from the axis: without that rotations have no measuring error, and none can be
+    what the model measures.
 
-    Raises
-    ------
-    DataError
-        If the model does not move, is a stage without hysteresis, or measures a rotation at no arm.
-    RuntimeError
-        If JAX is not in double precision.
+    A `DataError` says that the model does not move, is a stage without hysteresis, or measures a rotation at no arm,
+    a `RuntimeError` that JAX is not in double precision.
     """
     require_float64("budgets")
     if arm_mm is not None and not (math.isfinite(arm_mm) and arm_mm > 0):
@@ -189,26 +157,22 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
     """Driving error in um of the piezo."""
     law = static_equivalent(model) if isinstance(model, m.Stage) else model
     lower_V, upper_V = float(law.density.lower_V), float(law.density.upper_V)
-    rise = np.linspace(lower_V, upper_V, _STEPS + 1)
+    # The largest error is a maximum, where a step this small changes it by a millionth of the loop.
+    rise = np.linspace(lower_V, upper_V, 1001)
     error, highest_um = _loop(law, jnp.asarray(np.concatenate([rise, rise[-2::-1]])))
     # What the model calls a um is this many of the piezo.
-    scale = 1.0
-    if measures != "pzt":
-        # The model's um per unit of the output, which is a rotation at an arm where it is in rad.
-        per_unit = 1.0
-        if m.MOTIONS[measures].unit == "rad":
-            if arm_mm is None:
-                raise DataError(
-                    f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
-                )
-            per_unit = 1e3 * arm_mm
-        scale = 1 / (per_unit * float(derivatives_of(design, measures).gain))
+    per_unit = 1.0
+    if measures != "pzt" and m.MOTIONS[measures].unit == "rad":
+        if arm_mm is None:
+            raise DataError(
+                f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
+            )
+        per_unit = 1e3 * arm_mm
+    scale = 1.0 if measures == "pzt" else 1 / (per_unit * float(derivatives_of(design, measures).gain))
     stroke_um = scale * float(highest_um)
     if not stroke_um > 0:
-        raise DataError(
-            f"expected a model that moves between {lower_V:g} and {upper_V:g} V, found one that does not; fit it "
-            "again."
-        )
+        range_V = f"{lower_V:g} and {upper_V:g} V"
+        raise DataError(f"expected a model that moves between {range_V}, found one that does not; fit it again.")
     figures = error.slope_um_per_V, error.signed_um.max(), error.signed_um.min()
     return Driving(stroke_um, *(scale * float(figure) for figure in figures))
 
@@ -226,27 +190,16 @@ def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | 
     # The load takes a fixed part of any free elongation.
     loaded_um = derivatives_of(design, axis).loaded_stroke_um
     free_um = driving.stroke_um * float(design.actuation.free_stroke_um / loaded_um)
-    actuation = dataclasses.replace(design.actuation, free_stroke_um=jnp.asarray(free_um))
+    actuation = replace(design.actuation, free_stroke_um=jnp.asarray(free_um))
     derived = derivatives_of(design, axis, actuation)
     stroke = scale * float(derived.stroke)
     slope = scale * float(derived.by_voltage.piezo) * free_um / driving.stroke_um
     signed, worst, squares = _combined(design, derived.slopes_at_full_stroke, scale)
     _, voltage_worst, voltage_squares = _combined(design, derived.by_voltage.dimensions, scale)
     refuse_infinite(axis, (stroke, slope, worst, voltage_worst))
-    return AxisBudget(
-        axis=axis,
-        output_unit=unit,
-        stroke=stroke,
-        piezo_sensitivity=slope,
-        driving_highest=slope * driving.highest_um,
-        driving_lowest=slope * driving.lowest_um,
-        machining_signed=signed,
-        machining_worst_case=worst,
-        machining_root_sum_square=squares,
-        machining_voltage_worst_case=voltage_worst,
-        machining_voltage_root_sum_square=voltage_squares,
-        measuring=measuring,
-    )
+    highest, lowest = slope * driving.highest_um, slope * driving.lowest_um
+    machining = signed, worst, squares, voltage_worst, voltage_squares
+    return AxisBudget(axis, unit, stroke, slope, highest, lowest, *machining, measuring)
 
 
 def _combined(design: Design, slopes: Mapping[str, Array], scale: float) -> tuple[float, float, float]:
@@ -256,23 +209,21 @@ def _combined(design: Design, slopes: Mapping[str, Array], scale: float) -> tupl
     return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
 
 
-def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, arm_mm: float | None) -> list[str]:
-    remarks = []
+def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, arm_mm: float | None) -> Iterator[str]:
     turning = [axis for axis in axes if m.MOTIONS[axis].unit == "rad"]
     if turning and arm_mm is None:
-        remarks.append(
+        yield (
             f"The measuring error of {', '.join(turning)} is left out: a displacement sensor reads a rotation at an "
             "arm; give it."
         )
     loaded_um = max(float(derivatives_of(design, axis).loaded_stroke_um) for axis in axes)
     if driving.stroke_um > 1.05 * loaded_um:
-        remarks.append(
+        yield (
             f"The model elongates its piezo by {driving.stroke_um:.4g} um, but against the stage the piezos of this "
             f"design reach {loaded_um:.4g} um: if it was measured without the stage, scale its displacement or say "
             "what it measures."
         )
-    remarks.append(
+    yield (
         "The totals take machining at a fixed elongation of the piezo (Eq. 4); open loop the voltage is fixed, and "
         "the column beside it counts."
     )
-    return remarks

@@ -1,7 +1,7 @@
 """What the paper reads in its Fig. 7, beside what the derivatives of a design say."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,18 +13,11 @@ from jaxtyping import Array, Float
 import microid as m
 from fits.machining._design import TOLERANCE_MM, Design
 from fits.machining._gains import quick_jit
-from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, gains_at, sensitivities
+from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at, sensitivities
 
 Verdict = Literal["agree", "partly", "disagree"]
-# Verdict, number, unit and reason of a claim.
-_Judgement = tuple[Verdict, float, str, str]
-_AXES: tuple[m.Axis, ...] = ("x", "z", "alpha", "gamma")
-# Below this part of the largest effect of an axis, one can be neglected.
-_NEGLIGIBLE = 0.05
-# From this part on, it is severe.
-_SEVERE = 0.5
-_STEPS = 41
-_WIDTH, _INDENT = 110, " " * 12
+# Below this part of the largest effect of an axis, one can be neglected; from the other on, it is severe.
+_NEGLIGIBLE, _SEVERE = 0.05, 0.5
 
 
 @dataclass(frozen=True)
@@ -48,38 +41,77 @@ def paper_claims(design: Design) -> tuple[Claim, ...]:
     The paper gives no tolerance for angles (erratum 9), so its lengths are compared with lengths. Errors are those of
     `sensitivities`.
     """
-    report = sensitivities(design, _AXES)
-    x, z, alpha, gamma = (report[axis] for axis in _AXES)
-    (_, grows, thicker), (bend, one_way, longer) = (_shape_of_curve(design, z[name]) for name in ("t4", "la2"))
-    longer += " The first-order differential that the paper draws is straight and can do neither."
-    severe, share = _leaders(gamma, ("t6", "t7", "l6"))
-    leading = f"Among the lengths {_changes(_lengths(gamma))}; the three named make up {share:.1f} % of the variance."
-    xy: tuple[m.Axis, ...] = ("x", "y")
-    tilts: tuple[m.Axis, ...] = ("alpha", "beta")
-    return (
-        Claim(xy, "t1, t2, l1 and la1 have a great influence", *_leaders_of_x(x)),
-        Claim(xy, "t1 has a great influence", *_t1(design, x)),
-        Claim(("z",), "t4 affects the error most", *_t4_of_z(z)),
-        Claim(
-            ("z",),
-            "the effect of t4 grows gradually with the machining error",
-            *(_verdict(grows), z["t4"].relative_change_exact_pct, "%", thicker),
-        ),
-        Claim(
-            ("z",),
-            "the effect of la2 rises sharply, then falls and flattens",
-            *(_verdict(not one_way), bend, "%", longer),
-        ),
-        Claim(tilts, "l is among the most severe", *_l(alpha)),
-        Claim(tilts, "l5 can be neglected", *_negligible(alpha, "l5")),
-        Claim(tilts, "t4 can be neglected", *_negligible(alpha, "t4")),
-        Claim(
-            ("z", *tilts),
-            "t4 affects z most, and can be neglected in the rotations about x and y",
-            *_same_amplifiers(z, alpha),
-        ),
-        Claim(("gamma",), "t6, t7 and l6 are the most severe", severe, share, "%", leading),
+    report = sensitivities(design, ("x", "z", "alpha", "gamma"))
+    return (*_of_x(design, report["x"]), *_of_z(design, report["z"]), *_of_turns(report))
+
+
+def _of_x(design: Design, x: AxisSensitivity) -> Iterator[Claim]:
+    verdict, share = _leaders(x, ("t1", "t2", "l1", "la1"))
+    reason = (
+        f"The largest among the lengths are {_changes(_lengths(x)[:4])}; the four named make up {share:.1f} % of the "
+        f"variance. alpha1, for which the paper gives no tolerance, has place {_rank(x, 'alpha1')}."
     )
+    yield Claim(("x", "y"), "t1, t2, l1 and la1 have a great influence", verdict, share, "%", reason)
+    guides, change = sign_change_guides(design), x["t1"].relative_change_pct
+    if guides is None:
+        number, unit = change, "%"
+        reason = f"{change:+.3f} % at plus one tolerance, and no number of guiding legs makes it vanish."
+    else:
+        number, unit = guides, "guiding legs"
+        reason = (
+            f"{change:+.3f} % with {design.guides:g} guiding legs, but it changes its sign at {guides:.2f}, as a "
+            "thicker hinge lowers the ratio and stiffens the output; near there terms of second order decide."
+        )
+    verdict = _verdict(_share_of_largest(x, "t1") >= _NEGLIGIBLE, partly=guides is not None)
+    yield Claim(("x", "y"), "t1 has a great influence", verdict, number, unit, reason)
+
+
+def _of_z(design: Design, z: AxisSensitivity) -> Iterator[Claim]:
+    first, second = z.dimensions[:2]
+    ratio = _ratio(z["t4"].relative_change_pct, (second if first.name == "t4" else first).relative_change_pct)
+    reason = f"{_changes(z.dimensions)}: t4 has {ratio:.3g} times the effect of the largest other dimension."
+    yield Claim(
+        ("z",), "t4 affects the error most", _verdict(first.name == "t4", ratio >= _SEVERE), ratio, "", reason
+    )
+    _, grows, reason = _shape_of_curve(design, z["t4"])
+    statement = "the effect of t4 grows gradually with the machining error"
+    yield Claim(("z",), statement, _verdict(grows), z["t4"].relative_change_exact_pct, "%", reason)
+    bend, one_way, reason = _shape_of_curve(design, z["la2"])
+    reason += " The first-order differential that the paper draws is straight and can do neither."
+    statement = "the effect of la2 rises sharply, then falls and flattens"
+    yield Claim(("z",), statement, _verdict(not one_way), bend, "%", reason)
+
+
+def _of_turns(report: SensitivityReport) -> Iterator[Claim]:
+    """What is said of the rotations, and of one of them and z."""
+    z, alpha, gamma = report["z"], report["alpha"], report["gamma"]
+    first = alpha.dimensions[0]
+    ratio = _ratio(first.relative_change_pct, alpha["l"].relative_change_pct)
+    # By Eq. 14 of the tilt's lever, the relative change per mm of l is below 2 / (2 l + l5).
+    slope_per_mm = abs(first.relative_change_pct) / 100 / alpha["l"].tolerance if alpha["l"].tolerance else 0.0
+    below = f"; to have as much, 2 l + l5 would have to be below {2 / slope_per_mm:.2g} mm" if slope_per_mm else ""
+    reason = f"{first.name} has {ratio:.3g} times the effect of l{below if first.name != 'l' else ''}."
+    verdict = _verdict(first.name == "l", ratio * _SEVERE <= 1)
+    yield Claim(("alpha", "beta"), "l is among the most severe", verdict, ratio, "", reason)
+    for name in ("l5", "t4"):
+        part = _share_of_largest(alpha, name)
+        reason = (
+            f"{name} has place {_rank(alpha, name)}, with {alpha[name].relative_change_pct:+.3f} % or "
+            f"{100 * part:.3g} % of the largest effect."
+        )
+        verdict = _verdict(part < _NEGLIGIBLE, part < _SEVERE)
+        yield Claim(("alpha", "beta"), f"{name} can be neglected", verdict, 100 * part, "%", reason)
+    of_z, of_alpha = (axis["t4"].derivative / axis.gain for axis in (z, alpha))
+    reason = (
+        f"d ln z / d t4 = {of_z:+.6g} per mm and d ln alpha / d t4 = {of_alpha:+.6g} per mm: the same amplifiers "
+        "drive both, so that the paper contradicts itself."
+    )
+    verdict = _verdict(z.dimensions[0].name == "t4" and _share_of_largest(alpha, "t4") < _NEGLIGIBLE)
+    statement = "t4 affects z most, and can be neglected in the rotations about x and y"
+    yield Claim(("z", "alpha", "beta"), statement, verdict, _ratio(of_alpha, of_z), "", reason)
+    verdict, share = _leaders(gamma, ("t6", "t7", "l6"))
+    reason = f"Among the lengths {_changes(_lengths(gamma))}; the three named make up {share:.1f} % of the variance."
+    yield Claim(("gamma",), "t6, t7 and l6 are the most severe", verdict, share, "%", reason)
 
 
 def describe_claims(claims: Sequence[Claim]) -> str:
@@ -87,7 +119,7 @@ def describe_claims(claims: Sequence[Claim]) -> str:
     lines = ["The paper on its Fig. 7, and this stage:"]
     for claim in claims:
         lines.append(f"  {claim.verdict:8}  {', '.join(claim.axes)}: {claim.statement}")
-        lines += textwrap.wrap(claim.reason, _WIDTH, initial_indent=_INDENT, subsequent_indent=_INDENT)
+        lines.append(textwrap.indent(textwrap.fill(claim.reason, 98), " " * 12))
     return "\n".join(lines)
 
 
@@ -99,7 +131,7 @@ def sign_change_guides(design: Design) -> float | None:
     design's own number of guides plays no role.
     """
     guides = float(_sign_change(design.geometry, design.constants))
-    return guides if np.isfinite(guides) and guides > 0 else None
+    return guides if 0 < guides < np.inf else None
 
 
 @quick_jit
@@ -125,64 +157,6 @@ def _leaders(axis: AxisSensitivity, said: Sequence[str]) -> tuple[Verdict, float
     lengths = [effect.name for effect in _lengths(axis)]
     verdict = _verdict(set(lengths[: len(said)]) == set(said), lengths[0] in said)
     return verdict, 100 * sum(axis[name].share_of_variance for name in said)
-
-
-def _leaders_of_x(x: AxisSensitivity) -> _Judgement:
-    verdict, share = _leaders(x, ("t1", "t2", "l1", "la1"))
-    reason = (
-        f"The largest among the lengths are {_changes(_lengths(x)[:4])}; the four named make up {share:.1f} % of the "
-        f"variance. alpha1, for which the paper gives no tolerance, has place {_rank(x, 'alpha1')}."
-    )
-    return verdict, share, "%", reason
-
-
-def _t1(design: Design, x: AxisSensitivity) -> _Judgement:
-    guides, change = sign_change_guides(design), x["t1"].relative_change_pct
-    severe = _share_of_largest(x, "t1") >= _NEGLIGIBLE
-    if guides is None:
-        reason = f"{change:+.3f} % at plus one tolerance, and no number of guiding legs makes it vanish."
-        return _verdict(severe), change, "%", reason
-    reason = (
-        f"{change:+.3f} % with {design.guides:g} guiding legs, but it changes its sign at {guides:.2f}, as a thicker "
-        "hinge lowers the ratio and stiffens the output; near there terms of second order decide."
-    )
-    return _verdict(severe, partly=True), guides, "guiding legs", reason
-
-
-def _t4_of_z(z: AxisSensitivity) -> _Judgement:
-    first, second = z.dimensions[:2]
-    ratio = _ratio(z["t4"].relative_change_pct, (second if first.name == "t4" else first).relative_change_pct)
-    reason = f"{_changes(z.dimensions)}: t4 has {ratio:.3g} times the effect of the largest other dimension."
-    return _verdict(first.name == "t4", ratio >= _SEVERE), ratio, "", reason
-
-
-def _l(alpha: AxisSensitivity) -> _Judgement:
-    first = alpha.dimensions[0]
-    ratio = _ratio(first.relative_change_pct, alpha["l"].relative_change_pct)
-    # By Eq. 14 of the tilt's lever, the relative change per mm of l is below 2 / (2 l + l5).
-    slope_per_mm = abs(first.relative_change_pct) / 100 / alpha["l"].tolerance if alpha["l"].tolerance else 0.0
-    below = f"; to have as much, 2 l + l5 would have to be below {2 / slope_per_mm:.2g} mm" if slope_per_mm else ""
-    reason = f"{first.name} has {ratio:.3g} times the effect of l{below if first.name != 'l' else ''}."
-    return _verdict(first.name == "l", ratio * _SEVERE <= 1), ratio, "", reason
-
-
-def _negligible(alpha: AxisSensitivity, name: str) -> _Judgement:
-    part = _share_of_largest(alpha, name)
-    reason = (
-        f"{name} has place {_rank(alpha, name)}, with {alpha[name].relative_change_pct:+.3f} % or {100 * part:.3g} "
-        "% of the largest effect."
-    )
-    return _verdict(part < _NEGLIGIBLE, part < _SEVERE), 100 * part, "%", reason
-
-
-def _same_amplifiers(z: AxisSensitivity, alpha: AxisSensitivity) -> _Judgement:
-    of_z, of_alpha = (axis["t4"].derivative / axis.gain for axis in (z, alpha))
-    reason = (
-        f"d ln z / d t4 = {of_z:+.6g} per mm and d ln alpha / d t4 = {of_alpha:+.6g} per mm: the same amplifiers "
-        "drive both, so that the paper contradicts itself."
-    )
-    agree = z.dimensions[0].name == "t4" and _share_of_largest(alpha, "t4") < _NEGLIGIBLE
-    return _verdict(agree), _ratio(of_alpha, of_z), "", reason
 
 
 def _rank(axis: AxisSensitivity, name: str) -> str:
@@ -211,15 +185,13 @@ def _shape_of_curve(design: Design, effect: DimensionEffect) -> tuple[float, boo
     """How far the output in z over errors of a dimension is off a line, in %; whether it goes one way; in words."""
     names = m.MOTIONS["z"].dimensions
     width = effect.tolerance or TOLERANCE_MM
-    errors = np.zeros((_STEPS, len(names)))
-    errors[:, names.index(effect.name)] = np.linspace(-width, width, _STEPS)
+    errors = np.zeros((41, len(names)))
+    errors[:, names.index(effect.name)] = np.linspace(-width, width, len(errors))
     gains = gains_at(design, "z", errors)
-    steps = np.diff(gains)
-    bend = 100 * float(np.max(np.abs(gains - np.linspace(gains[0], gains[-1], _STEPS))) / gains[_STEPS // 2])
-    one_way = bool(np.all(steps > 0) or np.all(steps < 0))
-    return (
-        bend,
-        one_way,
+    bend = 100 * float(np.max(np.abs(gains - np.linspace(gains[0], gains[-1], len(gains)))) / gains[20])
+    one_way = bool(np.all(np.diff(gains) > 0) or np.all(np.diff(gains) < 0))
+    words = (
         f"{effect.relative_change_exact_pct:+.3f} % at plus one tolerance; over all of it the curve "
-        f"{'goes one way' if one_way else 'turns'} and is off a straight line by {bend:.2g} % of the output.",
+        f"{'goes one way' if one_way else 'turns'} and is off a straight line by {bend:.2g} % of the output."
     )
+    return bend, one_way, words

@@ -1,10 +1,9 @@
 """A stage as it is designed: dimensions with their tolerances, material, piezos and moving masses."""
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +16,7 @@ TOLERANCE_MM = 0.02
 LARGEST_ANGLE_RAD = 1.5
 # Hinges and the distance between the centres of the two of a leg, which they cannot exceed.
 _HINGES = (("l1", "la1", "alpha1"), ("l2", "l3", ""), ("l4", "la2", "alpha2"), ("l6", "la3", "alpha3"))
-# The paper's middle platform has hinges that are longer than their leg's run by 0.2 %.
-_OVERLAP = 0.01
 _MOST_GUIDES = 1000
-# What rounding may take from the smallest eigenvalue of a correlation matrix.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -39,24 +34,13 @@ class Together:
 class Design:
     """A stage as it is designed: what a machining error is counted from.
 
-    Attributes
-    ----------
-    tolerance
-        Largest error to either side of every dimension by name, in the dimension's unit. It stands for three standard
-        deviations of a normal distribution, or for the half-width of a uniform or a triangular one.
-    level
-        0 for Euler-Bernoulli leaves between rigid blocks, 1 with elastic roots, shear and links.
-    guides, youngs_modulus_GPa
-        Guiding legs of a translation in x or y; and the modulus of all flexures.
-    actuation
-        Piezos and moving masses.
-    together
-        Dimensions with correlated errors; all others are independent.
+    The tolerance of every dimension by name is the largest error to either side, in the dimension's unit: three
+    standard deviations of a normal distribution, or the half-width of a uniform or a triangular one. The level is 0
+    for Euler-Bernoulli leaves between rigid blocks, 1 with elastic roots, shear and links. `guides` are the guiding
+    legs of a translation in x or y, the modulus is that of all flexures, the actuation are piezos and moving masses,
+    and errors of dimensions are independent but for those that go `together`.
 
-    Raises
-    ------
-    DataError
-        If anything in it is impossible; the sentence begins with its place, such as `geometry.t2`.
+    A `DataError` says that anything in it is impossible, beginning with its place, such as `geometry.t2`.
     """
 
     geometry: m.Geometry
@@ -64,7 +48,7 @@ class Design:
     level: int = 1
     guides: float = 4.0
     youngs_modulus_GPa: float = 206.0
-    actuation: m.Actuation = dataclasses.field(default_factory=m.Actuation)
+    actuation: m.Actuation = field(default_factory=m.Actuation)
     together: tuple[Together, ...] = ()
 
     def __post_init__(self) -> None:
@@ -78,7 +62,7 @@ class Design:
 
     def with_tolerance(self, length_mm: float) -> "Design":
         """Give every length this tolerance, and every angle what an error of that size makes of it at its leg."""
-        return dataclasses.replace(self, tolerance=uniform_tolerance(self.geometry, length_mm))
+        return replace(self, tolerance=uniform_tolerance(self.geometry, length_mm))
 
     def correlation(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Correlation of the errors of some dimensions, shape `(n, n)`."""
@@ -114,7 +98,7 @@ def lever_mm(geometry: m.Geometry, name: str) -> float:
 def _faults(design: Design) -> Iterator[str]:
     """Sentences on what is impossible, each beginning with its place."""
     yield from _faults_of_sizes(design)
-    if isinstance(design.level, bool) or not isinstance(design.level, int) or design.level not in (0, 1):
+    if type(design.level) is not int or design.level not in (0, 1):
         yield f"level: expected 0 or 1, found {design.level!r}; give one of them."
     if not 0 <= design.guides <= _MOST_GUIDES:
         yield f"material.guides: expected 0 to {_MOST_GUIDES} legs, found {design.guides:g}; correct it."
@@ -155,7 +139,8 @@ def _faults_of_sizes(design: Design) -> Iterator[str]:
             )
     for hinge, leg, angle in _HINGES:
         run = sizes[leg] * math.cos(sizes[angle]) if angle else sizes[leg]
-        if sizes[hinge] > (1 + _OVERLAP) * run:
+        # The paper's middle platform has hinges that are longer than their leg's run by 0.2 %.
+        if sizes[hinge] > 1.01 * run:
             yield (
                 f"geometry.{hinge}: expected a hinge no longer than its leg, which runs {run:.4g} mm along it "
                 f"({leg} = {sizes[leg]:g} mm), found {sizes[hinge]:g} mm; shorten the hinge or lengthen the leg."
@@ -169,7 +154,7 @@ def _faults_of_groups(design: Design) -> Iterator[str]:
         for name in group.dimensions:
             if name not in m.DIMENSIONS:
                 yield f"{place}.dimensions: '{name}' is no dimension; {nearest(name, [*m.DIMENSIONS])}"
-        if len(set(group.dimensions)) < 2 or len(set(group.dimensions)) < len(group.dimensions):
+        if len(set(group.dimensions)) < max(2, len(group.dimensions)):
             yield f"{place}.dimensions: expected at least two different dimensions, found {list(group.dimensions)}."
         if not -1 <= group.correlation <= 1:
             yield (
@@ -183,7 +168,8 @@ def _faults_of_groups(design: Design) -> Iterator[str]:
                 )
             pairs[pair] = k
     names = sorted({name for group in design.together for name in group.dimensions})
-    if names and np.linalg.eigvalsh(design.correlation(names))[0] < -_ROUNDING:
+    # Rounding may take a little from the smallest eigenvalue of a correlation matrix.
+    if names and np.linalg.eigvalsh(design.correlation(names))[0] < -1e-9:
         yield (
             f"together[{len(design.together) - 1}].correlation: expected correlations that errors can have, found a "
             "matrix that is not positive semidefinite; n dimensions can all have -1 / (n - 1) at least, and two "

@@ -17,15 +17,13 @@ from fits.io._typed import typed
 from fits.machining._design import TOLERANCE_MM, Design, Together, lever_mm
 
 SCHEMA = "microid.stage/1"
-_DEGREE = math.pi / 180
 # What to multiply by, or to divide by where that is exact.
 _LENGTH = {"mm": (1.0, 1.0), "um": (1.0, 1e3), "m": (1e3, 1.0)}
 _STROKE = {"um": (1.0, 1.0), "mm": (1e3, 1.0), "m": (1e6, 1.0)}
-_ANGLE = {"rad": (1.0, 1.0), "mrad": (1.0, 1e3), "deg": (_DEGREE, 1.0)}
+_ANGLE = {"rad": (1.0, 1.0), "mrad": (1.0, 1e3), "deg": (math.pi / 180, 1.0)}
 _INERTIA = {"kg mm^2": (1.0, 1.0), "kg m^2": (1e6, 1.0)}
 _MASS = {"kg": (1.0, 1.0), "g": (1.0, 1e3)}
 _MODULUS = {"GPa": (1.0, 1.0), "MPa": (1.0, 1e3)}
-_NO_UNIT: dict[str, tuple[float, float]] = {}
 _Units = Mapping[str, tuple[float, float]]
 
 # Key, units (the first is the one written), field of `microid.Actuation`, and meaning.
@@ -37,7 +35,7 @@ _ACTUATION: tuple[tuple[str, _Units, str, str], ...] = (
     ("mass_z", _MASS, "mass_z_kg", "moved along z"),
     ("inertia_tilt", _INERTIA, "inertia_tilt_kg_mm2", "turned about x or y"),
     ("inertia_rotor", _INERTIA, "inertia_rotor_kg_mm2", "turned about z"),
-    ("damping_ratio", _NO_UNIT, "damping_ratio", "of all axes"),
+    ("damping_ratio", {}, "damping_ratio", "of all axes"),
 )
 
 
@@ -88,9 +86,8 @@ def read_design(path: str | os.PathLike[str]) -> Design:
     try:
         return _design(table)
     except DataError as error:
-        sentence = str(error)
-        line = _line_of(text, sentence.partition(":")[0])
-        raise DataError(f"{name}{'' if line is None else f', line {line}'}: {sentence}") from None
+        line = _line_of(text, str(error).partition(":")[0])
+        raise DataError(f"{name}{'' if line is None else f', line {line}'}: {error}") from None
 
 
 def write_design(design: Design, path: str | os.PathLike[str]) -> None:
@@ -99,36 +96,30 @@ def write_design(design: Design, path: str | os.PathLike[str]) -> None:
 
 
 def design_text(design: Design) -> str:
-    lines = [
-        f'schema = "{SCHEMA}"',
-        "# 0: Euler-Bernoulli leaves between rigid blocks; 1: elastic roots, shear, links.",
-    ]
-    lines += [f"level = {design.level}", "", "[geometry]"]
+    levels = "# 0: Euler-Bernoulli leaves between rigid blocks; 1: elastic roots, shear, links."
+    lines = [f'schema = "{SCHEMA}"', levels, f"level = {design.level}", "", "[geometry]"]
     platform = ""
     for name, dimension in m.DIMENSIONS.items():
         if dimension.platform != platform:
             platform = dimension.platform
             lines.append(f"# {platform.capitalize()} platform")
-        value = f"value = {float(design.geometry[name])!r}, unit = {_quoted(dimension.unit)}"
-        entry = f"{name} = {{ {value}, tolerance = {float(design.tolerance[name])!r} }}"
-        lines.append(f"{entry}  # {dimension.meaning}")
-    modulus = f"value = {float(design.youngs_modulus_GPa)!r}, unit = {_quoted('GPa')}"
-    lines += ["", "[material]", f"youngs_modulus = {{ {modulus} }}  # of all flexures"]
+        tolerance = f", tolerance = {float(design.tolerance[name])!r}"
+        written = _written(design.geometry[name], dimension.unit, tolerance)
+        lines.append(f"{name} = {written}  # {dimension.meaning}")
+    lines += ["", "[material]", f"youngs_modulus = {_written(design.youngs_modulus_GPa, 'GPa')}  # of all flexures"]
     lines += [f"guides = {float(design.guides)!r}  # guiding legs of a translation in x or y", "", "[actuation]"]
     for key, units, field, meaning in _ACTUATION:
-        number = repr(float(getattr(design.actuation, field)))
-        unit = next(iter(units), None)
-        written = number if unit is None else f"{{ value = {number}, unit = {_quoted(unit)} }}"
-        lines.append(f"{key} = {written}  # {meaning}")
+        lines.append(f"{key} = {_written(getattr(design.actuation, field), next(iter(units), None))}  # {meaning}")
     for group in design.together:
-        names = ", ".join(map(_quoted, group.dimensions))
+        names = ", ".join(f'"{name}"' for name in group.dimensions)
         lines += ["", "[[together]]", f"dimensions = [{names}]  # whose errors go together"]
         lines.append(f"correlation = {float(group.correlation)!r}")
     return "\n".join([*lines, ""])
 
 
-def _quoted(text: str) -> str:
-    return f'"{text}"'
+def _written(value: Any, unit: str | None, more: str = "") -> str:
+    number = repr(float(value))
+    return number if unit is None else f'{{ value = {number}, unit = "{unit}"{more} }}'
 
 
 def _design(table: Mapping[str, Any]) -> Design:
@@ -136,7 +127,7 @@ def _design(table: Mapping[str, Any]) -> Design:
     # First of all: keys of another file are not ours to show.
     if table.get("schema") != SCHEMA:
         found = shown(table["schema"]) if "schema" in table else "none"
-        raise DataError(f"schema: expected {_quoted(SCHEMA)}, found {found}; give that, or another file.")
+        raise DataError(f'schema: expected "{SCHEMA}", found {found}; give that, or another file.')
     stage = typed(table, _Stage)
     sizes, tolerance = {}, {}
     for name, dimension in m.DIMENSIONS.items():
@@ -146,9 +137,8 @@ def _design(table: Mapping[str, Any]) -> Design:
         if written.tolerance is not None:
             tolerance[name] = _converted(written.tolerance, written.unit, units, f"geometry.{name}")
     geometry = m.Geometry(**{m.DIMENSIONS[name].field: jnp.asarray(size) for name, size in sizes.items()})
-    for name in m.DIMENSIONS:
-        # A leg of no length is refused below.
-        tolerance.setdefault(name, TOLERANCE_MM / (lever_mm(geometry, name) or 1.0))
+    # A leg of no length is refused below.
+    usual = {name: TOLERANCE_MM / (lever_mm(geometry, name) or 1.0) for name in m.DIMENSIONS}
     moved = {}
     for key, scale, field, _ in _ACTUATION:
         number, place = getattr(stage.actuation, key), f"actuation.{key}"
@@ -158,7 +148,7 @@ def _design(table: Mapping[str, Any]) -> Design:
     modulus = stage.material.youngs_modulus
     return Design(
         geometry=geometry,
-        tolerance={name: tolerance[name] for name in m.DIMENSIONS},
+        tolerance=usual | tolerance,
         level=stage.level,
         guides=stage.material.guides,
         youngs_modulus_GPa=_converted(modulus.value, modulus.unit, _MODULUS, "material.youngs_modulus"),

@@ -48,10 +48,9 @@ def check_axes(axes: Iterable[str]) -> None:
 def quick_jit(function: Callable[..., _Result]) -> Callable[..., _Result]:
     """Compile fast: a call takes microseconds however it is compiled, and compiling with optimisation seconds."""
     # Without its fusion emitters, which a user's flags may switch off, XLA compiles what is not fused wrongly.
-    emitters = {"xla_cpu_use_fusion_emitters": True}
-    quick = {"xla_backend_optimization_level": 0, "xla_disable_hlo_passes": "fusion", **emitters}
-    compiled: Callable[..., _Result] = eqx.filter_jit(function, compiler_options=quick)  # type: ignore[call-overload]
-    return compiled
+    options = {"xla_disable_hlo_passes": "fusion", "xla_cpu_use_fusion_emitters": True}
+    options |= {"xla_backend_optimization_level": 0}
+    return eqx.filter_jit(function, compiler_options=options)  # type: ignore[call-overload]
 
 
 class GainModel(eqx.Module):
@@ -87,11 +86,8 @@ def _gains(
     model: GainModel, errors: Float[Array, "k n"], axes: tuple[m.Axis, ...], names: tuple[str, ...]
 ) -> Float[Array, "axes n"]:
     """Gains of some axes for many stages, whose errors of the named dimensions are in mm and rad."""
-
-    def one(error: Float[Array, " k"]) -> Float[Array, " axes"]:
-        return jnp.stack([model(error, axis, names) for axis in axes])
-
-    return jax.vmap(one, in_axes=1, out_axes=1)(errors)
+    of_one = jax.vmap(lambda error: jnp.stack([model(error, axis, names) for axis in axes]), in_axes=1, out_axes=1)
+    return of_one(errors)
 
 
 # For few stages what counts is the time to compile, for millions the time to run.

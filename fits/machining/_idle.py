@@ -20,11 +20,6 @@ FloatArray = NDArray[np.float64]
 MIN_IDLE_SAMPLES = 100
 # Share of a step by which steps may differ: spectra do not see less.
 _UNEVEN = 0.05
-_SEGMENTS = 8
-_MIN_SEGMENT = 64
-# Fewer stretches that know nothing of each other than this, and the error of the mean is itself a guess.
-_MIN_STRETCHES = 50
-_BATCHES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,29 +32,17 @@ class IdleNoise:
     only a standard deviation of 0.0318 um is consistent with its band of 0.05 to 0.15 um (errata 41). Here both are
     in um, and `error_um` says what enters Eq. 1.
 
-    Attributes
-    ----------
-    duration_s
-        Length of the record; `samples` times the interval between them.
-    mean_um, mean_sd_um
-        The offset, and its standard error with the noise's own correlation.
-    sd_um, sd_detrended_um
-        Standard deviation about the mean, and about a straight line in time.
-    drift_um_per_s, drift_sd_um_per_s
-        Slope of that line, and its standard error with the noise's own correlation.
-    resolution_um
-        Quantum of the readings, be it the converter's or the last digit of the file; None where none shows.
-    correlation_s
-        Time after which a sample counts as a new one; the sampling interval for white noise.
-    frequency_Hz, asd_um_per_rtHz
-        Amplitude spectral density, one-sided, shape `(f,)`, by Welch's method without the drift.
-    bands, lines
-        The noise by decades of frequency, whose squares add up to the variance about the line; and sines above the
-        floor, such as mains hum.
-    averaging_s, adev_um, adev_sd_um
-        Overlapping Allan deviation of the readings, shape `(a,)`, and its approximate standard error.
-    bias_instability_um, bias_instability_s
-        Its minimum, and the averaging time at which it is reached: averaging any longer does not help.
+    The mean is the offset; `sd_um` is the standard deviation about it, `sd_detrended_um` that about a straight line
+    in time, whose slope is the drift. Standard errors of mean and drift are with the noise's own correlation, and
+    `correlation_s` is the time after which a sample counts as a new one: the interval for white noise. The duration
+    is `samples` times that interval. The resolution is the quantum of the readings, be it the converter's or the last
+    digit of the file; None where none shows.
+
+    The amplitude spectral density, one-sided, shape `(f,)` as its frequencies, is by Welch's method without the
+    drift. `bands` are the noise by decades of frequency, whose squares add up to the variance about the line; `lines`
+    are sines above the floor, such as mains hum. The overlapping Allan deviation of the readings and its approximate
+    standard error have shape `(a,)`, as the averaging times; its minimum is the bias instability, beyond whose time
+    averaging does not help.
     """
 
     samples: int
@@ -106,25 +89,19 @@ class IdleNoise:
 def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> Reference:
     """Read what a sensor shows while the stage is at rest: `time_s`, `displacement_um` and perhaps `voltage_V`.
 
-    Units, separators and `columns` are as in `read_csv`.
-
-    Raises
-    ------
-    DataError
-        One sentence with file, line and column: a voltage that changes, fewer than 100 samples, uneven time steps, a
-        reading that never changes, or what `read_csv` refuses.
+    Units, separators and `columns` are as in `read_csv`. A `DataError`, with file, line and column, refuses a voltage
+    that changes, fewer than 100 samples, uneven time steps, a reading that never changes, or what `read_csv` refuses.
     """
     read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), ("voltage_V",), alone=True)
     table, sources, arrays = read.table, read.sources, read.arrays
-    if "voltage_V" in arrays:
-        voltage_V = arrays["voltage_V"]
-        changes = np.flatnonzero(voltage_V != voltage_V[0])
-        if len(changes):
-            what = (
-                f"not idle: expected a constant voltage, found {voltage_V.min():.6g} to {voltage_V.max():.6g} V; cut "
-                "out the part at rest, or drop the column if it is a noisy monitor of a constant voltage"
-            )
-            raise data_error(table.path, what, table.line(int(changes[0])), sources["voltage_V"].column)
+    voltage_V = arrays.get("voltage_V", np.zeros(1))
+    changes = np.flatnonzero(voltage_V != voltage_V[0])
+    if len(changes):
+        what = (
+            f"not idle: expected a constant voltage, found {voltage_V.min():.6g} to {voltage_V.max():.6g} V; cut out "
+            "the part at rest, or drop the column if it is a noisy monitor of a constant voltage"
+        )
+        raise data_error(table.path, what, table.line(int(changes[0])), sources["voltage_V"].column)
     fault = _find_fault(arrays["time_s"], arrays["displacement_um"])
     if fault:
         what, row, name = fault
@@ -135,13 +112,7 @@ def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = 
 def idle_noise(reference: Reference) -> IdleNoise:
     """Describe the noise of an idle record from `read_idle` (Eq. 6 and Fig. 8).
 
-    Raises
-    ------
-    DataError
-        Fewer than 100 samples, uneven time steps, or readings that are not finite or never change.
-
-    Notes
-    -----
+    A `DataError` refuses fewer than 100 samples, uneven time steps, and readings that are not finite or never change.
     Standard errors: A. Sokal, "Monte Carlo Methods in Statistical Mechanics" (1997), section 3. Allan deviation: IEEE
     Std 952-1997, annex C.
     """
@@ -150,8 +121,7 @@ def idle_noise(reference: Reference) -> IdleNoise:
         raise DataError(f"{reference.source or 'idle record'}, row {fault[1]}, column '{fault[2]}': {fault[0]}.")
     readings, n = reference.displacement_um, len(reference.time_s)
     interval_s = float(reference.time_s[-1] - reference.time_s[0]) / (n - 1)
-    rate_Hz = 1 / interval_s
-    mean = float(readings.mean())
+    rate_Hz, mean = 1 / interval_s, float(readings.mean())
     time_s = interval_s * (np.arange(n) - (n - 1) / 2)
     moment = float(time_s @ time_s)
     drift = float(time_s @ (readings - mean)) / moment
@@ -161,7 +131,7 @@ def idle_noise(reference: Reference) -> IdleNoise:
     sd_detrended = float(np.sqrt(residual @ residual / (n - 2)))
     correlation = _correlation_samples(residual)
     error = sd_detrended * np.sqrt(correlation)
-    segment = min(n, max(_MIN_SEGMENT, n // _SEGMENTS))
+    segment = min(n, max(64, n // 8))
     # The drift is gone already; taking more out of each segment would take slow noise with it.
     frequency_Hz, density = signal.welch(residual, rate_Hz, nperseg=segment, detrend=False)
     averaging_s, adev, adev_sd = allan_deviation(readings, interval_s)
@@ -222,14 +192,11 @@ def _find_fault(time_s: FloatArray, displacement_um: FloatArray) -> tuple[str, i
 
 
 def _correlation_samples(residual_um: FloatArray) -> float:
-    """Samples that are worth one independent one, from autocorrelation or from batch means, whichever is more.
-
-    Slow noise that hides below white noise shows in the means of 32 batches, and not in the first autocorrelations.
-    """
-    length = len(residual_um) // _BATCHES
-    means = residual_um[: _BATCHES * length].reshape(_BATCHES, length).mean(axis=1)
+    """Samples that are worth one independent one; means of batches show slow noise that hides below white noise."""
+    length = len(residual_um) // 32
+    means = residual_um[: 32 * length].reshape(32, length).mean(axis=1)
     square = float(residual_um @ residual_um) / len(residual_um)
-    batch = length * float(means @ means) / (_BATCHES - 2) / square if square > 0 else 1.0
+    batch = length * float(means @ means) / 30 / square if square > 0 else 1.0
     return max(correlation_samples([residual_um]), batch)
 
 
@@ -262,7 +229,8 @@ def _remarks(noise: IdleNoise) -> Iterator[str]:
             "um over the record, so the standard deviation depends on how long one waits; zero again from time to "
             "time."
         )
-    if noise.duration_s < _MIN_STRETCHES * noise.correlation_s:
+    if noise.duration_s < 50 * noise.correlation_s:
+        # With so few stretches that know nothing of each other the error of the mean is itself a guess.
         yield (
             f"The noise is correlated over {noise.correlation_s:.3g} s, which is long for a record of "
             f"{noise.duration_s:.3g} s: the errors of mean and drift are rough; record for longer."

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Array
 
 from fits.io._errors import DataError
 from fits.machining._design import Design
@@ -24,25 +23,17 @@ from microid import AXES, MOTIONS, Axis
 _CHUNK = 65536
 _QUANTILES_PCT = (0.135, 2.5, 50.0, 97.5, 99.865)
 _FEWEST_SAMPLES, _MOST_SAMPLES = 1000, 30_000_000
-# First order counts as right within this, and this many standard errors.
-_AGREE, _STANDARD_ERRORS = 0.02, 3.0
 
 
 @dataclass(frozen=True)
 class SecondOrder:
     """Spread of the gain of an axis as a quadratic function of the errors of the `k` dimensions that it depends on.
 
-    Attributes
-    ----------
-    unit
-        Of the gain: `um/um` or `rad/um`; per um of free elongation with `voltage`.
-    gain, gradient, hessian
-        At the nominal dimensions, and derivatives per mm or rad, shapes `(k,)` and `(k, k)`.
-    first_order_sd, mean_shift
-        Standard deviation from the gradient alone, and mean less the gain at the nominal dimensions.
-    pairs
-        What each pair adds to the variance at second order, shape `(k, k)`; the sum of all counts, and two equal
-        halves of a pair stand at either side of the diagonal.
+    The unit of the gain is `um/um` or `rad/um`; per um of free elongation with `voltage`. It is that at the nominal
+    dimensions, with its derivatives per mm or rad, shapes `(k,)` and `(k, k)`. The standard deviation of first order
+    is from the gradient alone; the mean is shifted against the gain at the nominal dimensions. `pairs` is what each
+    pair adds to the variance at second order, shape `(k, k)`; the sum of all counts, and two equal halves of a pair
+    stand at either side of the diagonal.
     """
 
     axis: Axis
@@ -83,12 +74,7 @@ def second_order(
     for independent dimensions of any symmetric distribution with fourth moments :math:`\mu_4`, and for correlated
     normal ones. Correlated dimensions that are not normal have joint fourth moments that this leaves out. Third
     derivatives add to the variance at the same power of the tolerances unless the gradient vanishes; they are left
-    out, too.
-
-    Raises
-    ------
-    DataError
-        If there is no such axis or distribution, or a tolerance is as large as its dimension.
+    out, too. A `DataError` says that there is no such axis or distribution, or a tolerance as large as its dimension.
     """
     check(design, (axis,), distribution)
     names = inputs_of(axis, voltage)
@@ -97,33 +83,19 @@ def second_order(
     sigma = covariance(design, names, distribution)
     bent = bends @ sigma
     tails = np.diag(bends) ** 2 * excess_fourth_moment(distribution) * tolerances(design, names) ** 4 / 4
-    return SecondOrder(
-        axis=axis,
-        unit=f"{MOTIONS[axis].unit}/um",
-        distribution=distribution,
-        voltage=voltage,
-        names=names,
-        gain=float(value),
-        gradient=slopes,
-        hessian=bends,
-        first_order_sd=float(np.sqrt(slopes @ sigma @ slopes)),
-        mean_shift=float(np.trace(bent) / 2),
-        pairs=bent * bent.T / 2 + np.diag(tails),
-    )
+    first_order_sd, mean_shift = float(np.sqrt(slopes @ sigma @ slopes)), float(np.trace(bent) / 2)
+    pairs, unit = bent * bent.T / 2 + np.diag(tails), f"{MOTIONS[axis].unit}/um"
+    at_nominal = float(value), slopes, bends
+    return SecondOrder(axis, unit, distribution, voltage, names, *at_nominal, first_order_sd, mean_shift, pairs)
 
 
 @dataclass(frozen=True)
 class AxisSpread:
     """How the gain of an axis spreads, in um/um or rad/um; per um of free elongation with a fixed voltage.
 
-    Attributes
-    ----------
-    nominal, mean, sd, skewness
-        Gain at the nominal dimensions, and statistics of the draws.
-    sd_error, quantiles
-        Standard error of `sd`, from the fourth moment; and quantiles by percentage: 0.135, 2.5, 50, 97.5 and 99.865.
-    first_order_sd, second
-        Standard deviation from the gradient, and the expansion to second order where `flagged`, else `None`.
+    After the gain at the nominal dimensions come statistics of the draws: the standard error of `sd` is from the
+    fourth moment, and quantiles are by percentage: 0.135, 2.5, 50, 97.5 and 99.865. The standard deviation of first
+    order is from the gradient, and the expansion to second order is there where `flagged`, else `None`.
     """
 
     axis: Axis
@@ -154,7 +126,7 @@ class AxisSpread:
 
     def agrees(self, sd: float) -> bool:
         """Whether a standard deviation is within 2 % and three standard errors of that of the draws."""
-        return abs(sd - self.sd) <= _AGREE * self.sd + _STANDARD_ERRORS * self.sd_error
+        return abs(sd - self.sd) <= 0.02 * self.sd + 3 * self.sd_error
 
 
 @dataclass(frozen=True)
@@ -180,78 +152,43 @@ def monte_carlo(
 ) -> MonteCarlo:
     """Draw the dimensions within their tolerances and evaluate the gains.
 
-    Parameters
-    ----------
-    design
-        Dimensions, tolerances and which of them go together. The correlation of those is that of the dimensions,
-        whatever their distribution: a Gaussian copula joins them, and each keeps its own distribution.
-    samples, seed
-        Number of stages drawn, from 1000 to 30 million, and the seed of the draws.
-    distribution
-        Of each dimension: `normal` with the tolerance as three standard deviations; `uniform` or `triangular` over
-        the tolerance.
-    voltage
-        Impose the voltage of the piezos instead of their elongation.
-    progress
-        Called with a sentence now and then.
+    Each dimension is `normal`, with the tolerance as three standard deviations, or `uniform` or `triangular` over the
+    tolerance. The correlation of those that go together is that of the dimensions, whatever their distribution: a
+    Gaussian copula joins them, and each keeps its own distribution. From 1000 to 30 million stages are drawn, by the
+    seed; with `voltage` the voltage of the piezos is imposed instead of their elongation. `progress` is called with a
+    sentence now and then.
 
-    Raises
-    ------
-    DataError
-        If there is no such axis or distribution, a tolerance is as large as its dimension, or the number of samples
-        is out of bounds.
+    A `DataError` says that there is no such axis or distribution, that a tolerance is as large as its dimension, or
+    that the number of samples is out of bounds.
     """
     check(design, axes, distribution)
     if not _FEWEST_SAMPLES <= samples <= _MOST_SAMPLES:
         raise DataError(f"between {_FEWEST_SAMPLES:,} and {_MOST_SAMPLES:,} samples are needed, got {samples:,}")
     different = tuple(dict.fromkeys(twin(axis) for axis in axes))
-    gains = _gains_of_draws(design, different, samples, distribution, seed, voltage, progress)
-    progress("summing up")
-    spreads = once_per_function(
-        axes, lambda axis: _spread(gains[different.index(twin(axis))], design, axis, distribution, voltage)
-    )
-    for axis, spread in spreads.items():
-        if spread.flagged:
-            spreads[axis] = replace(spread, second=second_order(design, axis, distribution, voltage=voltage))
-    return MonteCarlo(spreads, samples, distribution, seed, voltage)
-
-
-def _gains_of_draws(
-    design: Design,
-    axes: tuple[Axis, ...],
-    samples: int,
-    distribution: Distribution,
-    seed: int,
-    voltage: bool,
-    progress: Callable[[str], None],
-) -> np.ndarray:
-    """Gains of the axes, shape `(axes, samples)`."""
-    names = tuple(dict.fromkeys(name for axis in axes for name in inputs_of(axis, voltage)))
+    names = tuple(dict.fromkeys(name for axis in different for name in inputs_of(axis, voltage)))
     model, scale = gain_model(design, voltage), tolerances(design, names)[:, None]
     root = copula_root(design, names, distribution)
     rng = np.random.Generator(np.random.SFC64(seed))
-    gains = np.empty((len(axes), samples))
-
-    def keep(begin: int, found: Array) -> None:
-        part = gains[:, begin : begin + _CHUNK]
-        part[:] = np.asarray(found)[:, : part.shape[1]]
-
-    before: tuple[int, Array] | None = None
+    gains, coming = np.empty((len(different), samples)), None
     for begin in range(0, samples, _CHUNK):
         standard = rng.standard_normal((len(names), _CHUNK))
         errors = scale * from_normal(root @ standard if design.together else standard, distribution)
         # Computed while the next are drawn.
-        coming = begin, gains_of_many(model, errors, axes, names)
-        if before is not None:
-            keep(*before)
-        before = coming
+        before, coming = coming, gains_of_many(model, errors, different, names)
+        if begin:
+            gains[:, begin - _CHUNK : begin] = before
         if begin * 10 // samples != (begin + _CHUNK) * 10 // samples:
             progress(f"{min(samples, begin + _CHUNK):,} of {samples:,} samples")
-    assert before is not None
-    keep(*before)
+    gains[:, begin:] = np.asarray(coming)[:, : samples - begin]
     if not np.isfinite(gains).all():
         raise DataError("some of the stages drawn cannot be built: lower the tolerances")
-    return gains
+    progress("summing up")
+    gains_of = dict(zip(different, gains, strict=True))
+    spreads = once_per_function(axes, lambda axis: _spread(gains_of[twin(axis)], design, axis, distribution, voltage))
+    for axis, spread in spreads.items():
+        if spread.flagged:
+            spreads[axis] = replace(spread, second=second_order(design, axis, distribution, voltage=voltage))
+    return MonteCarlo(spreads, samples, distribution, seed, voltage)
 
 
 def _spread(values: np.ndarray, design: Design, axis: Axis, distribution: Distribution, voltage: bool) -> AxisSpread:
@@ -264,15 +201,8 @@ def _spread(values: np.ndarray, design: Design, axis: Axis, distribution: Distri
     off = (values - mean) / sd
     squares = off * off
     kurtosis = float(squares @ squares) / len(off)
-    return AxisSpread(
-        axis=axis,
-        unit=f"{MOTIONS[axis].unit}/um",
-        nominal=float(value),
-        mean=mean,
-        sd=sd,
-        skewness=float(squares @ off) / len(off),
-        sd_error=sd * float(np.sqrt((kurtosis - 1) / (4 * len(values)))),
-        quantiles=dict(zip(_QUANTILES_PCT, quantiles.tolist(), strict=True)),
-        first_order_sd=float(np.sqrt(slopes @ covariance(design, names, distribution) @ slopes)),
-        second=None,
-    )
+    skewness = float(squares @ off) / len(off)
+    sd_error = sd * float(np.sqrt((kurtosis - 1) / (4 * len(values))))
+    first_order_sd = float(np.sqrt(slopes @ covariance(design, names, distribution) @ slopes))
+    by_pct, unit = dict(zip(_QUANTILES_PCT, quantiles.tolist(), strict=True)), f"{MOTIONS[axis].unit}/um"
+    return AxisSpread(axis, unit, float(value), mean, sd, skewness, sd_error, by_pct, first_order_sd, None)

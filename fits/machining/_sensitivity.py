@@ -25,7 +25,6 @@ from fits.machining._gains import (
 )
 from fits.machining._tolerances import tolerances
 
-_TEN_UM_MM = 0.01
 # So short a stroke that all motions are in proportion to it, to the last digit.
 SHORT_um = 1e-6
 
@@ -34,20 +33,11 @@ SHORT_um = 1e-6
 class DimensionEffect:
     """What an error of one dimension does to one axis, the piezo's elongation being imposed.
 
-    Attributes
-    ----------
-    name, unit, value, tolerance
-        The dimension, in mm or rad.
-    derivative
-        Of the gain, in its unit per mm or rad.
-    relative_change_pct, relative_change_exact_pct
-        Of the output at an error of plus one tolerance, to first order and without linearising.
-    share_of_variance
-        Of the output, to first order; with correlated dimensions it can be negative. Zero where no tolerance has any
-        effect, otherwise the shares of an axis add up to 1.
-    output_change_per_10um
-        At the full stroke of the loaded piezo, to first order, in um or urad per 10 um of a length, or of 10 um
-        across the leg of an angle.
+    The dimension is in mm or rad. The derivative is that of the gain, in its unit per mm or rad; relative changes are
+    those of the output at an error of plus one tolerance, to first order and without linearising. With correlated
+    dimensions the share of the variance, to first order, can be negative; it is zero where no tolerance has any
+    effect, otherwise the shares of an axis add up to 1. `output_change_per_10um` is that at the full stroke of the
+    loaded piezo, to first order, in um or urad per 10 um of a length, or of 10 um across the leg of an angle.
     """
 
     name: str
@@ -65,19 +55,12 @@ class DimensionEffect:
 class AxisSensitivity:
     """The sensitivities of one axis, whose outputs are in `output_unit`: `um` or `urad`.
 
-    Attributes
-    ----------
-    gain
-        Output per elongation of the piezo for small strokes, in `output_unit` per um.
-    loaded_stroke_um, stroke
-        Elongation of the loaded piezo at the highest voltage (Eq. 14), and the output there.
-    dimensions
-        The arguments of Eq. 5, largest relative change first.
-    rss_pct, worst_case_pct
-        Root sum of squares of the relative changes, with their correlations, and sum of their sizes.
-    voltage_change_pct
-        Relative change of the output at plus one tolerance, to first order, the voltage being imposed instead of the
-        elongation: for every dimension that has an effect, also by the input stiffness, largest first.
+    The gain is the output per um of the piezo for small strokes; the stroke is the output at `loaded_stroke_um`, the
+    elongation of the loaded piezo at the highest voltage (Eq. 14). Dimensions are the arguments of Eq. 5, largest
+    relative change first; `rss_pct` is the root sum of squares of these changes, with their correlations, and
+    `worst_case_pct` the sum of their sizes. `voltage_change_pct` is the relative change of the output at plus one
+    tolerance, to first order, the voltage being imposed instead of the elongation: for every dimension that has an
+    effect, also by the input stiffness, largest first.
     """
 
     axis: m.Axis
@@ -97,13 +80,10 @@ class AxisSensitivity:
 
     def __getitem__(self, name: str) -> DimensionEffect:
         """Effect of a dimension by its name."""
-        for effect in self.dimensions:
-            if effect.name == name:
-                return effect
-        raise KeyError(
-            f"{self.axis} does not depend on {name!r}: choose one of "
-            f"{', '.join(effect.name for effect in self.dimensions)}"
-        )
+        effects = {effect.name: effect for effect in self.dimensions}
+        if name not in effects:
+            raise KeyError(f"{self.axis} does not depend on {name!r}: choose one of {', '.join(effects)}")
+        return effects[name]
 
 
 @dataclass(frozen=True)
@@ -119,24 +99,16 @@ class SensitivityReport:
 
     def alike(self) -> list[list[AxisSensitivity]]:
         """Group axes that are the same function of the same dimensions."""
-        groups: dict[m.Axis, list[AxisSensitivity]] = {}
-        for name, axis in self.axes.items():
-            groups.setdefault(twin(name), []).append(axis)
-        return list(groups.values())
+        firsts = dict.fromkeys(map(twin, self.axes))
+        return [[axis for name, axis in self.axes.items() if twin(name) == first] for first in firsts]
 
 
 def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> SensitivityReport:
     """Differentiate the motion of a stage with respect to its dimensions, for all axes by default.
 
     The derivatives are those of the implicit motion functions (Eq. 4, with the inverse that the paper leaves out,
-    erratum 6).
-
-    Raises
-    ------
-    DataError
-        If the dimensions are such that no finite number comes out.
-    RuntimeError
-        If JAX is not in double precision.
+    erratum 6). A `DataError` says that the dimensions are such that no finite number comes out, a `RuntimeError` that
+    JAX is not in double precision.
     """
     require_float64("sensitivities")
     chosen: Sequence[m.Axis] = (axes,) if isinstance(axes, str) else axes  # type: ignore[assignment]
@@ -168,14 +140,10 @@ def _differentiate(
     full_um = m.loaded_um(axis, geometry, *piezo)
     strokes_um = jnp.stack([jnp.full_like(full_um, SHORT_um), full_um])
     found = jax.vmap(lambda stroke_um: m.sensitivity(axis, geometry, stroke_um, constants))(strokes_um)
-    return AxisDerivatives(
-        gain=found.piezo[0],
-        slopes={name: slope[0] / SHORT_um for name, slope in found.dimensions.items()},
-        loaded_stroke_um=full_um,
-        stroke=found.output[1],
-        slopes_at_full_stroke={name: slope[1] for name, slope in found.dimensions.items()},
-        by_voltage=m.voltage_sensitivity(axis, geometry, *piezo),
-    )
+    slopes = {name: slope[0] / SHORT_um for name, slope in found.dimensions.items()}
+    at_full_stroke = {name: slope[1] for name, slope in found.dimensions.items()}
+    by_voltage = m.voltage_sensitivity(axis, geometry, *piezo)
+    return AxisDerivatives(found.piezo[0], slopes, full_um, found.output[1], at_full_stroke, by_voltage)
 
 
 def gains_at(design: Design, axis: m.Axis, errors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -200,45 +168,28 @@ def refuse_infinite(axis: m.Axis, numbers: Iterable[float]) -> None:
 def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
     names = m.MOTIONS[axis].dimensions
     derived = derivatives_of(design, axis)
-    gain, tolerance = float(derived.gain), tolerances(design, names)
+    gain, stroke, tolerance = float(derived.gain), float(derived.stroke), tolerances(design, names)
     slopes = np.array([float(derived.slopes[name]) for name in names])
     changes = slopes * tolerance / gain
     exact = gains_at(design, axis, np.diag(tolerance)) / gain - 1
-    imposed = derived.by_voltage
     by_voltage = {
-        name: 100 * float(slope) * design.tolerance[name] / float(imposed.output)
-        for name, slope in imposed.dimensions.items()
+        name: 100 * float(slope) * design.tolerance[name] / float(derived.by_voltage.output)
+        for name, slope in derived.by_voltage.dimensions.items()
         if slope != 0
     }
-    refuse_infinite(
-        axis, [*changes, *exact, *slopes, *by_voltage.values(), float(derived.stroke), gain if gain > 0 else math.nan]
-    )
+    refuse_infinite(axis, [*changes, *exact, *slopes, *by_voltage.values(), stroke, gain if gain > 0 else math.nan])
     scale, unit = output_scale(axis)
     parts = changes * (design.correlation(names) @ changes)
     variance = float(parts.sum())
-    ten_um = uniform_tolerance(design.geometry, _TEN_UM_MM)
-    effects = [
-        DimensionEffect(
-            name=name,
-            unit=m.DIMENSIONS[name].unit,
-            value=float(design.geometry[name]),
-            tolerance=float(tolerance[i]),
-            derivative=scale * float(slopes[i]),
-            relative_change_pct=100 * float(changes[i]),
-            relative_change_exact_pct=100 * float(exact[i]),
-            share_of_variance=float(parts[i]) / variance if variance > 0 else 0.0,
-            output_change_per_10um=scale * float(derived.slopes_at_full_stroke[name]) * ten_um[name],
-        )
-        for i, name in enumerate(names)
-    ]
-    return AxisSensitivity(
-        axis=axis,
-        output_unit=unit,
-        gain=scale * gain,
-        loaded_stroke_um=float(derived.loaded_stroke_um),
-        stroke=scale * float(derived.stroke),
-        dimensions=tuple(sorted(effects, key=lambda effect: -abs(effect.relative_change_pct))),
-        rss_pct=100 * math.sqrt(max(variance, 0.0)),
-        worst_case_pct=100 * float(np.abs(changes).sum()),
-        voltage_change_pct=dict(sorted(by_voltage.items(), key=lambda item: -abs(item[1]))),
-    )
+    ten_um = uniform_tolerance(design.geometry, length_mm=0.01)
+    shares = parts / variance if variance > 0 else np.zeros_like(parts)
+    sizes = [float(design.geometry[name]) for name in names]
+    per_10um = [scale * float(derived.slopes_at_full_stroke[name]) * ten_um[name] for name in names]
+    columns = sizes, tolerance, scale * slopes, 100 * changes, 100 * exact, shares, per_10um
+    rows = zip(names, np.stack(columns, axis=1).tolist(), strict=True)
+    effects = [DimensionEffect(name, m.DIMENSIONS[name].unit, *row) for name, row in rows]
+    effects.sort(key=lambda effect: -abs(effect.relative_change_pct))
+    by_voltage = dict(sorted(by_voltage.items(), key=lambda item: -abs(item[1])))
+    rss_pct, worst_case_pct = 100 * math.sqrt(max(variance, 0.0)), 100 * float(np.abs(changes).sum())
+    motion = scale * gain, float(derived.loaded_stroke_um), scale * stroke
+    return AxisSensitivity(axis, unit, *motion, tuple(effects), rss_pct, worst_case_pct, by_voltage)

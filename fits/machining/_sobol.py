@@ -20,16 +20,10 @@ _FEWEST_SAMPLES, _MOST_SAMPLES = 256, 2**20
 class SobolIndices:
     """What part of the variance of the gain of an axis comes from which of the `k` dimensions that it depends on.
 
-    Attributes
-    ----------
-    first, total
-        Part that a dimension explains by itself, and part that would not be there without it: with all its
-        interactions, shape `(k,)`.
-    first_interval, total_interval
-        Lower and upper end of confidence intervals by bootstrap, shape `(k, 2)`. Points that fill the space evenly
-        err less than independent ones, so these are on the safe side.
-    evaluations
-        Number of stages evaluated.
+    `first` is the part that a dimension explains by itself, `total` the part that would not be there without it, with
+    all its interactions, shape `(k,)`. Confidence intervals, shape `(k, 2)`, are by bootstrap; points that fill the
+    space evenly err less than independent ones, so these are on the safe side. So many `evaluations` of a stage it
+    took.
     """
 
     axis: Axis
@@ -55,20 +49,10 @@ def sobol(
 ) -> dict[Axis, SobolIndices]:
     """Sobol indices of the gains over the tolerances, by the estimators of Saltelli et al. (2010).
 
-    Parameters
-    ----------
-    design, distribution, seed, axes, voltage
-        See `monte_carlo`.
-    samples
-        A power of two; each costs two evaluations and one more per dimension.
-    confidence, resamples
-        Of the intervals, and of the bootstrap that gives them.
-
-    Raises
-    ------
-    DataError
-        If dimensions go together, for then the variance has no unique parts; if there is no such axis or
-        distribution, a tolerance is as large as its dimension, or the number of samples is not a power of two.
+    The number of samples is a power of two; each costs two evaluations and one more per dimension. Intervals have the
+    confidence given, by a bootstrap of so many resamples; of the other arguments see `monte_carlo`. A `DataError`
+    says that dimensions go together, for then the variance has no unique parts; that there is no such axis or
+    distribution, that a tolerance is as large as its dimension, or that the number of samples is not a power of two.
     """
     check(design, axes, distribution)
     check_independent(design, "the variance has no unique parts for correlated dimensions: use monte_carlo")

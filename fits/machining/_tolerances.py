@@ -18,15 +18,10 @@ _MOMENTS: dict[Distribution, tuple[float, float]] = {
     "uniform": (1 / 3, 1 / 5),
     "triangular": (1 / 6, 1 / 15),
 }
-_NODES = 80
 
 
 def check(design: Design, axes: tuple[Axis, ...], distribution: str) -> None:
-    """Refuse, in a `DataError`, what cannot be drawn; float64 must be on.
-
-    These are an axis or a distribution that is unknown, an axis without tolerances, and draws that reach a dimension
-    of zero.
-    """
+    """Refuse unknown axes and distributions, no tolerances at all, and draws that reach a dimension of zero."""
     require_float64("tolerances")
     if distribution not in _MOMENTS:
         raise DataError(f"there is no distribution {distribution!r}: choose one of {', '.join(_MOMENTS)}")
@@ -95,7 +90,7 @@ def _copula(correlation: float, distribution: Distribution) -> float:
     """Correlation of normal numbers whose transforms have the one given."""
     if distribution == "normal" or abs(correlation) in (0.0, 1.0):
         return correlation
-    node, weight = np.polynomial.hermite_e.hermegauss(_NODES)
+    node, weight = np.polynomial.hermite_e.hermegauss(80)
     weight = weight / weight.sum()
     first = from_normal(node, distribution)
     variance = weight @ first**2

@@ -59,10 +59,7 @@ def placed_pid(mode: PaperMode, pair_rad_per_s: float, single_rad_per_s: float, 
 
 
 def paper_controller(scheme: str, mode: PaperMode, seed: int, largest_um: float, step: bool) -> AbstractController:
-    """The controller of `HC+PID`, `HC+BP-PID` or `HC+CMAC-PID`, for references from 0 to `largest_um` or a step.
-
-    The seed is that of the network's first weights.
-    """
+    """The controller of a scheme, for references from 0 to `largest_um` or a step; the seed is that of weights."""
     pid = placed_pid(mode, *(_STEP if step else _TRACK[scheme]), step)
     if scheme == "HC+PID":
         return pid

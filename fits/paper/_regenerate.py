@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import data_synth
+from fits.control._compensate_stage import simulate_model
 from fits.io._atomic import finite_json
 from fits.io._record import Reference
 from fits.machining._design import paper_design
@@ -47,12 +48,10 @@ def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], 
         progress(f"identifying the hysteresis from {seeds} noisy CSVs")
         identified = identify(piezo, loops.spawn(seeds), Path(records))
         stands, noises = {}, {}
-        for (name, axis), modes_rng, runs_rng in zip(
-            data_synth.PAPER_AXES.items(), others[::2], others[1::2], strict=True
-        ):
+        for k, (name, axis) in enumerate(data_synth.PAPER_AXES.items()):
             progress(f"identifying the response of axis {name}")
-            modes = identify_modes(axis, piezo, seeds, modes_rng, Path(records))
-            stands[name], noises[name] = PaperStand(axis, piezo, identified, modes), runs_rng
+            modes = identify_modes(axis, piezo, seeds, others[2 * k], Path(records))
+            stands[name], noises[name] = PaperStand(axis, piezo, identified, modes), others[2 * k + 1]
     steps: dict[str, PaperRun] = {}
     for scheme in PAPER["table2"]:
         progress(f"step, {scheme}")
@@ -79,19 +78,16 @@ def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], 
         "fig9": _of_loops("fig9", [(loop_width_pct(um, end), errors(um, end)) for um, _, end in loops_um]),
     }
     loop, inverse = _draw_loops(identified[0], piezo, folder)
+    other_axes = {title: tracks[name] for name, title in AXIS_TITLES.items()}
     pictures = [
         ("Fig. 6: the hysteresis and its model", loop),
         *_draw_errors(idle, folder),
         ("Fig. 9: the inverse model", inverse),
         ("Fig. 10: a step by scheme", _draw_steps(steps, folder)),
         ("Fig. 11: tracking along X, Y", _draw_tracks({"X, Y": tracks["x"]}, folder / "fig11.png")),
-        (
-            "Fig. 12: tracking along and about the other axes",
-            _draw_tracks({AXIS_TITLES[name]: tracks[name] for name in AXIS_TITLES}, folder / "fig12.png"),
-        ),
+        ("Fig. 12: tracking along and about the other axes", _draw_tracks(other_axes, folder / "fig12.png")),
     ]
-    text = finite_json(paper_json(result))
-    (folder / "paper.json").write_text(f"{text}\n", encoding="utf-8")
+    (folder / "paper.json").write_text(f"{finite_json(paper_json(result))}\n", encoding="utf-8")
     page = paper_page(result, [(caption, path.name) for caption, path in pictures])
     (folder / "paper.md").write_text(page, encoding="utf-8")
     return result
@@ -102,12 +98,11 @@ _tracking_errors = eqx.filter_jit(tracking_errors)
 
 
 def _steps(run: PaperRun, noisy: PaperRun, said: dict[str, float]) -> dict[str, Measured]:
-    time_s = jnp.asarray(np.arange(len(run.reference_um)) * INTERVAL_s)
-    target_um = jnp.asarray(run.reference_um[-1])
+    time_s, way_um = jnp.asarray(np.arange(len(run.reference_um)) * INTERVAL_s), float(run.reference_um[-1])
     ours, beside = (
-        [_step_metrics(time_s, jnp.asarray(one), target_um) for one in each.displacement_um] for each in (run, noisy)
+        [_step_metrics(time_s, jnp.asarray(one), jnp.asarray(way_um)) for one in each.displacement_um]
+        for each in (run, noisy)
     )
-    way_um = float(target_um)
 
     def distance_um(name: str, values: np.ndarray) -> np.ndarray | None:
         if name == "settling_time_s":
@@ -152,7 +147,8 @@ def _of_loops(figure: str, found: list[tuple[float | None, Any]]) -> dict[str, M
 def _draw_loops(one: Identified, piezo: data_synth.PaperPiezo, folder: Path) -> tuple[Path, Path]:
     voltage_V, measured_um = one.record.voltage_V, one.record.displacement_um
     assert measured_um is not None
-    fitted = plot_loop(voltage_V, measured_um, one.model_um(), folder / "fig6.png")
+    fitted_um = simulate_model(one.fit.model, one.record, "negative")
+    fitted = plot_loop(voltage_V, measured_um, fitted_um, folder / "fig6.png")
     # Up to the end of the second full loop.
     end = 1 + int(np.flatnonzero(voltage_V == voltage_V.min())[2])
     return fitted, plot_inverse(voltage_V[:end], measured_um[:end], *compensated(one, piezo), folder / "fig9.png")

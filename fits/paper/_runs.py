@@ -14,7 +14,6 @@ import numpy as np
 import data_synth
 from data_synth import PaperBench
 from fits.control._compensate import compensate
-from fits.control._compensate_stage import simulate_model
 from fits.io._atomic import write_csv
 from fits.io._read_csv import read_csv
 from fits.io._record import Record, Reference
@@ -36,10 +35,7 @@ _STEP_s = 3.0
 
 @dataclass(frozen=True, eq=False)
 class PaperRun:
-    """What happened on the benches, each of shape `(benches, n)` but for the reference, `(n,)`.
-
-    The displacement is the true one at the sample, and the command is held from there to the next.
-    """
+    """True displacement, reading, and the command held from there on, `(benches, n)`, for a reference, `(n,)`."""
 
     reference_um: np.ndarray
     displacement_um: np.ndarray
@@ -53,10 +49,7 @@ class PaperRun:
 
 @functools.cache
 def _compiled(controllers: Any, states: Any) -> Callable[..., Any]:
-    """One step of controllers and states of these structures, from and to their bare arrays.
-
-    Calls of compiled functions are many here, and modules take longer to take apart than a step takes.
-    """
+    """One step of such controllers and states on bare arrays: modules take longer to take apart than a step takes."""
 
     @jax.jit
     def advance(held: Any, before: Any, signals: Any) -> tuple[Any, Any]:
@@ -82,11 +75,7 @@ def run_feedback(
     feedforward_V: np.ndarray,
     shown_um: np.ndarray | None = None,
 ) -> PaperRun:
-    """Run closed loops on benches side by side; the controllers come from `stacked`.
-
-    The reference has shape `(n,)`; feedforward, and the reference as the controllers are shown it if that differs,
-    have shape `(benches, n)`.
-    """
+    """Run closed loops with `stacked` controllers side by side; what leads and what is shown are `(benches, n)`."""
     shown = np.broadcast_to(reference_um, feedforward_V.shape) if shown_um is None else shown_um
     states, form = jax.tree.flatten(eqx.filter_jit(eqx.filter_vmap(lambda one: one.init()))(controllers))
     held, kind = jax.tree.flatten(controllers)
@@ -113,15 +102,8 @@ class Identified:
     # The straight line of the open loop: stroke over range.
     slope_um_per_V: float
 
-    def model_um(self) -> np.ndarray:
-        """What the fit says of the record, shape `(n,)`."""
-        return simulate_model(self.fit.model, self.record, "negative")
-
     def feedforward_V(self, axis: data_synth.PaperAxis, reference_um: np.ndarray) -> np.ndarray:
-        """Voltage of the inverse hysteresis for a reference at the sensor, shape `(n,)` as the reference has.
-
-        The amplification is the nominal one: of its error, nothing is known ahead.
-        """
+        """Voltage of the inverse hysteresis at the nominal amplification, shape `(n,)` as the reference has."""
         wanted_um = self.rest_um + np.append(0.0, reference_um) / axis.amplification
         time_s = np.arange(len(wanted_um), dtype=float) * INTERVAL_s
         found = compensate(self.fit.model, Reference(time_s, wanted_um, source="reference"), "positive", clip=True)
@@ -218,10 +200,7 @@ class PaperStand:
 
 
 def compensated(one: Identified, piezo: data_synth.PaperPiezo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A full slow loop of the piezo under its inverse, for Fig. 9: what was wanted, the voltage, and what came of it.
-
-    All of shape `(n,)`, in um, V and um.
-    """
+    """A slow loop of the piezo under its inverse, for Fig. 9: wanted um, voltage and reached um, of shape `(n,)`."""
     model = one.fit.model
     lowest_um = float(model.offset_um)
     ramp_um = np.linspace(lowest_um, lowest_um + piezo.stroke_um, 1501)

@@ -83,7 +83,7 @@ class Measured:
     def spread(self) -> float | None:
         """Largest less smallest."""
         with np.errstate(invalid="ignore"):
-            return _finite(np.max(self.ours) - np.min(self.ours))
+            return _finite(np.ptp(self.ours))
 
     @property
     def ratio(self) -> float | None:
@@ -118,13 +118,11 @@ class PaperResult:
 
     def rows(self) -> list[tuple[str, str, str, Measured]]:
         """Place, scheme, name and figure of all rows of the tables."""
-        places = {"table2": self.table2, "table3": self.table3, **self.table4}
-        return [
-            (place, scheme, name, figure)
-            for place, schemes in places.items()
-            for scheme, figures in schemes.items()
-            for name, figure in figures.items()
-        ]
+        rows = []
+        for place, schemes in {"table2": self.table2, "table3": self.table3, **self.table4}.items():
+            for scheme, figures in schemes.items():
+                rows += [(place, scheme, name, figure) for name, figure in figures.items()]
+        return rows
 
     def worse(self) -> list[str]:
         """Rows in which ours is worse than the paper's, calibrated ones and settling values apart."""

@@ -1,6 +1,5 @@
 """The rows of a sweep: grids, drawn designs and lists, crossed and zipped, made as they are needed."""
 
-import abc
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,8 +17,6 @@ SAMPLERS = ("random", "latin_hypercube", "sobol")
 _PIECE = 4096
 # A Latin hypercube is one permutation per axis, which must be held at once.
 _LARGEST_HYPERCUBE = 10_000_000
-# Within these, a normal variable is never infinite.
-_TINY = 2.0**-54
 
 
 @dataclass(frozen=True)
@@ -39,28 +36,16 @@ class Axis:
     def quantile(self, chance: FloatArray) -> FloatArray:
         """Values at cumulative probabilities."""
         if self.distribution == "normal":
-            return np.asarray(self.first + self.second * ndtri(np.clip(chance, _TINY, 1 - _TINY)))
-        if self.distribution == "log":
-            low, high = math.log(self.first), math.log(self.second)
-            return np.clip(np.exp(low + (high - low) * chance), self.first, self.second)
-        return np.clip(self.first + (self.second - self.first) * chance, self.first, self.second)
-
-
-class AbstractGroup(abc.ABC):
-    """Axes that run together; groups are crossed."""
-
-    axes: tuple[Axis, ...]
-
-    @abc.abstractmethod
-    def __len__(self) -> int: ...
-
-    @abc.abstractmethod
-    def at(self, place: NDArray[np.int64]) -> FloatArray:
-        """Values at some places of the group, shape `(axes, n)`."""
+            # Within these chances it is never infinite.
+            return np.asarray(self.first + self.second * ndtri(np.clip(chance, 2.0**-54, 1 - 2.0**-54)))
+        log = self.distribution == "log"
+        low, high = (math.log(self.first), math.log(self.second)) if log else (self.first, self.second)
+        found = low + (high - low) * chance
+        return np.clip(np.exp(found) if log else found, self.first, self.second)
 
 
 @dataclass(frozen=True)
-class Listed(AbstractGroup):
+class Listed:
     """Axes with stated values, shape `(axes, n)`: one axis of a grid, zipped axes, or the columns of a CSV."""
 
     axes: tuple[Axis, ...]
@@ -70,15 +55,13 @@ class Listed(AbstractGroup):
         return self.table.shape[1]
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
+        """Values at some places of the group, shape `(axes, n)`."""
         return np.asarray(self.table[:, place])
 
 
 @dataclass(frozen=True)
-class Drawn(AbstractGroup):
-    """Axes that are drawn together: at random, in a Latin hypercube or as a Sobol sequence, one of `SAMPLERS`.
-
-    A `DataError` refuses a design that is larger than its method can be.
-    """
+class Drawn:
+    """Axes that are drawn together by one of `SAMPLERS`; a `DataError` refuses a design that is too large for it."""
 
     axes: tuple[Axis, ...]
     method: str
@@ -100,24 +83,20 @@ class Drawn(AbstractGroup):
         return self.rows
 
     def at(self, place: NDArray[np.int64]) -> FloatArray:
+        """Values at some places of the group, shape `(axes, n)`."""
         chance = np.empty((len(place), len(self.axes)))
         if self.method == "latin_hypercube":
             chance[:] = _hypercube(len(self.axes), self.rows, self.seed)[place]
         else:
-            for piece in np.unique(place // _PIECE):
+            for piece in np.unique(place // _PIECE).tolist():
+                if self.method == "random":
+                    drawn = np.random.default_rng([self.seed, piece]).random((_PIECE, len(self.axes)))
+                else:
+                    sampler = qmc.Sobol(len(self.axes), scramble=True, rng=np.random.default_rng(self.seed))
+                    drawn = (sampler.fast_forward(piece * _PIECE) if piece else sampler).random(_PIECE)
                 here = place // _PIECE == piece
-                chance[here] = self._piece(int(piece))[place[here] - piece * _PIECE]
+                chance[here] = drawn[place[here] - piece * _PIECE]
         return np.stack([axis.quantile(chance[:, k]) for k, axis in enumerate(self.axes)])
-
-    def _piece(self, piece: int) -> FloatArray:
-        dimensions = len(self.axes)
-        if self.method == "sobol":
-            sampler = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(self.seed))
-            if piece:
-                sampler.fast_forward(piece * _PIECE)
-            return np.asarray(sampler.random(_PIECE))
-        rng = np.random.default_rng([self.seed, piece])
-        return rng.random((_PIECE, dimensions))
 
 
 @lru_cache(maxsize=1)
@@ -129,7 +108,7 @@ def _hypercube(dimensions: int, rows: int, seed: int) -> FloatArray:
 class Plan:
     """All rows: groups crossed with each other, the last running fastest, repeated for each source such as a file."""
 
-    groups: tuple[AbstractGroup, ...]
+    groups: tuple[Listed | Drawn, ...]
     repeats: int = 1
 
     @property
@@ -141,12 +120,12 @@ class Plan:
 
     def values(self, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
         """Values of all axes at some rows by parameter, shape `(n,)` each."""
-        found: dict[str, FloatArray] = {}
-        left = rows
+        names = [axis.parameter for axis in self.axes]
+        columns: list[FloatArray] = []
         for group in reversed(self.groups):
-            left, place = np.divmod(left, len(group))
-            found |= {axis.parameter: row for axis, row in zip(group.axes, group.at(place), strict=True)}
-        return {axis.parameter: found[axis.parameter] for axis in self.axes}
+            rows, place = np.divmod(rows, len(group))
+            columns = [*group.at(place), *columns]
+        return dict(zip(names, columns, strict=True))
 
     def repeat_of(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Index of the source of each row, shape `(n,)`."""

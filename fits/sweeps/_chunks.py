@@ -9,11 +9,6 @@ from numpy.typing import NDArray
 from fits.sweeps._spec import Sweep, outside
 from fits.sweeps._types import DONE, FAILED, Block, Output, Rows
 
-# A chunk is a fraction of all rows, so that there is progress to see and little to do again, and not too large.
-# Rows that go one by one are slow ones, of which few are to be lost.
-_PARTS, _LARGEST, _LARGEST_SLOW = 16, 65536, 4
-# More of one variable no codec takes at once.
-_LARGEST_BYTES = 2_000_000_000
 _REASON_LENGTH = 120
 REASON = Output("reason", "1", "why the row failed", dtype=f"U{_REASON_LENGTH}")
 
@@ -22,12 +17,15 @@ def chunk_rows(sweep: Sweep) -> int:
     """Rows of a chunk: whole blocks, as many as the memory and the codec allow."""
     block, rows = sweep.facts.block, len(sweep.plan)
     widest = max(output.bytes_per_row for output in (*sweep.facts.outputs, REASON))
-    most = max(1, min(-(-rows // block), _LARGEST_BYTES // (widest * block)))
+    # No codec takes more of one variable at once than 2 GB.
+    most = max(1, min(-(-rows // block), 2_000_000_000 // (widest * block)))
     if sweep.chunk_rows is not None:
         return min(sweep.chunk_rows, block * most)
     fit = int(sweep.memory_MB * 1e6 / (bytes_per_row(sweep) + REASON.bytes_per_row))
-    wanted = min(fit, most * block, _LARGEST if block > 1 else _LARGEST_SLOW, max(1, rows // _PARTS))
-    return block * max(1, min(wanted, rows) // block if wanted >= block else 1)
+    # A sixteenth of all rows, so that there is progress to see and little to do again, and not too large. Rows that
+    # go one by one are slow ones, of which few are to be lost.
+    wanted = min(fit, most * block, 65536 if block > 1 else 4, max(1, rows // 16))
+    return block * max(1, min(wanted, rows) // block)
 
 
 def bytes_per_row(sweep: Sweep) -> int:
@@ -60,10 +58,7 @@ def rows_of(sweep: Sweep, chunk: int) -> NDArray[np.int64]:
 
 
 def compute_chunk(sweep: Sweep, chunk: int, tell: Callable[[int], None] = lambda _: None) -> Rows:
-    """Compute a chunk, as many blocks at a time as there are devices, the last ones filled up with the last row.
-
-    The rows have the swept values beside the outputs, and `status`; `tell` is called with the number that is added.
-    """
+    """Compute a chunk, its last blocks filled up; `tell` is called with the number of rows that is added."""
     rows, facts = rows_of(sweep, chunk), sweep.facts
     together = facts.block * (1 if facts.alone else jax.local_device_count())
     parts = []
@@ -80,11 +75,14 @@ def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
     inside, refused = outside(sweep, values) if values else (values, [""] * len(padded))
     relative = tuple(axis.parameter for axis in sweep.plan.axes if axis.relative)
     found = sweep.job.compute(Block(inside, relative, padded, sweep.plan.repeat_of(padded), sweep.seed))
-    reasons = tuple((why or reason)[:_REASON_LENGTH] for why, reason in zip(refused, found.reasons, strict=True))[
-        : len(rows)
-    ]
+    both = zip(refused, found.reasons, strict=True)
+    reasons = tuple((why or reason)[:_REASON_LENGTH] for why, reason in both)[: len(rows)]
     failed = np.array([bool(reason) for reason in reasons])
-    outputs = {output.name: _kept(found, output, failed, len(rows)) for output in sweep.facts.outputs}
+    outputs: dict[str, NDArray[np.generic]] = {}
+    for output in sweep.facts.outputs:
+        outputs[output.name] = np.asarray(found.outputs[output.name])[: len(rows)].astype(output.dtype)
+        if outputs[output.name].dtype.kind == "f":
+            outputs[output.name][failed] = np.nan
     known = {parameter.name: parameter for parameter in sweep.facts.parameters}
     for name, value in values.items():
         words = np.array(known[name].words)
@@ -94,11 +92,3 @@ def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
         outputs["source"] = np.array(names, dtype=source_of(sweep).dtype)
     outputs["status"] = np.where(failed, FAILED, DONE).astype("i1")
     return Rows(outputs, reasons)
-
-
-def _kept(found: Rows, output: Output, failed: NDArray[np.bool_], count: int) -> NDArray[np.generic]:
-    value = np.asarray(found.outputs[output.name])[:count].astype(output.dtype)
-    if value.dtype.kind == "f":
-        value = value.copy()
-        value[failed] = np.nan
-    return value

@@ -4,6 +4,7 @@ import importlib.util
 import logging
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -16,10 +17,7 @@ from fits.sweeps._packages import need, versions
 from fits.sweeps._spec import Sweep, parse_sweep
 from fits.sweeps._types import Rows
 
-# Chunks that wait per thread of the workers, so that none is idle; and how often a chunk may lose its worker.
-_WAITING_PER_THREAD, _MOST_LOSSES = 2, 5
-_CONNECT_s = 20
-_MOST_LOCAL = 1024
+_MOST_LOSSES = 5
 # How long a scheduler without workers is waited for, without a word and at all; how often workers are looked for.
 _SILENT_s, _GIVE_UP_s, _LOOK_s, _PAUSE_s = 5, 600, 1.0, 0.005
 # What a worker has read stays with it.
@@ -49,15 +47,12 @@ class _Answer:
 
 @contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """Connect to a scheduler by its address, or to N processes of this machine by `local:N`, and give its client.
-
-    A `DataError` says that there is no scheduler.
-    """
+    """Connect to a scheduler by its address, or to N processes of this machine by `local:N`, and give its client."""
     distributed = need("distributed")
     # What it tells of a lost scheduler is told here in a sentence.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     count = address.removeprefix("local:")
-    if count != address and (not count.isdecimal() or not 1 <= int(count) <= _MOST_LOCAL):
+    if count != address and (not count.isdecimal() or not 1 <= int(count) <= 1024):
         raise DataError(f"--cluster: expected local:N with a number of processes, found {shown(address)}; give one.")
     with ExitStack() as stack:
         try:
@@ -65,17 +60,14 @@ def connected(address: str) -> Iterator[Any]:
             if count != address:
                 own = distributed.LocalCluster(
                     n_workers=int(count),
-                    # XLA would have as many threads as there are cores in each worker, and they would be in each
-                    # other's way.
-                    env={"NPROC": "1"},
+                    env={"NPROC": "1"},  # one thread of XLA in each worker, so that none is in another's way
                     threads_per_worker=1,
                     processes=True,
-                    # Any port that is free: another cluster may have the usual one.
-                    dashboard_address="127.0.0.1:0",
+                    dashboard_address="127.0.0.1:0",  # any free port: another cluster may have the usual one
                     memory_limit=0,
                 )
                 where = stack.enter_context(own).scheduler_address
-            client = stack.enter_context(distributed.Client(where, timeout=_CONNECT_s, set_as_default=False))
+            client = stack.enter_context(distributed.Client(where, timeout=20, set_as_default=False))
         except (OSError, TimeoutError, ValueError) as error:
             raise DataError(
                 f"--cluster: {address} does not answer ({error}); give the address of a Dask scheduler, such as "
@@ -87,16 +79,45 @@ def connected(address: str) -> Iterator[Any]:
 def on_cluster(
     client: Any, sweep: Sweep, chunks: list[int], progress: Callable[[str], None]
 ) -> Iterator[tuple[int, Rows]]:
-    """Compute chunks on the workers of a scheduler and give them back as they come.
-
-    `progress` is told of workers that are refused, and if there is none. A `DataError` says that the scheduler is
-    lost, has no workers, or none with the versions of this process.
-    """
+    """Compute chunks on the workers of a scheduler; a `DataError` says that it is lost, or has none to be used."""
     distributed = need("distributed")
-    if not chunks:
-        return
+    payload = _Payload(
+        sweep.text, sweep.name, sweep.inputs, str(Path(sweep.name).resolve().parent), sweep.digest, versions()
+    )
     try:
-        yield from _all(distributed, client, sweep, chunks, progress)
+        waiting, losses = list(reversed(chunks)), Counter[int]()
+        futures: dict[Any, int] = {}
+        results, workers = distributed.as_completed(loop=client.loop), _Workers(client, progress)
+        while waiting or futures:
+            usable = workers.usable()
+            # Two chunks wait per thread of the workers, so that none is idle.
+            while waiting and len(futures) < 2 * sum(usable.values()):
+                chunk = waiting.pop()
+                # Should all of them die, others may have it: those that are refused give it back.
+                chosen = {"workers": [*usable], "allow_other_workers": True} if workers.banned else {}
+                future = client.submit(work, payload, chunk, pure=False, retries=0, **chosen)
+                futures[future] = chunk
+                results.add(future)
+            asked = time.monotonic()
+            while not (ready := results.next_batch(block=False)) and time.monotonic() - asked < _LOOK_s:
+                time.sleep(_PAUSE_s)
+            for future in ready:
+                chunk = futures.pop(future)
+                try:
+                    answer: _Answer = future.result()
+                except (distributed.KilledWorker, ImportError) as error:
+                    losses[chunk] += 1
+                    if losses[chunk] > _MOST_LOSSES:
+                        raise DataError(_often(chunk, error)) from None
+                    waiting.append(chunk)
+                    continue
+                finally:
+                    future.release()
+                if answer.rows is None:
+                    workers.ban(answer.worker, answer.refused)
+                    waiting.append(chunk)
+                else:
+                    yield chunk, answer.rows
     except (OSError, distributed.client.FuturesCancelledError, distributed.CancelledError) as error:
         raise DataError(
             f"--cluster: the scheduler was lost ({type(error).__name__}); what was computed is kept: start it again, "
@@ -122,8 +143,8 @@ class _Workers:
             answers = self._client.run(
                 lambda: importlib.util.find_spec("fits") is not None, workers=new, on_error="return"
             )
-            for address in new:
-                if answers.get(address) is False:
+            for address, answer in answers.items():
+                if answer is False:
                     self.ban(address, f"worker {found[address].get('name', address)} at {address} has no microid")
             self._known |= set(new)
         usable = {address: about["nthreads"] for address, about in found.items() if address not in self.banned}
@@ -148,46 +169,6 @@ class _Workers:
             self._progress(f"refused: {reason}")
 
 
-def _all(
-    distributed: Any, client: Any, sweep: Sweep, chunks: list[int], progress: Callable[[str], None]
-) -> Iterator[tuple[int, Rows]]:
-    payload = _Payload(
-        sweep.text, sweep.name, sweep.inputs, str(Path(sweep.name).resolve().parent), sweep.digest, versions()
-    )
-    waiting, losses = list(reversed(chunks)), dict[int, int]()
-    futures: dict[Any, int] = {}
-    results, workers = distributed.as_completed(loop=client.loop), _Workers(client, progress)
-    while waiting or futures:
-        usable = workers.usable()
-        while waiting and len(futures) < _WAITING_PER_THREAD * sum(usable.values()):
-            chunk = waiting.pop()
-            # Should all of them die, others may have it: those that are refused give it back.
-            chosen = {"workers": [*usable], "allow_other_workers": True} if workers.banned else {}
-            future = client.submit(work, payload, chunk, pure=False, retries=0, **chosen)
-            futures[future] = chunk
-            results.add(future)
-        asked = time.monotonic()
-        while not (ready := results.next_batch(block=False)) and time.monotonic() - asked < _LOOK_s:
-            time.sleep(_PAUSE_s)
-        for future in ready:
-            chunk = futures.pop(future)
-            try:
-                answer: _Answer = future.result()
-            except (distributed.KilledWorker, ImportError) as error:
-                losses[chunk] = losses.get(chunk, 0) + 1
-                if losses[chunk] > _MOST_LOSSES:
-                    raise DataError(_often(chunk, error)) from None
-                waiting.append(chunk)
-                continue
-            finally:
-                future.release()
-            if answer.rows is None:
-                workers.ban(answer.worker, answer.refused)
-                waiting.append(chunk)
-                continue
-            yield chunk, answer.rows
-
-
 def _often(chunk: int, error: Exception) -> str:
     if isinstance(error, ImportError):
         return f"--cluster: workers cannot import what they need ({error}); install the same microid on all of them."
@@ -206,8 +187,7 @@ def work(payload: _Payload, chunk: int) -> _Answer:
     mine = versions()
     for package, version in payload.versions.items():
         if mine.get(package) != version:
-            reason = f"{name} has {package} {mine.get(package)}, and {version} is needed"
-            return _Answer(worker.address, None, reason)
+            return _Answer(worker.address, None, f"{name} has {package} {mine.get(package)}, and {version} is needed")
     try:
         return _Answer(worker.address, compute_chunk(_sweep(payload), chunk))
     except (DataError, OSError, ImportError) as error:

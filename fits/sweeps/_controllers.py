@@ -19,7 +19,7 @@ from fits.io._record import Reference
 from fits.io._typed import nearest
 from fits.sweeps._programs import Program
 from fits.sweeps._stages import memory_before, range_of
-from fits.sweeps._types import FloatArray, Parameter, check_plain, number
+from fits.sweeps._types import FloatArray, Parameter, check_plain, number, one_of
 
 _LIMITS = (m.Setting("lower_V", "V", varies=False), m.Setting("upper_V", "V", varies=False))
 
@@ -48,13 +48,13 @@ class Controllers(eqx.Module):
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What may vary, with its nominal value."""
-        found = self.at({})
-
-        def nominal(name: str) -> float:
-            return float(np.ravel(self.numbers[name] if name in self.numbers else getattr(found, name))[0])
-
-        varied = [setting for setting in m.settings_of(self.kind) if setting.varies]
-        return tuple(_parameter(setting, nominal(setting.name), float(self.interval_s)) for setting in varied)
+        nominal, found = self.at({}), []
+        for setting in m.settings_of(self.kind):
+            if setting.varies:
+                name = setting.name
+                value = float(np.ravel(self.numbers[name] if name in self.numbers else getattr(nominal, name))[0])
+                found.append(_parameter(setting, value, float(self.interval_s)))
+        return tuple(found)
 
 
 def _parameter(setting: m.Setting, nominal: float, interval_s: float) -> Parameter:
@@ -64,12 +64,7 @@ def _parameter(setting: m.Setting, nominal: float, interval_s: float) -> Paramet
 
 def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, reference: Program) -> Controllers:
     """Read the table `[controller]` of a sweep, for the nominal stage, its memory, and what it is to follow."""
-    name = given.get("kind", "pid")
-    if not isinstance(name, str) or name not in m.CONTROLLERS:
-        raise DataError(
-            f"controller.kind: expected one of {', '.join(m.CONTROLLERS)}, found {shown(name)}; "
-            f"{nearest(str(name), [*m.CONTROLLERS])}"
-        )
+    name = one_of(m.CONTROLLERS, given.get("kind", "pid"), "controller.kind")
     kind = m.CONTROLLERS[name]
     settings = {setting.name: setting for setting in (*m.settings_of(kind), *_LIMITS)}
     known = (*settings, "kind", "delay_samples")
@@ -88,12 +83,19 @@ def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, ref
     task = _task(stage, initial, reference)
     numbers, _ = with_defaults(settings.values(), limits | stated, task, lambda each: f"controller.{each}")
     for each, value in numbers.items():
-        _check(settings[each], value, reference.interval_s)
+        # Out of its bounds none may be, varied or not.
+        place, setting = f"controller.{each}", settings[each]
+        parameter = _parameter(setting, value, reference.interval_s)
+        if setting.above and not value > setting.lower:
+            raise DataError(f"{place}: expected more than {setting.lower:g}, found {value:g}; correct it.")
+        if not parameter.lower <= value <= parameter.upper:
+            raise DataError(f"{place}: expected {parameter.range_words}, found {value:g}; correct it.")
+        check_plain(parameter, np.array([value]), False, place)
         partner = each.replace("lower_", "upper_", 1)
         if partner != each and not value < numbers.get(partner, math.inf):
             raise DataError(
-                f"controller.{each}: expected less than {partner}, which is {numbers[partner]:g} {each[6:]}, found "
-                f"{value:g}; correct one of them."
+                f"{place}: expected less than {partner}, which is {numbers[partner]:g} {each[6:]}, found {value:g}; "
+                "correct one of them."
             )
     left = [each for each in settings if each not in numbers]
     found = Controllers(
@@ -113,16 +115,6 @@ def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, ref
     return found
 
 
-def _check(setting: m.Setting, value: float, interval_s: float) -> None:
-    """Refuse a number out of its bounds, varied or not."""
-    place, parameter = f"controller.{setting.name}", _parameter(setting, value, interval_s)
-    if setting.above and not value > setting.lower:
-        raise DataError(f"{place}: expected more than {setting.lower:g}, found {value:g}; correct it.")
-    if not parameter.lower <= value <= parameter.upper:
-        raise DataError(f"{place}: expected {parameter.range_words}, found {value:g}; correct it.")
-    check_plain(parameter, np.array([value]), False, place)
-
-
 def _task(stage: m.Stage, initial: str, reference: Program) -> m.ControlTask:
     """What the controllers are made for, as `microid control` has it, with the nominal stage and reference."""
 
@@ -133,10 +125,8 @@ def _task(stage: m.Stage, initial: str, reference: Program) -> m.ControlTask:
 
     def static_V() -> FloatArray:
         way_um = from_rest_um()
-        time_s = np.arange(len(way_um)) * reference.interval_s
-        return setup(
-            stage, Reference(np.asarray(time_s, dtype=np.float64), way_um, "reference"), "none", initial=initial
-        ).static_V
+        time_s = np.arange(len(way_um), dtype=np.float64) * reference.interval_s
+        return setup(stage, Reference(time_s, way_um, "reference"), "none", initial=initial).static_V
 
     def frequency_Hz() -> float | None:
         nominal = dict(reference.nominal)
@@ -144,6 +134,5 @@ def _task(stage: m.Stage, initial: str, reference: Program) -> m.ControlTask:
             return nominal["frequency_Hz"]
         return None if reference.shape == "step" else strongest_Hz(reference.wanted(), reference.interval_s)
 
-    return m.ControlTask(
-        stage, reference.interval_s, from_rest_um, static_V, lambda: steepest_slope(stage), frequency_Hz
-    )
+    found = from_rest_um, static_V, lambda: steepest_slope(stage), frequency_Hz
+    return m.ControlTask(stage, reference.interval_s, *found)

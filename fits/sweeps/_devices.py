@@ -12,14 +12,13 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 _ROWS = "rows"
-# Arrays of one value per sample that a row needs at a time, and how much memory all rows of a block may need.
-_ARRAYS, _BLOCK_BYTES, _LARGEST_BLOCK = 30, 128e6, 256
 
 
 def block_rows(samples: int) -> int:
     """Rows to compute together: a power of two that depends on the number of samples alone."""
-    fit = _BLOCK_BYTES / (8 * _ARRAYS * samples)
-    return int(min(_LARGEST_BLOCK, 2 ** max(0, int(np.log2(max(fit, 1.0))))))
+    # A row needs 30 arrays of one value per sample at a time, and all rows of a block may need 128 MB.
+    fit = 128e6 / (8 * 30 * samples)
+    return int(min(256, 2 ** max(0, int(np.log2(max(fit, 1.0))))))
 
 
 def place(rows: Any) -> Any:
@@ -43,7 +42,7 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         first, whole = names.index(own[0]), eqx.filter_jit(function)
 
         @eqx.filter_jit
-        def shared(mesh: Mesh, arguments: tuple[Any, ...]) -> Any:
+        def shared(mesh: Any, arguments: tuple[Any, ...]) -> Any:
             arrays, others = eqx.partition(arguments, eqx.is_array)
             run = jax.shard_map(
                 lambda arrays: function(*eqx.combine(arrays, others)),
@@ -57,8 +56,10 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
         @wraps(function)
         def called(*arguments: Any) -> Any:
-            mesh = _mesh(arguments[first])
-            return whole(*arguments) if mesh is None else shared(mesh, arguments)
+            sharding = getattr(jax.tree.leaves(arguments[first])[0], "sharding", None)
+            if not isinstance(sharding, NamedSharding) or sharding.num_devices == 1:
+                return whole(*arguments)
+            return shared(sharding.mesh, arguments)
 
         return called
 
@@ -71,9 +72,8 @@ def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
     For what LAPACK does: eigenvalues of general matrices are found nowhere else, and in jaxlib 0.10 the threads of
     several CPU devices that factor many matrices at once wait for each other for ever.
     """
+    count, found = _shares(rows), []
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        count = _shares(rows)
-        found = []
         for k in range(count):
             block = jax.tree.map(lambda each, k=k: jnp.asarray(np.split(each, count)[k]), rows)
             found.append(jax.device_get(function(*block)))
@@ -83,12 +83,3 @@ def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
 def _shares(rows: Any) -> int:
     count = jax.local_device_count()
     return 1 if any(len(leaf) % count for leaf in jax.tree.leaves(rows)) else count
-
-
-def _mesh(rows: Any) -> Mesh | None:
-    """Devices that share rows, None where there is one."""
-    sharding = getattr(jax.tree.leaves(rows)[0], "sharding", None)
-    if not isinstance(sharding, NamedSharding) or sharding.num_devices == 1:
-        return None
-    assert isinstance(sharding.mesh, Mesh)
-    return sharding.mesh

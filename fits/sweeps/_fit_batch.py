@@ -1,7 +1,4 @@
-"""Many small loop fits at once: the regression of `fits.fit` on one grid, for all rows of a block.
-
-The smoothness is stated, not found from the data as `fits.fit` does; the noise level is found.
-"""
+"""Many small loop fits at once, as `fits.fit` does them on one grid: the smoothness is stated, the noise is found."""
 
 import equinox as eqx
 import jax
@@ -16,16 +13,9 @@ from fits.stats._nonnegative import minimise_nonnegative
 from fits.sweeps._devices import by_rows
 from microid import Staircase
 
-_ATOL, _STEPS = 1e-6, 500
-# The noise is found from that start, in squared strokes, in a few rounds of a fixed point.
-_NOISE, _ROUNDS = 1e-6, 4
-
 
 class BatchFit(eqx.Module):
-    """What a batch of fits gives, one row each: densities and slopes as in `Grid`, and the offset of the sensor.
-
-    The noise is a standard deviation; success is whether the regression met its conditions.
-    """
+    """What a batch of fits gives, one row each, as in `Grid`: the noise is a standard deviation."""
 
     columns_um: Float[Array, "n D"]
     offset_um: Float[Array, " n"]
@@ -56,39 +46,31 @@ def fit_batch(
         voltage, limits, start = row
         return design(Grid(limits[0], limits[1], levels), table, voltage, start)[0]
 
+    def one(columns: Array, displacement: Array, weight: Array, smoothness: Array) -> BatchFit:
+        count, used = jnp.maximum(jnp.sum(weight), 1.0), weight > 0
+        highest = jnp.max(displacement, where=used, initial=-jnp.inf)
+        stroke = highest - jnp.min(displacement, where=used, initial=jnp.inf)
+        mean_column, mean = weight @ columns / count, weight @ displacement / count
+        left, right = (columns - mean_column[None, :]) * weight[:, None], (displacement - mean) * weight / stroke
+        moments = Moments(left.T @ left, left.T @ right, right @ right, count)
+        weight_of = jnp.log(smoothness)
+        # The noise is found from this start, in squared strokes, in a few rounds of a fixed point.
+        hyper = Hyper(weight_of, weight_of, weight_of, jnp.log(jnp.asarray(1e-6)))
+
+        def renew(_: int, hyper: Hyper) -> Hyper:
+            posterior = Posterior.of(moments, rough, hyper)
+            return renew_noise(moments, hyper, posterior, effective(rough, hyper, posterior))
+
+        hyper = lax.fori_loop(0, 4, renew, hyper)
+        posterior = Posterior.of(moments, rough, hyper)
+        scale = jnp.sqrt(jnp.diagonal(posterior.precision))
+        precision, mode = posterior.precision / (scale[:, None] * scale[None, :]), posterior.mean * scale
+        solution, success = minimise_nonnegative(precision, -(precision @ mode), jnp.maximum(mode, 0), 1e-6, 500)
+        found = solution / scale * stroke
+        offset = mean - mean_column @ found
+        noise = jnp.exp(hyper.log_variance / 2) * stroke
+        return BatchFit(found, offset, noise, columns @ found + offset, success)
+
     # Row by row: what a hysteresis remembers is found fastest by a loop of scalars.
     columns = lax.map(responses, (voltage_V, limits_V, starts))
-    found = jax.vmap(lambda *row: _one(rough, *row))(columns, displacement_um, weight, smoothness)
-    return BatchFit(*found)
-
-
-def _one(
-    rough: Roughness,
-    columns: Float[Array, "t D"],
-    displacement: Float[Array, " t"],
-    weight: Float[Array, " t"],
-    smoothness: Float[Array, ""],
-) -> tuple[Array, ...]:
-    count = jnp.maximum(jnp.sum(weight), 1.0)
-    stroke = jnp.max(jnp.where(weight > 0, displacement, -jnp.inf)) - jnp.min(
-        jnp.where(weight > 0, displacement, jnp.inf)
-    )
-    mean_column, mean = weight @ columns / count, weight @ displacement / count
-    left, right = (columns - mean_column[None, :]) * weight[:, None], (displacement - mean) * weight / stroke
-    moments = Moments(left.T @ left, left.T @ right, right @ right, count)
-    weight_of = jnp.log(smoothness)
-    hyper = Hyper(weight_of, weight_of, weight_of, jnp.log(jnp.asarray(_NOISE)))
-
-    def renew(_: int, hyper: Hyper) -> Hyper:
-        posterior = Posterior.of(moments, rough, hyper)
-        return renew_noise(moments, hyper, posterior, effective(rough, hyper, posterior))
-
-    hyper = lax.fori_loop(0, _ROUNDS, renew, hyper)
-    posterior = Posterior.of(moments, rough, hyper)
-    scale = jnp.sqrt(jnp.diagonal(posterior.precision))
-    precision, mode = posterior.precision / (scale[:, None] * scale[None, :]), posterior.mean * scale
-    solution, success = minimise_nonnegative(precision, -(precision @ mode), jnp.maximum(mode, 0), _ATOL, _STEPS)
-    found = solution / scale * stroke
-    offset = mean - mean_column @ found
-    noise = jnp.exp(hyper.log_variance / 2) * stroke
-    return found, offset, noise, columns @ found + offset, success
+    return jax.vmap(one)(columns, displacement_um, weight, smoothness)

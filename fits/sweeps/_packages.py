@@ -10,8 +10,6 @@ from typing import Any
 
 from fits.io._errors import DataError
 
-_NAMES = ("microid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy")
-
 
 def need(name: str) -> Any:
     """Import a package of the extras `sweep` and `cluster`; a `DataError` says what to run if it is not installed."""
@@ -29,7 +27,7 @@ def need(name: str) -> Any:
 def versions() -> dict[str, str]:
     """Version of Python and of each package that computes."""
     found = {"python": platform.python_version()}
-    for name in _NAMES:
+    for name in ("microid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy"):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

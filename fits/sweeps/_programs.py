@@ -20,22 +20,20 @@ from fits.io._table import open_table
 from fits.io._typed import check_keys, typed
 from fits.io._units import recognise
 from fits.sweeps._devices import by_rows, place
-from fits.sweeps._types import Block, FloatArray, Parameter, in_a_file, number
+from fits.sweeps._types import Block, FloatArray, Parameter, in_a_file, number, one_of
 
-# Parameters of each shape beside offset and amplitude.
-SHAPES: dict[str, tuple[str, ...]] = {
-    "sine": ("frequency_Hz", "phase_rad"),
-    "triangle": ("frequency_Hz", "phase_rad"),
-    "decay": ("frequency_Hz", "phase_rad"),
-    "chirp": ("frequency_Hz", "frequency_end_Hz", "phase_rad"),
-    "step": ("step_s",),
-    "file": (),
+# Parameters of each shape beside offset and amplitude, with their defaults.
+_WAVE = {"frequency_Hz": 10.0, "phase_rad": 0.0}
+SHAPES: dict[str, dict[str, float]] = {
+    "sine": _WAVE,
+    "triangle": _WAVE,
+    "decay": _WAVE,
+    "chirp": {"frequency_Hz": 10.0, "frequency_end_Hz": 100.0, "phase_rad": 0.0},
+    "step": {"step_s": 0.0},
+    "file": {},
 }
-_DEFAULTS = {"frequency_Hz": 10.0, "frequency_end_Hz": 100.0, "phase_rad": 0.0, "step_s": 0.0}
 _UNITS = {"frequency_Hz": "Hz", "frequency_end_Hz": "Hz", "phase_rad": "rad", "step_s": "s", "gain": "1"}
 _SAMPLES, _LONGEST_s = 10_000_000, 1e4
-# Samples that differ by less from even intervals, as a fraction of one, count as even.
-_EVEN = 1e-3
 
 
 class _Times(msgspec.Struct):
@@ -50,11 +48,7 @@ class _Times(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Program:
-    """A signal over evenly spaced times, of one of `SHAPES`; one that decays is a sine that ends at nothing.
-
-    The table is `program`, in V, or `reference`, in um. Nominal values have their names without it; a file gives the
-    signal, shape `(samples,)`.
-    """
+    """A signal over even times, of one of `SHAPES` or of a file; `nominal` values are by name within its table."""
 
     table: str
     unit: str
@@ -71,18 +65,12 @@ class Program:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        lower = {"frequency_Hz": 0.0, "frequency_end_Hz": 0.0}
-        upper = {"step_s": self.last_s}
-        return tuple(
-            Parameter(
-                f"{self.table}.{name}",
-                _UNITS.get(name, self.unit),
-                nominal,
-                lower.get(name, -math.inf),
-                upper.get(name, math.inf),
-            )
-            for name, nominal in self.nominal
-        )
+        found = []
+        for name, nominal in self.nominal:
+            unit = _UNITS.get(name, self.unit)
+            lower, upper = 0.0 if unit == "Hz" else -math.inf, self.last_s if unit == "s" else math.inf
+            found.append(Parameter(f"{self.table}.{name}", unit, nominal, lower, upper))
+        return tuple(found)
 
     def signal(self, values: Mapping[str, Float[Array, ""]], given: Float[Array, " t"] | None) -> Float[Array, " t"]:
         """The signal of one row, shape `(samples,)`; parameters that are not given have their nominal values."""
@@ -91,37 +79,33 @@ class Program:
         offset = at[f"offset_{self.unit}"]
         if given is not None:
             return offset + at["gain"] * given
-        time = jnp.arange(self.samples, dtype=float) * self.interval_s
-        return offset + at[f"amplitude_{self.unit}"] * self._unit_shape(time, at)
+        time, whole = jnp.arange(self.samples, dtype=float) * self.interval_s, self.samples * self.interval_s
+        if self.shape == "step":
+            shape = (time >= at["step_s"]).astype(time.dtype)
+        else:
+            turns = at["frequency_Hz"] * time + at["phase_rad"] / (2 * math.pi)
+            if self.shape == "chirp":
+                turns = turns + (at["frequency_end_Hz"] - at["frequency_Hz"]) * time**2 / (2 * whole)
+            triangle = self.shape == "triangle"
+            shape = 1 - 4 * jnp.abs((turns + 0.25) % 1 - 0.5) if triangle else jnp.sin(2 * math.pi * turns)
+            if self.shape == "decay":
+                shape = shape * (1 - time / whole)
+        return offset + at[f"amplitude_{self.unit}"] * shape
 
     def wanted(self) -> FloatArray:
         """The nominal signal, shape `(samples,)`."""
         given = None if self.given is None else jnp.asarray(self.given)
         return np.asarray(self.signal({}, given), dtype=np.float64)
 
-    def _unit_shape(self, time: Float[Array, " t"], at: Mapping[str, Float[Array, ""]]) -> Float[Array, " t"]:
-        if self.shape == "step":
-            return (time >= at["step_s"]).astype(time.dtype)
-        turns = at["frequency_Hz"] * time + at["phase_rad"] / (2 * math.pi)
-        if self.shape == "triangle":
-            return 1 - 4 * jnp.abs((turns + 0.25) % 1 - 0.5)
-        whole = self.samples * self.interval_s
-        if self.shape == "chirp":
-            turns = turns + (at["frequency_end_Hz"] - at["frequency_Hz"]) * time**2 / (2 * whole)
-        wave = jnp.sin(2 * math.pi * turns)
-        return wave * (1 - time / whole) if self.shape == "decay" else wave
-
 
 def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes]) -> Program:
     """Read the table `[program]` or `[reference]` of a sweep; a `DataError` says what is wrong with it."""
     if not isinstance(table, dict):
         raise DataError(f"{name}: expected a table, found {shown(table)}; write [{name}] and its keys below.")
-    shape = table.get("shape", "file" if "file" in table else None)
-    if not isinstance(shape, str) or shape not in SHAPES:
-        raise DataError(f"{name}.shape: expected one of {', '.join(SHAPES)}, found {shown(shape)}; choose one.")
+    shape = one_of(SHAPES, table.get("shape", "file" if "file" in table else None), f"{name}.shape", "choose one.")
     nominal = {f"offset_{unit}": 0.0, "gain": 1.0}
     if shape != "file":
-        nominal = {f"offset_{unit}": 0.0, f"amplitude_{unit}": 1.0} | {key: _DEFAULTS[key] for key in SHAPES[shape]}
+        nominal = {f"offset_{unit}": 0.0, f"amplitude_{unit}": 1.0} | SHAPES[shape]
     times = ("file",) if shape == "file" else _Times.__struct_fields__
     check_keys(table, ["shape", *times, *nominal], name)
     nominal |= {key: number(table[key], f"{name}.{key}") for key in nominal if key in table}
@@ -130,12 +114,11 @@ def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes])
         return Program(name, unit, shape, len(given), interval_s, tuple(nominal.items()), given)
     even = typed({key: table[key] for key in times if key in table}, _Times, name)
     program = Program(name, unit, shape, even.samples, even.interval_s, tuple(nominal.items()))
-    for parameter in program.parameters:
-        value = dict(nominal)[parameter.name.removeprefix(f"{name}.")]
-        if not parameter.lower <= value <= parameter.upper:
+    for each in program.parameters:
+        if not each.lower <= each.nominal <= each.upper:
             raise DataError(
-                f"{parameter.name}: expected {parameter.lower:g} to {parameter.upper:g} {parameter.unit}, found "
-                f"{value:g}; correct it."
+                f"{each.name}: expected {each.lower:g} to {each.upper:g} {each.unit}, found {each.nominal:g}; "
+                "correct it."
             )
     return program
 
@@ -157,7 +140,7 @@ def _read_signal(path: Any, name: str, unit: str, load: Callable[[str], bytes]) 
 
     time_s, given = in_a_file(load(path), path, read)
     interval = np.diff(time_s)
-    if np.ptp(interval) > _EVEN * np.mean(interval):
+    if np.ptp(interval) > 1e-3 * np.mean(interval):
         raise DataError(f"{name}.file: {path} is not sampled evenly, which a sweep needs; resample it.")
     return given, float(np.mean(interval))
 
@@ -165,8 +148,7 @@ def _read_signal(path: Any, name: str, unit: str, load: Callable[[str], bytes]) 
 def drive(program: Program, block: Block, values: Mapping[str, Array]) -> Float[Array, "n t"]:
     """Signals of all rows of a block, by the values that vary."""
     given = None if program.given is None else jnp.asarray(program.given)
-    signals: Array = _drive(place(block.rows), values, program, given)
-    return signals
+    return _drive(place(block.rows), values, program, given)
 
 
 @by_rows("rows", "values")

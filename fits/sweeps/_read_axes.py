@@ -13,8 +13,8 @@ from msgspec import Meta
 
 from fits.io._errors import DataError, shown
 from fits.io._typed import typed
-from fits.sweeps._axes import SAMPLERS, AbstractGroup, Axis, Drawn, Listed, Plan
-from fits.sweeps._types import Parameter, check_plain, code_of, number
+from fits.sweeps._axes import SAMPLERS, Axis, Drawn, Listed, Plan
+from fits.sweeps._types import Parameter, check_plain, number, one_of
 
 _PREFIXES = {"k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
 _BASES = ("s", "V", "m", "Hz", "Pa", "rad")
@@ -53,10 +53,7 @@ class _Design(msgspec.Struct):
 def read_plan(
     table: Mapping[str, Any], parameters: Sequence[Parameter], repeats: int, seed: int, load: Callable[[str], bytes]
 ) -> Plan:
-    """Read `[[axis]]`, `[design]` and `[list]` of a sweep, whose rows are repeated for each of so many sources.
-
-    The seed is that of random draws, and `load` gives the content of a file. A `DataError` says what is wrong.
-    """
+    """Read `[[axis]]`, `[design]` and `[list]` of a sweep, whose rows are repeated for each of so many sources."""
     known = {parameter.name: parameter for parameter in parameters}
     listed: dict[str, list[tuple[Axis, np.ndarray]]] = {}
     drawn: list[Axis] = []
@@ -70,7 +67,7 @@ def read_plan(
         else:
             label = entry.get("zip")
             listed.setdefault(f"{k}" if label is None else f"zip {label}", []).append((axis, values))
-    groups: list[AbstractGroup] = []
+    groups: list[Listed | Drawn] = []
     for label, members in listed.items():
         lengths = {len(values) for _, values in members}
         if len(lengths) > 1:
@@ -95,10 +92,9 @@ def read_plan(
             raise DataError(f"axis.parameter: {name} is varied twice; keep one of the two.")
     if not groups and repeats == 1:
         raise DataError("axis: expected at least one axis, found none; add [[axis]].")
-    plan = Plan(tuple(groups), repeats)
     if math.prod(len(group) for group in groups) * repeats > _MOST_ROWS:
         raise DataError("axis: these are more rows than can be counted; leave out some.")
-    return plan
+    return Plan(tuple(groups), repeats)
 
 
 def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) -> tuple[Axis, np.ndarray | None]:
@@ -114,30 +110,32 @@ def _axis(entry: Mapping[str, Any], place: str, known: Mapping[str, Parameter]) 
             f"{place}.parameter: {parameter.name} is an array, varied relative to itself; add relative = true."
         )
     factor = _factor(table.unit, "1" if relative else parameter.unit, f"{place}.unit", name)
-    found = _values(entry, table, place, factor, parameter)
-    check_plain(parameter, found if isinstance(found, np.ndarray) else None, relative, place)
+    way, values = _values(entry, table, place, factor, parameter)
+    check_plain(parameter, values if way == "listed" else None, relative, place)
     if relative and math.isfinite(parameter.nominal):
         # Factors of single numbers become values at once; only those of arrays stay factors.
-        if parameter.nominal == 0:
-            raise DataError(f"{place}.relative: {parameter.name} is 0, which no factor changes; give values.")
         relative, nominal = False, parameter.nominal
-        found = found * nominal if isinstance(found, np.ndarray) else _scaled(*found, nominal)
-    lower, upper = parameter.lower, parameter.upper
-    if isinstance(found, np.ndarray):
-        outside = bool(np.all((found < lower) | (found > upper)))
-    else:
-        outside = found[0] != "normal" and (min(found[1:]) > upper or max(found[1:]) < lower)
+        if nominal == 0:
+            raise DataError(f"{place}.relative: {parameter.name} is 0, which no factor changes; give values.")
+        if nominal < 0 and way == "log":
+            raise DataError(f"axis.relative: a logarithmic axis needs a positive parameter, found {nominal:g}.")
+        values = values * (np.array([nominal, abs(nominal)]) if way == "normal" else nominal)
+        values = np.sort(values) if way in ("uniform", "log") else values
+    below, above = values < parameter.lower, values > parameter.upper
+    outside = np.all(below | above) if way == "listed" else way != "normal" and (np.all(below) or np.all(above))
     if outside and not relative:
         raise DataError(
             f"{place}: all values lie outside the bounds of {name}, {parameter.range_words}; correct them."
         )
-    return (Axis(name, relative), found) if isinstance(found, np.ndarray) else (Axis(name, relative, *found), None)
+    if way == "listed":
+        return Axis(name, relative), values
+    return Axis(name, relative, way, *values.tolist()), None
 
 
 def _values(
     entry: Mapping[str, Any], table: _Axis, place: str, factor: float, parameter: Parameter
-) -> np.ndarray | tuple[str, float, float]:
-    """Values of a list or grid, or the distribution to draw from with its two numbers."""
+) -> tuple[str, np.ndarray]:
+    """Values that are `listed`, also by a grid, or the distribution to draw from with its two numbers."""
     ways = [way for way in ("values", "low", "mean") if way in entry]
     if len(ways) != 1:
         raise DataError(
@@ -161,36 +159,28 @@ def _values(
         if not values:
             raise DataError(f"{place}.values: the axis is empty; give at least one value.")
         if parameter.words:
-            return np.array([code_of(value, parameter, f"{place}.values") for value in values])
-        return factor * np.array([number(value, f"{place}.values") for value in values])
+            words = parameter.words
+            return "listed", np.array([float(words.index(one_of(words, x, f"{place}.values"))) for x in values])
+        return "listed", factor * np.array([number(value, f"{place}.values") for value in values])
+    keys = ("mean", "sd") if ways[0] == "mean" else ("low", "high")
+    low, high = both = np.array([number(entry.get(key), f"{place}.{key}") * factor for key in keys])
     if ways[0] == "mean":
-        mean, sd = (number(entry.get(key), f"{place}.{key}") * factor for key in ("mean", "sd"))
-        if not sd > 0:
-            raise DataError(f"{place}.sd: expected a standard deviation above 0, found {sd:g}; correct it.")
-        return "normal", mean, sd
-    low, high = (number(entry.get(key), f"{place}.{key}") * factor for key in ("low", "high"))
-    spacing, count = table.spacing, table.count
-    if not low <= high or (spacing == "log" and not low > 0):
-        above = " above 0" if spacing == "log" else ""
+        if not high > 0:
+            raise DataError(f"{place}.sd: expected a standard deviation above 0, found {high:g}; correct it.")
+        return "normal", both
+    log, count = table.spacing == "log", table.count
+    if not low <= high or (log and not low > 0):
+        above = " above 0" if log else ""
         raise DataError(f"{place}: expected low{above} and no higher than high, found {low:g} and {high:g}.")
     if count is None:
-        return ("log" if spacing == "log" else "uniform"), low, high
+        return "log" if log else "uniform", both
     if count < 1:
         raise DataError(f"{place}.count: the axis is empty: expected a number of 1 or more, found {shown(count)}.")
     if count > _LONGEST:
         raise DataError(
             f"{place}.count: expected up to {_LONGEST:,} values, found more; leave out count and add [design]."
         )
-    return np.geomspace(low, high, count) if spacing == "log" else np.linspace(low, high, count)
-
-
-def _scaled(distribution: str, first: float, second: float, nominal: float) -> tuple[str, float, float]:
-    if distribution == "normal":
-        return distribution, first * nominal, second * abs(nominal)
-    if nominal < 0 and distribution == "log":
-        raise DataError(f"axis.relative: a logarithmic axis needs a positive parameter, found {nominal:g}.")
-    ends = sorted((first * nominal, second * nominal))
-    return distribution, ends[0], ends[1]
+    return "listed", np.geomspace(low, high, count) if log else np.linspace(low, high, count)
 
 
 def _factor(unit: str | None, wanted: str, place: str, name: str) -> float:
@@ -209,53 +199,50 @@ def _split(unit: str) -> tuple[int, str]:
     return (_PREFIXES[unit[0]], unit[1:]) if prefixed else (0, unit)
 
 
-def read_list(content: bytes, name: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Names in the header of a CSV, and the cells of each row with the number of its line, but blank ones."""
-    reader = csv.reader(io.StringIO(content.decode("utf-8-sig", errors="replace"), newline=""))
-    try:
-        lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
-    except csv.Error as error:
-        raise DataError(f"{name}, line {reader.line_num}: expected CSV ({error}); correct it.") from None
-    return [cell.strip() for cell in lines[0][1]] if lines else [], lines[1:]
-
-
 def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], bytes]) -> Listed:
     if not isinstance(entry, dict) or set(entry) != {"file"} or not isinstance(entry["file"], str):
         raise DataError("list: expected the one key file, the name of a CSV with a column per parameter.")
     name = entry["file"]
-    header, lines = read_list(load(name), name)
-    if not lines:
+    reader = csv.reader(io.StringIO(load(name).decode("utf-8-sig", errors="replace"), newline=""))
+    try:
+        lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
+    except csv.Error as error:
+        raise DataError(f"{name}, line {reader.line_num}: expected CSV ({error}); correct it.") from None
+    if len(lines) < 2:
         raise DataError(f"{name}: the list is empty: expected a header and at least one row.")
-    for k, column in enumerate(header, 1):
-        if column not in known:
-            # What stands in a file that is no list is not ours to show.
-            raise DataError(f"{name}: cell {k} of its header is no parameter; use some of {', '.join(known)}.")
-    axes = tuple(Axis(column) for column in header)
-    for axis in axes:
-        if math.isnan(known[axis.parameter].nominal):
-            raise DataError(f"{name}: {axis.parameter} is an array; vary it by [[axis]] with relative = true.")
-    table = np.empty((len(axes), len(lines)))
-    columns = [known[axis.parameter] for axis in axes]
-    kind = "values" if any(parameter.words for parameter in columns) else "numbers"
-    for k, (line, cells) in enumerate(lines):
-        place = f"{name}, line {line}"
-        numbers: list[float] = []
-        if len(cells) == len(axes):
-            numbers = [_cell(cell, parameter, place) for cell, parameter in zip(cells, columns, strict=True)]
-        if not numbers or any(map(math.isnan, numbers)):
-            raise DataError(f"{place}: expected {len(axes)} {kind}, found {shown(', '.join(cells))}; correct it.")
-        table[:, k] = numbers
+    columns = [known.get(cell.strip()) for cell in lines.pop(0)[1]]
+    if None in columns:
+        # What stands in a file that is no list is not ours to show.
+        raise DataError(
+            f"{name}: cell {columns.index(None) + 1} of its header is no parameter; use some of {', '.join(known)}."
+        )
+    parameters = [column for column in columns if column is not None]
+    for parameter in parameters:
+        if math.isnan(parameter.nominal):
+            raise DataError(f"{name}: {parameter.name} is an array; vary it by [[axis]] with relative = true.")
+    rows = []
+    kind = "values" if any(parameter.words for parameter in parameters) else "numbers"
+    for line, cells in lines:
+        place, row = f"{name}, line {line}", [math.nan]
+        if len(cells) == len(parameters):
+            row = [_cell(cell, parameter, place) for cell, parameter in zip(cells, parameters, strict=True)]
+        if any(map(math.isnan, row)):
+            raise DataError(
+                f"{place}: expected {len(parameters)} {kind}, found {shown(', '.join(cells))}; correct it."
+            )
+        rows.append(row)
+    table = np.array(rows).T
     if not np.all(np.isfinite(table)):
         raise DataError(f"{name}: expected finite numbers, found others; correct them.")
-    for parameter, values in zip(columns, table, strict=True):
+    for parameter, values in zip(parameters, table, strict=True):
         check_plain(parameter, values, False, name)
-    return Listed(axes, table)
+    return Listed(tuple(Axis(parameter.name) for parameter in parameters), table)
 
 
 def _cell(cell: str, parameter: Parameter, place: str) -> float:
     """The number of a cell, or of its word; NaN where it is none."""
     if parameter.words:
-        return code_of(cell.strip(), parameter, place)
+        return float(parameter.words.index(one_of(parameter.words, cell.strip(), place)))
     try:
         return float(cell)
     except ValueError:

@@ -1,9 +1,10 @@
 """The records that a sweep fits or diagnoses: files that a pattern finds, or simulations with noise."""
 
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +17,12 @@ from fits.io._read_csv import read_csv
 from fits.io._record import Record
 from fits.io._typed import typed
 from fits.io._units import parse_columns
+from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES
 from fits.sweeps._devices import place
 from fits.sweeps._programs import Program, drive, read_program
 from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
-from fits.sweeps._types import Block, Parameter, Request
+from fits.sweeps._types import Block, Output, Parameter, Request, Rows
 from microid import Stage
 
 _NOISE = "records.noise_um"
@@ -51,13 +53,13 @@ class Files:
     def records(self, block: Block) -> list[Record | str]:
         """Read the file of each row; a sentence stands for one that cannot be read."""
         found: dict[int, Record | str] = {}
-        for source in np.unique(block.sources):
+        for source in set(block.sources.tolist()):
             path = self.folder / self.sources[source]
             try:
-                found[int(source)] = read_csv(path, self.columns)
+                found[source] = read_csv(path, self.columns)
             except DataError as error:
-                found[int(source)] = str(error).replace(str(path), self.sources[source])
-        return [found[int(source)] for source in block.sources]
+                found[source] = str(error).replace(str(path), self.sources[source])
+        return [found[source] for source in block.sources.tolist()]
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,8 @@ class Simulated:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """What may be varied: the stage, the program and the noise."""
-        noise = Parameter(_NOISE, "um", self.noise_um, 0.0)
-        return (*stage_parameters(self.stage), *self.program.parameters, noise)
+        own = Parameter(_NOISE, "um", self.noise_um, 0.0)
+        return *stage_parameters(self.stage), *self.program.parameters, own
 
     def records(self, block: Block) -> list[Record | str]:
         """Simulate the record of each row; its noise depends on the seed and the row's number alone."""
@@ -84,18 +86,15 @@ class Simulated:
         voltage = drive(self.program, block, values)
         memory, interval_s = memory_before(self.stage, self.initial), jnp.asarray(self.program.interval_s)
         displacement = respond(self.stage, values, block.relative, interval_s, voltage, memory)
-        time_s = np.arange(self.program.samples) * self.program.interval_s
-        sd = block.numbers(_NOISE, self.noise_um)
+        time_s = np.asarray(np.arange(self.program.samples) * self.program.interval_s, dtype=np.float64)
+        sd_um = block.numbers(_NOISE, self.noise_um)
         found: list[Record | str] = []
-        pairs = zip(block.rows, sd, *jax.device_get((voltage, displacement)), strict=True)
-        for row, spread, v, w in pairs:
-            noise = np.random.default_rng([block.seed, int(row)]).normal(0.0, 1.0, len(w))
-            fine = np.all(np.isfinite(w))
-            found.append(
-                Record(np.asarray(time_s, dtype=np.float64), v, w + spread * noise, source=f"row {row}")
-                if fine
-                else "the simulated displacement is not finite"
-            )
+        for row, sd, v, w in zip(block.rows, sd_um, *jax.device_get((voltage, displacement)), strict=True):
+            if np.all(np.isfinite(w)):
+                noise = np.random.default_rng([block.seed, int(row)]).normal(0.0, 1.0, len(w))
+                found.append(Record(time_s, v, w + sd * noise, source=f"row {row}"))
+            else:
+                found.append("the simulated displacement is not finite")
         return found
 
 
@@ -110,18 +109,30 @@ def requested_records(request: Request) -> Files | Simulated:
     for key in ("model", "program"):
         if key in request.table:
             raise DataError(f"{key}: records come from files here; leave out {key}, or records.files.")
+    expected = f"records.files: expected a pattern such as data/*.csv, found {shown(pattern)}"
     if os.path.isabs(pattern) or request.folder is None:
-        raise DataError(f"records.files: expected a pattern such as data/*.csv, found {shown(pattern)}; correct it.")
+        raise DataError(f"{expected}; correct it.")
     try:
         files = [path for path in request.folder.glob(pattern) if path.is_file()]
         names = tuple(sorted(str(path.relative_to(request.folder)) for path in files))
     except (ValueError, NotImplementedError, OSError) as error:
-        raise DataError(
-            f"records.files: expected a pattern such as data/*.csv, found {shown(pattern)} ({error}); correct it."
-        ) from None
+        raise DataError(f"{expected} ({error}); correct it.") from None
     if not names:
         raise DataError(f"records.files: the axis is empty: no file matches {pattern}; correct the pattern.")
     return Files(request.folder, names, parse_columns(table.columns))
+
+
+def each_alone(
+    outputs: Sequence[Output], records: Sequence[Record | str], find: Callable[..., dict[str, Any]], *options: Any
+) -> Rows:
+    """Rows of what is found in one record after the other, each with its options, or why nothing is."""
+    found: list[dict[str, Any] | str] = []
+    for record, *own in zip(records, *options, strict=True):
+        try:
+            found.append(record if isinstance(record, str) else find(record, *own))
+        except (DataError, FitError) as error:
+            found.append(" ".join(str(error).split()))
+    return Rows.one_by_one(outputs, found)
 
 
 def assumed_initial(request: Request, records: Files | Simulated) -> str:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -15,10 +15,7 @@ from fits.sweeps._chunks import chunk_count, compute_chunk, rows_of
 from fits.sweeps._packages import need
 from fits.sweeps._spec import Sweep
 from fits.sweeps._store import TABLE, Store, check_folder, opened
-from fits.sweeps._types import FAILED, Rows
-
-_EVERY_s = 1.0
-_BAR = 24
+from fits.sweeps._types import FAILED
 
 
 @dataclass(frozen=True)
@@ -45,12 +42,11 @@ class _Progress:
     def __call__(self, rows: int) -> None:
         self._done, self._new = self._done + rows, self._new + rows
         now = time.monotonic()
-        if now - self._told >= _EVERY_s or self._done == self._rows:
+        if now - self._told >= 1 or self._done == self._rows:
             self._told = now
             rate = self._new / max(now - self._began, 1e-9)
-            full = _BAR * self._done // self._rows
             left = _duration((self._rows - self._done) / rate)
-            bar = "#" * full + "." * (_BAR - full)
+            bar = ("#" * (24 * self._done // self._rows)).ljust(24, ".")
             self._progress(f"[{bar}] {self._done:,} of {self._rows:,} rows, {rate:.3g} rows/s, {left} left")
 
 
@@ -64,24 +60,12 @@ def run_sweep(
 ) -> Outcome:
     """Run a sweep, or what is missing of it.
 
-    Parameters
-    ----------
-    sweep, out
-        From `read_sweep`, and the folder for the results.
-    resume
-        Go on with the sweep that is in the folder.
-    cluster
-        Address of a Dask scheduler, or `local:N` for N processes of this machine; None computes in this process.
-    progress
-        Told how far it is, a sentence at a time.
+    `resume` goes on with the sweep that is in the folder `out`. The cluster is the address of a Dask scheduler, or
+    `local:N` for N processes of this machine; None computes in this process. `progress` is told how far it is, a
+    sentence at a time.
 
-    Raises
-    ------
-    DataError
-        If the folder, the disk or the cluster does not allow it. Rows that fail do not raise: they are kept with the
-        reason.
-    RuntimeError
-        If JAX computes in single precision.
+    A `DataError` says that the folder, the disk or the cluster does not allow it, a `RuntimeError` that JAX computes
+    in single precision. Rows that fail do not raise: they are kept with the reason.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('sweeps need float64: jax.config.update("jax_enable_x64", True)')
@@ -103,26 +87,19 @@ def run_sweep(
             progress(f"{len(done)} of {len(chunks)} chunks are there" + (f", {again} broken" if again else ""))
         left = [chunk for chunk in chunks if chunk not in done]
         tell = _Progress(progress, len(sweep.plan), sum(len(rows_of(sweep, chunk)) for chunk in done))
-        for chunk, rows in _computed(sweep, left, client, tell, progress):
-            store.write(chunk, rows)
+        if client is None:
+            for chunk in left:
+                store.write(chunk, compute_chunk(sweep, chunk, tell))
+        else:
+            from fits.sweeps._cluster import on_cluster
+
+            for chunk, rows in on_cluster(client, sweep, left, progress):
+                tell(len(rows.reasons))
+                store.write(chunk, rows)
         progress("writing the table")
         failed = _table(store)
-    computed = sum(len(rows_of(sweep, chunk)) for chunk in left)
-    return Outcome(len(sweep.plan), failed, computed, again, time.monotonic() - began)
-
-
-def _computed(
-    sweep: Sweep, chunks: list[int], client: Any, tell: Callable[[int], None], progress: Callable[[str], None]
-) -> Iterator[tuple[int, Rows]]:
-    if client is None:
-        for chunk in chunks:
-            yield chunk, compute_chunk(sweep, chunk, tell)
-        return
-    from fits.sweeps._cluster import on_cluster
-
-    for chunk, rows in on_cluster(client, sweep, chunks, progress):
-        tell(len(rows.reasons))
-        yield chunk, rows
+    new = sum(len(rows_of(sweep, chunk)) for chunk in left)
+    return Outcome(len(sweep.plan), failed, new, again, time.monotonic() - began)
 
 
 def _table(store: Store) -> int:

@@ -1,6 +1,7 @@
 """What a sweep's folder holds: how far it is, figures of its outputs, and the best rows."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from fits.sweeps._store import LEDGER, RESULTS, about_of
 from fits.sweeps._types import DONE, FAILED
 
 SCHEMA = "microid.sweep.summary/1"
+_PERCENTILES = ("min", "p5", "median", "p95", "max")
 
 
 def open_sweep(folder: str | os.PathLike[str]) -> Any:
@@ -35,9 +37,9 @@ def readable(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Turn the errors of decoders of a broken file into a `DataError`."""
     try:
         yield
-    except DataError:
-        raise
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, DataError):
+            raise
         why = " ".join(str(error).split()) or type(error).__name__
         raise DataError(
             f"{os.fspath(folder)}: {RESULTS} is missing or broken ({why[:200]}); run the sweep again with --resume, "
@@ -49,55 +51,39 @@ def summarise(folder: str | os.PathLike[str], by: str | None = None, largest: bo
     """Sum up a sweep as JSON values; its rows are ranked by an output, the first by default."""
     about, data = about_of(folder), open_sweep(folder)
     with readable(folder):
-        return _summary(folder, about, data, by, largest)
-
-
-def _summary(
-    folder: str | os.PathLike[str], about: dict[str, Any], data: Any, by: str | None, largest: bool
-) -> dict[str, Any]:
-    status = data["status"].values
-    done = status == DONE
-    noted = len(list((Path(folder) / LEDGER).glob("[0-9]*.json")))
-    numbers = [name for name in about["outputs"] if data[name].dims == ("row",) and data[name].dtype.kind == "f"]
-    if by is not None and by not in numbers:
-        raise DataError(f"--best: there is no output {by!r}; choose one of {', '.join(numbers)}.")
-    by = by or (numbers[0] if numbers else None)
-    reasons: dict[str, int] = {}
-    for reason in data["reason"].values[status == FAILED]:
-        kind = str(reason).partition(" = ")[0]
-        reasons[kind] = reasons.get(kind, 0) + 1
-    return {
-        "schema": SCHEMA,
-        "kind": about["kind"],
-        "rows": about["rows"],
-        "done": int(done.sum()),
-        "failed": int((status == FAILED).sum()),
-        "left": int(about["rows"] - np.sum(status > 0)),
-        "chunks": about["chunks"],
-        "chunks_done": noted,
-        "reasons": dict(sorted(reasons.items(), key=lambda item: -item[1])[:10]),
-        "outputs": {name: _figures(data[name].values[done], data[name].attrs.get("units", "1")) for name in numbers},
-        "best": {"by": by, "largest": largest, "rows": _best(data, about, done, by, largest)},
-        "versions": about["versions"],
-    }
+        status = data["status"].values
+        done = status == DONE
+        numbers = [name for name in about["outputs"] if data[name].dims == ("row",) and data[name].dtype.kind == "f"]
+        if by is not None and by not in numbers:
+            raise DataError(f"--best: there is no output {by!r}; choose one of {', '.join(numbers)}.")
+        by = by or (numbers[0] if numbers else None)
+        kinds = Counter(str(reason).partition(" = ")[0] for reason in data["reason"].values[status == FAILED])
+        return {
+            "schema": SCHEMA,
+            "kind": about["kind"],
+            "rows": about["rows"],
+            "done": int(done.sum()),
+            "failed": int((status == FAILED).sum()),
+            "left": int(about["rows"] - np.sum(status > 0)),
+            "chunks": about["chunks"],
+            "chunks_done": len(list((Path(folder) / LEDGER).glob("[0-9]*.json"))),
+            "reasons": dict(kinds.most_common(10)),
+            "outputs": {
+                name: _figures(data[name].values[done], data[name].attrs.get("units", "1")) for name in numbers
+            },
+            "best": {"by": by, "largest": largest, "rows": _best(data, about, done, by, largest)},
+            "versions": about["versions"],
+        }
 
 
 def _figures(values: np.ndarray, unit: str) -> dict[str, Any]:
     values = values[np.isfinite(values)]
-    if not len(values):
-        return {"unit": unit, "count": 0}
-    low, middle, high = np.percentile(values, (5, 50, 95)).tolist()
-    return {
-        "unit": unit,
-        "count": len(values),
-        "min": float(values.min()),
-        "p5": low,
-        "median": middle,
-        "p95": high,
-        "max": float(values.max()),
-        "mean": float(values.mean()),
-        "sd": float(values.std()),
-    }
+    found: dict[str, Any] = {"unit": unit, "count": len(values)}
+    if len(values):
+        percentiles = np.percentile(values, (0, 5, 50, 95, 100)).tolist()
+        found |= dict(zip(_PERCENTILES, percentiles, strict=True))
+        found |= {"mean": float(values.mean()), "sd": float(values.std())}
+    return found
 
 
 def _best(data: Any, about: dict[str, Any], done: np.ndarray, by: str | None, largest: bool) -> list[dict[str, Any]]:
@@ -106,10 +92,11 @@ def _best(data: Any, about: dict[str, Any], done: np.ndarray, by: str | None, la
     values = data[by].values
     there = np.flatnonzero(done & np.isfinite(values))
     order = there[np.argsort(-values[there] if largest else values[there], kind="stable")[:5]]
-    names = [*about["parameters"], by]
-    rows = [{name: data[name].values[row] for name in names} for row in order]
-    plain = [{name: x if isinstance(x, str) else float(x) for name, x in row.items()} for row in rows]
-    return [{"row": int(row)} | values for row, values in zip(order, plain, strict=True)]
+    rows = []
+    for row in order.tolist():
+        found = {name: data[name].values[row] for name in (*about["parameters"], by)}
+        rows.append({"row": row} | {name: x if isinstance(x, str) else float(x) for name, x in found.items()})
+    return rows
 
 
 def describe_sweep(summary: dict[str, Any]) -> str:
@@ -122,18 +109,13 @@ def describe_sweep(summary: dict[str, Any]) -> str:
     filled = {name: each for name, each in summary["outputs"].items() if each["count"]}
     if filled:
         lines += ["", f"{'output':28} {'min':>10} {'5 %':>10} {'median':>10} {'95 %':>10} {'max':>10}"]
-        lines += [
-            f"{name:28} " + " ".join(f"{each[key]:10.4g}" for key in ("min", "p5", "median", "p95", "max"))
-            for name, each in filled.items()
-        ]
+        for name, each in filled.items():
+            lines.append(f"{name:28} " + " ".join(f"{each[key]:10.4g}" for key in _PERCENTILES))
     best = summary["best"]
     if best["rows"]:
         lines += ["", f"{'largest' if best['largest'] else 'smallest'} {best['by']}"]
         for row in best["rows"]:
-            place = ", ".join(f"{name} {_told(x)}" for name, x in row.items() if name not in ("row", best["by"]))
+            swept = {name: x for name, x in row.items() if name not in ("row", best["by"])}
+            place = ", ".join(f"{name} {x if isinstance(x, str) else f'{x:.5g}'}" for name, x in swept.items())
             lines.append(f"  row {row['row']}: {row[best['by']]:.6g} at {place}")
     return "\n".join(lines)
-
-
-def _told(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.5g}"

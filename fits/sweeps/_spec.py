@@ -18,12 +18,9 @@ from fits.io._typed import check_keys, typed
 from fits.sweeps import kinds
 from fits.sweeps._axes import Plan
 from fits.sweeps._read_axes import read_plan
-from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request
+from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request, one_of
 
-_COMMON = ("schema", "kind", "title", "seed", "axis", "design", "list", "run")
 _MOST_MB = 1_000_000_000
-# Keys of kinds that are words; all others are tables.
-_NO_TABLES = ("model", "initial", "stage")
 
 
 class _Run(msgspec.Struct):
@@ -35,10 +32,7 @@ class _Run(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that can run: its TOML and where that is from, the files it names, its rows and what is done with each.
-
-    `memory_MB` is what a chunk may take, `chunk_rows` its rows if they are stated; sources are in `folder`.
-    """
+    """A sweep that can run: its TOML and its place, the files it names, its rows and what is done with each."""
 
     text: str
     name: str
@@ -54,16 +48,13 @@ class Sweep:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the text, all files, and the names and contents of all sources: what the rows depend on.
-
-        It is made anew each time, as sources may have changed; one that cannot be read counts as such.
-        """
-        parts: list[str | bytes] = [self.text]
+        """SHA-256 of the text, all files, and the names and contents of all sources as they are now."""
+        parts = [self.text.encode()]
         for source in self.facts.sources:
-            parts += [source, _sum_of((self.folder or Path()) / source)]
-        parts += [part for name in sorted(self.inputs) for part in (name, self.inputs[name])]
-        sums = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
-        return hashlib.sha256("".join(sums).encode()).hexdigest()
+            parts += [source.encode(), _sum_of((self.folder or Path()) / source).encode()]
+        for name, content in sorted(self.inputs.items()):
+            parts += [name.encode(), content]
+        return hashlib.sha256("".join(hashlib.sha256(part).hexdigest() for part in parts).encode()).hexdigest()
 
 
 def read_sweep(path: str | os.PathLike[str]) -> Sweep:
@@ -94,31 +85,27 @@ def parse_sweep(text: str, name: str, load: Callable[[str], bytes], folder: Path
     try:
         if table.get("schema") != SCHEMA:
             raise DataError(f'schema: expected "{SCHEMA}", found {shown(table.get("schema"))}; give that.')
-        kind = table.get("kind")
-        if not isinstance(kind, str) or kind not in kinds.names():
-            raise DataError(f"kind: expected one of {', '.join(kinds.names())}, found {shown(kind)}; choose one.")
+        kind = one_of(kinds.names(), table.get("kind"), "kind", "choose one.")
         made_by = kinds.kind(kind)
-        tables = made_by.KEYS
-        check_keys(table, [*_COMMON, *tables], "")
-        for key in table:
-            if key in tables and key not in _NO_TABLES and not isinstance(table[key], dict):
-                raise DataError(
-                    f"{key}: expected a table, found {shown(table[key])}; write [{key}] and its keys below."
-                )
+        common = ["schema", "kind", "title", "seed", "axis", "design", "list", "run"]
+        check_keys(table, [*common, *made_by.KEYS], "")
+        for key, value in table.items():
+            # Some keys of kinds are words; all others are tables.
+            if key not in (*common, "model", "initial", "stage") and not isinstance(value, dict):
+                raise DataError(f"{key}: expected a table, found {shown(value)}; write [{key}] and its keys below.")
         seed = table.get("seed", 0)
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise DataError(f"seed: expected a whole number of 0 or more, found {shown(seed)}; correct it.")
-        options = typed(table.get("run", {}), _Run, "run")
-        chunk_rows = options.chunk_rows
+        run = typed(table.get("run", {}), _Run, "run")
         job = made_by.make(Request(table, kept, folder))
         facts = job.facts
         plan = read_plan(table, facts.parameters, max(1, len(facts.sources)), seed, kept)
-        if chunk_rows is not None and chunk_rows % job.facts.block:
+        if run.chunk_rows is not None and run.chunk_rows % facts.block:
             raise DataError(
-                f"run.chunk_rows: expected a multiple of {job.facts.block}, as so many rows are computed together, "
-                f"found {chunk_rows}; correct it, or leave it out."
+                f"run.chunk_rows: expected a multiple of {facts.block}, as so many rows are computed together, found "
+                f"{run.chunk_rows}; correct it, or leave it out."
             )
-        return Sweep(text, name, inputs, kind, seed, plan, job, facts, options.memory_MB, chunk_rows, folder)
+        return Sweep(text, name, inputs, kind, seed, plan, job, facts, run.memory_MB, run.chunk_rows, folder)
     except DataError as error:
         raise DataError(f"{name}: {error}") from None
 
@@ -139,15 +126,12 @@ def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, n
     kept = dict(values)
     parameters = {parameter.name: parameter for parameter in sweep.facts.parameters}
     for axis in sweep.plan.axes:
-        parameter = parameters[axis.parameter]
-        value = values[axis.parameter]
-        lower, upper = (0.0, math.inf) if axis.relative else (parameter.lower, parameter.upper)
+        parameter, value = parameters[axis.parameter], values[axis.parameter]
+        lower, upper, nominal, words = parameter.lower, parameter.upper, parameter.nominal, parameter.range_words
+        if axis.relative:
+            lower, upper, nominal, words = 0.0, math.inf, 1.0, "0 to inf times its own"
         wrong = ~((value >= lower) & (value <= upper))
-        if wrong.any():
-            kept[axis.parameter] = np.where(wrong, 1.0 if axis.relative else parameter.nominal, value)
-            for k in np.flatnonzero(wrong):
-                reasons[k] = reasons[k] or (
-                    f"{parameter.name} = {value[k]:.6g} lies outside its bounds, "
-                    f"{f'{lower:g} to {upper:g} times its own' if axis.relative else parameter.range_words}"
-                )
+        kept[axis.parameter] = np.where(wrong, nominal, value)
+        for k in np.flatnonzero(wrong):
+            reasons[k] = reasons[k] or f"{parameter.name} = {value[k]:.6g} lies outside its bounds, {words}"
     return kept, reasons

@@ -13,20 +13,20 @@ import microid as m
 from fits.control._tune import parameter_values
 from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
+from fits.stage._run import as_stage
 from fits.sweeps._devices import by_rows
-from fits.sweeps._types import Parameter, Request, in_a_file
+from fits.sweeps._types import Parameter, Request, in_a_file, one_of
 
 NOMINAL = "nominal"
 INITIAL = ("negative", "positive", "demagnetised")
-_LEVELS, _RANGE_V, _LOOPS_um, _SLOPE_um_per_V = 16, (0.0, 120.0), 5.0, 0.1
+_LEVELS, _LOOPS_um, _SLOPE_um_per_V = 16, 5.0, 0.1
 # Share of the range over which the density of relays falls by e away from the diagonal.
 _DENSITY_WIDTH = 0.2
-_EXTREMES = 16
 
 
 def nominal_stage() -> m.Stage:
     """A stage of common size: 0 to 120 V, 17 um, loops of some 15 %, 1 ms, 200 Hz and a damping ratio of 0.03."""
-    lower, upper = (jnp.asarray(value) for value in _RANGE_V)
+    lower, upper = jnp.asarray(0.0), jnp.asarray(120.0)
     i, j = np.tril_indices(_LEVELS)
     density = np.exp(-(i - j) / (_LEVELS - 1) / _DENSITY_WIDTH) * m.node_areas(_LEVELS)[i, j]
     grid = m.GridDensity(jnp.asarray(_LOOPS_um * density / density.sum()), lower, upper)
@@ -43,14 +43,13 @@ def requested_stage(request: Request) -> tuple[m.Stage, str]:
     name, initial = request.table.get("model", NOMINAL), request.table.get("initial", INITIAL[0])
     if not isinstance(name, str):
         raise DataError(f'model: expected "{NOMINAL}" or the name of a model file, found {shown(name)}; give one.')
-    if initial not in INITIAL:
-        raise DataError(f"initial: expected one of {', '.join(INITIAL)}, found {shown(initial)}; choose one.")
+    initial = one_of(INITIAL, initial, "initial", "choose one.")
     model = nominal_stage() if name == NOMINAL else in_a_file(request.load(name), name, load_model).model
-    if isinstance(model, m.Preisach):
-        return m.Stage.of(hysteresis=model), initial
-    if isinstance(model, m.Stage):
-        return model, initial
-    raise DataError(f"{name}: expected a stage or a Preisach model, found a {type(model).__name__}; fit one first.")
+    if not isinstance(model, m.Preisach | m.Stage):
+        raise DataError(
+            f"{name}: expected a stage or a Preisach model, found a {type(model).__name__}; fit one first."
+        )
+    return as_stage(model), initial
 
 
 def stage_parameters(stage: m.Stage) -> tuple[Parameter, ...]:
@@ -63,10 +62,7 @@ def stage_parameters(stage: m.Stage) -> tuple[Parameter, ...]:
 
 
 def varied(stage: m.Stage, values: Mapping[str, Float[Array, "..."]], relative: Sequence[str]) -> m.Stage:
-    """Return a stage with other values of some parameters; those that are relative are multiplied by theirs.
-
-    Values may have rows, if all arrays of the stage have an axis for them in front.
-    """
+    """Return a stage, perhaps of rows, with other values of some parameters; relative ones are factors."""
     names = {info.path: stage.named(info.path) for info in m.parameter_table(stage)}
 
     def changed(path: Any, leaf: Any) -> Any:
@@ -76,8 +72,7 @@ def varied(stage: m.Stage, values: Mapping[str, Float[Array, "..."]], relative: 
         factor = jnp.reshape(values[name], jnp.shape(values[name]) + (1,) * (leaf.ndim - jnp.ndim(values[name])))
         return leaf * factor if name in relative else jnp.asarray(values[name], leaf.dtype)
 
-    found: m.Stage = jax.tree_util.tree_map_with_path(changed, stage)
-    return found
+    return jax.tree_util.tree_map_with_path(changed, stage)
 
 
 @by_rows("voltage_V", "values")
@@ -96,10 +91,8 @@ def respond(
 
 def range_of(stage: m.Stage) -> tuple[float, float] | None:
     """Range of the hysteresis in V, None where there is none."""
-    for part in stage.parts:
-        if isinstance(part, m.Preisach):
-            return float(part.density.lower_V), float(part.density.upper_V)
-    return None
+    laws = [part for part in stage.parts if isinstance(part, m.Preisach)]
+    return (float(laws[0].density.lower_V), float(laws[0].density.upper_V)) if laws else None
 
 
 def memory_before(stage: m.Stage, initial: str) -> m.Staircase | None:
@@ -111,4 +104,4 @@ def memory_before(stage: m.Stage, initial: str) -> m.Staircase | None:
         return m.negative_saturation(limits[0], 1)
     if initial == "positive":
         return m.positive_saturation(*limits, 2)
-    return m.demagnetised(*limits, size=_EXTREMES)
+    return m.demagnetised(*limits, size=16)

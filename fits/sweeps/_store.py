@@ -31,11 +31,9 @@ from fits.sweeps._types import STATUS_WORDS, Output, Rows
 SCHEMA = "microid.sweep.results/1"
 ABOUT, RESULTS, LEDGER, TEXT, TABLE = "about.json", "results.zarr", "ledger", "sweep.toml", "results.parquet"
 _STATUS = Output("status", "1", "of the row: 0 pending, 1 done, 2 failed", dtype="i1")
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
-# A disk that is nearly full is full for others.
-_USABLE_SHARE = 0.9
-# What zarr calls a file before it is whole.
-_PARTIAL = "**/*.partial"
+# What the user can do something about: a full or a broken disk, permissions, and folders that are gone.
+_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+_TROUBLE |= {errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR}
 
 
 class _About(TypedDict):
@@ -66,70 +64,67 @@ class Store:
 
     def create(self) -> None:
         """Write the empty store and what is known of the sweep."""
-        zarr = need("zarr")
+        zarr, sweep = need("zarr"), self.sweep
+        rows, size, names = len(sweep.plan), chunk_rows(sweep), [axis.parameter for axis in sweep.plan.axes]
+        about = {
+            "schema": SCHEMA,
+            "kind": sweep.kind,
+            "rows": rows,
+            "chunk_rows": size,
+            "chunks": chunk_count(sweep),
+            "seed": sweep.seed,
+            "parameters": names,
+            "relative": [axis.parameter for axis in sweep.plan.axes if axis.relative],
+            "outputs": [output.name for output in sweep.facts.outputs],
+            "digest": sweep.digest,
+            "versions": versions(),
+            "sweep": sweep.text,
+        }
         with _sentences(self.folder):
             (self.folder / LEDGER).mkdir(parents=True, exist_ok=True)
             group = zarr.open_group(str(self.folder / RESULTS), mode="w", zarr_format=2)
-            rows, size = len(self.sweep.plan), chunk_rows(self.sweep)
             for variable in self.variables:
-                kind = np.dtype(variable.dtype).kind
                 array = group.create_array(
                     variable.name,
                     shape=(rows, *variable.shape),
                     chunks=(size, *variable.shape),
                     dtype=variable.dtype,
                     # Without one xarray leaves whole numbers and texts as they are.
-                    fill_value=float("nan") if kind == "f" else None,
+                    fill_value=float("nan") if np.dtype(variable.dtype).kind == "f" else None,
                 )
                 attributes: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
                 if variable is _STATUS:
                     attributes |= {"flag_values": [0, 1, 2], "flag_meanings": " ".join(STATUS_WORDS)}
                 array.attrs.update(attributes | {"_ARRAY_DIMENSIONS": ["row", *(name for name, _ in variable.dims)]})
-            for name, (axis, unit, values) in self.sweep.facts.coordinates.items():
+            for name, (axis, unit, values) in sweep.facts.coordinates.items():
                 array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype)
                 array[:] = values
                 array.attrs.update({"units": unit, "_ARRAY_DIMENSIONS": [axis]})
-            swept = [axis.parameter for axis in self.sweep.plan.axes]
-            about = self._about()
-            group.attrs.update(about | ({"coordinates": " ".join(swept)} if swept else {}))
+            group.attrs.update(about | ({"coordinates": " ".join(names)} if names else {}))
             zarr.consolidate_metadata(group.store)
-            atomic_write_text(self.folder / TEXT, self.sweep.text)
+            atomic_write_text(self.folder / TEXT, sweep.text)
             # Last: a folder without it holds no sweep yet.
             atomic_write_text(self.folder / ABOUT, json.dumps(about, indent=1) + "\n")
-
-    def _about(self) -> dict[str, Any]:
-        return {
-            "schema": SCHEMA,
-            "kind": self.sweep.kind,
-            "rows": len(self.sweep.plan),
-            "chunk_rows": chunk_rows(self.sweep),
-            "chunks": chunk_count(self.sweep),
-            "seed": self.sweep.seed,
-            "parameters": [axis.parameter for axis in self.sweep.plan.axes],
-            "relative": [axis.parameter for axis in self.sweep.plan.axes if axis.relative],
-            "outputs": [output.name for output in self.sweep.facts.outputs],
-            "digest": self.sweep.digest,
-            "versions": versions(),
-            "sweep": self.sweep.text,
-        }
 
     def _open(self) -> Any:
         if self._group is None:
             self._group = need("zarr").open_group(str(self.folder / RESULTS), mode="r+", zarr_format=2)
         return self._group
 
+    def _entry(self, chunk: int) -> Path:
+        return self.folder / LEDGER / f"{chunk:08d}.json"
+
     def sound(self) -> bool:
         """Whether the store is there, with all variables as they should be."""
-        size = chunk_rows(self.sweep)
+        rows, size = len(self.sweep.plan), chunk_rows(self.sweep)
         try:
             json.loads((self.folder / RESULTS / ".zmetadata").read_text(encoding="utf-8"))
-            arrays = {variable: self._open()[variable.name] for variable in self.variables}
-            rows = len(self.sweep.plan)
-            return (self.folder / LEDGER).is_dir() and all(
-                (array.shape, array.chunks) == ((rows, *variable.shape), (size, *variable.shape))
-                and array.dtype == np.dtype(variable.dtype)
-                for variable, array in arrays.items()
-            )
+            for variable in self.variables:
+                array, shape = self._open()[variable.name], variable.shape
+                expected = (rows, *shape), (size, *shape), np.dtype(variable.dtype)
+                if (array.shape, array.chunks, array.dtype) != expected:
+                    return False
+            return (self.folder / LEDGER).is_dir()
         except Exception:
             # Whatever a broken file makes a decoder say, the store is not sound.
             return False
@@ -137,50 +132,42 @@ class Store:
     def clear(self) -> None:
         """Delete what processes that were killed have left of files; the lock says that no other is at work."""
         left = [path for folder in (self.folder, self.folder / LEDGER) for path in folder.glob(".*")]
-        left = [path for path in left if is_temporary(path.name)] + [*(self.folder / RESULTS).glob(_PARTIAL)]
-        for path in left:
+        left = [path for path in left if is_temporary(path.name)]
+        # What zarr calls a file before it is whole.
+        for path in (*left, *(self.folder / RESULTS).glob("**/*.partial")):
             path.unlink(missing_ok=True)
 
     def write(self, chunk: int, rows: Rows) -> None:
         """Keep a chunk, then say so in the ledger; a `DataError` says that the disk does not take it."""
         arrays = dict(rows.outputs) | {"reason": np.array(rows.reasons, dtype=REASON.dtype)}
         with _sentences(self.folder):
-            group = self._open()
             start = chunk * chunk_rows(self.sweep)
             for variable in self.variables:
                 array = np.ascontiguousarray(arrays[variable.name], dtype=variable.dtype)
-                group[variable.name][start : start + len(array)] = array
-            self._flush(chunk)
+                self._open()[variable.name][start : start + len(array)] = array
+                path = self.folder / RESULTS / variable.name / f"{chunk}{'.0' * len(variable.shape)}"
+                # A chunk of nothing but fill values has no file; others are on the disk before the ledger says so.
+                if path.exists():
+                    flush(path)
             entry = {"sha256": self._sum(arrays), "failed": sum(map(bool, rows.reasons)), "rows": len(rows.reasons)}
-            atomic_write_text(self.folder / LEDGER / f"{chunk:08d}.json", json.dumps(entry) + "\n")
-
-    def _flush(self, chunk: int) -> None:
-        """Have a chunk on the disk before the ledger says that it is there."""
-        for variable in self.variables:
-            file = ".".join(map(str, (chunk, *(0 for _ in variable.shape))))
-            path = self.folder / RESULTS / variable.name / file
-            # A chunk of nothing but fill values has no file.
-            if path.exists():
-                flush(path)
+            atomic_write_text(self._entry(chunk), json.dumps(entry) + "\n")
 
     def read(self, chunk: int) -> dict[str, np.ndarray]:
         rows, group = rows_of(self.sweep, chunk), self._open()
-        return {
-            variable.name: np.asarray(group[variable.name][int(rows[0]) : int(rows[-1]) + 1])
-            for variable in self.variables
-        }
+        place = slice(int(rows[0]), int(rows[-1]) + 1)
+        return {variable.name: np.asarray(group[variable.name][place]) for variable in self.variables}
 
     def whole(self, chunk: int) -> bool:
         """Whether a chunk is in the ledger and what is kept of it has the sum that is written there."""
         try:
-            entry = json.loads((self.folder / LEDGER / f"{chunk:08d}.json").read_text(encoding="utf-8"))
+            entry = json.loads(self._entry(chunk).read_text(encoding="utf-8"))
             return bool(entry["sha256"] == self._sum(self.read(chunk)))
         except Exception:
             # Whatever a broken file makes a decoder say, the chunk is not whole.
             return False
 
     def noted(self, chunk: int) -> bool:
-        return (self.folder / LEDGER / f"{chunk:08d}.json").exists()
+        return self._entry(chunk).exists()
 
     def _sum(self, arrays: dict[str, np.ndarray]) -> str:
         total = hashlib.sha256()
@@ -191,18 +178,18 @@ class Store:
 
 def about_of(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Read what is known of a sweep; a `DataError` says why it cannot be read."""
-    shown, again = os.fspath(folder), "run the sweep again in another folder."
     if not (Path(folder) / ABOUT).exists():
-        raise DataError(f"{shown}: there is no sweep in this folder; give what --out named.")
+        raise DataError(f"{folder}: there is no sweep in this folder; give what --out named.")
     try:
         what = "what is known of a sweep"
         about: Any = parse_json(read_text(Path(folder) / ABOUT, what, MOST_JSON_BYTES), ABOUT, what)
         if isinstance(about, dict) and about.get("schema") == SCHEMA:
             msgspec.convert(about, _About)
             return about
+        fault = f"expected results of the format {SCHEMA}"
     except (DataError, msgspec.ValidationError) as error:
-        raise DataError(f"{shown}: {ABOUT} is broken ({error}); {again}") from None
-    raise DataError(f"{shown}: expected results of the format {SCHEMA}; {again}")
+        fault = f"{ABOUT} is broken ({error})"
+    raise DataError(f"{folder}: {fault}; run the sweep again in another folder.")
 
 
 def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
@@ -214,21 +201,36 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
             raise DataError(
                 f"{out}: there is a sweep in this folder; add --resume to go on, or choose another for --out."
             )
-        _check_same(sweep, out)
+        about = about_of(out)
+        for name, version in versions().items():
+            before = about["versions"].get(name)
+            if before != version:
+                raise DataError(
+                    f"{out}: the sweep was begun with {name} {before}, and this is {version}; go on with that "
+                    "version, or begin anew in another folder."
+                )
+        if about["digest"] != sweep.digest or about["chunk_rows"] != chunk_rows(sweep):
+            raise DataError(
+                f"{out}: the folder holds the results of another sweep or other files; give the one that is in its "
+                f"{TEXT}, or choose another folder for --out."
+            )
         return
     own = (RESULTS, LEDGER, TEXT, ".lock")
     if folder.exists() and any(path.name not in own and not is_temporary(path.name) for path in folder.iterdir()):
         raise DataError(f"{out}: the folder holds other files; choose another for --out.")
-    _check_size(sweep, out, anchor)
+    # The table holds all but the traces once more, and a disk that is nearly full is full for others.
+    needed = len(sweep.plan) * 2 * bytes_per_row(sweep)
+    free = shutil.disk_usage(anchor).free
+    if needed > 0.9 * free:
+        raise DataError(
+            f"{out}: {len(sweep.plan):,} rows would take about {needed / 1e9:.3g} GB, and the disk has "
+            f"{free / 1e9:.3g} GB; keep fewer rows or no traces, or choose another disk."
+        )
 
 
 @contextmanager
 def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
-    """Open the folder of a sweep, new or to go on with, and keep other processes out of it.
-
-    A `DataError` says that it cannot be written to, holds another sweep or one that was begun with other versions, or
-    that the results would not fit on the disk.
-    """
+    """Open the folder of a sweep, new or to go on with, and keep others out; refusals are those of `check_folder`."""
     check_folder(sweep, out, resume)
     folder = Path(os.path.realpath(out))
     begun = (folder / ABOUT).exists()
@@ -245,33 +247,6 @@ def opened(sweep: Sweep, out: str, resume: bool) -> Iterator[Store]:
             store = Store(sweep, folder)
             store.create()
         yield store
-
-
-def _check_size(sweep: Sweep, out: str, anchor: Path) -> None:
-    # The table holds all but the traces once more.
-    needed = len(sweep.plan) * 2 * bytes_per_row(sweep)
-    free = shutil.disk_usage(anchor).free
-    if needed > _USABLE_SHARE * free:
-        raise DataError(
-            f"{out}: {len(sweep.plan):,} rows would take about {needed / 1e9:.3g} GB, and the disk has "
-            f"{free / 1e9:.3g} GB; keep fewer rows or no traces, or choose another disk."
-        )
-
-
-def _check_same(sweep: Sweep, out: str) -> None:
-    about = about_of(out)
-    digest, before, size = about["digest"], about["versions"], about["chunk_rows"]
-    for name, version in versions().items():
-        if before.get(name) != version:
-            raise DataError(
-                f"{out}: the sweep was begun with {name} {before.get(name)}, and this is {version}; go on with that "
-                "version, or begin anew in another folder."
-            )
-    if digest != sweep.digest or size != chunk_rows(sweep):
-        raise DataError(
-            f"{out}: the folder holds the results of another sweep or other files; give the one that is in its "
-            f"{TEXT}, or choose another folder for --out."
-        )
 
 
 @contextmanager
@@ -296,7 +271,7 @@ def _sentences(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in _FULL | {errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR}:
+        if error.errno not in _TROUBLE:
             raise
         raise DataError(
             f"{folder}: cannot be written ({error.strerror or error}); what was done before is kept: free the disk "

@@ -4,7 +4,7 @@ import abc
 import math
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,14 +50,12 @@ def choice(name: str, words: Sequence[str], nominal: str) -> Parameter:
     return Parameter(name, "1", float(words.index(nominal)), 0.0, len(words) - 1.0, tuple(words))
 
 
-def code_of(found: Any, parameter: Parameter, place: str) -> float:
-    """Place of a word among those of its parameter, or a `DataError` that begins with its place in the sweep."""
-    if not isinstance(found, str) or found not in parameter.words:
-        raise DataError(
-            f"{place}: expected one of {', '.join(parameter.words)}, found {shown(found)}; "
-            f"{nearest(str(found), parameter.words)}"
-        )
-    return float(parameter.words.index(found))
+def one_of(words: Iterable[str], found: Any, place: str, what_to_do: str = "") -> str:
+    """What was found, if it is one of some words, or a `DataError` that begins with its place in the sweep."""
+    if not isinstance(found, str) or found not in words:
+        what_to_do = what_to_do or nearest(str(found), [*words])
+        raise DataError(f"{place}: expected one of {', '.join(words)}, found {shown(found)}; {what_to_do}")
+    return found
 
 
 def check_plain(parameter: Parameter, values: FloatArray | None, relative: bool, place: str) -> None:
@@ -76,11 +74,7 @@ def check_plain(parameter: Parameter, values: FloatArray | None, relative: bool,
 
 @dataclass(frozen=True)
 class Output:
-    """One number, text or trace per row, whose name ends in its unit.
-
-    It may have axes beside that of the rows, by name and length, and is `"f8"`, `"i4"`, or a text of fixed width such
-    as `"U80"`.
-    """
+    """One number, text (such as `'U80'`) or trace per row, named with its unit; `dims` are axes beside the rows."""
 
     name: str
     unit: str
@@ -137,10 +131,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Block:
-    """Rows that are computed together: values, numbers in the sweep, and places among the sources, shape `(n,)` each.
-
-    The values are by parameter, in their own units, but for those that are factors. Rows of filling are repeated.
-    """
+    """Rows that are computed together: values by parameter, numbers in the sweep, places of sources, `(n,)` each."""
 
     values: dict[str, FloatArray]
     relative: tuple[str, ...]
@@ -159,10 +150,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Request:
-    """What a job is made from: the sweep as TOML gives it, and what gives the content of a file by its name in it.
-
-    Patterns of file names start in the folder; it is None where there are none.
-    """
+    """What a job is made from: the sweep as TOML gives it, what gives a file's content by its name, and a folder."""
 
     table: Mapping[str, Any]
     load: Callable[[str], bytes]
@@ -170,10 +158,7 @@ class Request:
 
 
 class AbstractJob(abc.ABC):
-    """What is done with each row. Rows go through in blocks of one size, the last one filled up.
-
-    With several local devices as many blocks go through at once, one on each device.
-    """
+    """What is done with each row. Rows go through in blocks of one size, one on each local device at once."""
 
     @property
     @abc.abstractmethod

@@ -36,12 +36,6 @@ _STEP = (
     Output("settling_time_s", "s", "from the step until the displacement stays within 2 %; inf if it does not"),
     Output("overshoot_pct", "%", "beyond the final value, of the way; of the target where it has not settled"),
 )
-# A loop whose error grows beyond this share of the reference's range is not a loop that anybody wants.
-_LOST_PCT = 1e4
-# References that move by less stand still.
-_STILL_um = 1e-9
-# Voltages per level at which the slope of a hysteresis is looked at.
-_FINE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,22 +60,22 @@ class ControlJob(AbstractJob):
         wanted = drive(self.reference, block, values)
         found = _control(self.stage, self.controllers, values, block.relative, wanted, self.start, step)
         outputs = {name: np.asarray(value) for name, value in found.items()}
-        outputs["pole_radius"] = in_turn(
-            lambda rows, values: _radius(self.stage, self.controllers, rows, values, block.relative),
-            block.rows,
-            block.values,
-        )
-        moved = np.ptp(np.asarray(wanted), axis=1)
-        way = np.maximum(moved, np.abs(outputs.pop("from_um")))
+
+        def radius(rows: Array, values: Mapping[str, Array]) -> Array:
+            return _radius(self.stage, self.controllers, rows, values, block.relative)
+
+        outputs["pole_radius"] = in_turn(radius, block.rows, block.values)
+        way = np.maximum(np.ptp(np.asarray(wanted), axis=1), np.abs(outputs.pop("from_um")))
         return Rows(outputs, tuple(map(_why_not, way, outputs["pole_radius"], outputs["e_max_pct"])))
 
 
 def _why_not(way_um: float, radius: float, error_pct: float) -> str:
-    if not way_um > _STILL_um:
+    if not way_um > 1e-9:
         return "the reference does not move"
     if radius >= 1:
         return f"the loop is unstable where the hysteresis is steepest: modulus of its largest pole = {radius:.6g}"
-    if not error_pct < _LOST_PCT:
+    # An error of a hundred times the reference's range is not of a loop that anybody wants.
+    if not error_pct < 1e4:
         return "the loop is unstable: its error grows without end"
     return ""
 
@@ -142,7 +136,7 @@ def _radius(
 
     def one(values: Mapping[str, Float[Array, ""]]) -> Float[Array, ""]:
         changed = varied(stage, values, relative)
-        slopes = [major_loop_slope(part, _FINE) for part in changed.parts if isinstance(part, Preisach)]
+        slopes = [major_loop_slope(part, fine=8) for part in changed.parts if isinstance(part, Preisach)]
         linear, slope = controllers.at(values).linear(), slopes[0] if slopes else None
         return margins(linear, changed, delay=controllers.delay, slope_um_per_V=slope).radius
 

@@ -6,12 +6,10 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io._typed import typed
-from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES
-from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
+from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, each_alone, requested_records
 from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows, choice
 
 KEYS = ("model", "initial", "program", "records", "diagnose")
@@ -58,22 +56,14 @@ class DiagnoseJob(AbstractJob):
         alarm = block.numbers("diagnose.false_alarm", self.options.false_alarm).tolist()
         holdout = block.numbers("diagnose.holdout", self.options.holdout).tolist()
         initial = block.words("diagnose.initial", INITIAL_STATES, self.initial)
-        rows = zip(self.records.records(block), alarm, holdout, initial, strict=True)
-        found = [_diagnosed(*options, block.seed) for options in rows]
-        return Rows.one_by_one(_OUTPUTS, found)
+        seeds = [block.seed] * len(alarm)
+        return each_alone(_OUTPUTS, self.records.records(block), _diagnosed, alarm, holdout, initial, seeds)
 
 
-def _diagnosed(
-    record: Record | str, false_alarm: float, holdout: float, initial: str, seed: int
-) -> dict[str, Any] | str:
-    if isinstance(record, str):
-        return record
+def _diagnosed(record: Record, false_alarm: float, holdout: float, initial: str, seed: int) -> dict[str, Any]:
     from fits.diagnosis._diagnose import diagnose
 
-    try:
-        found = diagnose([record], holdout=holdout, false_alarm=false_alarm, initial=initial, seed=seed)
-    except (DataError, FitError) as error:
-        return " ".join(str(error).split())
+    found = diagnose([record], holdout=holdout, false_alarm=false_alarm, initial=initial, seed=seed)
     first = found.causes[0] if found.causes else None
     return {
         "causes": float(len(found.causes)),

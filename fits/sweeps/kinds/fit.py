@@ -17,12 +17,11 @@ from fits.io._typed import typed
 from fits.loop._design import branch_table
 from fits.loop._fit import fit
 from fits.loop._prior import roughness
-from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES, initial_state, known_samples
 from fits.stats._metrics import errors
 from fits.sweeps._devices import in_turn, place
 from fits.sweeps._fit_batch import BatchFit, fit_batch
-from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, requested_records
+from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, each_alone, requested_records
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
 from microid import Staircase, node_areas
 
@@ -75,46 +74,34 @@ class FitJob(AbstractJob):
         if self.options.weights:
             size = len(_packed(self.options.levels or 0)[0])
             outputs.append(Output("weights_um", "um", "weights of Eq. 9, packed row by row", (("weight", size),)))
-        levels = float(self.options.levels or _DEFAULT_LEVELS)
-        parameters: tuple[Parameter, ...] = (
-            *self.records.parameters,
-            Parameter("fit.holdout", "1", self.options.holdout, 0.0, 0.9),
-            choice("fit.initial", INITIAL_STATES, self.initial),
-        )
+        parameters = [*self.records.parameters, Parameter("fit.holdout", "1", self.options.holdout, 0.0, 0.9)]
+        parameters.append(choice("fit.initial", INITIAL_STATES, self.initial))
         if not self.options.weights:
             # Rows of other levels have other weights.
-            parameters += (Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True),)
+            levels = float(self.options.levels or _DEFAULT_LEVELS)
+            parameters.append(Parameter("fit.levels", "1", levels, _FEWEST_LEVELS, _MOST_LEVELS, whole=True))
         if self._batch:
-            parameters += (Parameter("fit.smoothness", "1", self.options.smoothness, 1e-12, 1e6),)
+            parameters.append(Parameter("fit.smoothness", "1", self.options.smoothness, 1e-12, 1e6))
         block = _BLOCK if self._batch else 1
-        return Facts(parameters, tuple(outputs), block, self.records.sources, alone=not self._batch)
+        return Facts(tuple(parameters), tuple(outputs), block, self.records.sources, alone=not self._batch)
 
     def compute(self, block: Block) -> Rows:
         """Fit the records of some blocks; see `AbstractJob.compute`."""
         records, holdout = self.records.records(block), block.numbers("fit.holdout", self.options.holdout)
         initial = block.words("fit.initial", INITIAL_STATES, self.initial)
         if self._batch:
-            levels = block.numbers("fit.levels", self.options.levels or _DEFAULT_LEVELS).astype(int)
-            return self._together(
-                records, holdout, initial, levels, block.numbers("fit.smoothness", self.options.smoothness)
-            )
+            return self._together(block, records, holdout, initial)
         swept = block.values.get("fit.levels")
         numbers = [self.options.levels] * len(records) if swept is None else swept.astype(int).tolist()
-        found = [_alone(*options) for options in zip(records, numbers, holdout.tolist(), initial, strict=True)]
-        return Rows.one_by_one(self.facts.outputs, found)
+        return each_alone(self.facts.outputs, records, _alone, numbers, holdout.tolist(), initial)
 
-    def _together(
-        self,
-        records: list[Record | str],
-        holdout: FloatArray,
-        initial: list[str],
-        levels: NDArray[np.int64],
-        smoothness: FloatArray,
-    ) -> Rows:
+    def _together(self, block: Block, records: list[Record | str], holdout: FloatArray, initial: list[str]) -> Rows:
+        levels = block.numbers("fit.levels", self.options.levels or _DEFAULT_LEVELS).astype(int)
+        smoothness = block.numbers("fit.smoothness", self.options.smoothness)
         count, samples = len(records), self.options.samples
-        voltage, displacement = np.zeros((count, samples)), np.zeros((count, samples))
-        fitted, known = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
-        limits, extremes, used = np.tile([0.0, 1.0], (count, 1)), np.zeros((count, _PLACES)), np.ones(count, "i4")
+        voltage, displacement, fitted = np.zeros((3, count, samples))
+        known, limits = np.zeros((count, samples), dtype=bool), np.tile([0.0, 1.0], (count, 1))
+        extremes, used = np.zeros((count, _PLACES)), np.ones(count, "i4")
         reasons = [""] * count
         for k, record in enumerate(records):
             reasons[k] = record if isinstance(record, str) else self._why_not(record)
@@ -154,16 +141,9 @@ class FitJob(AbstractJob):
         return ""
 
 
-def _alone(record: Record | str, levels: int | None, holdout: float, initial: str) -> dict[str, Any] | str:
-    """What comes of the fit of one record, or why there is none."""
-    if isinstance(record, str):
-        return record
-    try:
-        result = fit([record], levels=levels, holdout=holdout, initial=initial)
-    except (DataError, FitError) as error:
-        return " ".join(str(error).split())
-    run = result.runs[0]
-    weights = np.asarray(result.weights_um)
+def _alone(record: Record, levels: int | None, holdout: float, initial: str) -> dict[str, Any]:
+    result = fit([record], levels=levels, holdout=holdout, initial=initial)
+    run, weights = result.runs[0], np.asarray(result.weights_um)
     found: dict[str, Any] = {
         "offset_um": run.offset_um,
         "noise_um": result.noise_um,
@@ -182,21 +162,14 @@ def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[An
     table, rough = jnp.asarray(branch_table(levels)), roughness(levels)
 
     def regress(*rows: Array) -> BatchFit:
-        fits: BatchFit = fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
-        return fits
+        return fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
 
     found = in_turn(regress, *rows) if jax.default_backend() == "cpu" else regress(*map(place, rows))
     packed = _packed(levels)
     weights = np.asarray(found.columns_um)[:, : len(packed[0])] * node_areas(levels)[packed]
-    return {
-        "offset_um": np.asarray(found.offset_um),
-        "noise_um": np.asarray(found.noise_um),
-        "loops_um": weights.sum(axis=1),
-        "levels": np.full(len(weights), float(levels)),
-        "weights_um": weights,
-        "predicted_um": np.asarray(found.predicted_um),
-        "success": np.asarray(found.success),
-    }
+    same = {name: np.asarray(getattr(found, name)) for name in ("offset_um", "noise_um", "predicted_um", "success")}
+    numbers = np.full(len(weights), float(levels))
+    return same | {"loops_um": weights.sum(axis=1), "levels": numbers, "weights_um": weights}
 
 
 def _packed(levels: int) -> tuple[NDArray[np.int64], ...]:
@@ -227,6 +200,5 @@ def make(request: Request) -> FitJob:
     if isinstance(records, Simulated):
         if "samples" in table:
             raise DataError("fit.samples: simulated records have the samples of their program; leave it out.")
-        samples = {"samples": records.program.samples}
-        options.samples = typed(samples, _Options, "fit").samples
+        options.samples = typed({"samples": records.program.samples}, _Options, "fit").samples
     return FitJob(records, options, options.initial or assumed_initial(request, records))

@@ -23,7 +23,6 @@ from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Req
 
 _Tree = TypeVar("_Tree", m.Geometry, m.Actuation)
 KEYS = ("stage", "sensitivity")
-_BLOCK = 256
 
 
 class _Options(msgspec.Struct):
@@ -54,7 +53,17 @@ class SensitivityJob(AbstractJob):
                 Output(f"{axis}_resonance_Hz", "Hz", f"first resonance of {axis}"),
                 Output(f"{axis}_spread_pct", "%", f"root sum of squares of what the tolerances do to {axis}"),
             ]
-        return Facts(_parameters(self.design), tuple(outputs), _BLOCK)
+        parameters = []
+        for name, each in m.DIMENSIONS.items():
+            upper, size = LARGEST_ANGLE_RAD if each.unit == "rad" else math.inf, float(self.design.geometry[name])
+            parameters.append(Parameter(f"geometry.{each.field}", each.unit, size, 1e-9, upper))
+        for info in m.parameter_table(self.design.actuation):
+            value = float(getattr(self.design.actuation, info.path))
+            parameters.append(Parameter(f"actuation.{info.path}", info.spec.unit, value, 1e-9))
+        modulus_GPa, guides = float(self.design.youngs_modulus_GPa), float(self.design.guides)
+        parameters.append(Parameter("material.youngs_modulus_GPa", "GPa", modulus_GPa, 1e-9))
+        parameters.append(Parameter("material.guides", "1", guides, 0.0))
+        return Facts(tuple(parameters), tuple(outputs), block=256)
 
     def compute(self, block: Block) -> Rows:
         """Evaluate a block of stages on each device; see `AbstractJob.compute`."""
@@ -81,19 +90,6 @@ def make(request: Request) -> SensitivityJob:
     design = paper_design() if name == "paper" else in_a_file(request.load(name), name, read_design)
     axes = typed(request.table.get("sensitivity", {}), _Options, "sensitivity").axes
     return SensitivityJob(design, tuple(dict.fromkeys(axes)))
-
-
-def _parameters(design: Design) -> tuple[Parameter, ...]:
-    found = []
-    for name, each in m.DIMENSIONS.items():
-        upper = LARGEST_ANGLE_RAD if each.unit == "rad" else math.inf
-        found.append(Parameter(f"geometry.{each.field}", each.unit, float(design.geometry[name]), 1e-9, upper))
-    for info in m.parameter_table(design.actuation):
-        value = float(getattr(design.actuation, info.path))
-        found.append(Parameter(f"actuation.{info.path}", info.spec.unit, value, 1e-9))
-    found.append(Parameter("material.youngs_modulus_GPa", "GPa", float(design.youngs_modulus_GPa), 1e-9))
-    found.append(Parameter("material.guides", "1", float(design.guides), 0.0))
-    return tuple(found)
 
 
 @by_rows("values")

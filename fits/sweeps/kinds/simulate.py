@@ -41,10 +41,7 @@ class _Options(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class SimulateJob(AbstractJob):
-    """Simulations of a stage under a voltage, from a memory before each row.
-
-    Figures count from `from_s` on; traces are kept at every so many samples, not at all if that is 0.
-    """
+    """Simulations of a stage under a voltage; traces are kept at every so many samples, not at all if that is 0."""
 
     stage: Stage
     program: Program
@@ -55,18 +52,18 @@ class SimulateJob(AbstractJob):
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
-        samples = self.program.samples
-        outputs = list(_OUTPUTS)
+        outputs: tuple[Output, ...] = _OUTPUTS
         coordinates: dict[str, tuple[str, str, FloatArray]] = {}
         if self.every:
-            time_s = np.arange(0, samples, self.every) * self.program.interval_s
-            outputs += [
-                Output("displacement_um", "um", "displacement at times", (("time", len(time_s)),)),
-                Output("voltage_V", "V", "command at times", (("time", len(time_s)),)),
-            ]
-            coordinates["time_s"] = ("time", "s", np.asarray(time_s, dtype=np.float64))
+            time_s = np.arange(0, self.program.samples, self.every, dtype=np.float64) * self.program.interval_s
+            times = (("time", len(time_s)),)
+            outputs += (
+                Output("displacement_um", "um", "displacement at times", times),
+                Output("voltage_V", "V", "command at times", times),
+            )
+            coordinates["time_s"] = "time", "s", time_s
         parameters = (*stage_parameters(self.stage), *self.program.parameters)
-        return Facts(parameters, tuple(outputs), block_rows(samples), coordinates=coordinates)
+        return Facts(parameters, outputs, block_rows(self.program.samples), coordinates=coordinates)
 
     def compute(self, block: Block) -> Rows:
         """Simulate a block on each device; see `AbstractJob.compute`."""
@@ -91,14 +88,11 @@ def make(request: Request) -> SimulateJob:
     asked = typed(request.table.get("outputs", {}), _Options, "outputs")
     if not asked.from_s < program.last_s:
         raise DataError(f"outputs.from_s: expected a time within the program, found {asked.from_s:g}; correct it.")
-    every = asked.every if asked.traces else 0
-    return SimulateJob(stage, program, initial, asked.from_s, every)
+    return SimulateJob(stage, program, initial, asked.from_s, asked.every if asked.traces else 0)
 
 
 @by_rows("voltage", "displacement")
-def _sum_up(
-    voltage: Float[Array, "n t"], displacement: Float[Array, "n t"], first: int
-) -> dict[str, Float[Array, " n"]]:
+def _sum_up(voltage: Float[Array, "n t"], displacement: Float[Array, "n t"], first: int) -> dict[str, Array]:
     return jax.vmap(summary)(voltage[:, first:], displacement[:, first:])
 
 
