@@ -34,11 +34,12 @@ def bench(tmp_path, monkeypatch, rng):
 
 
 def test_the_command_writes_everything(bench, rng):
-    done = run("diagnose", "run.csv", "--out", "a/b", "--duration", "30", "--false-alarm", "0.05")
+    done = run("diagnose", "run.csv", "--out", "a/b", "--duration", "30", "--false-alarm", "0.05", "--budget", "60")
     assert done.exit_code == 0, done.stderr
     names = ["baseline.json", "diagnosis.json", "extended.json", "next_experiment.csv", "report.html"]
     assert files(bench.folder / "a" / "b") == names
     assert (bench.asked["duration_s"], bench.asked["false_alarm"], bench.asked["holdout"]) == (30.0, 0.05, 0.2)
+    assert bench.asked["budget_s"] == 60.0
     assert [record.source for record in bench.asked["records"]] == ["run.csv"]
     for words in ("creep", "thermal_drift", "gain_per_decade", "0.0471", "0.0123", "It decides.", "report.html"):
         assert words in done.stdout

@@ -25,6 +25,14 @@ _LONGEST_s = 1e5
 @click.option(
     "--false-alarm", type=float, default=0.01, show_default=True, help="Chance of a cause where there is none."
 )
+@click.option(
+    "--budget",
+    type=float,
+    metavar="SECONDS",
+    default=300.0,
+    show_default=True,
+    help="Then the best answer so far is refined and given.",
+)
 @click.option("--duration", type=float, metavar="SECONDS", help="Of the next experiment, at most.")
 @options.initial("all runs", "unknown")
 @options.limit
@@ -42,6 +50,8 @@ def diagnose(given: common.Given) -> None:
     """
     if not 0 < given.false_alarm <= 0.5:
         raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {given.false_alarm:g}.")
+    if not 0 < given.budget <= _LONGEST_s:
+        raise DataError(f"--budget: expected a time above 0 and up to {_LONGEST_s:g} s, found {given.budget:g}.")
     if given.duration is not None and not 0 < given.duration <= _LONGEST_s:
         raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {given.duration:g}.")
     if not 0 <= given.margin <= 10:
@@ -64,6 +74,7 @@ def diagnose(given: common.Given) -> None:
         initial=given.initial,
         limits=limits,
         margin=given.margin,
+        budget_s=given.budget,
         progress=progress,
     )
     progress(late.Step.WRITING)
