@@ -87,6 +87,8 @@ def test_what_is_held_out_and_what_the_rig_stands_are_passed_on(bench):
         (["--false-alarm", "0.6"], ["--false-alarm", "0.6"]),
         (["--false-alarm", "nan"], ["--false-alarm"]),
         (["--duration", "0"], ["--duration"]),
+        (["--budget", "0"], ["--budget"]),
+        (["--budget", "nan"], ["--budget"]),
         (["--duration", "inf"], ["--duration"]),
         (["--holdout", "1.5"], ["--holdout"]),
         (["--holdout", "none.csv"], ["none.csv"]),

@@ -77,6 +77,25 @@ def test_all_files_are_there_and_keep_to_their_schema(case):
     assert violations(case.found, diagnosis_schema()) == [], case.seed
 
 
+def test_no_sentence_contradicts_a_number(case):
+    found, page = case.found, (case.folder / "diagnosis" / "report.html").read_text(encoding="utf-8").lower()
+    named = {name for cause in found["causes"] for name in (cause["name"], *cause["also_consistent"])}
+    assert (found["verdict"] == "effect_found") == bool(found["causes"]), case.seed
+    # What is named is not among what was not found, and what could not be seen has no evidence.
+    for bound in found["upper_bounds"]:
+        assert bound["name"] not in named, case.seed
+        assert not bound["reason"] or not bound["z"], (case.seed, bound)
+    gain = found["gain"]
+    worse = gain["heldout_rms_after_um"] - gain["heldout_rms_before_um"]
+    assert worse < 2 * gain["sd_of_difference_um"], case.seed
+    for words, verdict in (("effect found", "effect_found"), ("no effect found", "no_effect")):
+        assert (words in case.words) == (found["verdict"] == verdict), case.seed
+    for name in named:
+        assert name.replace("_", " ") in page or name in page, (case.seed, name)
+    if found["causes"]:
+        assert sum(cause["share_of_misfit"] for cause in found["causes"]) >= 0.65, case.seed
+
+
 def test_the_extended_model_simulates_new_runs_better(case):
     squares = {}
     for which in ("baseline", "extended"):

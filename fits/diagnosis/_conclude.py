@@ -148,6 +148,12 @@ def conclude(
     faults = _standing(ready.faults, beside, extension.compared, thresholds.spike_z) if kept else ready.faults
     named = name_faults(faults, cyclic, thresholds)
     causes = causes_of(kept, model, found.projector, found.bench, misfit.total, named, ready.faults)
+    bound = {law.form.name for law, x in zip(model.laws, model.x, strict=True) if law.at_bound(x)}
+    if bound:
+        remarks.append(
+            f"{', '.join(sorted(bound))}: a parameter ended at the bound of what such an effect may have, so that "
+            "something else that looks alike may be there instead"
+        )
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)
         remarks.append(held.sentence)
