@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -105,6 +106,9 @@ def test_the_second_truth_is_repeatable_and_nothing_like_the_first(seed):
     second, again = (ds.hidden(["creep"], seed=seed, truth="second", **SMALL) for _ in range(2))
     assert ds.files(second) == ds.files(again)
     assert ds.files(first) == ds.files(usual)
+    told = [json.loads(ds.files(bench)["truth.json"])["sensor"] for bench in (first, second)]
+    assert "correlation" not in told[0]
+    assert told[1]["correlation"] == second.scenario.sensor.correlation
     noise_um = second.scenario.sensor.noise_um
     assert noise_um == first.scenario.sensor.noise_um
     assert second.plant == first.plant
