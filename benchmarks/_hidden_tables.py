@@ -11,7 +11,15 @@ from scipy.stats import binomtest
 
 Row = dict[str, Any]
 _HOLDS = {"first": "lines", "zero": "steps"}
+# Standard deviations by which held-out runs are predicted worse beyond chance.
+_WORSE = 3.0
 _BINS = ((-math.inf, 3.0, "below 3"), (3.0, 5.5, "3 to 5.5"), (5.5, 11.0, "5.5 to 11"), (11.0, math.inf, "above 11"))
+_SECOND = (
+    "The second truth: every stage is 24 to 60 plays of random radii and weights, with a relaxation of eight "
+    "exponential terms and a gain that depends on the amplitude, each 0.5 to 1 times the noise, and its noise is "
+    "correlated from sample to sample by 0.5 to 0.9. No form of the library is that: the relaxation is nearest to "
+    "creep, so that creep named where nothing is hidden is not all wrong."
+)
 
 
 def _same(truth: str) -> Callable[[Row, Row], float]:
@@ -64,12 +72,16 @@ def report(rows: Sequence[Row], settings: Row, seed: int) -> str:
     singles = {name: own for name, own in groups.items() if name in EFFECTS}
     outside = {name: own for name, own in groups.items() if name in OUTSIDE}
     pairs = {name: own for name, own in groups.items() if "+" in name}
+    second = settings.get("truth") == "second"
+    title = "Hidden effects, second truth" if second else "Hidden effects"
     parts = [
-        f"# Hidden effects, {date.today()}\n\nRigs from seed {seed}, effects of {settings['rms_per_noise']:g} times "
+        f"# {title}, {date.today()}\n\nRigs from seed {seed}, effects of {settings['rms_per_noise']:g} times "
         f"the noise, {settings['slow_samples']} and {settings['fast_samples']} samples, commands in "
         f"{_HOLDS[settings.get('hold', 'first')]}, false alarms asked for "
         f"{settings['false_alarm']:g}, code {settings['code']}: {len(done)} of {len(rows)} rigs were diagnosed."
     ]
+    if second:
+        parts.append(_SECOND)
     if "none" in groups:
         parts.append(_none(groups["none"], settings["false_alarm"]))
     if singles:
@@ -81,8 +93,17 @@ def report(rows: Sequence[Row], settings: Row, seed: int) -> str:
     open_ = [row for row in done if row["hidden"] != "none" and row["causes"] and row["causes"][0]["also"]]
     if open_:
         parts.append(_again(open_))
+    parts.append(_heldout(done))
     parts.append(_undone([row for row in rows if "verdict" not in row]))
     return "\n\n".join(part for part in parts if part)
+
+
+def predicts_worse(row: Row) -> bool:
+    """Whether the causes predicted the held-out runs worse than the plain stage, beyond chance."""
+    if not row["causes"] or row.get("heldout_sd_um") is None:
+        return False
+    before_um, after_um = row["heldout_um"]
+    return bool(after_um - before_um > _WORSE * row["heldout_sd_um"])
 
 
 def outcome(row: Row, name: str) -> str:
@@ -260,6 +281,25 @@ def _again(rows: list[Row]) -> str:
         lines.append([*line, f"{again['predicted_z']:.1f}", after, "yes" if again["resolved"] else "no"])
     text = "## The suggested experiment, played on the same rig\n\nResolved: " + _share(resolved, len(rows))
     return text + "\n\n" + _table(["hidden", "seed", "before", "sd apart, predicted", "after", "resolved"], lines)
+
+
+def _heldout(done: list[Row]) -> str:
+    """Every rig whose held-out runs were predicted worse with the causes than without."""
+    asked = [row for row in done if row["causes"] and math.isfinite(row.get("heldout_sd_um") or math.nan)]
+    if not asked:
+        return ""
+    worse = [row for row in asked if predicts_worse(row)]
+    text = (
+        f"## Held-out runs\n\nPredicted worse with the causes than without, by more than {_WORSE:g} standard "
+        f"deviations: {_share(len(worse), len(asked))} of rigs with a cause."
+    )
+    lines = []
+    for row in worse:
+        named = ", ".join(cause["name"] for cause in row["causes"])
+        ratios = (f"{value_um / row['noise_um']:.3f}" for value_um in (*row["heldout_um"], row["heldout_sd_um"]))
+        lines.append([row["hidden"], str(row["seed"]), named, *ratios])
+    head = ["hidden", "seed", "causes", "before / noise", "after / noise", "sd of the difference / noise"]
+    return text + ("\n\n" + _table(head, lines) if lines else "")
 
 
 def _undone(rows: list[Row]) -> str:

@@ -8,7 +8,9 @@ per rig on one core.
 
     python benchmarks/hidden_effects.py --rigs 20 --seed 700 [--effects creep none creep+slew_limit] [--jobs 2]
 
-A row is replayed by `data_synth.hidden([effect], seed=seed)`.
+With `--truth second` the stage beneath the effects is never one of the library: few plays, a relaxation spectrum, a
+gain that depends on the amplitude, and coloured noise. A row is replayed by `data_synth.hidden([effect], seed=seed,
+truth=...)`.
 """
 
 import argparse
@@ -23,7 +25,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from _hidden_tables import report
+from _hidden_tables import predicts_worse, report
 
 PAIRS = (
     ("creep", "second_resonance"),
@@ -61,7 +63,8 @@ def hide(names: tuple[str, ...], seed: int, settings: dict[str, Any], temperatur
     import data_synth
 
     sizes = {name: settings[name] for name in ("rms_per_noise", "slow_samples", "fast_samples")}
-    return data_synth.hidden(names, seed=seed, temperature=temperature, hold=settings.get("hold", "first"), **sizes)
+    stage = {"hold": settings.get("hold", "first"), "truth": settings.get("truth", "first")}
+    return data_synth.hidden(names, seed=seed, temperature=temperature, **stage, **sizes)
 
 
 def read_back(bench: Any) -> tuple[list[Any], list[Any]]:
@@ -108,7 +111,7 @@ def answer(task: tuple[str, int, dict[str, Any]]) -> dict[str, Any]:
         return row | {"failed": f"{type(error).__name__}: {error}", "seconds": time.monotonic() - began}
     best = best_of(found.details["selection"].scores)
     gain = found.gain
-    return row | {
+    row |= {
         "seconds": time.monotonic() - began,
         "verdict": found.verdict,
         "found_noise_um": found.noise_um,
@@ -127,10 +130,12 @@ def answer(task: tuple[str, int, dict[str, Any]]) -> dict[str, Any]:
             for cause in found.causes
         ],
         "heldout_um": [float(gain.heldout_rms_before_um), float(gain.heldout_rms_after_um)],
+        "heldout_sd_um": float(gain.sd_of_difference_um),
         "remarks": list(found.remarks),
         "next_experiment": None if found.next_experiment is None else found.next_experiment.kind,
         "again": again,
     }
+    return row | {"heldout_worse": predicts_worse(row)}
 
 
 def play_next(
@@ -179,7 +184,7 @@ def words(row: dict[str, Any]) -> str:
     if "verdict" not in row:
         return row.get("refused") or row.get("failed") or ""
     named = ", ".join(" or ".join([c["name"], *c["also"]]) + f" {c['z']:.1f}" for c in row["causes"])
-    return f"{row['verdict']} {named}"
+    return f"{row['verdict']} {named}" + (", held-out runs predicted worse" if predicts_worse(row) else "")
 
 
 def main() -> None:
@@ -201,6 +206,7 @@ def main() -> None:
     parser.add_argument("--rms-per-noise", type=float, default=5.0, help="strength over the noise (default 5)")
     parser.add_argument("--samples", type=int, nargs=2, default=(4000, 8000), metavar=("SLOW", "FAST"))
     parser.add_argument("--hold", choices=["first", "zero"], default="first", help="command in lines, or in steps")
+    parser.add_argument("--truth", choices=["first", "second"], default="first", help="stage beneath the effects")
     parser.add_argument("--false-alarm", type=float, default=0.01)
     parser.add_argument("--jobs", type=int, default=2, help="rigs at a time (default 2)")
     parser.add_argument(
@@ -222,6 +228,8 @@ def main() -> None:
         "false_alarm": options.false_alarm,
         "hold": options.hold,
     }
+    if options.truth != "first":
+        settings["truth"] = options.truth
     plain = _NONE_PER_EFFECT * options.rigs if options.none is None else options.none
     counts = {name: plain if name == "none" else options.rigs for name in chosen}
     # Rig by rig, so that a study that is stopped has some of everything.

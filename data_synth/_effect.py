@@ -115,6 +115,8 @@ class Effect:
         Ranges of the other arguments, drawn evenly on a logarithmic scale, or words to choose from.
     outside
         Whether a library of effects to diagnose does not hold it.
+    own
+        Whether it is the stage's own way, as of the second truth of `hidden`, and no fault to be found.
     needs
         What must be there: `driver`, `mass` or `other_axis`.
     between
@@ -129,6 +131,7 @@ class Effect:
     limit: float
     draws: Mapping[str, Range]
     outside: bool
+    own: bool
     needs: str | None
     between: Mapping[str, tuple[float, float]]
 
@@ -171,6 +174,7 @@ def effect(
     draws: Mapping[str, Range] | None = None,
     *,
     outside: bool = False,
+    own: bool = False,
     needs: str | None = None,
     between: Mapping[str, tuple[float, float]] | None = None,
 ) -> Callable[[Function], Function]:
@@ -179,7 +183,7 @@ def effect(
     def enter(function: Function) -> Function:
         name = function.__name__
         REGISTRY[name] = Effect(
-            name, place, function, size, usual, limit, dict(draws or {}), outside, needs, dict(between or {})
+            name, place, function, size, usual, limit, dict(draws or {}), outside, own, needs, dict(between or {})
         )
         return function
 

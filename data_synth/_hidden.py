@@ -14,6 +14,7 @@ from data_synth._errors import ScenarioError
 from data_synth._plant import Hold
 from data_synth._rig import Kind
 from data_synth._scenario import PlantSettings, RigSettings, Run, Scenario, Segment
+from data_synth._second import Truth, second_truth
 from data_synth._sensor import Sensor
 from data_synth._strength import EffectSettings
 
@@ -36,8 +37,9 @@ def hidden(
     roughness: float | None = None,
     stroke_um: float | None = None,
     relays: int = 2000,
-    plays: int = 400,
+    plays: int | None = None,
     hold: Hold = "first",
+    truth: Truth = "first",
 ) -> Bench:
     """Draw a stage of 0 to 120 V, hide effects in it, and measure it.
 
@@ -68,14 +70,19 @@ def hidden(
     kind, roughness, stroke_um
         Of the hysteresis, as in `random_rig`; drawn if None. The stroke is drawn from 20 to 80 um.
     relays, plays
-        How fine the hysteresis is, as in `random_rig`.
+        How fine the hysteresis is, as in `random_rig`; 400 plays if None.
     hold
         Whether the command runs in lines between samples (`first`), or stays and jumps (`zero`).
+    truth
+        What stage there is beneath the effects. The `second` is in no library of models: 24 to 60 plays of random
+        radii and weights, a relaxation of eight exponential terms, a gain that depends on the amplitude, each 0.5 to
+        1 times as strong as the noise, and noise whose neighbours are correlated by 0.5 to 0.9. All is drawn; `kind`,
+        `roughness` and `plays` that are stated are kept.
 
     Returns
     -------
     Bench
-        Its `effects` hold the truth.
+        Its `effects` hold the truth: what is hidden first, and then the second truth's own.
 
     Raises
     ------
@@ -86,6 +93,8 @@ def hidden(
         seed = secrets.randbelow(2**32)
     if seed < 0:
         raise ScenarioError(f"the seed must be zero or positive, got {seed}")
+    if truth not in ("first", "second"):
+        raise ScenarioError(f"truth must be first or second, got {truth!r}")
     if min(slow_samples, fast_samples) < _LEAST_SAMPLES:
         raise ScenarioError(
             f"slow_samples and fast_samples must be {_LEAST_SAMPLES} or more, got {slow_samples} and {fast_samples}"
@@ -101,6 +110,13 @@ def hidden(
     has_room, has_axis = (extras.random(2) < 0.5).tolist()
     has_room = has_room if temperature is None else temperature
     has_axis = has_axis if other_axis is None else other_axis
+    second = None if truth == "first" else second_truth(np.random.default_rng((seed, 202)))
+    if second is not None:
+        kind, roughness, plays = (
+            kind or "plays",
+            1.0 if roughness is None else roughness,
+            second.plays if plays is None else plays,
+        )
     try:
         settings = tuple(
             EffectSettings(effect, {}, rms_per_noise) if isinstance(effect, str) else effect for effect in effects
@@ -130,13 +146,17 @@ def hidden(
                 upper_V=_UPPER_V,
                 stroke_um=stroke_um,
                 relays=relays,
-                plays=plays,
+                plays=400 if plays is None else plays,
                 roughness=drawn_roughness if roughness is None else roughness,
             ),
             runs=tuple(runs),
-            sensor=Sensor(noise_um=drawn_noise_um if noise_um is None else noise_um, quantum_um=1e-5),
+            sensor=Sensor(
+                noise_um=drawn_noise_um if noise_um is None else noise_um,
+                quantum_um=1e-5,
+                correlation=0.0 if second is None else second.correlation,
+            ),
             plant=PlantSettings(random=True, natural_frequency_Hz=frequency_Hz, hold=hold),
-            effects=settings,
+            effects=settings if second is None else (*settings, *second.effects),
             temperature=TemperatureSettings() if has_room else None,
             other_axis=OtherAxisSettings()
             if has_axis or any(REGISTRY[name].needs == "other_axis" for name in names)

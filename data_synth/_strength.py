@@ -86,7 +86,7 @@ class HiddenEffect:
     Attributes
     ----------
     name
-        One of `EFFECTS` or `OUTSIDE`.
+        One of `EFFECTS` or `OUTSIDE`, or of the second truth's own.
     parameters
         All arguments of its function.
     rms_um

@@ -56,6 +56,9 @@ def _csv(record: Record) -> str:
 
 
 def _truth(bench: Bench) -> str:
+    sensor = asdict(bench.scenario.sensor)
+    if not bench.scenario.sensor.correlation:  # white noise, as it was before there was any other
+        del sensor["correlation"]
     truth = {
         "schema": SCHEMA,
         "scenario": {"name": bench.scenario.name, "text": bench.scenario.text},
@@ -63,7 +66,7 @@ def _truth(bench: Bench) -> str:
         "rig": asdict(bench.rig),
         **({} if bench.plant is None else {"plant": asdict(bench.plant)}),
         **({"effects": [asdict(effect) for effect in bench.effects]} if bench.effects else {}),
-        "sensor": asdict(bench.scenario.sensor),
+        "sensor": sensor,
         "runs": {
             record.name: {
                 "history_V": record.history_V.tolist(),

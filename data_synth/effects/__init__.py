@@ -12,7 +12,7 @@ from data_synth._effect import REGISTRY
 for _found in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_found.name}")
 
-EFFECTS: tuple[str, ...] = tuple(sorted(name for name, entry in REGISTRY.items() if not entry.outside))
+EFFECTS: tuple[str, ...] = tuple(sorted(name for name, entry in REGISTRY.items() if not (entry.outside or entry.own)))
 """Effects that a library of diagnoses knows by these names."""
 
 OUTSIDE: tuple[str, ...] = tuple(sorted(name for name, entry in REGISTRY.items() if entry.outside))
