@@ -183,7 +183,11 @@ def test_hum_raises_no_bar_for_what_the_command_makes(rng):
 
 
 def test_no_cause_is_sought_once_the_time_is_over(rng):
-    case = made(rng, lambda bench, _: [one + 0.1 * np.gradient(one) for one in bench.plain])
+    def plant(bench, entering_um):
+        times = [np.asarray(one.run.record.time_s) for one in bench.prepared]
+        return [np.interp(t - 3e-4, t, p) for t, p in zip(times, bench.plain, strict=True)]
+
+    case = made(rng, plant)
     probes = asked(case, "transport_delay")
     found = select(case.bench, case.projector, probes, 0.01, rng, lambda _: None, has_time=lambda: False)
     assert found.causes == ()
