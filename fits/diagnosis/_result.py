@@ -44,10 +44,10 @@ class FoundCause:
     """One effect that the records need.
 
     `form` names its model if there are several, and `also_consistent` the effects that these records cannot tell from
-    it. `z` is the evidence in standard deviations, and `p_family` the probability that chance gives any effect as much
-    where there is none. `share_of_misfit` is the part that it explains of the reproducible variance that the plain
-    stage leaves, and `rms_um` the size of what it changes after the plain stage followed as far as it can. The last
-    three are sentences about the effect.
+    it. `z` is the evidence in standard deviations, and `p_family` the probability that chance gives any effect as
+    much where there is none. `share_of_misfit` is the part that it explains of the reproducible variance that the
+    plain stage leaves, and `rms_um` the size of what it changes after the plain stage followed as far as it can. The
+    last three are sentences about the effect.
     """
 
     name: str
@@ -67,8 +67,8 @@ class FoundCause:
 class Bound:
     """An effect that was not found, and how large it may still be.
 
-    `z` is the evidence for it beside the causes, in standard deviations; `absorbed_fraction` the part of its size that
-    the plain stage follows, so that the records cannot show it; and `bound_um` the root mean square in the
+    `z` is the evidence for it beside the causes, in standard deviations; `absorbed_fraction` the part of its size
+    that the plain stage follows, so that the records cannot show it; and `bound_um` the root mean square in the
     displacement, before anything follows, that it does not exceed at 95 %. They are NaN where it was not asked about,
     for a `reason`, which is empty otherwise.
     """
@@ -104,8 +104,8 @@ class Test:
 class Gain:
     """What the extension is worth on data that were not used; NaN where nothing was held out.
 
-    Errors on the held-out data, which `source` describes, are those of the plain stage before, and of the extended one
-    after; `sd_of_difference_um` is the standard deviation of the difference of the root mean squares. Of the
+    Errors on the held-out data, which `source` describes, are those of the plain stage before, and of the extended
+    one after; `sd_of_difference_um` is the standard deviation of the difference of the root mean squares. Of the
     feedforward they are root mean squares of the displacement of the extended stage, under voltages from the inverse
     of the plain one and from its own.
     """
@@ -166,10 +166,10 @@ class Diagnosis:
     The verdict is `unexplained` where something is left that no effect of the library explains, of the size
     `unexplained_rms_um` as far as it is reproducible. `noise_um` is the noise floor, learnt from `noise_source`, and
     `noise_samples` the samples that are worth one independent one. The `causes` are in order of importance, and
-    `upper_bounds` are those of all other effects; `tests` are of the plain stage's residual, and `gain` is on held-out
-    data. `next_experiment` is None where nothing would help. `baseline` is the plain stage and `extended` the one with
-    the causes, the same where there are none; of the `runs` those that were held out come last. `false_alarm` is the
-    probability of naming a cause where there is none.
+    `upper_bounds` are those of all other effects; `tests` are of the plain stage's residual, and `gain` is on
+    held-out data. `next_experiment` is None where nothing would help. `baseline` is the plain stage and `extended`
+    the one with the causes, the same where there are none; of the `runs` those that were held out come last.
+    `false_alarm` is the probability of naming a cause where there is none.
     """
 
     verdict: Verdict
