@@ -22,8 +22,8 @@ from microid.effects import card_of
 
 # Samples of a program: as many as are simulated some twenty times in a bearable time.
 _MOST_SAMPLES = 4096
-# A short program is repeated, so often at most, until it tells the suspects apart by so many standard deviations.
-_MOST_REPEATS, _ENOUGH_Z = 4, 12.0
+# A short program is repeated until it tells the suspects apart by so many standard deviations, so often at most.
+_ENOUGH_Z, _OVER = 12.0, {2: "twice", 3: "three times", 4: "four times"}
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
 # The shortest of the programs that are at least this part as good as the best is taken.
@@ -32,10 +32,8 @@ _NEARLY_BEST = 0.95
 _LEAST_GAIN = 1.02
 # Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
 _PROBE, _LENGTHS = 0.05, (0.4, 0.15)
-_ROUNDS = 2
 # Below so many standard deviations effects are not told apart.
 _TOLD_APART = 3.0
-_OVER = {2: "twice", 3: "three times", 4: "four times"}
 # Names, hypotheses, and which is compared with which.
 Question: TypeAlias = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
 
@@ -82,7 +80,6 @@ def suggest(
     if limits is None:
         return None
     predictor = Predictor(found.bench, found.projector, hypotheses, pairs)
-    present_z = predictor.present_z
     programs = guard.menu(limits, _MOST_SAMPLES)
     if not programs:
         return None
@@ -103,47 +100,34 @@ def suggest(
         return asked.predicted_z(*played) if guard.allows(played) else float("nan")
 
     parameters, z = refine(program, gain, z)
-    time_s, voltage_V = program.samples(parameters)
-    times, once = 1, (time_s, voltage_V)
-    most = min(_MOST_REPEATS, int(limits.duration_s / (1.1 * program.limits.duration_s)))
-    while times < most and z < _ENOUGH_Z:
-        longer = repeated(program.limits, once, times + 1)
-        if not guard.allows(longer):
+    once, words = program.samples(parameters), program.words
+    played, most = once, int(limits.duration_s / (1.1 * program.limits.duration_s))
+    for times, over in _OVER.items():
+        longer = repeated(program.limits, once, times)
+        if times > most or z >= _ENOUGH_Z or not guard.allows(longer):
             break
-        times += 1
-        time_s, voltage_V = longer
-        z = asked.predicted_z(time_s, voltage_V)
+        played, words = longer, f"{program.words}, {over} over"
+        z = asked.predicted_z(*played)
     if asked is not predictor:
-        z = predictor.predicted_z(time_s, voltage_V)
+        z = predictor.predicted_z(*played)
     # What tells nothing is not worth playing, but for a further column.
+    present_z = predictor.present_z
     if not column and (z < 1.0 or z < _LEAST_GAIN * present_z):
         return None
-    words = program.words if times < 2 else f"{program.words}, {_OVER[times]} over"
     purpose = _purpose(names, z, present_z, column)
-    extremes = guard.extremes((time_s, voltage_V))
-    return Experiment(time_s, voltage_V, words, purpose, names, z, present_z, column, extremes)
+    return Experiment(*played, words, purpose, names, z, present_z, column, guard.extremes(played))
 
 
 def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, ...]) -> Question | None:
     """What is to be decided: names, hypotheses, and which is compared with which."""
     named = {cause.name for cause in causes}
-    best = Hypothesis(found.model.laws, found.model.x, _covariances(found.model))
+    best = _hypothesis(found.model)
     for at, cause in enumerate(found.causes):
-        if cause.name not in named or not cause.rivals:
-            continue
-        rivals = cause.rivals[:MOST_RIVALS]
-        others = [
-            Hypothesis(
-                (*best.laws[:at], rival.refit.laws[-1], *best.laws[at + 1 :]),
-                (*best.x[:at], rival.refit.x[-1], *best.x[at + 1 :]),
-                (*best.covariances[:at], _last_covariance(rival.refit), *best.covariances[at + 1 :]),
-            )
-            for rival in rivals
-            # Another cause may have turned out to be the rival.
-            if rival.name not in {c.name for i, c in enumerate(found.causes) if i != at}
-        ]
-        if others:
-            every = (best, *others)
+        # Another cause may have turned out to be the rival.
+        taken = {other.name for k, other in enumerate(found.causes) if k != at}
+        rivals = [rival for rival in cause.rivals[:MOST_RIVALS] if rival.name not in taken]
+        if cause.name in named and rivals:
+            every = (best, *(_with_last(best, at, _hypothesis(rival.refit)) for rival in rivals))
             # The cause and each rival, be the one or the other true: rivals among themselves may be alike for ever.
             pairs = tuple(pair for k in range(1, len(every)) for pair in ((0, k), (k, 0)))
             return tuple(h.names[at] for h in every), every, pairs
@@ -161,17 +145,18 @@ def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, .
     return (leading.name,), (Hypothesis((law,), (law.start,)), nothing), ((0, 1),)
 
 
-def _covariances(model: Refit) -> tuple[np.ndarray, ...]:
-    """Covariance of the coordinates of each effect of a model."""
+def _hypothesis(model: Refit) -> Hypothesis:
+    """The effects of a model."""
     whole, stops = model.covariance(), np.cumsum([law.size for law in model.laws])
     blocks = [slice(stop - law.size, stop) for law, stop in zip(model.laws, stops, strict=True)]
-    return tuple(whole[block, block] for block in blocks)
+    return Hypothesis(model.laws, model.x, tuple(whole[block, block] for block in blocks))
 
 
-def _last_covariance(model: Refit) -> np.ndarray:
-    """The same of the last effect alone: those before it may only have followed along their tangent."""
-    size = model.laws[-1].size
-    return model.covariance()[-size:, -size:]
+def _with_last(best: Hypothesis, at: int, other: Hypothesis) -> Hypothesis:
+    """The best with the last effect of another instead of one; what is before it may only have followed."""
+    laws = *best.laws[:at], other.laws[-1], *best.laws[at + 1 :]
+    x = *best.x[:at], other.x[-1], *best.x[at + 1 :]
+    return Hypothesis(laws, x, (*best.covariances[:at], other.covariances[-1], *best.covariances[at + 1 :]))
 
 
 def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) -> tuple[np.ndarray, float]:
@@ -182,14 +167,13 @@ def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) 
     """
     span = program.upper - program.lower
     best, top = program.start.copy(), first
-    for _ in range(_ROUNDS):
+    for _ in range(2):
         slope = np.zeros(len(best))
         for k in np.flatnonzero(span > 0):
             ahead = best.copy()
             # Towards the middle, so that a step is never cut off.
             ahead[k] += span[k] * (_PROBE if best[k] < (program.lower + program.upper)[k] / 2 else -_PROBE)
-            there = gain(ahead)
-            if not np.isnan(there):
+            if not np.isnan(there := gain(ahead)):
                 slope[k] = np.log(max(there, 1e-12) / max(top, 1e-12)) * span[k] / (ahead[k] - best[k])
         size = float(np.max(np.abs(slope)))
         if size == 0:
@@ -198,21 +182,21 @@ def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) 
         gains = [gain(p) for p in tried]
         if np.isnan(gains).all():
             break
-        longest = int(np.nanargmax(gains))
-        if gains[longest] <= top:
+        highest = int(np.nanargmax(gains))
+        if gains[highest] <= top:
             break
-        best, top = tried[longest], gains[longest]
+        best, top = tried[highest], gains[highest]
     return best, top
 
 
 def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> str:
-    words = [name.replace("_", " ") for name in names]
-    if len(words) == 1:
+    *others, last = (name.replace("_", " ") for name in names)
+    if not others:
         return (
-            f"It would show {words[0]} of the size that is suspected by {z:.1f} standard deviations, where the "
-            f"records at hand show it by {present:.1f}."
+            f"It would show {last} of the size that is suspected by {z:.1f} standard deviations, where the records "
+            f"at hand show it by {present:.1f}."
         )
-    listed = " and ".join([", ".join(words[:-1]), words[-1]])
+    listed = f"{', '.join(others)} and {last}"
     if z < _TOLD_APART and column:
         return f"No program within the limits tells {listed} apart by itself: record this one with a further column."
     if z < _TOLD_APART:

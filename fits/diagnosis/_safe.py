@@ -58,10 +58,9 @@ class Guard:
         return not any(beyond(compared(ranges, self.limits)) for ranges in self._each(program))
 
     def _each(self, program: Samples) -> Iterable[Ranges]:
-        time_s, voltage_V = program
-        record = next_record(time_s, voltage_V, self._like.extra)
+        record = next_record(*program, self._like)
         # Relays that the program does not reach may have been left in any state.
-        whole = voltage_V[0] <= self._range_V[0]
+        whole = program[1][0] <= self._range_V[0]
         for model in self.models:
             for state in ("negative",) if whole else ("negative", "positive"):
                 ranges, _ = motion(model.stage, record, self._range_V, state)
