@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import takewhile
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 from fits.diagnosis._baseline import Baseline, with_effects
 from fits.io._record import Record
 from fits.stage._motion import Prepared, pass_signal, prepare, programs, signals
-from microid import AbstractEffect, Coordinates, Sensor, Signal, Stage
+from microid import AbstractEffect, Coordinates, Sensor, Signal
 
 # Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
 _LONG, _MANY = 20_000, 400
@@ -44,10 +45,17 @@ class Bench:
 
     def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
         """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
-        return [
-            _respond(with_effects(self.stage, self._seen(acting, one)), self.stage, known, one)
-            for acting, known, one in zip(effects, self.known, self.prepared, strict=True)
-        ]
+        out = []
+        for acting, known, one in zip(effects, self.known, self.prepared, strict=True):
+            stage = with_effects(self.stage, self._seen(acting, one))
+            # Up to the first part that is another, the signal is known.
+            pairs = zip(stage.parts, self.stage.parts, strict=False)
+            same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], pairs))
+            signal = known[same]
+            for part in stage.parts[same:]:
+                signal = pass_signal(part, one.time_s, signal, one.scene)
+            out.append(at_samples(signal, one))
+        return out
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
         """Those that a run may be asked about: none that is its own and too fast for its samples."""
@@ -57,23 +65,10 @@ class Bench:
         asked = [effect for effect in effects if slow or not (effect.fast and effect.per_run)]
         return [without_drifts(effect, interval_s, record.duration_s) for effect in asked]
 
-    def change(
-        self, effects: Sequence[AbstractEffect], before: Sequence[np.ndarray] | None = None
-    ) -> list[np.ndarray]:
+    def change(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
         """What effects that all runs share change in them, in um."""
-        out = self.respond([list(effects)] * len(self.prepared))
-        return [a - b for a, b in zip(out, self.plain if before is None else before, strict=True)]
-
-
-def _respond(stage: Stage, base: Stage, known: Sequence[Signal], prepared: Prepared) -> np.ndarray:
-    """Response of a stage that differs from a simulated one from some part on, in um, shape `(n,)`."""
-    same = 0
-    while same < min(len(stage.parts), len(base.parts)) and stage.parts[same] is base.parts[same]:
-        same += 1
-    signal = known[same]
-    for part in stage.parts[same:]:
-        signal = pass_signal(part, prepared.time_s, signal, prepared.scene)
-    return at_samples(signal, prepared)
+        out = self.respond([effects] * len(self.prepared))
+        return [a - b for a, b in zip(out, self.plain, strict=True)]
 
 
 def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:
