@@ -1,6 +1,6 @@
 """The next experiment: the voltage program that would tell apart best what the records leave open."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -15,9 +15,10 @@ from fits.diagnosis._result import Experiment, FoundCause
 from fits.diagnosis._safe import guard_of
 from fits.diagnosis._score import best_of, law_of
 from fits.diagnosis._select import Selection
-from fits.io._limits import MARGIN
+from fits.io._limits import MARGIN, RangeMap
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
+from fits.loop._run import Progress
 from microid.effects import card_of
 
 # Samples of a program: as many as are simulated some twenty times in a bearable time.
@@ -47,16 +48,12 @@ class Request:
     """
 
     duration_s: float | None = None
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    limits: RangeMap = field(default_factory=dict)
     margin: float = MARGIN
 
 
 def suggest(
-    ready: Prepared,
-    found: Selection,
-    causes: tuple[FoundCause, ...],
-    request: Request,
-    progress: Callable[[str], None],
+    ready: Prepared, found: Selection, causes: tuple[FoundCause, ...], request: Request, progress: Progress
 ) -> Experiment | None:
     """Choose and refine the program that decides best what is open.
 

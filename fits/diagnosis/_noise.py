@@ -49,13 +49,10 @@ def floor_of(run: Run, residual_um: np.ndarray, settling_s: float, thresholds: T
     for stretch in idle_stretches(run.record.voltage_V, round(settling_s * run.rate_Hz)):
         piece = residual_um[stretch]
         time = np.linspace(-1, 1, len(piece))
-        order = min(3, len(piece) // 12)
         # What settles is no noise.
-        pieces.append(piece - np.polyval(np.polyfit(time, piece, order), time))
-    count = sum(len(piece) for piece in pieces)
-    if count >= _IDLE:
+        pieces.append(piece - np.polyval(np.polyfit(time, piece, min(3, len(piece) // 12)), time))
+    if sum(len(piece) for piece in pieces) >= _IDLE:
         pieces = _without_mains(pieces, 1 / run.rate_Hz, 1 - thresholds.minor_share)
-        count = sum(len(piece) for piece in pieces)
         joined = np.concatenate(pieces)
         if (rough_um := rough_noise_um(joined)) > 0:
             joined = joined[np.abs(joined) < 8 * rough_um + 1e-300]
@@ -63,8 +60,8 @@ def floor_of(run: Run, residual_um: np.ndarray, settling_s: float, thresholds: T
         level = float(np.std(joined)) * (len(joined) / max(len(joined) - freedom, 1)) ** 0.5
         correlation = float(np.mean(joined[1:] * joined[:-1]) / max(np.mean(joined**2), 1e-300))
         if level > 0:
-            white = abs(correlation) * len(joined) ** 0.5 <= thresholds.apart_z
-            return Floor(_white(level) if white else learn_noise(joined, freedom), len(joined))
+            correlated = abs(correlation) * len(joined) ** 0.5 > thresholds.apart_z
+            return Floor(learn_noise(joined, freedom) if correlated else _white(level), len(joined))
     used = residual_um[run.fitted]
     return Floor(_white(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um)))), 0)
 

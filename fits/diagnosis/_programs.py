@@ -134,72 +134,56 @@ def repeated(limits: Limits, samples: Samples, times: int) -> Samples:
     return limits.interval_s * np.arange(len(whole_V)), whole_V
 
 
-def idle(limits: Limits, bias_V: float, approach_s: float) -> Samples:
-    """Rest at a voltage that is come to in some time."""
-    path = Path(limits)
-    path.within(bias_V, approach_s)
-    return path.samples()
-
-
-def staircase(limits: Limits, low_V: float, high_V: float, decades: float) -> Samples:
+def staircase(path: Path, low_V: float, high_V: float, decades: float) -> None:
     """Levels up and down, held for times that are spread over some decades, long ones among short ones."""
-    path = Path(limits)
     levels = np.r_[np.linspace(low_V, high_V, 5), np.linspace(high_V, low_V, 5)[1:]]
     holds = np.logspace(-decades, 0, len(levels))[[4, 0, 6, 2, 8, 1, 7, 3, 5]]
-    travel = float(np.abs(np.diff(np.r_[limits.lower_V, levels])).sum()) / limits.fastest_V_per_s
+    travel = float(np.abs(np.diff(np.r_[path.limits.lower_V, levels])).sum()) / path.limits.fastest_V_per_s
     free = max(path.left_s - travel, 0.0)
     for level, hold in zip(levels, holds / holds.sum(), strict=True):
         path.to(float(level))
         path.rest(free * hold)
-    return path.samples()
 
 
-def chirps(limits: Limits, bias_V: float, spread_V: float, amplitude_V: float, stop_Hz: float) -> Samples:
+def chirps(path: Path, bias_V: float, spread_V: float, amplitude_V: float, stop_Hz: float) -> None:
     """Chirps of three amplitudes at three biases each, from a thirtieth of the highest frequency."""
-    path = Path(limits)
-    biases = [limits.inside(bias_V + shift * spread_V) for shift in (-1, 0, 1)]
+    biases = [path.limits.inside(bias_V + shift * spread_V) for shift in (-1, 0, 1)]
     approach = 0.03 * path.left_s
-    each = path.left_s / 9 - approach / 3 - 2 * amplitude_V / limits.fastest_V_per_s
+    each = path.left_s / 9 - approach / 3 - 2 * amplitude_V / path.limits.fastest_V_per_s
     for bias in biases:
         path.within(bias, approach)
         for share in (0.25, 1.0, 0.5):
-            path.chirp(share * amplitude_V, stop_Hz / 30, stop_Hz, max(each, 2 * limits.interval_s))
-    return path.samples()
+            path.chirp(share * amplitude_V, stop_Hz / 30, stop_Hz, max(each, 2 * path.limits.interval_s))
 
 
-def multirate(limits: Limits, low_V: float, high_V: float, decades: float) -> Samples:
+def multirate(path: Path, low_V: float, high_V: float, decades: float) -> None:
     """The same loop at five rates, which are spread over some decades."""
-    path = Path(limits)
-    path.within(low_V, 0.02 * limits.duration_s)
+    path.within(low_V, 0.02 * path.limits.duration_s)
     ratios = np.logspace(0, -decades, 5)
     # Quick loops are repeated, to take a tenth of the slowest one.
     counts = [max(1, round(0.1 / ratio)) for ratio in ratios]
     slowest = path.left_s / float(np.sum(ratios * counts))
     for ratio, count in zip(ratios, counts, strict=True):
-        half = max(ratio * slowest / 2, _PER_PERIOD / 2 * limits.interval_s)
+        half = max(ratio * slowest / 2, _PER_PERIOD / 2 * path.limits.interval_s)
         for _ in range(count):
             path.within(high_V, half)
             path.within(low_V, half)
-    return path.samples()
 
 
-def minor_loops(limits: Limits, bias_V: float, amplitude_V: float) -> Samples:
+def minor_loops(path: Path, bias_V: float, amplitude_V: float) -> None:
     """Ten minor loops about a bias that is reached from below, and ten after it is reached from above."""
-    path = Path(limits)
-    low, high = limits.inside(bias_V - amplitude_V), limits.inside(bias_V + amplitude_V)
-    approach = limits.span_V / (0.06 * path.left_s)
+    low, high = path.limits.inside(bias_V - amplitude_V), path.limits.inside(bias_V + amplitude_V)
+    approach = path.limits.span_V / (0.06 * path.left_s)
     half = 0.9 * path.left_s / 40
-    for end, first, second in ((limits.lower_V, high, low), (limits.upper_V, low, high)):
+    for end, first, second in ((path.limits.lower_V, high, low), (path.limits.upper_V, low, high)):
         path.to(end, approach)
         for _ in range(10):
             path.within(first, half)
             path.within(second, half)
-    return path.samples()
 
 
-def repeat_after_wait(limits: Limits, low_V: float, high_V: float, wait_s: float) -> Samples:
+def repeat_after_wait(path: Path, low_V: float, high_V: float, wait_s: float) -> None:
     """The same loop and hold twice, with a rest at the lower voltage between."""
-    path = Path(limits)
     wait_s = min(wait_s, 0.8 * path.left_s)
     each = (path.left_s - wait_s) / 2
     for last in (False, True):
@@ -208,55 +192,50 @@ def repeat_after_wait(limits: Limits, low_V: float, high_V: float, wait_s: float
         path.within(low_V, 0.15 * each)
         path.within((low_V + high_V) / 2, 0.1 * each)
         path.rest(0.15 * each)
-        path.within(limits.lower_V, 0.1 * each)
+        path.within(path.limits.lower_V, 0.1 * each)
         if not last:
             path.rest(wait_s)
-    return path.samples()
 
 
-def steps(limits: Limits, base_V: float, height_V: float, decade: float) -> Samples:
+def steps(path: Path, base_V: float, height_V: float, decade: float) -> None:
     """Steps of three heights from a voltage near the bottom, over and over, with edges as fast as the rig.
 
     Each level is held for `10**decade` seconds, and four samples at least.
     """
-    path = Path(limits)
-    path.within(base_V, 0.03 * limits.duration_s)
-    dwell_s = max(10.0**decade, 4 * limits.interval_s)
+    path.within(base_V, 0.03 * path.limits.duration_s)
+    dwell_s = max(10.0**decade, 4 * path.limits.interval_s)
     heights = (height_V, height_V / 4, height_V / 2)
     for k in range(int(path.left_s / dwell_s) + 1):
         path.to(base_V + (heights[k // 2 % 3] if k % 2 == 0 else 0.0))
         path.rest(dwell_s)
-    return path.samples()
 
 
-def burst(limits: Limits, amplitude_V: float, burst_s: float, period_s: float) -> Samples:
+def burst(path: Path, amplitude_V: float, burst_s: float, period_s: float) -> None:
     """A slow loop, hard driving about the middle for some time, and the same loop twice again."""
-    path = Path(limits)
     burst_s = min(burst_s, 0.6 * path.left_s)
     loop = (path.left_s - burst_s) / 3.2
-    middle = (limits.lower_V + limits.upper_V) / 2
-    half = max(period_s / 2, _PER_PERIOD / 2 * limits.interval_s, 2 * amplitude_V / limits.fastest_V_per_s)
+    middle = (path.limits.lower_V + path.limits.upper_V) / 2
+    half = max(period_s / 2, _PER_PERIOD / 2 * path.limits.interval_s, 2 * amplitude_V / path.limits.fastest_V_per_s)
     for k in range(3):
-        path.within(limits.upper_V, loop / 2)
-        path.within(limits.lower_V, loop / 2)
+        path.within(path.limits.upper_V, loop / 2)
+        path.within(path.limits.lower_V, loop / 2)
         if k == 0:
             for _ in range(int(burst_s / (2 * half))):
                 path.within(middle + amplitude_V, half)
                 path.within(middle - amplitude_V, half)
-            path.within(limits.lower_V, 0.05 * loop)
-    return path.samples()
+            path.within(path.limits.lower_V, 0.05 * loop)
 
 
 @dataclass(frozen=True)
 class Program:
-    """One program of the menu: `play` makes times and command from limits of the rig and parameters.
+    """One program of the menu: `play` draws a path by parameters.
 
     `lower`, `upper` and `start` are of the parameters, in the order that `play` takes them, shape `(k,)`; `words` say
     what it is made of.
     """
 
     words: str
-    play: Callable[..., Samples]
+    play: Callable[..., None]
     limits: Limits
     lower: np.ndarray
     upper: np.ndarray
@@ -264,7 +243,9 @@ class Program:
 
     def samples(self, parameters: np.ndarray) -> Samples:
         """Times and command at parameters, which are brought into their limits."""
-        return self.play(self.limits, *np.clip(parameters, self.lower, self.upper).tolist())
+        path = Path(self.limits)
+        self.play(path, *np.clip(parameters, self.lower, self.upper).tolist())
+        return path.samples()
 
 
 def menu(limits: Limits, most: int) -> tuple[Program, ...]:
@@ -279,14 +260,13 @@ def menu(limits: Limits, most: int) -> tuple[Program, ...]:
         fine = pace.interval_s < 1.5 * limits.interval_s
         whole = pace.duration_s > 0.7 * limits.duration_s
         for words, play, table in _entries(pace):
-            if not (play is multirate or (fine if play in (chirps, steps) else whole)):
-                continue
-            lower, start, upper = np.array(table).T
-            found.append(Program(words, play, pace, lower, upper, np.clip(start, lower, upper)))
+            if play is multirate or (fine if play in (chirps, steps) else whole):
+                lower, start, upper = np.array(table).T
+                found.append(Program(words, play, pace, lower, upper, np.clip(start, lower, upper)))
     return tuple(found)
 
 
-def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[np.ndarray | tuple[float, ...]]]]:
+def _entries(limits: Limits) -> list[tuple[str, Callable[..., None], list[np.ndarray | tuple[float, ...]]]]:
     """Words, function, and of each parameter the least, the first and the largest value."""
     low, span, whole = limits.lower_V, limits.span_V, limits.duration_s
     places = ((0.0, 0.1, 0.4), (0.2, 0.5, 0.8), (0.6, 0.95, 1.0), (0.0, 0.5, 1.0))
@@ -305,7 +285,7 @@ def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[np.
     shortest, longest = float(np.log10(4 * limits.interval_s)), max(ringing + 1, float(np.log10(0.05 * whole)))
     quick = "fast steps of three heights near the bottom"
     return [
-        ("a rest after one loop", idle, [anywhere, approach]),
+        ("a rest after one loop", Path.within, [anywhere, approach]),
         ("a staircase up and down with long and short holds", staircase, [bottom, top, (0.3, 1.5, 2.5)]),
         ("chirps of three amplitudes at three biases", chirps, [bias, spread, amplitude, stop]),
         ("the same loop at five rates over two decades", multirate, [bottom, top, (1.0, 2.0, 2.3)]),

@@ -1,6 +1,6 @@
 """Programs that stay inside the limits of a rig, whichever of the stages that the records allow is the true one."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._programs import Limits, Path, Program, Samples, menu
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._select import Selection
-from fits.io._limits import Extreme, Ranges, allowed, beyond, compared, joined
+from fits.io._limits import Extreme, RangeMap, Ranges, allowed, beyond, compared, joined
 from fits.io._record import Record
 from fits.loop._run import known_samples
 from fits.stage._motion import motion, reached_by
@@ -96,12 +96,7 @@ class Guard:
 
 
 def guard_of(
-    ready: Prepared,
-    found: Selection,
-    hypotheses: Sequence[Hypothesis],
-    stated: Mapping[str, tuple[float, float]],
-    margin: float,
-    seed: int = 0,
+    ready: Prepared, found: Selection, hypotheses: Sequence[Hypothesis], stated: RangeMap, margin: float
 ) -> Guard:
     """Make a guard of what a diagnosis knows, with stages drawn from what the records leave open.
 
@@ -118,7 +113,7 @@ def guard_of(
     assert like.displacement_um is not None
     # As the sensor of the first record would have read it.
     read_um = like.displacement_um - offsets_um[longest] + offsets_um[0]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
 
     def model(stage: Stage) -> Model:
         _, own_um = motion(stage, like, baseline.range_V)

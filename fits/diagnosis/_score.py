@@ -117,9 +117,8 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
 
 def one_sided(form: type[AbstractEffect]) -> bool:
     """Whether the strength of an effect cannot be negative."""
-    fields = form.__dataclass_fields__
-    specs = [spec_of(fields[name]) for name in form.strength]
-    return not specs or all(spec is not None and spec.lower >= 0 for spec in specs)
+    specs = [spec_of(form.__dataclass_fields__[name]) for name in form.strength]
+    return all(spec is not None and spec.lower >= 0 for spec in specs)
 
 
 @dataclass(frozen=True)
