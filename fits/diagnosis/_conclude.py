@@ -147,7 +147,7 @@ def conclude(
         )
     faults = _standing(ready.faults, beside, extension.compared, thresholds.spike_z) if kept else ready.faults
     named = name_faults(faults, cyclic, thresholds)
-    causes = causes_of(kept, model, found.projector, found.bench, misfit.total, named, ready.faults)
+    causes = causes_of(kept, model, found, misfit.total, named, ready.faults)
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)
         remarks.append(held.sentence)

@@ -69,7 +69,7 @@ def suggest(
     if question is None:
         return None
     names, hypotheses, pairs = question
-    progress("looking for the experiment that tells " + (" from ".join(names) if len(names) > 1 else names[0]))
+    progress(f"looking for the experiment that tells {' from '.join(names)}")
     baseline = ready.baseline
     guard = guard_of(ready, found, hypotheses, request.limits, request.margin)
     records = [run.record for run in baseline.runs]
@@ -87,9 +87,8 @@ def suggest(
         # Only the column tells: what shows the first of them best is played with it.
         asked = Predictor(found.bench, found.projector, (hypotheses[0], hypotheses[0].without(names[0])), ((0, 1),))
         scores = [asked.predicted_z(*program.samples(program.start)) for program in programs]
-    near = [k for k, z in enumerate(scores) if z >= _NEARLY_BEST * max(scores)]
-    chosen = min(near, key=lambda k: (programs[k].limits.duration_s, -scores[k]))
-    program, z = programs[chosen], scores[chosen]
+    near = [(one, z) for one, z in zip(programs, scores, strict=True) if z >= _NEARLY_BEST * max(scores)]
+    program, z = min(near, key=lambda one: (one[0].limits.duration_s, -one[1]))
     progress(f"refining {program.words}")
 
     def gain(parameters: np.ndarray) -> float:

@@ -36,17 +36,12 @@ _FAR_Z, _FAR_WITHIN = 3.0, 1.4
 
 
 def causes_of(
-    causes: Sequence[Cause],
-    model: Refit,
-    projector: Projector,
-    bench: Bench,
-    misfit: float,
-    faults: Sequence[Fault],
-    noise: Faults,
+    causes: Sequence[Cause], model: Refit, beside: Selection, misfit: float, faults: Sequence[Fault], noise: Faults
 ) -> tuple[FoundCause, ...]:
     """Describe the causes, the most important first: by the misfit that each removes."""
     found: dict[str, FoundCause] = {}
     weight: defaultdict[str, float] = defaultdict(float)
+    bench, projector = beside.bench, beside.projector
     covariance, at = model.covariance(), 0
     total = float(np.mean([n.total_um**2 for n in projector.noise]))
     for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
@@ -122,21 +117,20 @@ def _parameters(
         for away, there in along:
             moved = law.values(there, run)
             below, above = np.maximum(below, (values - moved) / away), np.maximum(above, (moved - values) / away)
-        mine = []
+        mine: list[EffectParameter] = []
         for info, place in law.entries:
             differs = runs > 1 and info.path in law.form.strength
             # What went on before a run is no property of the rig.
-            for at in range(place.start, place.stop) if info.path not in law.form.history else ():
+            if info.path in law.form.history or (run and not differs):
+                continue
+            for at in range(place.start, place.stop):
                 name = info.path if place.stop - place.start == 1 else f"{info.path}[{at - place.start}]"
                 value, less, more = float(values[at]), float(below[at]), float(above[at])
                 low = max(value - TWO_SIDED_95 * less, info.spec.lower)
                 high = min(value + TWO_SIDED_95 * more, info.spec.upper)
                 name = f"{name} in run {run + 1}" if differs else name
                 one = EffectParameter(name, value, max(less, more), info.spec.unit, low, high)
-                if differs:
-                    mine.append(one)
-                elif run == 0:
-                    shared.append(one)
+                (mine if differs else shared).append(one)
         own.append(mine)
     # At its bound a strength has no standard deviation to speak of: a run without the effect says nothing of it.
     showing = [mine for mine in own if any(abs(one.value) > _SHOWS * one.sd for one in mine)] or own

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
@@ -46,6 +45,11 @@ class Hypothesis:
         kept = [k for k, other in enumerate(self.names) if other != name]
         return Hypothesis(tuple(self.laws[k] for k in kept), tuple(self.x[k] for k in kept))
 
+    def alone(self, run: int) -> "Hypothesis":
+        """The same in one run only."""
+        laws = tuple(Law([law.effect(x, run)], law.remembers) for law, x in zip(self.laws, self.x, strict=True))
+        return Hypothesis(laws, tuple(law.vector(x, run) for law, x in zip(self.laws, self.x, strict=True)))
+
     def effects(self, run: int) -> list[AbstractEffect]:
         """The effects as they are in one run."""
         return [law.effect(x, run) for law, x in zip(self.laws, self.x, strict=True)]
@@ -74,10 +78,9 @@ class Predictor:
     ):
         self.bench, self.projector = bench, projector
         self.hypotheses, self.pairs = tuple(hypotheses), tuple(pairs)
-        self._runs = range(len(bench.prepared))
         # Where an effect differs from run to run, it will be as it was in the longest.
         self._like = int(np.argmax([one.run.record.duration_s for one in bench.prepared]))
-        self._vectors = [[law.vector(x, self._like) for law, x in zip(h.laws, h.x, strict=True)] for h in hypotheses]
+        self._next = [h.alone(self._like) for h in hypotheses]
         self._kinds = [kind for kind, size in enumerate(projector.roughness) if size > 0]
         regression = projector.regression
         self._shared = regression.size + sum(regression.finer[kind][0].shape[1] for kind in self._kinds)
@@ -101,7 +104,7 @@ class Predictor:
         projector = self.projector
         if k == 0:
             return projector
-        effects = [self.hypotheses[k].effects(run) for run in self._runs]
+        effects = [self.hypotheses[k].effects(run) for run in range(len(self.bench.prepared))]
         regression = regress(self.bench.baseline, _same(projector.regression, effects), effects)
         return Projector(regression, projector.noise, projector.roughness)
 
@@ -109,15 +112,12 @@ class Predictor:
         """Of all hypotheses, what they change in the runs at hand, and the derivatives of that."""
         columns: list[list[np.ndarray]] = []
         for h in self.hypotheses:
-            at = self.bench.respond([h.effects(run) for run in self._runs])
-            columns.append([a - b for a, b in zip(at, self.bench.plain, strict=True)])
-            for k, law in enumerate(h.laws):
-                for i in range(law.size):
-                    moved = replace(h, x=tuple(_moved(h.x, k, i)))
-                    ahead = self.bench.respond([moved.effects(run) for run in self._runs])
-                    columns.append([(a - b) / _STEP for a, b in zip(ahead, at, strict=True)])
+            change, slopes = _changes(self.bench, h)
+            columns.append(change)
+            for law, along in zip(h.laws, slopes, strict=True):
                 # Strengths in the new run, which no old run says anything of.
-                columns += [[np.zeros_like(b) for b in at]] * int(law.differs.sum())
+                nothing = [np.zeros_like(one) for one in change]
+                columns += [*along, *[nothing] * int(law.differs.sum())]
         return columns
 
     def _old_gram(self, projector: Projector, columns: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
@@ -140,21 +140,18 @@ class Predictor:
         alone = baseline.alone(run)
         bench, noise = Bench(alone), self._noise(float(time_s[1] - time_s[0]))
         columns = []
-        for h, vectors in zip(self.hypotheses, self._vectors, strict=True):
-            at = self._respond(bench, h, vectors)
-            columns.append(at - bench.plain[0])
-            for k, law in enumerate(h.laws):
-                slopes = [
-                    (self._respond(bench, h, _moved(vectors, k, i)) - at) / _STEP for i in range(len(vectors[k]))
-                ]
+        for h, new in zip(self.hypotheses, self._next, strict=True):
+            (change,), slopes = _changes(bench, new)
+            columns.append(change)
+            for law, along in zip(h.laws, slopes, strict=True):
                 # Along the coordinates in the old runs, and then along the strengths that are its own.
-                old = [np.zeros_like(at)] * law.size
+                old = [np.zeros_like(change)] * law.size
                 for i in np.flatnonzero(~law.differs):
-                    old[law.places[self._like, i]] = slopes[i]
-                columns += [*old, *(slopes[i] for i in np.flatnonzero(law.differs))]
+                    old[law.places[self._like, i]] = along[i][0]
+                columns += [*old, *(along[i][0] for i in np.flatnonzero(law.differs))]
         grams, last = {}, None
         for k in self._old:
-            effects = [self._effects(self.hypotheses[k], self._vectors[k])]
+            effects = [self._next[k].effects(0)]
             last = regress(alone, None if last is None else _same(last, effects), effects)
             shared = [last.rows[0], *(last.finer[kind][0] for kind in self._kinds)]
             rows = noise.whiten(np.concatenate([*shared, np.stack(columns, axis=1)], axis=1))[run.fitted]
@@ -162,12 +159,6 @@ class Predictor:
             rows -= nuisance @ (nuisance.T @ rows)
             grams[k] = rows.T @ rows
         return grams
-
-    def _effects(self, h: Hypothesis, vectors: Sequence[np.ndarray]) -> list[AbstractEffect]:
-        return [law.maps[self._like](jnp.asarray(v)) for law, v in zip(h.laws, vectors, strict=True)]
-
-    def _respond(self, bench: Bench, h: Hypothesis, vectors: Sequence[np.ndarray]) -> np.ndarray:
-        return bench.respond([self._effects(h, vectors)])[0]
 
     def _noise(self, interval_s: float) -> Noise:
         """Noise of the run that was sampled most alike; white where none was."""
@@ -204,10 +195,17 @@ def _same(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -
     return None if any(regression.saturating) or any(map(saturating, effects)) else regression.finer
 
 
-def _moved(x: Sequence[np.ndarray], k: int, i: int) -> list[np.ndarray]:
-    out = [np.array(own) for own in x]
-    out[k][i] += _STEP
-    return out
+def _changes(bench: Bench, h: Hypothesis) -> tuple[list[np.ndarray], list[list[list[np.ndarray]]]]:
+    """What a hypothesis changes in all runs, in um, and of each effect the derivatives along its coordinates."""
+    runs = range(len(bench.prepared))
+    at = bench.respond([h.effects(run) for run in runs])
+    slopes: list[list[list[np.ndarray]]] = [[] for _ in h.laws]
+    for k, law in enumerate(h.laws):
+        for step in _STEP * np.eye(law.size):
+            moved = replace(h, x=(*h.x[:k], h.x[k] + step, *h.x[k + 1 :]))
+            ahead = bench.respond([moved.effects(run) for run in runs])
+            slopes[k].append([(a - b) / _STEP for a, b in zip(ahead, at, strict=True)])
+    return [a - b for a, b in zip(at, bench.plain, strict=True)], slopes
 
 
 def _eliminated(gram: np.ndarray, keep: np.ndarray) -> np.ndarray:
