@@ -79,8 +79,8 @@ def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:
 def drop_programs(records: Sequence[Record]) -> None:
     """Free the compiled programs that simulate parts, where records are long or programs are many.
 
-    A program is compiled for runs of one length, those of short runs serve the next diagnosis as well; and several
-    hundred of them take as much memory as long records do. What else the process has compiled stays.
+    Those of short runs serve the next diagnosis as well, but several hundred take as much memory as long records do.
+    What else the process has compiled stays.
     """
     if sum(len(record) for record in records) >= _LONG or len(get_backend().live_executables()) > _MANY:
         programs.drop()
@@ -99,8 +99,7 @@ class Law:
     """The coordinates of one effect in all runs.
 
     Those of an effect that differs from run to run are what the runs share, then what is its own in each: strengths,
-    and where it `remembers`, what went on before each run, which is nothing otherwise. Parameters that are `held`
-    stay.
+    and where it `remembers`, what went on before each run, nothing otherwise. Parameters that are `held` stay.
     """
 
     def __init__(self, effects: Sequence[AbstractEffect], remembers: bool = False, held: Sequence[str] = ()):

@@ -43,8 +43,7 @@ Question: TypeAlias = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple
 class Request:
     """What is asked of the next experiment: its duration, that of the longest run if None, and the limits of the rig.
 
-    `limits` are given by name; a quantity without one may go beyond what the records reached by the part `margin` of
-    its range, see `fits.io._limits.allowed`.
+    A quantity of which no limit is stated may go beyond what the records reached by the part `margin` of its range.
     """
 
     duration_s: float | None = None
@@ -57,13 +56,11 @@ def suggest(
 ) -> Experiment | None:
     """Choose and refine the program that decides best what is open.
 
-    Each program of the menu is played virtually: the regression of the new run is added to that of the old ones, and
-    what the rivals change in all of them is projected off what the stage and the other rival can follow. Only those
-    count that keep the rig inside its limits, whichever of the rivals is true.
-
-    The first of the `causes` that has rivals is asked about, or what is suspected where there is none at all. None
-    where every cause is told from all others or nothing is suspected, and where no program inside the limits and no
-    further column would help.
+    The first of the `causes` that has rivals is asked about, or what is suspected where there is none at all. Each
+    program that keeps the rig inside its limits, whichever of the rivals is true, is played virtually: the regression
+    of the new run is added to that of the old ones, and what the rivals change in all of them is projected off what
+    the stage and the other rival can follow. None where nothing is open or suspected, and where no program inside the
+    limits and no further column would help.
     """
     question = open_question(ready, found, causes)
     if question is None:
@@ -158,8 +155,7 @@ def _with_last(best: Hypothesis, at: int, other: Hypothesis) -> Hypothesis:
 def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) -> tuple[np.ndarray, float]:
     """Climb the logarithm of a gain in a program's parameters by finite differences, and keep the best.
 
-    The `gain` of parameters of shape `(k,)` is NaN where they are not allowed, and `first` that at the program's
-    start.
+    The `gain` of parameters of shape `(k,)` is NaN where they are not allowed, and `first` at the program's start.
     """
     span = program.upper - program.lower
     best, top = program.start.copy(), first
@@ -207,13 +203,11 @@ def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> s
 
 
 def further_column(names: tuple[str, ...], records: Sequence[Record]) -> str:
-    """Which further column helps most of the suspects, and why; empty if none does, or the records have it.
-
-    Of several that help as many, it is that of the first.
-    """
+    """Which further column helps most of the suspects, and why; empty if none does, or the records have it."""
     wanted = [column for name in names if (column := card_of(name).column)]
     if not wanted:
         return ""
+    # Of several that help as many, that of the first.
     column = max(wanted, key=wanted.count)
     # One that shows nothing is there all the same.
     if any(column in record.extra or column in columns_beside(record) for record in records):

@@ -103,8 +103,7 @@ def _parameters(
 ) -> tuple[EffectParameter, ...]:
     """Values in their units: of each run in which the effect shows where runs differ, the others by their place.
 
-    Intervals reach as far to either side as the profile, coordinates `along` which each is so many standard
-    deviations away.
+    Intervals reach as far to either side as the profile `along` coordinates that are so many deviations away each.
     """
     runs = len(law.maps) if law.form.per_run and law.each.any() else 1
     shared: list[EffectParameter] = []
@@ -140,12 +139,11 @@ def _parameters(
 def profile_likelihood(
     bench: Bench, projector: Projector, model: Refit, which: int, covariance: np.ndarray
 ) -> list[tuple[float, np.ndarray]]:
-    """Profile of the likelihood over the nonlinear parameters of a law: coordinates, and how many deviations away.
+    """Profile of the likelihood over nonlinear parameters of one law: coordinates, and how many deviations away.
 
     Where records hardly show a parameter, or one is near its bound, the sum of squares is no parabola, and the
     standard deviations of its curvature, `covariance` of shape `(size, size)`, promise too much. A distance is the
     root of what the place costs (Wilks, Annals of Mathematical Statistics 9 (1938) 60), but 3 if that is less.
-    `which` numbers the law.
     """
     law, x = model.laws[which], model.x[which]
     sd = np.sqrt(np.diagonal(covariance))

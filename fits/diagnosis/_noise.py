@@ -138,8 +138,7 @@ def jitter_s(
 ) -> tuple[float, float, float]:
     """Jitter of the instants of sampling, its evidence in standard deviations, and the most that it may be.
 
-    Noise that grows with the speed, from sample to sample: the variance of the residual about its neighbours is
-    compared with the square of the speed.
+    It is noise that grows with the speed: the variance about the neighbours is compared with the square of the speed.
     """
     bent = residual_um[1:-1] - (residual_um[2:] + residual_um[:-2]) / 2
     square = bent**2 / 1.5

@@ -27,8 +27,7 @@ _LIKE = 1.5
 class Hypothesis:
     """Effects that the stage may have, none for the plain stage.
 
-    `x` are the coordinates of the `laws` in all runs, and `covariances` those of the coordinates of each, empty where
-    they are not known.
+    `x` are the coordinates of the `laws` in all runs; `covariances` are of those of each, or empty if not known.
     """
 
     laws: tuple[Law, ...]

@@ -230,8 +230,7 @@ def burst(path: Path, amplitude_V: float, burst_s: float, period_s: float) -> No
 class Program:
     """One program of the menu: `play` draws a path by parameters.
 
-    `lower`, `upper` and `start` are of the parameters, in the order that `play` takes them, shape `(k,)`; `words` say
-    what it is made of.
+    `lower`, `upper` and `start` are of the parameters, in that order, shape `(k,)`; `words` say what it is made of.
     """
 
     words: str

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -38,9 +38,9 @@ class Regression:
     Per run: `masks` of the samples that are fitted, shape `(n,)`; `rows`, derivatives along columns and coordinates,
     shape `(n, D + p)`; `nuisance`, signals of the run's nuisance parameters, shape `(n, k)`; `residuals`, measurement
     less simulation without effects, in um, shape `(n,)`; `saturating`, the effects that the derivatives go through.
-    By kind and run, `finer` is what relative roughness of the density changes that the grid cannot follow, shape `(n,
-    k)`: of loops of one width at all biases, as play operators are, and at single places of the half-plane. `root` is
-    the root of the prior precision of the columns, shape `(D, D)`.
+    By kind and run, `finer` is what roughness of the density changes that the grid cannot follow, shape `(n, k)`: of
+    loops of one width at all biases, as of plays, and at single places. `root` is that of the prior precision of the
+    columns, shape `(D, D)`.
     """
 
     baseline: Baseline
@@ -63,9 +63,9 @@ def regress(
 ) -> Regression:
     """Linearise a baseline in all its runs.
 
-    `finer` is the structure finer than its grid, from a baseline nearby and under the same effects; it is computed by
-    default. `effects` are those of each run beside which the baseline moves: derivatives along coordinates go through
-    all that depend on the stage, those along columns through those that saturate.
+    `finer` is taken from a baseline nearby under the same effects, or else computed. `effects` are those of each run
+    beside which the baseline moves: derivatives along coordinates go through all that depend on the stage, those
+    along columns through those that saturate.
     """
     chain, runs, z = baseline.chain, baseline.runs, jnp.asarray(baseline.z)
     assert chain.grid is not None
@@ -167,30 +167,22 @@ def saturating(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
     return tuple(one for one in effects if one.finite and not hasattr(one, "inner") and one.place in early)
 
 
-class _WithEffects(eqx.Module):
-    """Coordinates of a plain stage, of which a stage with effects is made."""
-
-    plain: Coordinates[Stage]
-    effects: tuple[AbstractEffect, ...]
-
-    def __call__(self, z: Float[Array, " p"]) -> Stage:
-        """The stage with the effects."""
-        return with_effects(self.plain(z), self.effects)
+def _extended(plain: Coordinates[Stage], effects: tuple[AbstractEffect, ...], z: Float[Array, " p"]) -> Stage:
+    return with_effects(plain(z), effects)
 
 
 def with_effects_in(chain: Chain, z: np.ndarray, effects: tuple[AbstractEffect, ...]) -> Chain:
     """The chain of a stage with effects, in the same coordinates and columns."""
     if not effects:
         return chain
-    coordinates = _WithEffects(chain.coordinates, effects)
-    return Chain(coordinates, place_of_hysteresis(coordinates(jnp.asarray(z))), chain.grid)  # type: ignore[arg-type]
+    coordinates: Any = eqx.Partial(_extended, chain.coordinates, effects)
+    return Chain(coordinates, place_of_hysteresis(coordinates(jnp.asarray(z))), chain.grid)
 
 
 def propagated(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
-    """Pass changes of the hysteresis, shape `(n, k)`, on through what follows it, to first order.
+    """Pass changes of what comes out of the hysteresis, shape `(n, k)`, on through what follows it, to first order.
 
-    Where all that follows is linear, they have been passed on already. `around_um` is what comes out of the
-    hysteresis, shape `(n,)`.
+    They are `around_um`, shape `(n,)`. Where all that follows is linear, they have been passed on already.
     """
     assert chain.place is not None
     after = chain.coordinates(jnp.asarray(z)).parts[chain.place + 1 :]

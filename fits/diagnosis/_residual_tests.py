@@ -183,10 +183,7 @@ class Cycles:
 
 
 def cycles(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.ndarray]) -> Cycles:
-    """Search a joined residual for a period in the position, from 16 in the stroke to 2,000.
-
-    What is slower lies in the density.
-    """
+    """Search a joined residual for a period in the position, 16 to 2,000 in the stroke; what is slower is density."""
     span_um = max(float(np.ptp(p)) for p in plain_um)
     parts = [
         (part, 2 * np.pi * plain[mask] / span_um)

@@ -39,8 +39,8 @@ class Model:
 class Guard:
     """Predicts what a program makes the rig do, and compares it with the limits.
 
-    The `models` are stages that the records allow, the fitted one first, `range_V` the range of the commands that
-    they were fitted with, and the next run is taken to have the further columns of the record that it is `like`.
+    The `models` are stages that the records allow, fitted with commands in `range_V`. The next run is taken to have
+    the further columns of the record that it is `like`.
     """
 
     def __init__(self, models: Sequence[Model], limits: Ranges, like: Record, range_V: tuple[float, float]):

@@ -128,8 +128,8 @@ class Scored:
     `columns` are its signatures off the baseline's tangent space, whitened and joined, shape `(rows, k)`, and
     `coefficients` their best multiples, shape `(k,)`; `share_left` is the norm of the columns over that of the raw
     signatures. `z` is the evidence in standard deviations, `drop` the decrease of the sum of squares in noise
-    variances. `robust_z` is the evidence where what is left counts as noise that stays alike for a while, as large as
-    it is where it is: little for an effect that only comes nearest to a misfit of another shape.
+    variances. `robust_z` is the evidence where what is left counts as noise that stays alike for a while: little for
+    an effect that only comes nearest to a misfit of another shape.
     """
 
     probe: Probe
@@ -160,17 +160,14 @@ def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -
     joined = np.empty((len(residual), len(signals)), order="F")
     for k, column in enumerate(signals):
         joined[:, k] = projector.join(column)
-    raw = _squares(joined)
     off = np.asfortranarray(projector.off(joined))
-    found = []
-    stops = np.cumsum([len(probe.signatures) for probe in probes])
-    for probe, stop in zip(probes, stops, strict=True):
-        own = slice(stop - len(probe.signatures), stop)
-        columns = off[:, own]
+    found, cuts = [], np.cumsum([len(probe.signatures) for probe in probes])[:-1]
+    each = zip(probes, np.split(off, cuts, axis=1), np.split(_squares(joined), cuts), strict=True)
+    for probe, columns, raw in each:
         # A line that sampling turns into a constant, for example: what is left of it is rounding. Or what has died
         # away so far that its square is nothing.
-        columns[:, _squares(columns) <= _BLIND**2 * raw[own]] = 0.0
-        found.append(_scored(probe, columns, residual, float(np.sum(raw[own])) ** 0.5))
+        columns[:, _squares(columns) <= _BLIND**2 * raw] = 0.0
+        found.append(_scored(probe, columns, residual, float(np.sum(raw)) ** 0.5))
     return tuple(found)
 
 
@@ -213,10 +210,7 @@ def _robust_z(along: np.ndarray, residual: np.ndarray) -> float:
 
 
 def improvement_z(before: np.ndarray, after: np.ndarray) -> float:
-    """Standard deviations by which errors of shape `(n,)` became smaller; samples in blocks err alike.
-
-    0 where there are none.
-    """
+    """Standard deviations by which errors of shape `(n,)` became smaller, 0 without any; blocks of them are alike."""
     if not len(before):
         return 0.0
     blocks = np.add.reduceat(before**2 - after**2, np.arange(0, len(before), BLOCK))
@@ -294,14 +288,14 @@ def law_of(scored: Scored, runs: int, more: float = 1.0) -> Law:
     form, first = scored.form, scored.probe.effects[0]
     specs = {info.path: info.spec for info in Coordinates(without_host(first)).table}
     effects: list[AbstractEffect] = []
-    per_run = form.per_run and runs > 1
     for run in range(runs):
+        shares = scored.coefficients[run::runs] if form.per_run and runs > 1 else scored.coefficients
         values = {}
         for name in form.strength:
-            total = np.zeros(np.shape(getattr(first, name)))
-            for k, effect in enumerate(scored.probe.effects):
-                share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]
-                total = total + more * float(share) * np.asarray(getattr(effect, name))
-            values[name] = jnp.asarray(np.clip(total, specs[name].lower, specs[name].upper))
+            each = [
+                more * share * np.asarray(getattr(effect, name))
+                for share, effect in zip(shares, scored.probe.effects, strict=True)
+            ]
+            values[name] = jnp.asarray(np.clip(sum(each), specs[name].lower, specs[name].upper))
         effects.append(replace(first, **values) if values else first)
     return Law(effects)
