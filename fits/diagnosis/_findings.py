@@ -88,8 +88,7 @@ def described(
 ) -> FoundCause:
     """A cause with what its effect's card says of it."""
     card = form.fingerprint, form.experiment, form.source
-    share = float(min(1.0, share))
-    return FoundCause(form.name, form.form, rivals, float(z), p, parameters, share, rms_um, *card)
+    return FoundCause(form.name, form.form, rivals, float(z), p, parameters, float(min(1.0, share)), rms_um, *card)
 
 
 def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:

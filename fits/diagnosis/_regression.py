@@ -71,7 +71,7 @@ def regress(
     assert chain.grid is not None
     effects = effects or ((),) * len(runs)
     levelling = tuple(map(saturating, effects))
-    bases = _bases(baseline) if finer is None else []
+    roughness = _roughness(baseline) if finer is None else None
     rows, nuisance, residuals = [], [], []
     # By run, and then by kind.
     structure: list[list[np.ndarray]] = []
@@ -97,9 +97,10 @@ def regress(
         blur = [np.gradient(speed, run.record.time_s)] if baseline.blurred else []
         nuisance.append(_without_decayed(np.column_stack([free[:n], *late, *blur]), run.fitted))
         residuals.append(run.displacement_um - plain)
-        if finer is None:
+        if roughness is not None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
-            structure.append(_along(fine, baseline, run, bases, around))
+            moved = np.concatenate([columns @ roughness for _, columns in pieces(fine, z, run, True)])[:n]
+            structure.append(np.split(propagated(fine, baseline.z, run, around, moved), [_FINE], axis=1))
     kinds = tuple(zip(*structure, strict=True)) if finer is None else finer
     data = tuple(rows), tuple(nuisance), kinds, tuple(residuals)
     return Regression(baseline, tuple(run.fitted for run in runs), *data, root_of(baseline.prior), levelling)
@@ -131,8 +132,8 @@ def _slope(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: Run) ->
     return out
 
 
-def _bases(baseline: Baseline) -> list[np.ndarray]:
-    """Relative roughness of the density, in columns of the finer grid, in um, shape `(D, k)` by kind."""
+def _roughness(baseline: Baseline) -> np.ndarray:
+    """Relative roughness of the density of both kinds, in columns of the finer grid, in um, shape `(D, k)`."""
     grid = baseline.chain.grid
     assert grid is not None
     smooth = interpolation(grid.levels, _FINE) @ baseline.columns_um
@@ -146,16 +147,7 @@ def _bases(baseline: Baseline) -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     places = np.zeros((len(smooth), _EXAMPLES))
     places[:weights] = density[:, None] * rng.standard_normal((weights, _EXAMPLES)) / _EXAMPLES**0.5
-    return [loops, places]
-
-
-def _along(
-    finer: Chain, baseline: Baseline, run: Run, bases: list[np.ndarray], around_um: np.ndarray
-) -> list[np.ndarray]:
-    joined = np.concatenate(bases, axis=1)
-    parts = [columns @ joined for _, columns in pieces(finer, jnp.asarray(baseline.z), run, True)]
-    moved = propagated(finer, baseline.z, run, around_um, np.concatenate(parts)[: len(run.record)])
-    return np.split(moved, np.cumsum([base.shape[1] for base in bases])[:-1], axis=1)
+    return np.concatenate([loops, places], axis=1)
 
 
 def saturating(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:

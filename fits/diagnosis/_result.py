@@ -46,8 +46,8 @@ class FoundCause:
     `form` names its model if there are several, and `also_consistent` the effects that these records cannot tell from
     it. `z` is the evidence in standard deviations, and `p_family` the probability that chance gives any effect as
     much where there is none. `share_of_misfit` is the part that it explains of the reproducible variance that the
-    plain stage leaves, and `rms_um` the size of what it changes after the plain stage followed as far as it can. The
-    last three are sentences about the effect.
+    plain stage leaves, and `rms_um` the size of what it changes after the plain stage followed as far as it can.
+    `fingerprint`, `experiment` and `source` are sentences about the effect.
     """
 
     name: str
@@ -105,9 +105,9 @@ class Gain:
     """What the extension is worth on data that were not used; NaN where nothing was held out.
 
     Errors on the held-out data, which `source` describes, are those of the plain stage before, and of the extended
-    one after; `sd_of_difference_um` is the standard deviation of the difference of the root mean squares. Of the
-    feedforward they are root mean squares of the displacement of the extended stage, under voltages from the inverse
-    of the plain one and from its own.
+    one after: root mean squares, the standard deviation of their difference, and the largest. Those of the
+    feedforward are root mean squares in the displacement of the extended stage, under voltages from the inverse of
+    the plain one and from its own. `noise_um` is the noise floor.
     """
 
     heldout_rms_before_um: float = np.nan

@@ -123,15 +123,15 @@ def guard_of(
     beside = found.bench.baseline
     stages = [baseline.stage]
     stages += [with_effects(beside.stage, h.effects(longest)) for h in hypotheses if h.laws]
-    stages += [_drawn(baseline, ready.projector, rng).stage for _ in range(_DRAWS)]
+    stages += [_drawn(baseline, ready.projector, rng) for _ in range(_DRAWS)]
     for h in hypotheses:
         for _ in range(_EACH if h.laws else 0):
-            stages.append(with_effects(_drawn(beside, found.projector, rng).stage, h.drawn(rng).effects(longest)))
+            stages.append(with_effects(_drawn(beside, found.projector, rng), h.drawn(rng).effects(longest)))
     return Guard([model(stage) for stage in stages], limits, like, baseline.range_V)
 
 
-def _drawn(baseline: Baseline, projector: Projector, rng: np.random.Generator) -> Baseline:
+def _drawn(baseline: Baseline, projector: Projector, rng: np.random.Generator) -> Stage:
     """A plain stage out of those that the records allow."""
     dz, dcolumns_um = projector.draw(rng)
     kept = np.maximum(baseline.columns_um + dcolumns_um, 0.0)
-    return baseline.moved(np.clip(dz, -FARTHEST_DRAW, FARTHEST_DRAW), kept - baseline.columns_um)
+    return baseline.moved(np.clip(dz, -FARTHEST_DRAW, FARTHEST_DRAW), kept - baseline.columns_um).stage
