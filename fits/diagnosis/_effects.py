@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import takewhile
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 from fits.diagnosis._baseline import Baseline, with_effects
 from fits.io._record import Record
 from fits.stage._motion import Prepared, pass_signal, prepare, programs, signals
-from microid import AbstractEffect, Coordinates, ParameterInfo, Sensor, Signal, Stage
+from microid import AbstractEffect, Coordinates, Sensor, Signal
 
 # Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
 _LONG, _MANY = 20_000, 400
@@ -37,45 +38,37 @@ class Bench:
         # What a fit may move is looked up anew for every stage that is built.
         self.stage = stage.thaw(*stage.frozen)
         few, many = (baseline.coarse_aside, baseline.finest_aside) if aside else (baseline.coarse, baseline.finest)
-        runs = many if finest else few
         self.resonance_Hz = baseline.resonance_Hz or 0.0
-        self.prepared = [prepare(self.stage, run) for run in runs]
+        self.prepared = [prepare(self.stage, run) for run in (many if finest else few)]
         self.known = [signals(self.stage, one) for one in self.prepared]
         self.plain = [at_samples(known[-1], one) for known, one in zip(self.known, self.prepared, strict=True)]
 
     def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
         """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
-        return [
-            _respond(with_effects(self.stage, self._seen(acting, one)), self.stage, known, one)
-            for acting, known, one in zip(effects, self.known, self.prepared, strict=True)
-        ]
+        out = []
+        for acting, known, one in zip(effects, self.known, self.prepared, strict=True):
+            stage = with_effects(self.stage, self._seen(acting, one))
+            # Up to the first part that is another, the signal is known.
+            pairs = zip(stage.parts, self.stage.parts, strict=False)
+            same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], pairs))
+            signal = known[same]
+            for part in stage.parts[same:]:
+                signal = pass_signal(part, one.time_s, signal, one.scene)
+            out.append(at_samples(signal, one))
+        return out
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
         """Those that a run may be asked about: none that is its own and too fast for its samples."""
         record = prepared.run.record
         interval_s = float(np.median(np.diff(record.time_s)))
-        effects = [without_drifts(effect, interval_s, record.duration_s) for effect in effects]
-        if not self.resonance_Hz * interval_s > _PERIOD:
-            return effects
-        return [effect for effect in effects if not (effect.fast and effect.per_run)]
+        slow = not self.resonance_Hz * interval_s > _PERIOD
+        asked = [effect for effect in effects if slow or not (effect.fast and effect.per_run)]
+        return [without_drifts(effect, interval_s, record.duration_s) for effect in asked]
 
-    def change(
-        self, effects: Sequence[AbstractEffect], before: Sequence[np.ndarray] | None = None
-    ) -> list[np.ndarray]:
+    def change(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
         """What effects that all runs share change in them, in um."""
-        out = self.respond([list(effects)] * len(self.prepared))
-        return [a - b for a, b in zip(out, self.plain if before is None else before, strict=True)]
-
-
-def _respond(stage: Stage, base: Stage, known: Sequence[Signal], prepared: Prepared) -> np.ndarray:
-    """Response of a stage that differs from a simulated one from some part on, in um, shape `(n,)`."""
-    same = 0
-    while same < min(len(stage.parts), len(base.parts)) and stage.parts[same] is base.parts[same]:
-        same += 1
-    signal = known[same]
-    for part in stage.parts[same:]:
-        signal = pass_signal(part, prepared.time_s, signal, prepared.scene)
-    return at_samples(signal, prepared)
+        out = self.respond([effects] * len(self.prepared))
+        return [a - b for a, b in zip(out, self.plain, strict=True)]
 
 
 def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:
@@ -86,8 +79,8 @@ def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:
 def drop_programs(records: Sequence[Record]) -> None:
     """Free the compiled programs that simulate parts, where records are long or programs are many.
 
-    A program is compiled for runs of one length, those of short runs serve the next diagnosis as well; and several
-    hundred of them take as much memory as long records do. What else the process has compiled stays.
+    Those of short runs serve the next diagnosis as well, but several hundred take as much memory as long records do.
+    What else the process has compiled stays.
     """
     if sum(len(record) for record in records) >= _LONG or len(get_backend().live_executables()) > _MANY:
         programs.drop()
@@ -99,36 +92,34 @@ def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float)
     # Samples shift a frequency by a multiple of their rate.
     shifted_Hz = np.abs(lines_Hz - np.round(lines_Hz * interval_s) / interval_s)
     seen = (shifted_Hz - effect.tolerance * lines_Hz) * duration_s > _PERIODS
-    if seen.all():
-        return effect
-    return times(effect, seen.astype(float))
+    return effect if seen.all() else times(effect, seen.astype(float))
 
 
 class Law:
     """The coordinates of one effect in all runs.
 
     Those of an effect that differs from run to run are what the runs share, then what is its own in each: strengths,
-    and where it `remembers`, what went on before each run, which is nothing otherwise. Parameters that are `held`
-    stay.
+    and where it `remembers`, what went on before each run, nothing otherwise. Parameters that are `held` stay.
     """
 
     def __init__(self, effects: Sequence[AbstractEffect], remembers: bool = False, held: Sequence[str] = ()):
         self.form, self.remembers = type(effects[0]), remembers
         closed = (*held, *(() if remembers else self.form.history))
         # The part that an effect is put around is put in anew wherever it is simulated.
-        self.maps = [Coordinates(without_host(effect), lambda info: _free(info, closed)) for effect in effects]
-        vectors = [np.asarray(one.of(without_host(effect))) for one, effect in zip(self.maps, effects, strict=True)]
+        alone = [without_host(effect) for effect in effects]
+        self.maps = [
+            Coordinates(one, lambda i: not i.path.startswith("inner") and i.path not in closed) for one in alone
+        ]
+        vectors = [np.asarray(coordinates.of(one)) for coordinates, one in zip(self.maps, alone, strict=True)]
+        sizes = [math.prod(info.shape) for info in self.maps[0].table]
+        stops = np.cumsum(sizes).tolist()
+        self.entries = [(i, slice(b - s, b)) for i, s, b in zip(self.maps[0].table, sizes, stops, strict=True)]
         self.each = self.differs if len(effects) > 1 else np.zeros(len(vectors[0]), dtype=bool)
         self.start = np.concatenate([vectors[0][~self.each], *(v[self.each] for v in vectors)])
         # Which of them are those of a run, shape `(runs, k)`.
         shared, own = np.cumsum(~self.each) - 1, np.cumsum(self.each) - 1
         first = np.arange(len(effects))[:, None] * int(self.each.sum()) + int(np.sum(~self.each))
         self.places = np.where(self.each, first + own, shared)
-        stops = np.cumsum([math.prod(info.shape) for info in self.maps[0].table])
-        self.entries = [
-            (info, slice(int(stop) - math.prod(info.shape), int(stop)))
-            for info, stop in zip(self.maps[0].table, stops, strict=True)
-        ]
 
     @property
     def differs(self) -> np.ndarray:
@@ -151,7 +142,7 @@ class Law:
         }
 
     def _of(self, paths: Sequence[str]) -> np.ndarray:
-        return np.concatenate([np.full(math.prod(info.shape), info.path in paths) for info in self.maps[0].table])
+        return np.concatenate([np.full(at.stop - at.start, info.path in paths) for info, at in self.entries])
 
     @property
     def size(self) -> int:
@@ -182,6 +173,10 @@ class Law:
         """The effect in one run."""
         return _at(self.maps[run], jnp.asarray(self.vector(x, run)))
 
+    def effects(self, x: np.ndarray) -> list[AbstractEffect]:
+        """The effect in each run."""
+        return [self.effect(x, run) for run in range(len(self.maps))]
+
 
 def strength_of(law: Law, x: np.ndarray, run: int) -> np.ndarray:
     effect = law.effect(x, run)
@@ -190,13 +185,12 @@ def strength_of(law: Law, x: np.ndarray, run: int) -> np.ndarray:
 
 def remembering(law: Law, x: np.ndarray) -> Law:
     """The same effects, what went on before the runs being unknown."""
-    return Law([law.effect(x, run) for run in range(len(law.maps))], True)
+    return Law(law.effects(x), True)
 
 
 def scaled(law: Law, x: np.ndarray, factor: float) -> Law:
     """The same effects with larger or smaller strengths."""
-    here = [law.effect(x, run) for run in range(len(law.maps))]
-    return Law([times(effect, factor) for effect in here], law.remembers)
+    return Law([times(effect, factor) for effect in law.effects(x)], law.remembers)
 
 
 def times(effect: AbstractEffect, factor: float | np.ndarray) -> AbstractEffect:
@@ -207,10 +201,6 @@ def times(effect: AbstractEffect, factor: float | np.ndarray) -> AbstractEffect:
 def without_host(effect: AbstractEffect) -> AbstractEffect:
     anything = Sensor(jnp.ones(()), jnp.zeros(()))
     return replace(effect, inner=anything) if hasattr(effect, "inner") else effect  # type: ignore[call-arg]
-
-
-def _free(info: ParameterInfo, closed: Sequence[str]) -> bool:
-    return not info.path.startswith("inner") and info.path not in closed
 
 
 @eqx.filter_jit

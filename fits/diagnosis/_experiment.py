@@ -1,6 +1,6 @@
 """The next experiment: the voltage program that would tell apart best what the records leave open."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -15,15 +15,16 @@ from fits.diagnosis._result import Experiment, FoundCause
 from fits.diagnosis._safe import guard_of
 from fits.diagnosis._score import best_of, law_of
 from fits.diagnosis._select import Selection
-from fits.io._limits import MARGIN
+from fits.io._limits import MARGIN, RangeMap
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
+from fits.loop._run import Progress
 from microid.effects import card_of
 
 # Samples of a program: as many as are simulated some twenty times in a bearable time.
 _MOST_SAMPLES = 4096
-# A short program is repeated, so often at most, until it tells the suspects apart by so many standard deviations.
-_MOST_REPEATS, _ENOUGH_Z = 4, 12.0
+# A short program is repeated until it tells the suspects apart by so many standard deviations, so often at most.
+_ENOUGH_Z, _OVER = 12.0, {2: "twice", 3: "three times", 4: "four times"}
 # An effect is suspected from this evidence on, or below this probability of as much by chance.
 _SUSPECT_Z, _SUSPECT_P = 3.5, 0.1
 # The shortest of the programs that are at least this part as good as the best is taken.
@@ -32,10 +33,8 @@ _NEARLY_BEST = 0.95
 _LEAST_GAIN = 1.02
 # Steps of the ascent: for the gradient, and the lengths that are tried along it, as shares of the parameters' ranges.
 _PROBE, _LENGTHS = 0.05, (0.4, 0.15)
-_ROUNDS = 2
 # Below so many standard deviations effects are not told apart.
 _TOLD_APART = 3.0
-_OVER = {2: "twice", 3: "three times", 4: "four times"}
 # Names, hypotheses, and which is compared with which.
 Question: TypeAlias = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple[int, int], ...]]
 
@@ -44,37 +43,30 @@ Question: TypeAlias = tuple[tuple[str, ...], tuple[Hypothesis, ...], tuple[tuple
 class Request:
     """What is asked of the next experiment: its duration, that of the longest run if None, and the limits of the rig.
 
-    `limits` are given by name; a quantity without one may go beyond what the records reached by the part `margin` of
-    its range, see `fits.io._limits.allowed`.
+    A quantity of which no limit is stated may go beyond what the records reached by the part `margin` of its range.
     """
 
     duration_s: float | None = None
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    limits: RangeMap = field(default_factory=dict)
     margin: float = MARGIN
 
 
 def suggest(
-    ready: Prepared,
-    found: Selection,
-    causes: tuple[FoundCause, ...],
-    request: Request,
-    progress: Callable[[str], None],
+    ready: Prepared, found: Selection, causes: tuple[FoundCause, ...], request: Request, progress: Progress
 ) -> Experiment | None:
     """Choose and refine the program that decides best what is open.
 
-    Each program of the menu is played virtually: the regression of the new run is added to that of the old ones, and
-    what the rivals change in all of them is projected off what the stage and the other rival can follow. Only those
-    count that keep the rig inside its limits, whichever of the rivals is true.
-
-    The first of the `causes` that has rivals is asked about, or what is suspected where there is none at all. None
-    where every cause is told from all others or nothing is suspected, and where no program inside the limits and no
-    further column would help.
+    The first of the `causes` that has rivals is asked about, or what is suspected where there is none at all. Each
+    program that keeps the rig inside its limits, whichever of the rivals is true, is played virtually: the regression
+    of the new run is added to that of the old ones, and what the rivals change in all of them is projected off what
+    the stage and the other rival can follow. None where nothing is open or suspected, and where no program inside the
+    limits and no further column would help.
     """
     question = open_question(ready, found, causes)
     if question is None:
         return None
     names, hypotheses, pairs = question
-    progress("looking for the experiment that tells " + (" from ".join(names) if len(names) > 1 else names[0]))
+    progress(f"looking for the experiment that tells {' from '.join(names)}")
     baseline = ready.baseline
     guard = guard_of(ready, found, hypotheses, request.limits, request.margin)
     records = [run.record for run in baseline.runs]
@@ -82,7 +74,6 @@ def suggest(
     if limits is None:
         return None
     predictor = Predictor(found.bench, found.projector, hypotheses, pairs)
-    present_z = predictor.present_z
     programs = guard.menu(limits, _MOST_SAMPLES)
     if not programs:
         return None
@@ -93,9 +84,8 @@ def suggest(
         # Only the column tells: what shows the first of them best is played with it.
         asked = Predictor(found.bench, found.projector, (hypotheses[0], hypotheses[0].without(names[0])), ((0, 1),))
         scores = [asked.predicted_z(*program.samples(program.start)) for program in programs]
-    near = [k for k, z in enumerate(scores) if z >= _NEARLY_BEST * max(scores)]
-    chosen = min(near, key=lambda k: (programs[k].limits.duration_s, -scores[k]))
-    program, z = programs[chosen], scores[chosen]
+    near = [(one, z) for one, z in zip(programs, scores, strict=True) if z >= _NEARLY_BEST * max(scores)]
+    program, z = min(near, key=lambda one: (one[0].limits.duration_s, -one[1]))
     progress(f"refining {program.words}")
 
     def gain(parameters: np.ndarray) -> float:
@@ -103,47 +93,34 @@ def suggest(
         return asked.predicted_z(*played) if guard.allows(played) else float("nan")
 
     parameters, z = refine(program, gain, z)
-    time_s, voltage_V = program.samples(parameters)
-    times, once = 1, (time_s, voltage_V)
-    most = min(_MOST_REPEATS, int(limits.duration_s / (1.1 * program.limits.duration_s)))
-    while times < most and z < _ENOUGH_Z:
-        longer = repeated(program.limits, once, times + 1)
-        if not guard.allows(longer):
+    once, words = program.samples(parameters), program.words
+    played, most = once, int(limits.duration_s / (1.1 * program.limits.duration_s))
+    for times, over in _OVER.items():
+        longer = repeated(program.limits, once, times)
+        if times > most or z >= _ENOUGH_Z or not guard.allows(longer):
             break
-        times += 1
-        time_s, voltage_V = longer
-        z = asked.predicted_z(time_s, voltage_V)
+        played, words = longer, f"{program.words}, {over} over"
+        z = asked.predicted_z(*played)
     if asked is not predictor:
-        z = predictor.predicted_z(time_s, voltage_V)
+        z = predictor.predicted_z(*played)
     # What tells nothing is not worth playing, but for a further column.
+    present_z = predictor.present_z
     if not column and (z < 1.0 or z < _LEAST_GAIN * present_z):
         return None
-    words = program.words if times < 2 else f"{program.words}, {_OVER[times]} over"
     purpose = _purpose(names, z, present_z, column)
-    extremes = guard.extremes((time_s, voltage_V))
-    return Experiment(time_s, voltage_V, words, purpose, names, z, present_z, column, extremes)
+    return Experiment(*played, words, purpose, names, z, present_z, column, guard.extremes(played))
 
 
 def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, ...]) -> Question | None:
     """What is to be decided: names, hypotheses, and which is compared with which."""
     named = {cause.name for cause in causes}
-    best = Hypothesis(found.model.laws, found.model.x, _covariances(found.model))
+    best = _hypothesis(found.model)
     for at, cause in enumerate(found.causes):
-        if cause.name not in named or not cause.rivals:
-            continue
-        rivals = cause.rivals[:MOST_RIVALS]
-        others = [
-            Hypothesis(
-                (*best.laws[:at], rival.refit.laws[-1], *best.laws[at + 1 :]),
-                (*best.x[:at], rival.refit.x[-1], *best.x[at + 1 :]),
-                (*best.covariances[:at], _last_covariance(rival.refit), *best.covariances[at + 1 :]),
-            )
-            for rival in rivals
-            # Another cause may have turned out to be the rival.
-            if rival.name not in {c.name for i, c in enumerate(found.causes) if i != at}
-        ]
-        if others:
-            every = (best, *others)
+        # Another cause may have turned out to be the rival.
+        taken = {other.name for k, other in enumerate(found.causes) if k != at}
+        rivals = [rival for rival in cause.rivals[:MOST_RIVALS] if rival.name not in taken]
+        if cause.name in named and rivals:
+            every = (best, *(_with_last(best, at, _hypothesis(rival.refit)) for rival in rivals))
             # The cause and each rival, be the one or the other true: rivals among themselves may be alike for ever.
             pairs = tuple(pair for k in range(1, len(every)) for pair in ((0, k), (k, 0)))
             return tuple(h.names[at] for h in every), every, pairs
@@ -161,35 +138,34 @@ def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, .
     return (leading.name,), (Hypothesis((law,), (law.start,)), nothing), ((0, 1),)
 
 
-def _covariances(model: Refit) -> tuple[np.ndarray, ...]:
-    """Covariance of the coordinates of each effect of a model."""
+def _hypothesis(model: Refit) -> Hypothesis:
+    """The effects of a model."""
     whole, stops = model.covariance(), np.cumsum([law.size for law in model.laws])
     blocks = [slice(stop - law.size, stop) for law, stop in zip(model.laws, stops, strict=True)]
-    return tuple(whole[block, block] for block in blocks)
+    return Hypothesis(model.laws, model.x, tuple(whole[block, block] for block in blocks))
 
 
-def _last_covariance(model: Refit) -> np.ndarray:
-    """The same of the last effect alone: those before it may only have followed along their tangent."""
-    size = model.laws[-1].size
-    return model.covariance()[-size:, -size:]
+def _with_last(best: Hypothesis, at: int, other: Hypothesis) -> Hypothesis:
+    """The best with the last effect of another instead of one; what is before it may only have followed."""
+    laws = *best.laws[:at], other.laws[-1], *best.laws[at + 1 :]
+    x = *best.x[:at], other.x[-1], *best.x[at + 1 :]
+    return Hypothesis(laws, x, (*best.covariances[:at], other.covariances[-1], *best.covariances[at + 1 :]))
 
 
 def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) -> tuple[np.ndarray, float]:
     """Climb the logarithm of a gain in a program's parameters by finite differences, and keep the best.
 
-    The `gain` of parameters of shape `(k,)` is NaN where they are not allowed, and `first` that at the program's
-    start.
+    The `gain` of parameters of shape `(k,)` is NaN where they are not allowed, and `first` at the program's start.
     """
     span = program.upper - program.lower
     best, top = program.start.copy(), first
-    for _ in range(_ROUNDS):
+    for _ in range(2):
         slope = np.zeros(len(best))
         for k in np.flatnonzero(span > 0):
             ahead = best.copy()
             # Towards the middle, so that a step is never cut off.
             ahead[k] += span[k] * (_PROBE if best[k] < (program.lower + program.upper)[k] / 2 else -_PROBE)
-            there = gain(ahead)
-            if not np.isnan(there):
+            if not np.isnan(there := gain(ahead)):
                 slope[k] = np.log(max(there, 1e-12) / max(top, 1e-12)) * span[k] / (ahead[k] - best[k])
         size = float(np.max(np.abs(slope)))
         if size == 0:
@@ -198,21 +174,21 @@ def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) 
         gains = [gain(p) for p in tried]
         if np.isnan(gains).all():
             break
-        longest = int(np.nanargmax(gains))
-        if gains[longest] <= top:
+        highest = int(np.nanargmax(gains))
+        if gains[highest] <= top:
             break
-        best, top = tried[longest], gains[longest]
+        best, top = tried[highest], gains[highest]
     return best, top
 
 
 def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> str:
-    words = [name.replace("_", " ") for name in names]
-    if len(words) == 1:
+    *others, last = (name.replace("_", " ") for name in names)
+    if not others:
         return (
-            f"It would show {words[0]} of the size that is suspected by {z:.1f} standard deviations, where the "
-            f"records at hand show it by {present:.1f}."
+            f"It would show {last} of the size that is suspected by {z:.1f} standard deviations, where the records "
+            f"at hand show it by {present:.1f}."
         )
-    listed = " and ".join([", ".join(words[:-1]), words[-1]])
+    listed = f"{', '.join(others)} and {last}"
     if z < _TOLD_APART and column:
         return f"No program within the limits tells {listed} apart by itself: record this one with a further column."
     if z < _TOLD_APART:
@@ -227,13 +203,11 @@ def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> s
 
 
 def further_column(names: tuple[str, ...], records: Sequence[Record]) -> str:
-    """Which further column helps most of the suspects, and why; empty if none does, or the records have it.
-
-    Of several that help as many, it is that of the first.
-    """
+    """Which further column helps most of the suspects, and why; empty if none does, or the records have it."""
     wanted = [column for name in names if (column := card_of(name).column)]
     if not wanted:
         return ""
+    # Of several that help as many, that of the first.
     column = max(wanted, key=wanted.count)
     # One that shows nothing is there all the same.
     if any(column in record.extra or column in columns_beside(record) for record in records):

@@ -1,5 +1,6 @@
 """What was found, in the terms of its users: parameters with intervals, shares, and bounds of what was not found."""
 
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
@@ -27,45 +28,38 @@ MOST_RIVALS = 2
 # The likelihood is profiled along a parameter that one standard deviation of its coordinate moves so many times as
 # far to one side as to the other.
 _NONLINEAR = 1.3
-# The first step of a profile along the coordinate; steps double until the cost is high enough, and then halve the
-# interval.
-_STEP = 0.5
-# So many steps at most, and coordinates no larger than this.
-_STEPS, _LARGEST = 10, 30.0
-# Rounds in which all other coordinates are fitted again at each step.
-_ROUNDS = 3
+# The first step of a profile along the coordinate: steps double until the cost is high enough, and then halve the
+# interval; how many at most, with coordinates up to which, and rounds in which all others are fitted again at each.
+_STEP, _STEPS, _LARGEST, _ROUNDS = 0.5, 10, 30.0, 3
 # A profile ends where the cost says so many standard deviations, within this factor.
 _FAR_Z, _FAR_WITHIN = 3.0, 1.4
 
 
 def causes_of(
-    causes: Sequence[Cause],
-    model: Refit,
-    projector: Projector,
-    bench: Bench,
-    misfit: float,
-    faults: Sequence[Fault],
-    noise: Faults,
+    causes: Sequence[Cause], model: Refit, beside: Selection, misfit: float, faults: Sequence[Fault], noise: Faults
 ) -> tuple[FoundCause, ...]:
     """Describe the causes, the most important first: by the misfit that each removes."""
     found: dict[str, FoundCause] = {}
-    weight: dict[str, float] = {}
-    occurrences: dict[str, int] = {}
+    weight: defaultdict[str, float] = defaultdict(float)
+    bench, projector = beside.bench, beside.projector
     covariance, at = model.covariance(), 0
     total = float(np.mean([n.total_um**2 for n in projector.noise]))
     for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
         block = covariance[at : at + law.size, at : at + law.size]
         at += law.size
-        changed = [[law.effect(x, run)] for run in range(len(bench.prepared))]
-        alone = [a - b for a, b in zip(bench.respond(changed), bench.plain, strict=True)]
+        changed = bench.respond([[effect] for effect in law.effects(x)])
+        alone = [a - b for a, b in zip(changed, bench.plain, strict=True)]
         joined = projector.join(alone)
         seen = float(np.linalg.norm(projector.off(joined)) / max(float(np.linalg.norm(joined)), 1e-300))
         rms_um, share = seen * _rms(alone, projector), cause.drop / misfit
-        occurrences[cause.name] = count = occurrences.get(cause.name, 0) + 1
-        weight[cause.name] = weight.get(cause.name, 0.0) + cause.drop / projector.count * total
+        weight[cause.name] += cause.drop / projector.count * total
         parameters = _parameters(law, x, block, profile_likelihood(bench, projector, model, number, block))
-        if count > 1:
-            found[cause.name] = _with_occurrence(found[cause.name], parameters, count, share, rms_um)
+        if cause.name in found:
+            first, count = found[cause.name], [one.name for one in causes[: number + 1]].count(cause.name)
+            more = (replace(one, name=f"{one.name}, number {count}") for one in parameters)
+            share, rms_um = min(1.0, first.share_of_misfit + share), float(np.hypot(first.rms_um, rms_um))
+            both = (*first.parameters, *more)
+            found[cause.name] = replace(first, parameters=both, share_of_misfit=share, rms_um=rms_um)
             continue
         rivals = tuple(rival.name for rival in cause.rivals[:MOST_RIVALS])
         found[cause.name] = described(law.form, rivals, cause.z, cause.p_family, parameters, share, rms_um)
@@ -94,8 +88,7 @@ def described(
 ) -> FoundCause:
     """A cause with what its effect's card says of it."""
     card = form.fingerprint, form.experiment, form.source
-    share = float(min(1.0, share))
-    return FoundCause(form.name, form.form, rivals, float(z), p, parameters, share, rms_um, *card)
+    return FoundCause(form.name, form.form, rivals, float(z), p, parameters, float(min(1.0, share)), rms_um, *card)
 
 
 def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:
@@ -104,25 +97,12 @@ def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:
     return (square / projector.count) ** 0.5
 
 
-def _with_occurrence(
-    first: FoundCause, more: Sequence[EffectParameter], count: int, share: float, rms_um: float
-) -> FoundCause:
-    """One cause for several of its kind."""
-    return replace(
-        first,
-        parameters=(*first.parameters, *(replace(one, name=f"{one.name}, number {count}") for one in more)),
-        share_of_misfit=float(min(1.0, first.share_of_misfit + share)),
-        rms_um=float(np.hypot(first.rms_um, rms_um)),
-    )
-
-
 def _parameters(
     law: Law, x: np.ndarray, covariance: np.ndarray, along: Sequence[tuple[float, np.ndarray]]
 ) -> tuple[EffectParameter, ...]:
     """Values in their units: of each run in which the effect shows where runs differ, the others by their place.
 
-    Intervals reach as far to either side as the profile, coordinates `along` which each is so many standard
-    deviations away.
+    Intervals reach as far to either side as the profile `along` coordinates that are so many deviations away each.
     """
     runs = len(law.maps) if law.form.per_run and law.each.any() else 1
     shared: list[EffectParameter] = []
@@ -135,26 +115,20 @@ def _parameters(
         for away, there in along:
             moved = law.values(there, run)
             below, above = np.maximum(below, (values - moved) / away), np.maximum(above, (moved - values) / away)
-        mine = []
+        mine: list[EffectParameter] = []
         for info, place in law.entries:
             differs = runs > 1 and info.path in law.form.strength
             # What went on before a run is no property of the rig.
-            for at in range(place.start, place.stop) if info.path not in law.form.history else ():
+            if info.path in law.form.history or (run and not differs):
+                continue
+            for at in range(place.start, place.stop):
                 name = info.path if place.stop - place.start == 1 else f"{info.path}[{at - place.start}]"
                 value, less, more = float(values[at]), float(below[at]), float(above[at])
-                low, high = value - TWO_SIDED_95 * less, value + TWO_SIDED_95 * more
-                one = EffectParameter(
-                    f"{name} in run {run + 1}" if differs else name,
-                    value,
-                    max(less, more),
-                    info.spec.unit,
-                    max(low, info.spec.lower),
-                    min(high, info.spec.upper),
-                )
-                if differs:
-                    mine.append(one)
-                elif run == 0:
-                    shared.append(one)
+                low = max(value - TWO_SIDED_95 * less, info.spec.lower)
+                high = min(value + TWO_SIDED_95 * more, info.spec.upper)
+                name = f"{name} in run {run + 1}" if differs else name
+                one = EffectParameter(name, value, max(less, more), info.spec.unit, low, high)
+                (mine if differs else shared).append(one)
         own.append(mine)
     # At its bound a strength has no standard deviation to speak of: a run without the effect says nothing of it.
     showing = [mine for mine in own if any(abs(one.value) > _SHOWS * one.sd for one in mine)] or own
@@ -164,12 +138,11 @@ def _parameters(
 def profile_likelihood(
     bench: Bench, projector: Projector, model: Refit, which: int, covariance: np.ndarray
 ) -> list[tuple[float, np.ndarray]]:
-    """Profile of the likelihood over the nonlinear parameters of a law: coordinates, and how many deviations away.
+    """Profile of the likelihood over nonlinear parameters of one law: coordinates, and how many deviations away.
 
     Where records hardly show a parameter, or one is near its bound, the sum of squares is no parabola, and the
     standard deviations of its curvature, `covariance` of shape `(size, size)`, promise too much. A distance is the
     root of what the place costs (Wilks, Annals of Mathematical Statistics 9 (1938) 60), but 3 if that is less.
-    `which` numbers the law.
     """
     law, x = model.laws[which], model.x[which]
     sd = np.sqrt(np.diagonal(covariance))
@@ -194,19 +167,18 @@ def _profile_to(
     bench: Bench, projector: Projector, model: Refit, which: int, path: str, at: int, way: int
 ) -> list[tuple[float, np.ndarray]]:
     """Costs and coordinates of a law with one held farther and farther to one side, and then less far again."""
-    law, runs = model.laws[which], range(len(model.laws[which].maps))
-    found: list[tuple[float, np.ndarray]] = []
+    law, found = model.laws[which], list[tuple[float, np.ndarray]]()
     step, last, outside = _STEP, model, None
-    inside = float(_law_of_model(model, which, law).start[at])
+    inside = float(_coordinates(model, which, law)[at])
     for _ in range(_STEPS):
         place = inside + way * step if outside is None else (inside + outside) / 2
-        moved = np.array(_law_of_model(last, which, law).start)
+        moved = np.array(_coordinates(last, which, law))
         moved[at] = place
         # One by itself has nothing beside it that is fitted again.
         only = sum(one.size for one in model.laws) == 1
-        held = Law([law.effect(moved, run) for run in runs], law.remembers, () if only else (path,))
+        held = Law(law.effects(moved), law.remembers, () if only else (path,))
         there = refit(bench, projector, *last.with_law(which, held), 0 if only else _ROUNDS)
-        found.append((there.cost, _law_of_model(there, which, law).start))
+        found.append((there.cost, _coordinates(there, which, law)))
         away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR_Z
         if 1 / _FAR_WITHIN < away < _FAR_WITHIN:
             break
@@ -219,29 +191,26 @@ def _profile_to(
     return found
 
 
-def _law_of_model(model: Refit, which: int, like: Law) -> Law:
-    """One law of a model in the coordinates of another."""
-    law, x = model.laws[which], model.x[which]
-    return Law([law.effect(x, run) for run in range(len(law.maps))], like.remembers)
+def _coordinates(model: Refit, which: int, like: Law) -> np.ndarray:
+    """Coordinates of one effect of a model, as in another law."""
+    return Law(model.laws[which].effects(model.x[which]), like.remembers).start
 
 
 def bounds(found: Selection, ready: Prepared, left: Sequence[Scored], named: Collection[str]) -> tuple[Bound, ...]:
     """How large each effect that was not named may still be, by the scores that are left."""
-    out = []
+    out, blind = [], "the plain stage follows all of it in these runs, so that they cannot show it"
     for name, one in best_of(left).items():
         if name in named:
             continue
         size = float(np.linalg.norm(one.columns))
         if size == 0:
-            reason = "the plain stage follows all of it in these runs, so that they cannot show it"
-            out.append(Bound(name, 0.0, 1.0, np.nan, reason))
+            out.append(Bound(name, 0.0, 1.0, np.nan, blind))
             continue
         # The largest multiple that would not have been noticed, by the size that it has in the displacement.
         raw = float(np.linalg.norm([_rms(column, found.first) for column in one.probe.signatures]))
         bound = (one.z + TWO_SIDED_95) / size * raw
         out.append(Bound(name, one.z, 1.0 - one.share_left, bound))
     asked = {bound.name for bound in out} | set(named)
-    for name, reason in dict(ready.skipped).items():
-        if name not in asked:
-            out.append(Bound(name, np.nan, np.nan, np.nan, reason))
+    skipped = dict(ready.skipped).items()
+    out += [Bound(name, np.nan, np.nan, np.nan, reason) for name, reason in skipped if name not in asked]
     return tuple(sorted(out, key=lambda bound: -bound.z if np.isfinite(bound.z) else 1e9))

@@ -17,23 +17,21 @@ from microid.effects import Statistic
 
 # So many samples at rest are enough to read the noise from.
 _IDLE = 150
-# Lines of mains are looked for in stretches of at least so many samples.
-_LONG = 60
-# Lines drift out of step with their frequency after so many s.
-_STEADY_s = 1.5
+# Lines of mains are looked for in stretches of at least so many samples, and no longer than stay in step, in s.
+_LONG, _STEADY_s = 60, 1.5
 # At most so many spikes stand together, and the other samples up to so far away are much smaller.
 _MOST_TOGETHER, _COMPARED_SAMPLES = 3, 16
 # A command that moves, or turns, by more than these parts of its range within so many samples may cause what looks
 # like a spike.
 _MOVED_SHARE, _TURNED_SHARE, _SAMPLES_AROUND = 0.02, 0.004, 6
+# There a spike is larger than this multiple of what is found in a tenth of such places.
+_OUTLYING = 2.0
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
 # Jitter beside rounding has at least so many times its variance.
 _ROUNDING = 10.0
 # A band is one of a resonance from this quality on; what is broader wanders, or jumps.
 _NARROW = 1.5
-# E-folds after which a motion has settled.
-_SETTLED = 8.0
 
 
 @dataclass(frozen=True)
@@ -53,53 +51,49 @@ def floor_of(run: Run, residual_um: np.ndarray, settling_s: float, thresholds: T
     for stretch in idle_stretches(run.record.voltage_V, round(settling_s * run.rate_Hz)):
         piece = residual_um[stretch]
         time = np.linspace(-1, 1, len(piece))
-        order = min(3, len(piece) // 12)
         # What settles is no noise.
-        pieces.append(piece - np.polyval(np.polyfit(time, piece, order), time))
-    count = sum(len(piece) for piece in pieces)
-    if count >= _IDLE:
+        pieces.append(piece - np.polyval(np.polyfit(time, piece, min(3, len(piece) // 12)), time))
+    if sum(len(piece) for piece in pieces) >= _IDLE:
         pieces = _without_mains(pieces, 1 / run.rate_Hz, 1 - thresholds.minor_share)
-        count = sum(len(piece) for piece in pieces)
         joined = np.concatenate(pieces)
         if (rough_um := rough_noise_um(joined)) > 0:
             joined = joined[np.abs(joined) < 8 * rough_um + 1e-300]
         freedom = 4.0 * len(pieces)
         level = float(np.std(joined)) * (len(joined) / max(len(joined) - freedom, 1)) ** 0.5
         correlation = float(np.mean(joined[1:] * joined[:-1]) / max(np.mean(joined**2), 1e-300))
-        if abs(correlation) * len(joined) ** 0.5 > thresholds.apart_z and level > 0:
-            return Floor(learn_noise(joined, freedom), len(joined))
         if level > 0:
-            return Floor(Noise(level, np.zeros(0)), len(joined))
+            correlated = abs(correlation) * len(joined) ** 0.5 > thresholds.apart_z
+            return Floor(learn_noise(joined, freedom) if correlated else _white(level), len(joined))
     used = residual_um[run.fitted]
-    return Floor(Noise(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um))), np.zeros(0)), 0)
+    return Floor(_white(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um)))), 0)
+
+
+def _white(level_um: float) -> Noise:
+    return Noise(level_um, np.zeros(0))
 
 
 def pooled(floors: Sequence[Floor], same_z: float = THRESHOLDS.apart_z) -> list[Floor]:
     """Floors of one sensor: white noise that was read off idle stretches, and is the same in all runs by chance."""
-    white = [floor for floor in floors if floor.idle and len(floor.noise.past) == 0]
-    if len(white) < 2:
+    white = [floor.idle > 0 and len(floor.noise.past) == 0 for floor in floors]
+    if sum(white) < 2:
         return list(floors)
-    counts = np.array([floor.idle for floor in white])
-    levels = np.array([floor.noise.innovation_um for floor in white])
+    counts = np.array([floor.idle for floor in floors])[white]
+    levels = np.array([floor.noise.innovation_um for floor in floors])[white]
     level = float(np.sqrt(np.average(levels**2, weights=counts)))
     if np.any(np.abs(levels / level - 1) > same_z / np.sqrt(2 * counts)):
         return list(floors)
-    return [
-        replace(one, noise=Noise(level, np.zeros(0))) if any(one is other for other in white) else one
-        for one in floors
-    ]
+    return [replace(one, noise=_white(level)) if own else one for one, own in zip(floors, white, strict=True)]
 
 
 def _without_mains(pieces: list[np.ndarray], interval_s: float, most_left: float) -> list[np.ndarray]:
     """Take the lines of mains out of stretches, where they are most of what is there: hum is a cause, not noise."""
-    most = max(round(_STEADY_s / interval_s), _LONG)
-    long = [
-        part for piece in pieces if len(piece) >= _LONG for part in np.array_split(piece, max(len(piece) // most, 1))
-    ]
+    most, long = max(round(_STEADY_s / interval_s), _LONG), []
+    for piece in pieces:
+        if len(piece) >= _LONG:
+            long += np.array_split(piece, max(len(piece) // most, 1))
     if sum(len(piece) for piece in long) < _IDLE:
         return pieces
-    before = sum(float(piece @ piece) for piece in long)
-    best, found = most_left * before, pieces
+    best, found = most_left * sum(float(piece @ piece) for piece in long), pieces
     for mains in MAINS_Hz:
         for frequency in mains * (1 + np.linspace(-DRIFT, DRIFT, 9)):
             left = []
@@ -117,12 +111,10 @@ def spikes(
     run: Run, residual_um: np.ndarray, least_um: float = 0.0, spike_z: float = THRESHOLDS.spike_z
 ) -> np.ndarray:
     """Samples that stand alone, far off their neighbours, where the command gives no reason; shape `(n,)`."""
-    off = residual_um - median_filter(residual_um, 7, mode="nearest")
-    spread = 1.4826 * median_filter(np.abs(off), 101, mode="nearest")
-    spread = np.maximum(spread, 1.4826 * float(np.median(np.abs(off))))
-    far = np.abs(off) > np.maximum(spike_z * spread, least_um + 1e-300)
+    size = np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
+    spread = np.maximum(1.4826 * median_filter(size, 101, mode="nearest"), 1.4826 * float(np.median(size)))
+    far = size > np.maximum(spike_z * spread, least_um + 1e-300)
     # What rings has neighbours as large; what is alone has none, or one of its kind by chance.
-    size = np.abs(off)
     # In two dimensions: in one, SciPy 1.17 takes a footprint with a gap for one without.
     beside = np.abs(np.arange(-_COMPARED_SAMPLES, _COMPARED_SAMPLES + 1))[None] > _MOST_TOGETHER
     far &= size > 3 * rank_filter(size[None], -2, footprint=beside, mode="nearest")[0]
@@ -130,15 +122,13 @@ def spikes(
     change = np.diff(voltage, prepend=voltage[0])
     turned = np.abs(np.diff(change, append=change[-1])) > _TURNED_SHARE * float(np.ptp(voltage))
     moved = (np.abs(change) > _MOVED_SHARE * float(np.ptp(voltage))) | turned
-    near = np.convolve(moved, np.ones(2 * _SAMPLES_AROUND + 1), mode="same") > 0.5
-    # Where it may, others do so, too: at most of the places, that is.
     width = 2 * _SAMPLES_AROUND + 1
+    near = np.convolve(moved, np.ones(width), mode="same") > 0.5
+    # Where it may, others do so, too, in a tenth of the places at least.
     places = [slice(k, min(k + width, stop)) for first, stop in stretches(near) for k in range(first, stop, width)]
     largest = np.array([size[place].max() for place in places]) if places else np.zeros(1)
-    usual = float(np.median(largest))
-    far &= ~near | (size > usual + spike_z * 1.4826 * float(np.median(np.abs(largest - usual))))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
-    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+    far &= ~near | (size > _OUTLYING * float(np.quantile(largest, 0.9)))
+    for first, stop in stretches(far):
         if stop - first > _MOST_TOGETHER:
             far[first:stop] = False
     return far
@@ -149,8 +139,7 @@ def jitter_s(
 ) -> tuple[float, float, float]:
     """Jitter of the instants of sampling, its evidence in standard deviations, and the most that it may be.
 
-    Noise that grows with the speed, from sample to sample: the variance of the residual about its neighbours is
-    compared with the square of the speed.
+    It is noise that grows with the speed: the variance about the neighbours is compared with the square of the speed.
     """
     bent = residual_um[1:-1] - (residual_um[2:] + residual_um[:-2]) / 2
     square = bent**2 / 1.5
@@ -201,11 +190,10 @@ class Faults:
         """Take the spikes out of records."""
         if not self.repaired:
             return list(records)
-        out = []
-        for record, height in zip(records, self.heights_um, strict=True):
-            assert record.displacement_um is not None
-            out.append(replace(record, displacement_um=record.displacement_um - height))
-        return out
+        return [
+            replace(record, displacement_um=np.asarray(record.displacement_um) - height)
+            for record, height in zip(records, self.heights_um, strict=True)
+        ]
 
 
 def find_faults(
@@ -219,10 +207,8 @@ def find_faults(
         left = tuple(r - change for r, change in zip(regression.residuals, change_um, strict=True))
         regression = replace(regression, residuals=left)
     baseline = regression.baseline
-    guess = [
-        Noise(max(rough_noise_um(r[m]), 1e-9 * baseline.stroke_um), np.zeros(0))
-        for r, m in zip(regression.residuals, regression.masks, strict=True)
-    ]
+    used = (left[mask] for left, mask in zip(regression.residuals, regression.masks, strict=True))
+    guess = [_white(max(rough_noise_um(left), 1e-9 * baseline.stroke_um)) for left in used]
     projector = Projector(regression, guess)
     dz, dw = projector.step(projector.residual)
     quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
@@ -230,14 +216,13 @@ def find_faults(
     least = quantum / 12**0.5
     floors, found, heights, jitters, bands = [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
-    settling_s = float(_SETTLED / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
-    for run, rows, nuisance, residual in zip(
-        baseline.runs, regression.rows, regression.nuisance, regression.residuals, strict=True
-    ):
+    # After so many e-folds a motion has settled.
+    settling_s = float(8.0 / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
+    each = zip(baseline.runs, regression.rows, regression.nuisance, regression.residuals, strict=True)
+    for run, rows, nuisance, residual in each:
         moved = residual - rows @ np.concatenate([dw, dz])
         mask = run.fitted
-        free = np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
-        left = moved - nuisance @ free
+        left = moved - nuisance @ np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
         bad = spikes(run, left, 2 * quantum, thresholds.spike_z)
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)
@@ -249,8 +234,7 @@ def find_faults(
         interval = float(np.median(np.diff(run.record.time_s)))
         bands.append(band_of(smooth[mask], interval, run.record.voltage_V[mask]))
     floors = pooled(floors, thresholds.apart_z)
-    idle = [floor.idle > 0 for floor in floors]
-    noise = [one.noise if one.noise.total_um > least else Noise(least, np.zeros(0)) for one in floors]
+    noise = [one.noise if one.noise.total_um > least else _white(least) for one in floors]
     z, size, _, _ = max(jitters, key=lambda j: j[0])
     # One recorder took all runs: what only one of them shows is something else.
     z = z if size / 2 < min(most for _, _, _, most in jitters) else 0.0
@@ -261,13 +245,11 @@ def find_faults(
         ]
     # What may be hum in one run may be told from it in another.
     band = max(bands, key=lambda one: (not one.mains, one.z))
-    source = (
-        "idle stretches of the runs"
-        if all(idle)
-        else "the fastest changes of the residual, as if it were white"
-        if not any(idle)
-        else "idle stretches where there are any, and the fastest changes of the residual elsewhere"
-    )
+    source = "idle stretches where there are any, and the fastest changes of the residual elsewhere"
+    if all(floor.idle for floor in floors):
+        source = "idle stretches of the runs"
+    elif not any(floor.idle for floor in floors):
+        source = "the fastest changes of the residual, as if it were white"
     size = size if z > thresholds.strong_z else 0.0
     made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
     return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
@@ -287,10 +269,10 @@ def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLD
     """Which of them explain enough of what is left; what repeats itself with the position (`cyclic`) is no jitter."""
     found = []
     total = float(np.mean([n.total_um**2 for n in faults.noise]))
-    count = sum(int(s.sum()) for s in faults.spikes)
-    samples = sum(len(s) for s in faults.spikes)
+    bad = np.concatenate(faults.spikes)
+    samples, count = len(bad), int(bad.sum())
     if count >= _FEWEST_SPIKES:
-        heights = np.concatenate([h[s] for h, s in zip(faults.heights_um, faults.spikes, strict=True)])
+        heights = np.concatenate(faults.heights_um)[bad]
         size = float(np.sqrt(np.mean(heights**2)))
         share, z = count / samples, float(np.max(np.abs(heights)) / total**0.5)
         known = ("fraction", share, count**0.5 / samples, "1"), ("size_um", size, size / (2 * count) ** 0.5, "um")
@@ -300,9 +282,8 @@ def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLD
         z = (samples * step**2 / 12 / total) ** 0.5
         found.append(Fault("rounding", z, (("step_um", step, 1e-6 * step, "um"),), step**2 / 12))
     if faults.jitter_s > 0 and not cyclic:
-        sd = faults.jitter_s / (2 * max(faults.jitter_z, 1e-9))
-        jitter = Fault("jitter", faults.jitter_z, (("jitter_s", faults.jitter_s, sd, "s"),), faults.jitter_um**2)
-        found.append(jitter)
+        jitter = "jitter_s", faults.jitter_s, faults.jitter_s / (2 * max(faults.jitter_z, 1e-9)), "s"
+        found.append(Fault("jitter", faults.jitter_z, (jitter,), faults.jitter_um**2))
     band = faults.band
     narrow = band.z > thresholds.strong_z and band.quality > _NARROW
     if narrow and band.size_um**2 > thresholds.minor_share / 3 * total and not band.mains:

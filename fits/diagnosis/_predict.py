@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
@@ -28,8 +27,7 @@ _LIKE = 1.5
 class Hypothesis:
     """Effects that the stage may have, none for the plain stage.
 
-    `x` are the coordinates of the `laws` in all runs, and `covariances` those of the coordinates of each, empty where
-    they are not known.
+    `x` are the coordinates of the `laws` in all runs; `covariances` are of those of each, or empty if not known.
     """
 
     laws: tuple[Law, ...]
@@ -42,10 +40,14 @@ class Hypothesis:
         return tuple(law.form.name for law in self.laws)
 
     def without(self, name: str) -> "Hypothesis":
-        """The same without an effect."""
+        """The same without an effect, its covariances left out."""
         kept = [k for k, other in enumerate(self.names) if other != name]
-        known = tuple(self.covariances[k] for k in kept) if self.covariances else ()
-        return Hypothesis(tuple(self.laws[k] for k in kept), tuple(self.x[k] for k in kept), known)
+        return Hypothesis(tuple(self.laws[k] for k in kept), tuple(self.x[k] for k in kept))
+
+    def alone(self, run: int) -> "Hypothesis":
+        """The same in one run only."""
+        laws = tuple(Law([law.effect(x, run)], law.remembers) for law, x in zip(self.laws, self.x, strict=True))
+        return Hypothesis(laws, tuple(law.vector(x, run) for law, x in zip(self.laws, self.x, strict=True)))
 
     def effects(self, run: int) -> list[AbstractEffect]:
         """The effects as they are in one run."""
@@ -75,12 +77,9 @@ class Predictor:
     ):
         self.bench, self.projector = bench, projector
         self.hypotheses, self.pairs = tuple(hypotheses), tuple(pairs)
-        records = [one.run.record for one in bench.prepared]
         # Where an effect differs from run to run, it will be as it was in the longest.
-        self._runs = range(len(records))
-        self._like = int(np.argmax([record.duration_s for record in records]))
-        self._vectors = [[law.vector(x, self._like) for law, x in zip(h.laws, h.x, strict=True)] for h in hypotheses]
-        self._extra = {name: np.asarray(values) for name, values in records[self._like].extra.items()}
+        self._like = int(np.argmax([one.run.record.duration_s for one in bench.prepared]))
+        self._next = [h.alone(self._like) for h in hypotheses]
         self._kinds = [kind for kind, size in enumerate(projector.roughness) if size > 0]
         regression = projector.regression
         self._shared = regression.size + sum(regression.finer[kind][0].shape[1] for kind in self._kinds)
@@ -101,66 +100,57 @@ class Predictor:
 
     def _beside(self, k: int) -> Projector:
         """The projector beside a hypothesis."""
-        projector, h = self.projector, self.hypotheses[k]
+        projector = self.projector
         if k == 0:
             return projector
-        effects = [[law.effect(x, run) for law, x in zip(h.laws, h.x, strict=True)] for run in self._runs]
+        effects = [self.hypotheses[k].effects(run) for run in range(len(self.bench.prepared))]
         regression = regress(self.bench.baseline, _same(projector.regression, effects), effects)
         return Projector(regression, projector.noise, projector.roughness)
 
     def _old_columns(self) -> list[list[np.ndarray]]:
         """Of all hypotheses, what they change in the runs at hand, and the derivatives of that."""
-        runs = self._runs
         columns: list[list[np.ndarray]] = []
         for h in self.hypotheses:
-
-            def out(x: Sequence[np.ndarray], h: Hypothesis = h) -> list[np.ndarray]:
-                effects = [[law.effect(own, run) for law, own in zip(h.laws, x, strict=True)] for run in runs]
-                return self.bench.respond(effects)
-
-            at = out(h.x)
-            columns.append([a - b for a, b in zip(at, self.bench.plain, strict=True)])
-            for k, law in enumerate(h.laws):
-                for i in range(law.size):
-                    columns.append([(a - b) / _STEP for a, b in zip(out(_moved(h.x, k, i)), at, strict=True)])
+            change, slopes = _changes(self.bench, h)
+            columns.append(change)
+            for law, along in zip(h.laws, slopes, strict=True):
                 # Strengths in the new run, which no old run says anything of.
-                columns += [[np.zeros_like(b) for b in at]] * int(law.differs.sum())
+                nothing = [np.zeros_like(one) for one in change]
+                columns += [*along, *[nothing] * int(law.differs.sum())]
         return columns
 
     def _old_gram(self, projector: Projector, columns: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
         """Gram matrix of what runs share and of the signals, each run's nuisance parameters eliminated."""
         signals = np.stack([projector.join(column) for column in columns], axis=1)
-        root, inside = projector.root, projector.orthonormal.T @ signals
-        outside = projector.off(signals)
-        stacked = np.concatenate([root, inside], axis=1)
+        root, outside = projector.root, projector.off(signals)
+        stacked = np.concatenate([root, projector.orthonormal.T @ signals], axis=1)
         gram = stacked.T @ stacked
         size = root.shape[1]
         gram[size:, size:] += outside.T @ outside
-        keep = np.r_[0 : self._shared, size : len(gram)]
-        return _eliminated(gram, keep)
+        return _eliminated(gram, np.r_[0 : self._shared, size : len(gram)])
 
     def _new_grams(self, time_s: np.ndarray, voltage_V: np.ndarray) -> dict[int, np.ndarray]:
         """The same of a run with this command alone, beside each hypothesis that is fitted."""
         baseline = self.bench.baseline
-        n = len(time_s)
-        record = next_record(time_s, voltage_V, self._extra, np.zeros(n))
+        record = next_record(time_s, voltage_V, self.bench.prepared[self._like].run.record)
         # With steps between the samples that are too long, a lag and a delay differ by what both are off.
         stride = baseline.finest[self._like].samples.stride
         run = prepare_run(record, baseline.range_V, "unknown", 0.0, stride, hold=baseline.stage.hold)
         alone = baseline.alone(run)
         bench, noise = Bench(alone), self._noise(float(time_s[1] - time_s[0]))
         columns = []
-        for h, vectors in zip(self.hypotheses, self._vectors, strict=True):
-            at = self._respond(bench, h, vectors)
-            columns.append(at - bench.plain[0])
-            for k, law in enumerate(h.laws):
-                moved = [
-                    (self._respond(bench, h, _moved(vectors, k, i)) - at) / _STEP for i in range(len(vectors[k]))
-                ]
-                columns += _in_order(law, moved)
+        for h, new in zip(self.hypotheses, self._next, strict=True):
+            (change,), slopes = _changes(bench, new)
+            columns.append(change)
+            for law, along in zip(h.laws, slopes, strict=True):
+                # Along the coordinates in the old runs, and then along the strengths that are its own.
+                old = [np.zeros_like(change)] * law.size
+                for i in np.flatnonzero(~law.differs):
+                    old[law.places[self._like, i]] = along[i][0]
+                columns += [*old, *(along[i][0] for i in np.flatnonzero(law.differs))]
         grams, last = {}, None
         for k in self._old:
-            effects = [self._effects(self.hypotheses[k], self._vectors[k])]
+            effects = [self._next[k].effects(0)]
             last = regress(alone, None if last is None else _same(last, effects), effects)
             shared = [last.rows[0], *(last.finer[kind][0] for kind in self._kinds)]
             rows = noise.whiten(np.concatenate([*shared, np.stack(columns, axis=1)], axis=1))[run.fitted]
@@ -169,16 +159,10 @@ class Predictor:
             grams[k] = rows.T @ rows
         return grams
 
-    def _effects(self, h: Hypothesis, vectors: Sequence[np.ndarray]) -> list[AbstractEffect]:
-        return [law.maps[self._like](jnp.asarray(v)) for law, v in zip(h.laws, vectors, strict=True)]
-
-    def _respond(self, bench: Bench, h: Hypothesis, vectors: Sequence[np.ndarray]) -> np.ndarray:
-        return bench.respond([self._effects(h, vectors)])[0]
-
     def _noise(self, interval_s: float) -> Noise:
         """Noise of the run that was sampled most alike; white where none was."""
-        intervals = [float(np.median(np.diff(one.run.record.time_s))) for one in self.bench.prepared]
-        ratios = np.abs(np.log(np.asarray(intervals) / interval_s))
+        intervals = np.array([np.median(np.diff(one.run.record.time_s)) for one in self.bench.prepared])
+        ratios = np.abs(np.log(intervals / interval_s))
         nearest = int(np.argmin(ratios))
         noise = self.projector.noise[nearest]
         colour = noise.past if ratios[nearest] < np.log(_LIKE) else np.zeros(0)
@@ -187,33 +171,22 @@ class Predictor:
     def _worst(self, grams: Mapping[int, np.ndarray]) -> float:
         """The smallest difference of all pairs, off what the stage and the fitted hypothesis can follow."""
         rest = {k: _eliminated(gram, np.arange(self._shared, len(gram))) for k, gram in grams.items()}
-        starts, at = [], 0
-        for h in self.hypotheses:
-            starts.append(at)
-            at += 1 + sum(law.size + int(law.differs.sum()) for law in h.laws)
-        stops = [*starts[1:], at]
+        sizes = [1 + sum(law.size + int(law.differs.sum()) for law in h.laws) for h in self.hypotheses]
+        starts = np.cumsum([0, *sizes])
         found = []
         for true, fitted in self.pairs:
-            left = rest[fitted]
             # Difference of the two, then the coordinates of the fitted one.
-            pick = np.zeros((len(left), stops[fitted] - starts[fitted]))
+            pick = np.eye(len(rest[fitted]))[:, starts[fitted] : starts[fitted + 1]]
             pick[starts[true], 0], pick[starts[fitted], 0] = 1.0, -1.0
-            pick[starts[fitted] + 1 : stops[fitted], 1:] = np.eye(pick.shape[1] - 1)
-            small = pick.T @ left @ pick
-            found.append(float(_eliminated(small, np.arange(1))[0, 0]))
+            found.append(float(_eliminated(pick.T @ rest[fitted] @ pick, np.arange(1))[0, 0]))
         return max(min(found), 0.0) ** 0.5
 
 
-def next_record(
-    time_s: np.ndarray,
-    voltage_V: np.ndarray,
-    extra: Mapping[str, np.ndarray],
-    displacement_um: np.ndarray | None = None,
-) -> Record:
+def next_record(time_s: np.ndarray, voltage_V: np.ndarray, like: Record) -> Record:
     """A run that was not measured yet, whose further columns run as in another record, stretched to its duration."""
-    share = np.linspace(0, 1, len(time_s))
-    stretched = {name: np.interp(share, np.linspace(0, 1, len(values)), values) for name, values in extra.items()}
-    return Record(time_s, voltage_V, displacement_um, stretched, source="the next run")
+    share, old = np.linspace(0, 1, len(time_s)), np.linspace(0, 1, len(like))
+    extra = {name: np.interp(share, old, values) for name, values in like.extra.items()}
+    return Record(time_s, voltage_V, np.zeros(len(time_s)), extra, source="the next run")
 
 
 def _same(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -> Kinds | None:
@@ -221,22 +194,17 @@ def _same(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -
     return None if any(regression.saturating) or any(map(saturating, effects)) else regression.finer
 
 
-def _in_order(law: Law, moved: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Derivatives in the new run, along the coordinates in the old runs and then along those that are its own."""
-    each = law.differs
-    shared = ~each
-    out = [np.zeros_like(moved[0])] * law.size
-    # With one run so far, its strengths stand among the others.
-    places = np.flatnonzero(shared).tolist()
-    for place, i in enumerate(places) if law.each.any() else zip(places, places, strict=True):
-        out[place] = moved[i]
-    return out + [moved[i] for i in np.flatnonzero(each).tolist()]
-
-
-def _moved(x: Sequence[np.ndarray], k: int, i: int) -> list[np.ndarray]:
-    out = [np.array(own) for own in x]
-    out[k][i] += _STEP
-    return out
+def _changes(bench: Bench, h: Hypothesis) -> tuple[list[np.ndarray], list[list[list[np.ndarray]]]]:
+    """What a hypothesis changes in all runs, in um, and of each effect the derivatives along its coordinates."""
+    runs = range(len(bench.prepared))
+    at = bench.respond([h.effects(run) for run in runs])
+    slopes: list[list[list[np.ndarray]]] = [[] for _ in h.laws]
+    for k, law in enumerate(h.laws):
+        for step in _STEP * np.eye(law.size):
+            moved = replace(h, x=(*h.x[:k], h.x[k] + step, *h.x[k + 1 :]))
+            ahead = bench.respond([moved.effects(run) for run in runs])
+            slopes[k].append([(a - b) / _STEP for a, b in zip(ahead, at, strict=True)])
+    return [a - b for a, b in zip(at, bench.plain, strict=True)], slopes
 
 
 def _eliminated(gram: np.ndarray, keep: np.ndarray) -> np.ndarray:

@@ -2,18 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 
 from fits.io._record import Record
 
-# Share of a program that its first full loop takes, unless the rig is slower.
-_LOOP = 0.12
 # Samples of the shortest period that is still seen.
-PER_PERIOD = 12
+_PER_PERIOD = 12
 Samples = tuple[np.ndarray, np.ndarray]
-# A program with fewer samples than these decides nothing.
-_FEWEST_SAMPLES = 200
 
 
 @dataclass(frozen=True)
@@ -39,12 +36,6 @@ class Limits:
     def count(self) -> int:
         """Samples of a program."""
         return int(np.floor(self.duration_s / self.interval_s * (1 + 1e-12))) + 1
-
-    @property
-    def highest_Hz(self) -> float:
-        """The highest frequency of interest, about three times the resonance, that the samples show."""
-        seen = 1 / (PER_PERIOD * self.interval_s)
-        return seen if self.resonance_Hz is None else min(3 * self.resonance_Hz, 3 * seen)
 
     def inside(self, voltage_V: float) -> float:
         """The nearest voltage within the range."""
@@ -78,7 +69,8 @@ class Path:
     def __init__(self, limits: Limits):
         self.limits = limits
         self._time_s, self._voltage_V = [0.0], [limits.lower_V]
-        pace = 2 * limits.span_V / (_LOOP * limits.duration_s)
+        # The loop takes no more of a program, unless the rig is slower.
+        pace = 2 * limits.span_V / (0.12 * limits.duration_s)
         for end_V in (limits.upper_V, limits.lower_V):
             self.to(end_V, pace)
             # Long enough that a sample is taken there.
@@ -89,37 +81,32 @@ class Path:
         """What is left of the duration."""
         return max(self.limits.duration_s - self._time_s[-1], 0.0)
 
-    @property
-    def now_V(self) -> float:
-        """Where the command is."""
-        return self._voltage_V[-1]
-
     def to(self, voltage_V: float, rate_V_per_s: float = np.inf) -> None:
         """Go to a voltage, at a rate or as fast as the rig can."""
         voltage_V = self.limits.inside(voltage_V)
-        way = abs(voltage_V - self.now_V)
+        way = abs(voltage_V - self._voltage_V[-1])
         if way > 0:
             self._time_s.append(self._time_s[-1] + way / min(rate_V_per_s, self.limits.fastest_V_per_s))
             self._voltage_V.append(voltage_V)
 
     def within(self, voltage_V: float, duration_s: float) -> None:
         """Go to a voltage in a time, or as fast as the rig can."""
-        self.to(voltage_V, abs(self.limits.inside(voltage_V) - self.now_V) / max(duration_s, 1e-12))
+        self.to(voltage_V, abs(self.limits.inside(voltage_V) - self._voltage_V[-1]) / max(duration_s, 1e-12))
 
     def rest(self, duration_s: float) -> None:
         """Stay."""
         self._time_s.append(self._time_s[-1] + duration_s)
-        self._voltage_V.append(self.now_V)
+        self._voltage_V.append(self._voltage_V[-1])
 
     def chirp(self, amplitude_V: float, start_Hz: float, stop_Hz: float, duration_s: float) -> None:
         """Swing about the present voltage with a rising frequency, as far as range and rate allow, and come back."""
-        limits, bias = self.limits, self.now_V
+        limits, bias = self.limits, self._voltage_V[-1]
+        amplitude_V = min(amplitude_V, bias - limits.lower_V, limits.upper_V - bias)
         time = np.arange(1, max(int(duration_s / limits.interval_s), 1)) * limits.interval_s
         # The frequency rises exponentially.
         growth = np.log(stop_Hz / start_Hz) / duration_s
         phase = 2 * np.pi * start_Hz * np.expm1(growth * time) / growth
         rate = 2 * np.pi * start_Hz * np.exp(growth * time)
-        amplitude_V = min(amplitude_V, bias - limits.lower_V, limits.upper_V - bias)
         swing = np.minimum(amplitude_V, 0.95 * limits.fastest_V_per_s / rate) * np.sin(phase)
         self._time_s.extend((self._time_s[-1] + time).tolist())
         self._voltage_V.extend((bias + swing).tolist())
@@ -132,16 +119,10 @@ class Path:
         voltage = np.interp(time, self._time_s, self._voltage_V)
         most = limits.fastest_V_per_s * limits.interval_s
         if np.max(np.abs(np.diff(voltage)), initial=0.0) > most:
-            voltage = _slowed(voltage, most * (1 - 1e-9))
+            most *= 1 - 1e-9
+            followed = accumulate(voltage.tolist(), lambda now, wanted: now + min(max(wanted - now, -most), most))
+            voltage = np.array(list(followed))
         return time, np.clip(voltage, limits.lower_V, limits.upper_V)
-
-
-def _slowed(voltage_V: np.ndarray, most_V: float) -> np.ndarray:
-    out, now = [], float(voltage_V[0])
-    for wanted in voltage_V.tolist():
-        now += min(max(wanted - now, -most_V), most_V)
-        out.append(now)
-    return np.asarray(out)
 
 
 def repeated(limits: Limits, samples: Samples, times: int) -> Samples:
@@ -153,72 +134,56 @@ def repeated(limits: Limits, samples: Samples, times: int) -> Samples:
     return limits.interval_s * np.arange(len(whole_V)), whole_V
 
 
-def idle(limits: Limits, bias_V: float, approach_s: float) -> Samples:
-    """Rest at a voltage that is come to in some time."""
-    path = Path(limits)
-    path.within(bias_V, approach_s)
-    return path.samples()
-
-
-def staircase(limits: Limits, low_V: float, high_V: float, decades: float) -> Samples:
+def staircase(path: Path, low_V: float, high_V: float, decades: float) -> None:
     """Levels up and down, held for times that are spread over some decades, long ones among short ones."""
-    path = Path(limits)
     levels = np.r_[np.linspace(low_V, high_V, 5), np.linspace(high_V, low_V, 5)[1:]]
     holds = np.logspace(-decades, 0, len(levels))[[4, 0, 6, 2, 8, 1, 7, 3, 5]]
-    travel = float(np.abs(np.diff(np.r_[path.now_V, levels])).sum()) / limits.fastest_V_per_s
+    travel = float(np.abs(np.diff(np.r_[path.limits.lower_V, levels])).sum()) / path.limits.fastest_V_per_s
     free = max(path.left_s - travel, 0.0)
     for level, hold in zip(levels, holds / holds.sum(), strict=True):
         path.to(float(level))
         path.rest(free * hold)
-    return path.samples()
 
 
-def chirps(limits: Limits, bias_V: float, spread_V: float, amplitude_V: float, stop_Hz: float) -> Samples:
+def chirps(path: Path, bias_V: float, spread_V: float, amplitude_V: float, stop_Hz: float) -> None:
     """Chirps of three amplitudes at three biases each, from a thirtieth of the highest frequency."""
-    path = Path(limits)
-    biases = [limits.inside(bias_V + shift * spread_V) for shift in (-1, 0, 1)]
+    biases = [path.limits.inside(bias_V + shift * spread_V) for shift in (-1, 0, 1)]
     approach = 0.03 * path.left_s
-    each = path.left_s / 9 - approach / 3 - 2 * amplitude_V / limits.fastest_V_per_s
+    each = path.left_s / 9 - approach / 3 - 2 * amplitude_V / path.limits.fastest_V_per_s
     for bias in biases:
         path.within(bias, approach)
         for share in (0.25, 1.0, 0.5):
-            path.chirp(share * amplitude_V, stop_Hz / 30, stop_Hz, max(each, 2 * limits.interval_s))
-    return path.samples()
+            path.chirp(share * amplitude_V, stop_Hz / 30, stop_Hz, max(each, 2 * path.limits.interval_s))
 
 
-def multirate(limits: Limits, low_V: float, high_V: float, decades: float) -> Samples:
+def multirate(path: Path, low_V: float, high_V: float, decades: float) -> None:
     """The same loop at five rates, which are spread over some decades."""
-    path = Path(limits)
-    path.within(low_V, 0.02 * limits.duration_s)
+    path.within(low_V, 0.02 * path.limits.duration_s)
     ratios = np.logspace(0, -decades, 5)
     # Quick loops are repeated, to take a tenth of the slowest one.
     counts = [max(1, round(0.1 / ratio)) for ratio in ratios]
     slowest = path.left_s / float(np.sum(ratios * counts))
     for ratio, count in zip(ratios, counts, strict=True):
-        half = max(ratio * slowest / 2, PER_PERIOD / 2 * limits.interval_s)
+        half = max(ratio * slowest / 2, _PER_PERIOD / 2 * path.limits.interval_s)
         for _ in range(count):
             path.within(high_V, half)
             path.within(low_V, half)
-    return path.samples()
 
 
-def minor_loops(limits: Limits, bias_V: float, amplitude_V: float) -> Samples:
+def minor_loops(path: Path, bias_V: float, amplitude_V: float) -> None:
     """Ten minor loops about a bias that is reached from below, and ten after it is reached from above."""
-    path = Path(limits)
-    low, high = limits.inside(bias_V - amplitude_V), limits.inside(bias_V + amplitude_V)
-    approach = limits.span_V / (0.06 * path.left_s)
+    low, high = path.limits.inside(bias_V - amplitude_V), path.limits.inside(bias_V + amplitude_V)
+    approach = path.limits.span_V / (0.06 * path.left_s)
     half = 0.9 * path.left_s / 40
-    for end in (limits.lower_V, limits.upper_V):
+    for end, first, second in ((path.limits.lower_V, high, low), (path.limits.upper_V, low, high)):
         path.to(end, approach)
         for _ in range(10):
-            path.within(low if end == limits.upper_V else high, half)
-            path.within(high if end == limits.upper_V else low, half)
-    return path.samples()
+            path.within(first, half)
+            path.within(second, half)
 
 
-def repeat_after_wait(limits: Limits, low_V: float, high_V: float, wait_s: float) -> Samples:
+def repeat_after_wait(path: Path, low_V: float, high_V: float, wait_s: float) -> None:
     """The same loop and hold twice, with a rest at the lower voltage between."""
-    path = Path(limits)
     wait_s = min(wait_s, 0.8 * path.left_s)
     each = (path.left_s - wait_s) / 2
     for last in (False, True):
@@ -227,55 +192,49 @@ def repeat_after_wait(limits: Limits, low_V: float, high_V: float, wait_s: float
         path.within(low_V, 0.15 * each)
         path.within((low_V + high_V) / 2, 0.1 * each)
         path.rest(0.15 * each)
-        path.within(limits.lower_V, 0.1 * each)
+        path.within(path.limits.lower_V, 0.1 * each)
         if not last:
             path.rest(wait_s)
-    return path.samples()
 
 
-def steps(limits: Limits, base_V: float, height_V: float, decade: float) -> Samples:
+def steps(path: Path, base_V: float, height_V: float, decade: float) -> None:
     """Steps of three heights from a voltage near the bottom, over and over, with edges as fast as the rig.
 
     Each level is held for `10**decade` seconds, and four samples at least.
     """
-    path = Path(limits)
-    path.within(base_V, 0.03 * limits.duration_s)
-    dwell_s = max(10.0**decade, 4 * limits.interval_s)
+    path.within(base_V, 0.03 * path.limits.duration_s)
+    dwell_s = max(10.0**decade, 4 * path.limits.interval_s)
     heights = (height_V, height_V / 4, height_V / 2)
     for k in range(int(path.left_s / dwell_s) + 1):
         path.to(base_V + (heights[k // 2 % 3] if k % 2 == 0 else 0.0))
         path.rest(dwell_s)
-    return path.samples()
 
 
-def burst(limits: Limits, amplitude_V: float, burst_s: float, period_s: float) -> Samples:
+def burst(path: Path, amplitude_V: float, burst_s: float, period_s: float) -> None:
     """A slow loop, hard driving about the middle for some time, and the same loop twice again."""
-    path = Path(limits)
     burst_s = min(burst_s, 0.6 * path.left_s)
     loop = (path.left_s - burst_s) / 3.2
-    middle = (limits.lower_V + limits.upper_V) / 2
-    half = max(period_s / 2, PER_PERIOD / 2 * limits.interval_s, 2 * amplitude_V / limits.fastest_V_per_s)
+    middle = (path.limits.lower_V + path.limits.upper_V) / 2
+    half = max(period_s / 2, _PER_PERIOD / 2 * path.limits.interval_s, 2 * amplitude_V / path.limits.fastest_V_per_s)
     for k in range(3):
-        path.within(limits.upper_V, loop / 2)
-        path.within(limits.lower_V, loop / 2)
+        path.within(path.limits.upper_V, loop / 2)
+        path.within(path.limits.lower_V, loop / 2)
         if k == 0:
             for _ in range(int(burst_s / (2 * half))):
                 path.within(middle + amplitude_V, half)
                 path.within(middle - amplitude_V, half)
-            path.within(limits.lower_V, 0.05 * loop)
-    return path.samples()
+            path.within(path.limits.lower_V, 0.05 * loop)
 
 
 @dataclass(frozen=True)
 class Program:
-    """One program of the menu: `play` makes times and command from limits of the rig and parameters.
+    """One program of the menu: `play` draws a path by parameters.
 
-    `lower`, `upper` and `start` are of the parameters, in the order that `play` takes them, shape `(k,)`; `words` say
-    what it is made of.
+    `lower`, `upper` and `start` are of the parameters, in that order, shape `(k,)`; `words` say what it is made of.
     """
 
     words: str
-    play: Callable[..., Samples]
+    play: Callable[..., None]
     limits: Limits
     lower: np.ndarray
     upper: np.ndarray
@@ -283,67 +242,55 @@ class Program:
 
     def samples(self, parameters: np.ndarray) -> Samples:
         """Times and command at parameters, which are brought into their limits."""
-        return self.play(self.limits, *np.clip(parameters, self.lower, self.upper).tolist())
+        path = Path(self.limits)
+        self.play(path, *np.clip(parameters, self.lower, self.upper).tolist())
+        return path.samples()
 
 
 def menu(limits: Limits, most: int) -> tuple[Program, ...]:
     """All programs that fit into the limits, with so many samples at most."""
     found = []
     for pace in paces(limits, most):
-        if pace.count < _FEWEST_SAMPLES or 2 * pace.span_V / pace.fastest_V_per_s > 0.5 * pace.duration_s:
+        # Fewer samples decide nothing.
+        if pace.count < 200 or 2 * pace.span_V / pace.fastest_V_per_s > 0.5 * pace.duration_s:
             continue
         # What is fast is only seen finely, what is slow only in the whole time, and the same loop at several rates in
         # both.
         fine = pace.interval_s < 1.5 * limits.interval_s
         whole = pace.duration_s > 0.7 * limits.duration_s
         for words, play, table in _entries(pace):
-            if not (play is multirate or (fine if play in (chirps, steps) else whole)):
-                continue
-            lower, start, upper = np.array(table).T
-            found.append(Program(words, play, pace, lower, upper, np.clip(start, lower, upper)))
+            if play is multirate or (fine if play in (chirps, steps) else whole):
+                lower, start, upper = np.array(table).T
+                found.append(Program(words, play, pace, lower, upper, np.clip(start, lower, upper)))
     return tuple(found)
 
 
-def _entries(limits: Limits) -> list[tuple[str, Callable[..., Samples], list[tuple[float, ...]]]]:
+def _entries(limits: Limits) -> list[tuple[str, Callable[..., None], list[np.ndarray | tuple[float, ...]]]]:
     """Words, function, and of each parameter the least, the first and the largest value."""
     low, span, whole = limits.lower_V, limits.span_V, limits.duration_s
-    at = low + span * np.array([0.0, 0.1, 0.4, 0.2, 0.5, 0.8, 0.6, 0.95, 1.0])
-    bottom, bias, top = (tuple(at[k : k + 3].tolist()) for k in (0, 3, 6))
-    swing = (0.05 * span, 0.15 * span, 0.5 * span)
-    period = 2 * PER_PERIOD * limits.interval_s
+    places = ((0.0, 0.1, 0.4), (0.2, 0.5, 0.8), (0.6, 0.95, 1.0), (0.0, 0.5, 1.0))
+    bottom, bias, top, anywhere = low + span * np.array(places)
+    swing, height = span * np.array([[0.05, 0.15, 0.5], [0.1, 0.5, 0.9]])
+    spread, amplitude, burst_amplitude = span * np.array([[0.0, 0.3, 0.4], [0.02, 0.1, 0.4], [0.2, 0.45, 0.5]])
+    approach, wait, hard = whole * np.array([[0.01, 0.03, 0.2], [0.05, 0.3, 0.7], [0.05, 0.3, 0.5]])
+    shortest_s = _PER_PERIOD * limits.interval_s
+    seen_Hz = 1 / shortest_s
+    # The highest frequency of interest, about three times the resonance, that the samples show.
+    highest_Hz = seen_Hz if limits.resonance_Hz is None else min(3 * limits.resonance_Hz, 3 * seen_Hz)
+    stop = highest_Hz * np.array([0.2, 0.9, 1.0])
+    period = shortest_s * np.array([2.0, 2.0, 40.0])
     # Steps let the stage ring, as long as a period or so, or move on before it has begun to.
-    height = (0.1 * span, 0.5 * span, 0.9 * span)
     ringing = float(np.log10(1 / limits.resonance_Hz if limits.resonance_Hz else 0.0125 * whole))
     shortest, longest = float(np.log10(4 * limits.interval_s)), max(ringing + 1, float(np.log10(0.05 * whole)))
-
-    def share(*parts: float) -> tuple[float, ...]:
-        return tuple(part * whole for part in parts)
-
+    quick = "fast steps of three heights near the bottom"
     return [
-        ("a rest after one loop", idle, [(low, low + 0.5 * span, low + span), share(0.01, 0.03, 0.2)]),
+        ("a rest after one loop", Path.within, [anywhere, approach]),
         ("a staircase up and down with long and short holds", staircase, [bottom, top, (0.3, 1.5, 2.5)]),
-        (
-            "chirps of three amplitudes at three biases",
-            chirps,
-            [
-                bias,
-                (0.0, 0.3 * span, 0.4 * span),
-                (0.02 * span, 0.1 * span, 0.4 * span),
-                (0.2 * limits.highest_Hz, 0.9 * limits.highest_Hz, limits.highest_Hz),
-            ],
-        ),
+        ("chirps of three amplitudes at three biases", chirps, [bias, spread, amplitude, stop]),
         ("the same loop at five rates over two decades", multirate, [bottom, top, (1.0, 2.0, 2.3)]),
         ("a minor loop ten times from below and ten times from above", minor_loops, [bias, swing]),
-        ("the same pattern before and after a wait", repeat_after_wait, [bottom, top, share(0.05, 0.3, 0.7)]),
-        ("fast steps of three heights near the bottom", steps, [bottom, height, (shortest, ringing, longest)]),
-        (
-            "fast steps of three heights near the bottom in quick succession",
-            steps,
-            [bottom, height, (shortest, max(ringing - 1, shortest), longest)],
-        ),
-        (
-            "a slow loop before and twice after a burst of hard driving",
-            burst,
-            [(0.2 * span, 0.45 * span, 0.5 * span), share(0.05, 0.3, 0.5), (period, period, 20 * period)],
-        ),
+        ("the same pattern before and after a wait", repeat_after_wait, [bottom, top, wait]),
+        (quick, steps, [bottom, height, (shortest, ringing, longest)]),
+        (f"{quick} in quick succession", steps, [bottom, height, (shortest, max(ringing - 1, shortest), longest)]),
+        ("a slow loop before and twice after a burst of hard driving", burst, [burst_amplitude, hard, period]),
     ]

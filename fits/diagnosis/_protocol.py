@@ -13,14 +13,11 @@ from microid.effects import card_of
 
 # A hold lasts so long and has so many samples.
 _LONG_s, _SAMPLES = 1.0, 200
-# Meanwhile the displacement keeps within this part of its range.
-_AT_REST_SHARE = 3e-3
-# The voltage moves by more than this part of its own.
-_MOVED_SHARE = 5e-3
-# The voltage of a hold is read from so many intervals after its beginning on.
-_AFTER = 8
-# It is read in so many blocks, evenly spaced in the logarithm of time, over so many decades at least.
-_BLOCKS, _DECADES = 24, 2.0
+# Meanwhile the displacement keeps within this part of its range, and the voltage moves by more than that of its own.
+_AT_REST_SHARE, _MOVED_SHARE = 3e-3, 5e-3
+# The voltage is read from so many intervals after the beginning on, in so many blocks, evenly spaced in the logarithm
+# of time, over so many decades at least.
+_AFTER, _BLOCKS, _DECADES = 8, 24, 2.0
 # Part of the scatter about its mean that a line over the logarithm of time must explain.
 _STRAIGHT = 0.97
 
@@ -103,8 +100,8 @@ def _stretches_at_rest(place: np.ndarray, close: float) -> list[tuple[int, int]]
         away = np.flatnonzero(high - low > close)
         stop = first + (int(away[0]) if len(away) else len(place) - first)
         # Windows are laid in steps: the stretch may have begun before.
-        lowest, highest = place[first:stop].min(), place[first:stop].max()
-        off = np.flatnonzero(np.maximum(place[:first], highest) - np.minimum(place[:first], lowest) > close)
+        inside, before = place[first:stop], place[:first]
+        off = np.flatnonzero(np.maximum(before, inside.max()) - np.minimum(before, inside.min()) > close)
         found.append((int(off[-1]) + 1 if len(off) else 0, stop))
         first = stop
     return found
@@ -114,9 +111,7 @@ def _regressed(along: np.ndarray, values: np.ndarray) -> tuple[float, float, flo
     """Slope over blocks that are evenly spaced, its standard deviation, and the part of the scatter explained."""
     edges = np.linspace(along[0], along[-1], _BLOCKS + 1)
     block = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, _BLOCKS - 1)
-    seen = [k for k in range(_BLOCKS) if np.any(block == k)]
-    x = np.array([along[block == k].mean() for k in seen])
-    y = np.array([values[block == k].mean() for k in seen])
+    x, y = np.array([(along[block == k].mean(), values[block == k].mean()) for k in np.unique(block)]).T
     line = stats.linregress(x, y)
     # Neighbouring blocks err alike: only every other is taken to be of its own.
     return float(line.slope), float(2**0.5 * line.stderr), float(line.rvalue**2)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,8 +20,7 @@ from fits.stage._run import joined, place_of_hysteresis
 from microid import PLACES, AbstractEffect, Coordinates, Signal, Stage
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
-_FINE = 64
-_EXAMPLES = 120
+_FINE, _EXAMPLES = 64, 120
 # Of central differences along coordinates, which are of the size of one.
 _STEP = 1e-4
 # Part of an unknown of a run that must be left in the samples that count.
@@ -30,8 +29,6 @@ _DEAD = 1e-3
 Kinds: TypeAlias = tuple[tuple[np.ndarray, ...], ...]
 # Directions that are passed on at a time.
 _AT_ONCE = 64
-# Places of effects that are added to whatever the stage does.
-_ADDED = ("environment", "noise")
 
 
 @dataclass(frozen=True)
@@ -41,9 +38,9 @@ class Regression:
     Per run: `masks` of the samples that are fitted, shape `(n,)`; `rows`, derivatives along columns and coordinates,
     shape `(n, D + p)`; `nuisance`, signals of the run's nuisance parameters, shape `(n, k)`; `residuals`, measurement
     less simulation without effects, in um, shape `(n,)`; `saturating`, the effects that the derivatives go through.
-    By kind and run, `finer` is what relative roughness of the density changes that the grid cannot follow, shape `(n,
-    k)`: of loops of one width at all biases, as play operators are, and at single places of the half-plane. `root` is
-    the root of the prior precision of the columns, shape `(D, D)`.
+    By kind and run, `finer` is what roughness of the density changes that the grid cannot follow, shape `(n, k)`: of
+    loops of one width at all biases, as of plays, and at single places. `root` is that of the prior precision of the
+    columns, shape `(D, D)`.
     """
 
     baseline: Baseline
@@ -66,43 +63,47 @@ def regress(
 ) -> Regression:
     """Linearise a baseline in all its runs.
 
-    `finer` is the structure finer than its grid, from a baseline nearby and under the same effects; it is computed by
-    default. `effects` are those of each run beside which the baseline moves: derivatives along coordinates go through
-    all that depend on the stage, those along columns through those that saturate.
+    `finer` is taken from a baseline nearby under the same effects, or else computed. `effects` are those of each run
+    beside which the baseline moves: derivatives along coordinates go through all that depend on the stage, those
+    along columns through those that saturate.
     """
     chain, runs, z = baseline.chain, baseline.runs, jnp.asarray(baseline.z)
     assert chain.grid is not None
-    levelling = tuple(map(saturating, effects)) if effects else ((),) * len(runs)
-    bases = _bases(baseline) if finer is None else []
+    effects = effects or ((),) * len(runs)
+    levelling = tuple(map(saturating, effects))
+    roughness = _roughness(baseline) if finer is None else None
     rows, nuisance, residuals = [], [], []
-    kinds: list[list[np.ndarray]] = [[] for _ in bases]
+    # By run, and then by kind.
+    structure: list[list[np.ndarray]] = []
     stage = baseline.stage
-    beside = tuple(map(dependent, effects)) if effects else ((),) * len(runs)
-    for run, fine_run, there, own_effects in zip(runs, baseline.fine, levelling, beside, strict=True):
+    for run, fine_run, there, own in zip(runs, baseline.fine, levelling, effects, strict=True):
         here = with_effects_in(chain, baseline.z, there)
         _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
-        both[:, chain.size :] = _slope(baseline, own_effects, fine_run) if own_effects else slope[:n]
+        # The change of others depends on driver and mechanics: a lag of the sensor and one of the driver do nearly
+        # the same, so that telling them apart takes exact derivatives.
+        dependent = tuple(one for one in own if one.place not in ("environment", "noise"))
+        both[:, chain.size :] = _slope(baseline, dependent, fine_run) if dependent else slope[:n]
         for first, columns in pieces(here, z, run, True):
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         around = both[:, : chain.size] @ baseline.columns_um
         both[:, : chain.size] = propagated(here, baseline.z, run, around, both[:, : chain.size])
         rows.append(both)
         plain = simulate(stage, fine_run)
-        speed = np.gradient(plain, run.record.time_s)[:, None]
+        speed = np.gradient(plain, run.record.time_s)
         late = [speed] if baseline.skewed else []
         # With an instant off by d, a reading is y + d y' + d^2 y'' / 2: the first is noise, the second is not.
-        blur = [np.gradient(speed[:, 0], run.record.time_s)[:, None]] if baseline.blurred else []
-        nuisance.append(_without_decayed(np.concatenate([free[:n], *late, *blur], axis=1), run.fitted))
+        blur = [np.gradient(speed, run.record.time_s)] if baseline.blurred else []
+        nuisance.append(_without_decayed(np.column_stack([free[:n], *late, *blur]), run.fitted))
         residuals.append(run.displacement_um - plain)
-        if finer is None:
+        if roughness is not None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
-            for kind, part in zip(kinds, _along(fine, baseline, run, bases, around), strict=True):
-                kind.append(part)
-    masks, structure = tuple(run.fitted for run in runs), tuple(map(tuple, kinds)) if finer is None else finer
-    data = tuple(rows), tuple(nuisance), structure, tuple(residuals)
-    return Regression(baseline, masks, *data, root_of(baseline.prior), levelling)
+            moved = np.concatenate([columns @ roughness for _, columns in pieces(fine, z, run, True)])[:n]
+            structure.append(np.split(propagated(fine, baseline.z, run, around, moved), [_FINE], axis=1))
+    kinds = tuple(zip(*structure, strict=True)) if finer is None else finer
+    data = tuple(rows), tuple(nuisance), kinds, tuple(residuals)
+    return Regression(baseline, tuple(run.fitted for run in runs), *data, root_of(baseline.prior), levelling)
 
 
 def root_of(prior: np.ndarray) -> np.ndarray:
@@ -131,8 +132,8 @@ def _slope(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: Run) ->
     return out
 
 
-def _bases(baseline: Baseline) -> list[np.ndarray]:
-    """Relative roughness of the density, in columns of the finer grid, in um, shape `(D, k)` by kind."""
+def _roughness(baseline: Baseline) -> np.ndarray:
+    """Relative roughness of the density of both kinds, in columns of the finer grid, in um, shape `(D, k)`."""
     grid = baseline.chain.grid
     assert grid is not None
     smooth = interpolation(grid.levels, _FINE) @ baseline.columns_um
@@ -146,16 +147,7 @@ def _bases(baseline: Baseline) -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     places = np.zeros((len(smooth), _EXAMPLES))
     places[:weights] = density[:, None] * rng.standard_normal((weights, _EXAMPLES)) / _EXAMPLES**0.5
-    return [loops, places]
-
-
-def _along(
-    finer: Chain, baseline: Baseline, run: Run, bases: list[np.ndarray], around_um: np.ndarray
-) -> list[np.ndarray]:
-    joined = np.concatenate(bases, axis=1)
-    parts = [columns @ joined for _, columns in pieces(finer, jnp.asarray(baseline.z), run, True)]
-    moved = propagated(finer, baseline.z, run, around_um, np.concatenate(parts)[: len(run.record)])
-    return np.split(moved, np.cumsum([base.shape[1] for base in bases])[:-1], axis=1)
+    return np.concatenate([loops, places], axis=1)
 
 
 def saturating(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
@@ -163,48 +155,29 @@ def saturating(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
 
     They saturate, stand by themselves, and act before the mechanics has answered.
     """
-    last = PLACES.index("mechanics")
-    return tuple(
-        one for one in effects if one.finite and not hasattr(one, "inner") and PLACES.index(one.place) <= last
-    )
+    early = PLACES[: PLACES.index("mechanics") + 1]
+    return tuple(one for one in effects if one.finite and not hasattr(one, "inner") and one.place in early)
 
 
-def dependent(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
-    """Those whose change depends on driver and mechanics.
-
-    A lag of the sensor and one of the driver do nearly the same, so that telling them apart takes exact derivatives.
-    """
-    return tuple(one for one in effects if one.place not in _ADDED)
-
-
-class _WithEffects(eqx.Module):
-    """Coordinates of a plain stage, of which a stage with effects is made."""
-
-    plain: Coordinates[Stage]
-    effects: tuple[AbstractEffect, ...]
-
-    def __call__(self, z: Float[Array, " p"]) -> Stage:
-        """The stage with the effects."""
-        return with_effects(self.plain(z), self.effects)
+def _extended(plain: Coordinates[Stage], effects: tuple[AbstractEffect, ...], z: Float[Array, " p"]) -> Stage:
+    return with_effects(plain(z), effects)
 
 
 def with_effects_in(chain: Chain, z: np.ndarray, effects: tuple[AbstractEffect, ...]) -> Chain:
     """The chain of a stage with effects, in the same coordinates and columns."""
     if not effects:
         return chain
-    coordinates = _WithEffects(chain.coordinates, effects)
-    return Chain(coordinates, place_of_hysteresis(coordinates(jnp.asarray(z))), chain.grid)  # type: ignore[arg-type]
+    coordinates: Any = eqx.Partial(_extended, chain.coordinates, effects)
+    return Chain(coordinates, place_of_hysteresis(coordinates(jnp.asarray(z))), chain.grid)
 
 
 def propagated(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
-    """Pass changes of the hysteresis, shape `(n, k)`, on through what follows it, to first order.
+    """Pass changes of what comes out of the hysteresis, shape `(n, k)`, on through what follows it, to first order.
 
-    Where all that follows is linear, they have been passed on already. `around_um` is what comes out of the
-    hysteresis, shape `(n,)`.
+    They are `around_um`, shape `(n,)`. Where all that follows is linear, they have been passed on already.
     """
     assert chain.place is not None
-    stage = chain.coordinates(jnp.asarray(z))
-    after = stage.parts[chain.place + 1 :]
+    after = chain.coordinates(jnp.asarray(z)).parts[chain.place + 1 :]
     if not after or joined(after) is not None:
         return moved_um
     n, samples = len(run.record), run.samples
@@ -214,8 +187,7 @@ def propagated(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, mov
     out = np.empty_like(moved_um)
     for first in range(0, moved_um.shape[1], _AT_ONCE):
         part = moved_um[:, first : first + _AT_ONCE].T
-        more = _AT_ONCE - len(part)
-        full = np.pad(part, ((0, more), (0, pad)))
+        full = np.pad(part, ((0, _AT_ONCE - len(part)), (0, pad)))
         answer = _propagated(chain.coordinates, chain.place, jnp.asarray(z), time_s, signal, jnp.asarray(full))
         out[:, first : first + _AT_ONCE] = np.asarray(answer)[: len(part), :n].T
     return out

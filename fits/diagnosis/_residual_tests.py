@@ -1,6 +1,7 @@
 """Tests of a residual without any effect in mind: what it depends on, and whether it is noise."""
 
 import itertools
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,8 +15,7 @@ from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import Run
 from fits.stats._noise import learn_noise
 
-_WAVES, _POWERS = 12, 4
-_PERIODS = 1920
+_WAVES, _PERIODS = 12, 1920
 # Bands of the command, from two periods in a run to half the sampling rate, and the part of its energy that counts.
 _BANDS, _PLAYED = 12, 1e-8
 _SENTENCES = {
@@ -69,17 +69,14 @@ def further_regressors(runs: Sequence[Run]) -> list[Regressors]:
 
 
 def _joined(runs: Sequence[Run], found: Sequence[dict[str, list[np.ndarray]]]) -> list[Regressors]:
-    kinds: dict[str, list[list[np.ndarray]]] = {}
-    sizes = [len(run.record) for run in runs]
+    kinds = defaultdict[str, list[tuple[np.ndarray, ...]]](list)
+    nothing = [np.zeros(len(run.record)) for run in runs]
     for k, own in enumerate(found):
         for name, columns in own.items():
-            for column in columns:
-                kinds.setdefault(name, []).append(
-                    [column if i == k else np.zeros(size) for i, size in enumerate(sizes)]
-                )
+            kinds[name] += [(*nothing[:k], column, *nothing[k + 1 :]) for column in columns]
+    # Further columns are called by their titles.
     return [
-        # Further columns are called by their titles.
-        Regressors(name, tuple(tuple(c) for c in columns), _SENTENCES.get(name, f"the residual goes with the {name}"))
+        Regressors(name, tuple(columns), _SENTENCES.get(name, f"the residual goes with the {name}"))
         for name, columns in kinds.items()
     ]
 
@@ -88,34 +85,29 @@ def _of_run(run: Run, plain_um: np.ndarray) -> dict[str, list[np.ndarray]]:
     record = run.record
     n = len(record)
     time = (record.time_s - record.time_s[0]) / record.duration_s
-    low, span = float(plain_um.min()), float(np.ptp(plain_um)) or 1.0
-    place = (plain_um - low) / span
+    place = (plain_um - plain_um.min()) / (float(np.ptp(plain_um)) or 1.0)
     rate = np.gradient(plain_um, record.time_s)
     speed = rate / (np.std(rate) + 1e-300)
     up = np.gradient(record.voltage_V) >= 0
+    speeds = speed, np.sign(speed) * np.log1p(np.abs(speed) * 10), np.abs(speed)
     waves = [np.cos(np.pi * k * time) for k in range(1, _WAVES + 1)]
     found = {
         "time": waves,
         "position": [np.cos(np.pi * k * place) * side for side in (up.astype(float), 1.0 - up) for k in range(8)],
-        "velocity": [
-            f * np.cos(np.pi * k * place)
-            for f in (speed, np.sign(speed) * np.log1p(np.abs(speed) * 10), np.abs(speed))
-            for k in range(3)
-        ],
+        "velocity": [one * np.cos(np.pi * k * place) for one in speeds for k in range(3)],
         "gain": [place * wave for wave in waves],
     }
-    moves = np.flatnonzero(np.diff(record.voltage_V) != 0)
+    direction = np.sign(np.diff(record.voltage_V))
+    moves = np.flatnonzero(direction)
     if len(moves) > 1:
-        direction = np.sign(np.diff(record.voltage_V))[moves]
-        turned = moves[1:][direction[1:] != direction[:-1]]
-        stopped = np.flatnonzero((np.diff(record.voltage_V)[:-1] != 0) & (np.diff(record.voltage_V)[1:] == 0)) + 1
+        turned = moves[1:][np.diff(direction[moves]) != 0]
+        stopped = np.flatnonzero((direction[:-1] != 0) & (direction[1:] == 0)) + 1
         events = np.unique(np.concatenate([[0], turned, stopped]))
         since = record.time_s - record.time_s[events[np.searchsorted(events, np.arange(n), side="right") - 1]]
-        step = record.duration_s / n
-        age = np.log10(1 + since / (5 * step))
+        age = np.log10(1 + since / (5 * (record.duration_s / n)))
         age = age / max(float(age.max()), 1e-300)
         sign = np.where(up, 1.0, -1.0)
-        found["reversal"] = [sign * np.cos(np.pi * k * age) for k in range(1, _POWERS + 1)]
+        found["reversal"] = [sign * np.cos(np.pi * k * age) for k in range(1, 5)]
     edges = np.linspace(0, n, 25).astype(int)[1:-1]
     found["jumps"] = [(np.arange(n) >= edge).astype(float) for edge in edges]
     return found
@@ -159,7 +151,7 @@ def explain(
     found = []
     for regressors in groups:
         joined = projector.off(np.stack([projector.join(column) for column in regressors.columns], axis=1))
-        joined = joined - basis @ (basis.T @ joined)
+        joined -= basis @ (basis.T @ joined)
         scale = np.linalg.norm(joined, axis=0) + 1e-300
         left, size, _ = np.linalg.svd(joined / scale, full_matrices=False)
         keep = size > 1e-6 * size[0]
@@ -176,8 +168,8 @@ def explain_together(
     projector: Projector, basis: np.ndarray, residual: np.ndarray, groups: Sequence[Regressors]
 ) -> tuple[float, int]:
     """Decrease of the sum of squares by all regressors together, and the columns that it takes."""
-    columns = [column for regressors in groups for column in regressors.columns]
-    seen = explain(projector, basis, residual, [Regressors("together", tuple(columns), "")])[0]
+    columns = tuple(column for regressors in groups for column in regressors.columns)
+    (seen,) = explain(projector, basis, residual, [Regressors("together", columns, "")])
     return seen.drop, seen.freedom
 
 
@@ -191,10 +183,7 @@ class Cycles:
 
 
 def cycles(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.ndarray]) -> Cycles:
-    """Search a joined residual for a period in the position, from 16 in the stroke to 2,000.
-
-    What is slower lies in the density.
-    """
+    """Search a joined residual for a period in the position, 16 to 2,000 in the stroke; what is slower is density."""
     span_um = max(float(np.ptp(p)) for p in plain_um)
     parts = [
         (part, 2 * np.pi * plain[mask] / span_um)
@@ -238,18 +227,15 @@ def irregular(
         sizes = np.array([np.sqrt(np.mean(piece**2)) for piece in np.array_split(part, _STRETCHES)])
         spread = float(sizes.std() / sizes.mean())
         bursts |= heavy > thresholds.burst_kurtosis and spread > thresholds.burst_spread
-    asked = (
-        ("whiteness", "neighbouring residuals agree", white),
-        ("evenness", "the residual is larger in some stretches of a run than in others", even),
-        ("tails", "large residuals are more frequent than in normal noise", tails),
-    )
-    return tuple(
-        Test.of(name, *_evidence(float(logs.min()), runs), 0.0, words) for name, words, logs in asked
+    larger = "the residual is larger in some stretches of a run than in others"
+    return (
+        Test.of("whiteness", *_evidence(white), 0.0, "neighbouring residuals agree"),
+        Test.of("evenness", *_evidence(even), 0.0, larger),
+        Test.of("tails", *_evidence(tails), 0.0, "large residuals are more frequent than in normal noise"),
     ), bursts
 
 
-def _evidence(log_p: float, runs: int) -> tuple[float, float]:
-    """Evidence in standard deviations, and probability, where the worst of some runs was taken."""
-    log_p = min(log_p + float(np.log(runs)), 0.0)
-    p = float(np.exp(log_p))
+def _evidence(logs: np.ndarray) -> tuple[float, float]:
+    """Evidence of the worst of some runs in standard deviations, and its probability, by logarithms of each."""
+    p = float(np.exp(min(float(logs.min()) + float(np.log(len(logs))), 0.0)))
     return float(np.clip(stats.norm.isf(p), 0.0, _LARGEST_Z)) if p > 0 else _LARGEST_Z, p

@@ -43,24 +43,11 @@ class EffectParameter:
 class FoundCause:
     """One effect that the records need.
 
-    Attributes
-    ----------
-    name, form
-        Of the effect, and of its model if there are several.
-    also_consistent
-        Names of effects that this record cannot tell from it.
-    z
-        Evidence for it, in standard deviations.
-    p_family
-        Probability that chance gives any effect as much evidence where there is none.
-    parameters
-        Its strength and shape.
-    share_of_misfit
-        Part of the reproducible variance, of what the plain stage leaves, that it explains.
-    rms_um
-        Size of what it changes in the displacement, after the plain stage followed as far as it can.
-    fingerprint, experiment, source
-        Sentences about the effect.
+    `form` names its model if there are several, and `also_consistent` the effects that these records cannot tell from
+    it. `z` is the evidence in standard deviations, and `p_family` the probability that chance gives any effect as
+    much where there is none. `share_of_misfit` is the part that it explains of the reproducible variance that the
+    plain stage leaves, and `rms_um` the size of what it changes after the plain stage followed as far as it can.
+    `fingerprint`, `experiment` and `source` are sentences about the effect.
     """
 
     name: str
@@ -78,18 +65,12 @@ class FoundCause:
 
 @dataclass(frozen=True)
 class Bound:
-    """An effect that was not found, and how large it may still be; numbers are NaN where it was not asked about.
+    """An effect that was not found, and how large it may still be.
 
-    Attributes
-    ----------
-    name, z
-        Of the effect, and evidence for it beside the causes, in standard deviations.
-    absorbed_fraction
-        Part of its size that the plain stage follows, so that the records cannot show it.
-    bound_um
-        Size in the displacement, root mean square before anything follows, that it does not exceed at 95 %.
-    reason
-        Why it was not asked about; empty where it was.
+    `z` is the evidence for it beside the causes, in standard deviations; `absorbed_fraction` the part of its size
+    that the plain stage follows, so that the records cannot show it; and `bound_um` the root mean square in the
+    displacement, before anything follows, that it does not exceed at 95 %. They are NaN where it was not asked about,
+    for a `reason`, which is empty otherwise.
     """
 
     name: str
@@ -123,19 +104,10 @@ class Test:
 class Gain:
     """What the extension is worth on data that were not used; NaN where nothing was held out.
 
-    Attributes
-    ----------
-    heldout_rms_before_um, heldout_rms_after_um, sd_of_difference_um
-        Root mean square errors of plain and extended stage, and the standard deviation of their difference.
-    heldout_max_before_um, heldout_max_after_um
-        Largest errors.
-    noise_um
-        Noise floor.
-    feedforward_before_um, feedforward_after_um
-        Root mean square errors of the displacement of the extended stage under voltages from the inverse of the plain
-        one and from its own.
-    source
-        What was held out, in words.
+    Errors on the held-out data, which `source` describes, are those of the plain stage before, and of the extended
+    one after: root mean squares, the standard deviation of their difference, and the largest. Those of the
+    feedforward are root mean squares in the displacement of the extended stage, under voltages from the inverse of
+    the plain one and from its own. `noise_um` is the noise floor.
     """
 
     heldout_rms_before_um: float = np.nan
@@ -170,19 +142,10 @@ class RunView:
 class Experiment:
     """The next experiment: a voltage program of shape `(n,)`, and what it would tell apart.
 
-    Attributes
-    ----------
-    kind, purpose
-        What it is made of, in words, and what it decides, one sentence.
-    separates
-        Names of the effects.
-    predicted_z, present_z
-        Standard deviations by which they would differ, at the smallest, and by which they do in the records at hand.
-    extra_column
-        Which further column would help, and why; empty if none would.
-    extremes
-        What the program is predicted to reach at most, whichever of the stages that the records allow is the true
-        one, beside the limits.
+    `kind` says what it is made of, and `purpose` what it decides. The effects that it `separates` would differ by
+    `predicted_z` standard deviations, at the smallest, and do by `present_z` in the records at hand. `extra_column`
+    says which further column would help, and why; it is empty if none would. `extremes` are what the program is
+    predicted to reach at most, whichever of the stages that the records allow is the true one, beside the limits.
     """
 
     time_s: np.ndarray
@@ -200,34 +163,13 @@ class Experiment:
 class Diagnosis:
     """What a fitted stage gets wrong, why, and what is gained by extending it.
 
-    Attributes
-    ----------
-    verdict
-        `no_effect`, `effect_found`, or `unexplained`: something is left that no effect of the library explains.
-    noise_um, noise_source
-        Noise floor, and what it was learnt from, in words.
-    noise_samples
-        Samples that are worth one independent one.
-    causes
-        In order of importance.
-    unexplained_rms_um
-        Reproducible error that is left.
-    upper_bounds
-        Of all other effects.
-    tests
-        Of the plain stage's residual.
-    gain
-        On held-out data.
-    next_experiment
-        What to measure next; None where nothing would help.
-    remarks
-        What the user should know, one sentence each.
-    baseline, extended
-        The plain stage and the one with the causes; the same where there are none.
-    runs
-        For pictures; those that were held out come last.
-    false_alarm
-        Probability of naming a cause where there is none.
+    The verdict is `unexplained` where something is left that no effect of the library explains, of the size
+    `unexplained_rms_um` as far as it is reproducible. `noise_um` is the noise floor, learnt from `noise_source`, and
+    `noise_samples` the samples that are worth one independent one. The `causes` are in order of importance, and
+    `upper_bounds` are those of all other effects; `tests` are of the plain stage's residual, and `gain` is on
+    held-out data. `next_experiment` is None where nothing would help. `baseline` is the plain stage and `extended`
+    the one with the causes, the same where there are none; of the `runs` those that were held out come last.
+    `false_alarm` is the probability of naming a cause where there is none.
     """
 
     verdict: Verdict

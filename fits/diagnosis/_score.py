@@ -14,18 +14,11 @@ from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
 from microid import AbstractEffect, Coordinates, Scales, host
 
-# Strength at which an effect's derivative is taken, as a share of that of its probe.
-_STRENGTH_SHARE = 1e-2
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
 # Samples that are taken to err alike.
 BLOCK = 25
-# Rounds in which signatures whose multiples are not negative follow each other.
-_SWEEPS = 30
-# Multiple of a signature of finite size, as of a gap, beyond which it is none: what would have to be so much larger
-# to show is not seen in the records.
-_LARGEST = 300.0
 
 
 @dataclass(frozen=True)
@@ -50,22 +43,31 @@ class Probe:
         """Which model of it."""
         return type(self.effects[0])
 
+    @property
+    def most(self) -> float:
+        """The largest multiple of its signatures that means anything.
+
+        What has a finite size, as a gap, and would have to be so much larger to show is not seen in the records.
+        """
+        return 300.0 if self.effects[0].finite else np.inf
+
 
 def scales_of(bench: Bench, noise_um: float) -> Scales:
     """Measure how large things are in the runs."""
     baseline, plain = bench.baseline, bench.plain
     records = [run.record for run in baseline.runs]
     fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
+    lowest_um, highest_um = float(min(p.min() for p in plain)), float(max(p.max() for p in plain))
     columns: dict[str, tuple[float, float]] = {}
-    for run in baseline.runs:
-        for name, values in columns_beside(run.record).items():
+    for record in records:
+        for name, values in columns_beside(record).items():
             columns.setdefault(name, (float(np.mean(values)), float(np.ptp(values))))
     return Scales(
         lower_V=baseline.range_V[0],
         upper_V=baseline.range_V[1],
         fastest_V_per_s=fastest,
-        stroke_um=float(max(p.max() for p in plain) - min(p.min() for p in plain)),
-        middle_um=float(max(p.max() for p in plain) + min(p.min() for p in plain)) / 2,
+        stroke_um=highest_um - lowest_um,
+        middle_um=(highest_um + lowest_um) / 2,
         interval_s=min(float(np.median(np.diff(r.time_s))) for r in records),
         duration_s=max(r.duration_s for r in records),
         shortest_s=min(r.duration_s for r in records),
@@ -77,18 +79,18 @@ def scales_of(bench: Bench, noise_um: float) -> Scales:
 
 def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
     """Why an effect cannot be asked about, as the end of a sentence; None where it can."""
-    stage = baseline.stage
     if form.fast and not baseline.dynamic:
         return "the runs do not show the dynamics"
-    beside = [columns_beside(run.record) for run in (*baseline.runs, *baseline.aside)]
+    beside = [set(columns_beside(run.record)) for run in (*baseline.runs, *baseline.aside)]
+    everywhere = set.intersection(*beside)
     for name in form.needs:
-        if not all(name in columns for columns in beside):
+        if name not in everywhere:
             return f"not all runs, those held out included, have a column {name} that varies"
     for name in form.unless:
-        if all(name in columns for columns in beside):
+        if name in everywhere:
             return f"the column {name} says what it would be, and that is asked about instead"
     try:
-        host(form, stage)
+        host(form, baseline.stage)
     except ValueError as error:
         return str(error)
     return None
@@ -96,17 +98,17 @@ def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
 
 def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Iterator[Probe]:
     """Simulate all probes of an effect."""
-    stage = bench.stage
-    place = host(form, stage)
-    inner = None if place is None else stage.parts[place]
+    place = host(form, bench.stage)
+    inner = None if place is None else bench.stage.parts[place]
+    # The derivative of others is taken where they are weak.
+    share = 1.0 if form.finite else 1e-2
     for group in form.probes(scales, inner):
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
-            share = 1.0 if form.finite else _STRENGTH_SHARE
             change = [c / share for c in bench.change([effect if form.finite else times(effect, share)])]
             if form.per_run and len(change) > 1:
-                for k in range(len(change)):
-                    columns.append(tuple(c if i == k else np.zeros_like(c) for i, c in enumerate(change)))
+                nothing = [np.zeros_like(c) for c in change]
+                columns += [(*nothing[:k], own, *nothing[k + 1 :]) for k, own in enumerate(change)]
             else:
                 columns.append(tuple(change))
         if all(np.all(np.isfinite(c)) for column in columns for c in column):
@@ -115,9 +117,8 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
 
 def one_sided(form: type[AbstractEffect]) -> bool:
     """Whether the strength of an effect cannot be negative."""
-    fields = form.__dataclass_fields__
-    specs = [spec_of(fields[name]) for name in form.strength]
-    return not specs or all(spec is not None and spec.lower >= 0 for spec in specs)
+    specs = [spec_of(form.__dataclass_fields__[name]) for name in form.strength]
+    return all(spec is not None and spec.lower >= 0 for spec in specs)
 
 
 @dataclass(frozen=True)
@@ -127,8 +128,8 @@ class Scored:
     `columns` are its signatures off the baseline's tangent space, whitened and joined, shape `(rows, k)`, and
     `coefficients` their best multiples, shape `(k,)`; `share_left` is the norm of the columns over that of the raw
     signatures. `z` is the evidence in standard deviations, `drop` the decrease of the sum of squares in noise
-    variances. `robust_z` is the evidence where what is left counts as noise that stays alike for a while, as large as
-    it is where it is: little for an effect that only comes nearest to a misfit of another shape.
+    variances. `robust_z` is the evidence where what is left counts as noise that stays alike for a while: little for
+    an effect that only comes nearest to a misfit of another shape.
     """
 
     probe: Probe
@@ -159,17 +160,14 @@ def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -
     joined = np.empty((len(residual), len(signals)), order="F")
     for k, column in enumerate(signals):
         joined[:, k] = projector.join(column)
-    raw = _squares(joined)
     off = np.asfortranarray(projector.off(joined))
-    found, at = [], 0
-    for probe in probes:
-        own = slice(at, at + len(probe.signatures))
-        at = own.stop
-        columns = off[:, own]
+    found, cuts = [], np.cumsum([len(probe.signatures) for probe in probes])[:-1]
+    each = zip(probes, np.split(off, cuts, axis=1), np.split(_squares(joined), cuts), strict=True)
+    for probe, columns, raw in each:
         # A line that sampling turns into a constant, for example: what is left of it is rounding. Or what has died
         # away so far that its square is nothing.
-        columns[:, _squares(columns) <= _BLIND**2 * raw[own]] = 0.0
-        found.append(_scored(probe, columns, residual, float(np.sum(raw[own])) ** 0.5))
+        columns[:, _squares(columns) <= _BLIND**2 * raw] = 0.0
+        found.append(_scored(probe, columns, residual, float(np.sum(raw)) ** 0.5))
     return tuple(found)
 
 
@@ -196,7 +194,7 @@ def _scored(probe: Probe, columns: np.ndarray, residual: np.ndarray, raw: float)
     if left < _BLIND:
         # What the baseline follows but for rounding cannot be asked about.
         return Scored(probe, np.zeros_like(columns), 0.0, 0.0, np.zeros(columns.shape[1]), 0.0, left)
-    z, coefficients, drop = evidence(columns, residual, probe.positive, _most(probe))
+    z, coefficients, drop = evidence(columns, residual, probe.positive, probe.most)
     return Scored(probe, columns, z, _robust_z(columns @ coefficients, residual), coefficients, drop, left)
 
 
@@ -212,31 +210,23 @@ def _robust_z(along: np.ndarray, residual: np.ndarray) -> float:
 
 
 def improvement_z(before: np.ndarray, after: np.ndarray) -> float:
-    """Standard deviations by which errors of shape `(n,)` became smaller; samples in blocks err alike.
-
-    0 where there are none.
-    """
+    """Standard deviations by which errors of shape `(n,)` became smaller, 0 without any; blocks of them are alike."""
     if not len(before):
         return 0.0
     blocks = np.add.reduceat(before**2 - after**2, np.arange(0, len(before), BLOCK))
     return float(np.sum(blocks) / max(float(np.linalg.norm(blocks - np.mean(blocks))), 1e-300))
 
 
-def _most(probe: Probe) -> float:
-    """The largest multiple of its signatures that means anything."""
-    return _LARGEST if probe.effects[0].finite else np.inf
-
-
 def evidence(
     columns: np.ndarray, residual: np.ndarray, positive: bool, most: float = np.inf
 ) -> tuple[float, np.ndarray, float]:
     """Standard deviations, coefficients up to `most` where they are positive, and decrease of the sum of squares."""
-    gram, cross = columns.T @ columns, columns.T @ residual
+    gram = columns.T @ columns
     # What shows nowhere has no multiple: rounding over nothing would be one.
     scale = np.where(np.diagonal(gram) > 0, np.sqrt(np.diagonal(gram)), 1.0)
-    normal = gram / scale[:, None] / scale[None, :]
-    multiples = _multiples(normal, (cross / scale)[:, None], positive, most * scale)
-    z, drop = _size(normal, (cross / scale)[:, None], multiples)
+    normal, cross = gram / scale[:, None] / scale[None, :], (columns.T @ residual / scale)[:, None]
+    multiples = _multiples(normal, cross, positive, most * scale)
+    z, drop = _size(normal, cross, multiples)
     return float(z[0]), multiples[:, 0] / scale, float(drop[0])
 
 
@@ -249,7 +239,7 @@ def _multiples(gram: np.ndarray, cross: np.ndarray, positive: bool, most: np.nda
     if not positive:
         return np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ cross
     found = np.zeros_like(cross)
-    for _ in range(_SWEEPS if len(gram) > 1 else 1):
+    for _ in range(30 if len(gram) > 1 else 1):
         for k, row in enumerate(gram):
             found[k] = np.clip(found[k] + cross[k] - row @ found, 0.0, most[k]) if row[k] > 0 else 0.0
     return found
@@ -272,14 +262,12 @@ class Family:
         columns = columns / scale
         gram = columns.T @ columns
         value, vector = np.linalg.eigh(gram)
-        factor = vector * np.sqrt(np.maximum(value, 0))
-        draws = factor @ rng.standard_normal((len(value), _DRAWS))
+        draws = vector * np.sqrt(np.maximum(value, 0)) @ rng.standard_normal((len(value), _DRAWS))
         at, largest = 0, np.zeros(_DRAWS)
-        self.tests = 0
         for one in scored:
             stop = at + one.columns.shape[1]
             own, cross = gram[at:stop, at:stop], draws[at:stop]
-            multiples = _multiples(own, cross, one.probe.positive, _most(one.probe) * scale[at:stop])
+            multiples = _multiples(own, cross, one.probe.positive, one.probe.most * scale[at:stop])
             largest = np.maximum(largest, _size(own, cross, multiples)[0])
             at = stop
         self.largest = np.sort(largest)
@@ -297,18 +285,17 @@ class Family:
 
 def law_of(scored: Scored, runs: int, more: float = 1.0) -> Law:
     """Start from a probe and the multiples of its signatures that the data ask for, or more of them."""
-    form = scored.form
+    form, first = scored.form, scored.probe.effects[0]
+    specs = {info.path: info.spec for info in Coordinates(without_host(first)).table}
     effects: list[AbstractEffect] = []
-    per_run = form.per_run and runs > 1
     for run in range(runs):
-        first = scored.probe.effects[0]
+        shares = scored.coefficients[run::runs] if form.per_run and runs > 1 else scored.coefficients
         values = {}
         for name in form.strength:
-            spec = next(i.spec for i in Coordinates(without_host(first)).table if i.path == name)
-            total = np.zeros(np.shape(getattr(first, name)))
-            for k, effect in enumerate(scored.probe.effects):
-                share = scored.coefficients[k * runs + run] if per_run else scored.coefficients[k]
-                total = total + more * float(share) * np.asarray(getattr(effect, name))
-            values[name] = jnp.asarray(np.clip(total, spec.lower, spec.upper))
+            each = [
+                more * share * np.asarray(getattr(effect, name))
+                for share, effect in zip(shares, scored.probe.effects, strict=True)
+            ]
+            values[name] = jnp.asarray(np.clip(sum(each), specs[name].lower, specs[name].upper))
         effects.append(replace(first, **values) if values else first)
     return Law(effects)
