@@ -13,7 +13,7 @@ from fits.diagnosis import _diagnose
 from fits.diagnosis._conclude import Misfit
 from fits.diagnosis._effects import Law
 from fits.diagnosis._extension import Compared, gain_of, predicts_worse, shared_effects
-from fits.diagnosis._prepare import HOLDS, _covered
+from fits.diagnosis._prepare import _covered
 from fits.diagnosis._protocol import _regressed, _stretches_at_rest
 from microid.effects import EFFECTS
 
@@ -152,13 +152,12 @@ def asked(monkeypatch):
         parts = {"bench": None, "regression": None, "probes": (), "faults": None, "skipped": ()}
         from fits.diagnosis._prepare import Prepared
 
-        return Prepared(reading, baseline, projector=projector, doubted=answer.get("doubted", False), **parts)
+        return Prepared(reading, baseline, projector=projector, **parts)
 
     def select(*_):
         answer = log.answers[len(log.readings) - 1]
-        model = SimpleNamespace(is_noise=lambda *_: answer.get("noise", False), change_um=())
         causes = [SimpleNamespace(z=z) for z in answer.get("z", ())]
-        return SimpleNamespace(causes=causes, model=model, projector=None, left_um=answer.get("left", 1.0), of=answer)
+        return SimpleNamespace(causes=causes, model=SimpleNamespace(change_um=()), of=answer)
 
     monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
     monkeypatch.setattr(_diagnose, "select", select)
@@ -178,18 +177,8 @@ def test_a_plain_answer_is_taken(asked):
     answer = {"z": (9.0,)}
     ready, kept, (reading,) = asked(answer)
     assert kept is answer
-    assert (reading.fraction, reading.initial, reading.holds) == (0.2, "unknown", HOLDS)
+    assert (reading.fraction, reading.initial) == (0.2, "unknown")
     assert ready.baseline.remarks == ("said",)
-
-
-@pytest.mark.parametrize("better", [True, False])
-def test_steps_and_curves_are_doubted_where_they_leave_more(asked, better):
-    first, lines = {"doubted": True, "z": (9.0,)}, {"left": 0.5 if better else 2.0, "z": (8.0,)}
-    _, kept, (_, reading) = asked(first, lines)
-    assert reading.holds == HOLDS[:1]
-    assert kept is (lines if better else first)
-    # Noise leaves no doubt.
-    assert asked(first | {"noise": True})[1]["doubted"]
 
 
 @pytest.mark.parametrize("z", [20.0, 5.0])

@@ -2,16 +2,15 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import numpy as np
 
 from fits.diagnosis._conclude import conclude
 from fits.diagnosis._experiment import Request
-from fits.diagnosis._prepare import HOLDS, Prepared, Reading, prepare_diagnosis
+from fits.diagnosis._prepare import Prepared, Reading, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis, Step
 from fits.diagnosis._select import Selection, select
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
@@ -27,66 +26,6 @@ _ALL = (
     "what was held out is predicted far worse than noise allows, and the causes show only there: it was used to find "
     "them, so that the gain is not measured on new data"
 )
-
-
-@dataclass(frozen=True)
-class _Answer:
-    """What a selection found in one reading of the records."""
-
-    ready: Prepared
-    found: Selection
-
-
-@dataclass(frozen=True)
-class _Question:
-    """A doubt about the reading of the records: when it arises, how they are read instead, and which is kept."""
-
-    said: str
-    arises: Callable[[_Answer], bool]
-    changes: Mapping[str, Any]
-    is_better: Callable[[_Answer, _Answer], bool]
-    remark: str = ""
-
-
-def _not_in_lines(answer: _Answer) -> bool:
-    thresholds = answer.ready.reading.thresholds
-    return answer.ready.doubted and not answer.found.model.is_noise(answer.found.projector, thresholds.chance_z)
-
-
-def _leaves_less(other: _Answer, answer: _Answer) -> bool:
-    return other.found.left_um < answer.found.left_um
-
-
-def _held_out_is_unlike(answer: _Answer) -> bool:
-    found, ready = answer.found, answer.ready
-    if found.causes or ready.reading.aside:
-        return False
-    error = ready.projector.held_out(found.model.change_um)
-    return len(error) > 0 and float(np.mean(error**2)) > _UNLIKE
-
-
-def _finds_a_cause(other: _Answer, _: _Answer) -> bool:
-    strong = other.ready.reading.thresholds.strong_z
-    return max((cause.z for cause in other.found.causes), default=0.0) > strong
-
-
-def _questions() -> tuple[_Question, ...]:
-    """What is asked of each answer, in this order."""
-    return (
-        _Question(
-            "asking again with the command in lines between samples",
-            _not_in_lines,
-            {"holds": HOLDS[:1]},
-            _leaves_less,
-        ),
-        _Question(
-            "asking again with what was held out, which noise does not explain",
-            _held_out_is_unlike,
-            {"aside": (), "fraction": 0.0, "holds": HOLDS},
-            _finds_a_cause,
-            _ALL,
-        ),
-    )
 
 
 def diagnose(
@@ -171,21 +110,20 @@ def diagnose(
     def has_time() -> bool:
         return time.monotonic() < end_s
 
-    def answer(reading: Reading) -> _Answer:
+    def answer(reading: Reading) -> tuple[Prepared, Selection]:
         ready = prepare_diagnosis(reading, progress)
         progress(Step.SELECTION)
         stage = ready.bench, ready.projector, ready.probes
-        return _Answer(ready, select(*stage, false_alarm, rng, progress, thresholds, has_time))
+        return ready, select(*stage, false_alarm, rng, progress, thresholds, has_time)
 
-    best = answer(Reading(records, aside, fraction, initial, thresholds=thresholds))
-    for question in _questions():
-        if not question.arises(best) or not has_time():
-            continue
-        progress(question.said)
-        other = answer(replace(best.ready.reading, **question.changes))
-        if question.is_better(other, best):
-            baseline = other.ready.baseline
-            said = (*baseline.remarks, question.remark) if question.remark else baseline.remarks
-            best = replace(other, ready=replace(other.ready, baseline=replace(baseline, remarks=said)))
+    reading = Reading(records, aside, fraction, initial, thresholds)
+    ready, found = answer(reading)
+    error = ready.projector.held_out(found.model.change_um)
+    if not found.causes and not aside and len(error) and float(np.mean(error**2)) > _UNLIKE and has_time():
+        progress("asking again with what was held out, which noise does not explain")
+        whole, shown = answer(replace(reading, fraction=0.0))
+        if max((cause.z for cause in shown.causes), default=0.0) > thresholds.strong_z:
+            baseline = replace(whole.baseline, remarks=(*whole.baseline.remarks, _ALL))
+            ready, found = replace(whole, baseline=baseline), shown
     request = Request(duration_s, limits, margin) if has_time() else None
-    return conclude(best.ready, best.found, [*records, *aside], false_alarm, progress, request)
+    return conclude(ready, found, [*records, *aside], false_alarm, progress, request)

@@ -27,7 +27,6 @@ _SKEWED = (
     "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
 )
-HOLDS: tuple[Hold, ...] = ("first", "smooth", "zero")
 _STEPS = (
     "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
     "sample; a delay of that length would look the same"
@@ -46,7 +45,7 @@ ONE_WAY = (
     "nothing was held out, since the voltage goes through its range both ways only in what would have been: the gain "
     "is not measured"
 )
-_RUNS = {"smooth": ("along curves", _CURVES), "zero": ("held in steps", _STEPS)}
+_RUNS: dict[Hold, tuple[str, str]] = {"smooth": ("along curves", _CURVES), "zero": ("held in steps", _STEPS)}
 
 
 @dataclass(frozen=True)
@@ -54,24 +53,19 @@ class Reading:
     """How the records are read.
 
     The last `fraction` of each of the `records` is held out, and all of `aside`. `initial` is the memory before each
-    run. `holds` are the ways in which the command may run between samples, of which lines are the first, and
-    `thresholds` decide.
+    run, and `thresholds` decide.
     """
 
     records: Sequence[Record]
     aside: Sequence[Record]
     fraction: float
     initial: str
-    holds: Sequence[Hold] = HOLDS
     thresholds: Thresholds = THRESHOLDS
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """The fitted baseline of a `reading`, its regression, noise and probes, and why some effects were `skipped`.
-
-    `doubted` says that the command was not taken for lines, by less evidence than there was of some effect.
-    """
+    """The fitted baseline of a `reading`, its regression, noise and probes, and why some effects were `skipped`."""
 
     reading: Reading
     baseline: Baseline
@@ -81,7 +75,6 @@ class Prepared:
     probes: tuple[Probe, ...]
     faults: Faults
     skipped: tuple[tuple[str, str], ...]
-    doubted: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,8 +127,8 @@ class _Fit:
         change = [simulate(there, replace(run, hold=hold)) - simulate(here, run) for run in baseline.finest]
         return self.projector.off(self.projector.residual - self.projector.join(change))
 
-    def prefers(self, hold: Hold, thresholds: Thresholds) -> float:
-        """Evidence for another command between samples, as a decrease of the sum of squares; 0 for none.
+    def prefers(self, hold: Hold, thresholds: Thresholds) -> bool:
+        """Whether there is evidence for another command between samples.
 
         Curves must leave less than lines beyond chance, and beside the best effect, too. Steps must explain what a
         delay behind lines does.
@@ -143,15 +136,12 @@ class _Fit:
         least, off = thresholds.other_hold_z**2, thresholds.model_error
         late = self.delay_drop() if hold == "zero" else np.inf
         if late <= least:
-            return 0.0
+            return False
         left = self.left_under(hold)
         gained = float(self.left @ self.left - left @ left)
         if hold == "zero":
-            as_well = gained > (1 - off) * late or gained - late + self.delay_drop(left) > off * late
-            return late if as_well else 0.0
-        if gained <= least:
-            return 0.0
-        return gained if gained + self.largest_z(left) ** 2 > self.largest_z() ** 2 else 0.0
+            return gained > (1 - off) * late or gained - late + self.delay_drop(left) > off * late
+        return gained > least and gained + self.largest_z(left) ** 2 > self.largest_z() ** 2
 
     def largest_z(self, left: np.ndarray | None = None) -> float:
         """Evidence of the effect that has most, in what is `left`."""
@@ -181,20 +171,14 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     here = fitted("first")
     drop_programs(records)
     progress(Step.PROBES)
-    doubted = False
-    for hold in reading.holds:
-        if hold != "first":
-            if not here.regression.baseline.dynamic:
-                break
-            drop = here.prefers(hold, reading.thresholds)
-            if not drop:
-                continue
-            progress(f"fitting the plain stage again, its command {_RUNS[hold][0]}")
-            doubted = doubted or drop < here.largest_z() ** 2
+    taken = ""
+    for hold, (words, remark) in _RUNS.items():
+        if here.regression.baseline.dynamic and here.prefers(hold, reading.thresholds):
+            progress(f"fitting the plain stage again, its command {words}")
             drop_programs(records)
-            here = fitted(hold, here.regression.baseline.problem)
+            here, taken = fitted(hold, here.regression.baseline.problem), remark
             drop_programs(records)
-            said = (*(one for one in said if one != _RUNS["smooth"][1]), _RUNS[hold][1])
+    said = (*said, taken) if taken else said
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
         if (
@@ -219,7 +203,7 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     drop_programs(records)
     projector = Projector(regression, faults.noise, rough)
     projector = Projector(regression, with_discrepancy(projector, candidates), rough)
-    return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped), doubted)
+    return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:

@@ -68,12 +68,6 @@ class Selection:
     finest: bool = False
     stopped: bool = False
 
-    @property
-    def left_um(self) -> float:
-        """Root mean square of what baseline and causes leave."""
-        noise_um2 = float(np.mean([noise.total_um**2 for noise in self.projector.noise]))
-        return (noise_um2 * self.model.cost / max(self.projector.count - self.projector.freedom, 1.0)) ** 0.5
-
 
 @dataclass(frozen=True)
 class Search:
