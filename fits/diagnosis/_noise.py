@@ -24,7 +24,7 @@ _MOST_TOGETHER, _COMPARED_SAMPLES = 3, 16
 # A command that moves, or turns, by more than these parts of its range within so many samples may cause what looks
 # like a spike.
 _MOVED_SHARE, _TURNED_SHARE, _SAMPLES_AROUND = 0.02, 0.004, 6
-# There a spike is larger than this multiple of what is found in a tenth of such places.
+# There a spike is larger than this multiple of what is usual.
 _OUTLYING = 2.0
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
@@ -124,10 +124,12 @@ def spikes(
     moved = (np.abs(change) > _MOVED_SHARE * float(np.ptp(voltage))) | turned
     width = 2 * _SAMPLES_AROUND + 1
     near = np.convolve(moved, np.ones(width), mode="same") > 0.5
-    # Where it may, others do so, too, in a tenth of the places at least.
+    # Where it may, others do so, too: one sample in fifty, and one in a tenth of the places.
     places = [slice(k, min(k + width, stop)) for first, stop in stretches(near) for k in range(first, stop, width)]
-    largest = np.array([size[place].max() for place in places]) if places else np.zeros(1)
-    far &= ~near | (size > _OUTLYING * float(np.quantile(largest, 0.9)))
+    if places:
+        usual = _OUTLYING * float(np.quantile(size[near], 0.98))
+        usual = max(usual, float(np.quantile([size[place].max() for place in places], 0.9)))
+        far &= ~near | (size > _OUTLYING * usual)
     for first, stop in stretches(far):
         if stop - first > _MOST_TOGETHER:
             far[first:stop] = False
