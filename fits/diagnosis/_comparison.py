@@ -61,14 +61,24 @@ def compare_rivals(
             found = relocate(bench, projector, found, first)
         if not (_is_possible(bench, projector, model, found, thresholds) and has_occurred(bench, found)):
             continue
-        better = improvement_z(before, projector.held_out(found.change_um))
-        if better < (-thresholds.worse_z if one.robust_z > thresholds.determined_z else 0.0):
+        if _predicts_worse(before, projector.held_out(found.change_um), one, thresholds):
             continue
         found = _add_occurrences(bench, projector, found, scored, first + laws, thresholds)
         if one.name not in fitted or found.criterion(projector.count) < fitted[one.name].criterion(projector.count):
             fitted[one.name] = found
     rivals = [Rival(name, one, one.criterion(projector.count), one.cost) for name, one in fitted.items()]
     return _ranked(bench, projector, rivals, model.cost, thresholds)
+
+
+def _predicts_worse(before: np.ndarray, after: np.ndarray, one: Scored, thresholds: Thresholds) -> bool:
+    """Whether what was held out says no: by no better a prediction where an effect hardly stands out of the misfit."""
+    better = improvement_z(before, after)
+    if not one.robust_z > thresholds.determined_z:
+        return better < 0
+    # What else is not simulated yet may make it a little worse.
+    return better < -thresholds.worse_z and np.linalg.norm(after) > (1 + thresholds.model_error) * np.linalg.norm(
+        before
+    )
 
 
 def _leaders(scores: Sequence[Scored]) -> list[Scored]:
