@@ -145,7 +145,7 @@ def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(m
     ]
 
 
-@pytest.mark.parametrize(("gain", "before_um"), [(0.1, 0.5), (0.0, 30.0)])
+@pytest.mark.parametrize(("gain", "before_um"), [pytest.param(0.1, 0.5, marks=pytest.mark.study), (0.0, 30.0)])
 def test_a_settling_mount_is_no_creep_from_before(rng, gain, before_um):
     constant_s = float(rng.uniform(3, 8))
 
@@ -195,6 +195,7 @@ def test_no_cause_is_sought_once_the_time_is_over(rng):
     assert max(one.z for one in found.scores) > 20
 
 
+@pytest.mark.study
 def test_a_density_is_smooth_again_beside_the_cause(rng, monkeypatch):
     delay_s = float(rng.uniform(2e-4, 4e-4))
 

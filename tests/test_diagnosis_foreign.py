@@ -93,6 +93,7 @@ def test_creep_that_was_under_way(rng):
     assert all(float(getattr(part, name)) == 0 for name in type(part).history)
 
 
+@pytest.mark.study
 def test_what_shows_only_in_what_was_held_out(rng):
     time = np.arange(2500) / 50
     reading = plays(SLOW_V) + 0.005 * rng.standard_normal(2500)

@@ -71,14 +71,13 @@ def compare_rivals(
 
 
 def _predicts_worse(before: np.ndarray, after: np.ndarray, one: Scored, thresholds: Thresholds) -> bool:
-    """Whether what was held out says no: by no better a prediction where an effect hardly stands out of the misfit."""
+    """Whether what was held out says no: it must be predicted better by what hardly stands out of the misfit."""
     better = improvement_z(before, after)
     if not one.robust_z > thresholds.determined_z:
         return better < 0
     # What else is not simulated yet may make it a little worse.
-    return better < -thresholds.worse_z and np.linalg.norm(after) > (1 + thresholds.model_error) * np.linalg.norm(
-        before
-    )
+    most = (1 + thresholds.model_error) * float(np.linalg.norm(before))
+    return better < -thresholds.worse_z and float(np.linalg.norm(after)) > most
 
 
 def _leaders(scores: Sequence[Scored]) -> list[Scored]:
