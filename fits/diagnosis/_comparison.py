@@ -1,6 +1,6 @@
 """Which of the effects that explain most explains the records best, each fitted, and what is not told from it."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,8 +44,9 @@ def compare_rivals(
     scores: Sequence[Scored],
     laws: int,
     thresholds: Thresholds = THRESHOLDS,
+    has_time: Callable[[], bool] = lambda: True,
 ) -> list[Rival]:
-    """Fit the leaders beside what is there, the best first; none as more than so many `laws`.
+    """Fit the leaders beside what is there, while there is time, the best first; none as more than so many `laws`.
 
     The baseline is fitted again beside the best and those about as good: the plain stage may have given way to one
     and not to another. What predicts held-out data worse is left out, and what does not stand out of the rest of the
@@ -55,7 +56,7 @@ def compare_rivals(
     fits = [(one, refit_beside(bench, projector, model, one)) for one in _leaders(scores)]
     least = min(found.cost for _, found in fits)
     fitted: dict[str, Refit] = {}
-    for one, found in fits:
+    for one, found in fits if has_time() else ():
         scored = [other for other in scores if other.name == one.name]
         if found.cost - least < _PROMISING * (model.cost - least):
             found = relocate(bench, projector, found, first)
@@ -63,7 +64,8 @@ def compare_rivals(
             continue
         if _predicts_worse(before, projector.held_out(found.change_um), one, thresholds):
             continue
-        found = _add_occurrences(bench, projector, found, scored, first + laws, thresholds)
+        most = first + laws if has_time() else 0
+        found = _add_occurrences(bench, projector, found, scored, most, thresholds)
         if one.name not in fitted or found.criterion(projector.count) < fitted[one.name].criterion(projector.count):
             fitted[one.name] = found
     rivals = [Rival(name, one, one.criterion(projector.count), one.cost) for name, one in fitted.items()]

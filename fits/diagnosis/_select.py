@@ -190,7 +190,9 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
         if not open_ or one.family.p(top / sigma) >= false_alarm or not search.has_time():
             break
         search.progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
-        fitted = compare_rivals(bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds)
+        fitted = compare_rivals(
+            bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds, search.has_time
+        )
         refused |= {s.name for s in open_ if s.z >= WORTH * top} if not fitted else set()
         found = []
         for rival in [rival for rival in fitted if rival.end is not None]:
