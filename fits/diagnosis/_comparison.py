@@ -15,7 +15,7 @@ from microid import EFFECTS, AbstractEffect
 
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.
-_LEADERS, _FORMS, _NEAREST = 5, 2, 3
+_LEADERS, _FORMS, _NEAREST = 5, 2, 5
 # Scores below this share of the best are not worth a fit. The instant of an effect is not searched for, and the
 # baseline not fitted again beside it, where it leaves more than the best by these shares of what that explains.
 WORTH, _PROMISING, _NEAR = 0.4, 0.5, 0.1
@@ -55,7 +55,7 @@ def compare_rivals(
     before, first = projector.held_out(model.change_um), len(model.laws)
     fits = [(one, refit_beside(bench, projector, model, one)) for one in _leaders(scores)]
     least = min(found.cost for _, found in fits)
-    fitted: dict[str, Refit] = {}
+    fitted: dict[type[AbstractEffect], Refit] = {}
     for one, found in fits if has_time() else ():
         scored = [other for other in scores if other.name == one.name]
         if found.cost - least < _PROMISING * (model.cost - least):
@@ -66,9 +66,9 @@ def compare_rivals(
             continue
         most = first + laws if has_time() else 0
         found = _add_occurrences(bench, projector, found, scored, most, thresholds)
-        if one.name not in fitted or found.criterion(projector.count) < fitted[one.name].criterion(projector.count):
-            fitted[one.name] = found
-    rivals = [Rival(name, one, one.criterion(projector.count), one.cost) for name, one in fitted.items()]
+        if one.form not in fitted or found.criterion(projector.count) < fitted[one.form].criterion(projector.count):
+            fitted[one.form] = found
+    rivals = [Rival(form.name, one, one.criterion(projector.count), one.cost) for form, one in fitted.items()]
     return _ranked(bench, projector, rivals, model.cost, thresholds)
 
 
@@ -146,7 +146,11 @@ def _ranked(
         end = fit_jointly(bench, projector, one.refit)
         if end[-1].possible(bench):
             out.append(replace(one, cost=end[-1].cost, criterion=end[-1].criterion(projector.count), end=end))
-    return sorted(out, key=lambda one: one.criterion)
+    # Of an effect the best form counts, which may be another once the baseline has followed.
+    best: dict[str, Rival] = {}
+    for one in sorted(out, key=lambda one: one.criterion):
+        best.setdefault(one.name, one)
+    return list(best.values())
 
 
 def has_occurred(bench: Bench, model: Refit) -> bool:
