@@ -114,6 +114,15 @@ def test_the_extended_model_simulates_new_runs_better(case):
 
 
 @pytest.mark.study
+def test_an_answer_in_no_time_says_what_was_not_asked(tmp_path):
+    case = diagnosed(tmp_path, ["creep"], "--budget", "1e-3")
+    assert case.found["causes"] == [], case.seed
+    assert case.found["next_experiment"] is None, case.seed
+    assert any("the time was over" in words for words in case.found["remarks"]), case.seed
+    assert {"report.html", "extended.json"} <= set(files(case.folder / "diagnosis"))
+
+
+@pytest.mark.study
 def test_a_rig_without_an_effect_is_not_accused(tmp_path):
     case = diagnosed(tmp_path, [], "--false-alarm", FALSE_ALARM)
     assert "effects" not in case.truth

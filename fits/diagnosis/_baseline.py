@@ -137,9 +137,9 @@ def fit_baseline(
     remarks: tuple[str, ...] = ()
     past = has_known_loop(records, range_V, holdout)
     try:
-        stage = default_stage(hold) if onward is None else onward.held(hold).stage
-        settings = records, stage, None, holdout, initial, "squares", progress, _FINEST
         near = None if onward is None else onward.held(hold)
+        stage = default_stage(hold) if near is None else near.stage
+        settings = records, stage, None, holdout, initial, "squares", progress, _FINEST
         found = solve_stage(*settings, accept_best=True, estimated=past, onward=near)
     except (DataError, FitError) as error:
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {error}",)

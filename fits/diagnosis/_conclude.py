@@ -103,8 +103,8 @@ def conclude(
 ) -> Diagnosis:
     """Decide on the verdict, extend the stage, measure the gain, and say what else is to be said.
 
-    `records` are those whose warnings are passed on; for `false_alarm` and `request` see `diagnose`. No experiment is
-    suggested where there is no request.
+    `records` are those whose warnings are passed on; for `false_alarm` and `request` see `diagnose`. There is no
+    request where the time is over.
     """
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
@@ -158,10 +158,10 @@ def conclude(
         causes = with_held_gain(held, causes)
         remarks.append(held.sentence)
     ahead = None if request is None else suggest(ready, found, causes, request, progress)
-    if request is None or found.stopped:
+    if request is None:
         remarks.append(
-            "the time was over: what else may be there was not asked to the end, nor the next experiment; give it a "
-            "larger budget"
+            "the time was over: what else may be there was perhaps not asked to the end, and no next experiment was "
+            "sought; give it a larger budget"
         )
     elif ahead is None and any(cause.also_consistent for cause in causes):
         remarks.append(

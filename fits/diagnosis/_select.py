@@ -46,13 +46,13 @@ class Cause:
 
 @dataclass(frozen=True)
 class Selection:
-    """What the search found: the `causes` in the order of their evidence, and the `model` with all of them.
+    """What the search found: the `causes` in the order in which they were found, and the `model` with all of them.
 
     `plain` is the baseline without them. `scores` are those of all probes at the baseline, `left` those beside the
     causes, and `family` gives the chance of the largest. `bench` and `projector` are of the baseline as it is beside
     the causes, `first` of the one without them. `explained` is what the causes take off the sum of squares beside a
     baseline that may do all that it may without them; `finest` says whether they were simulated with many steps in
-    the end, and `stopped` that there was no time to ask for more.
+    the end.
     """
 
     causes: tuple[Cause, ...]
@@ -66,7 +66,6 @@ class Selection:
     first: Projector
     explained: float = 0.0
     finest: bool = False
-    stopped: bool = False
 
 
 @dataclass(frozen=True)
@@ -257,7 +256,7 @@ def _refined(best: Explanation, start: Explanation, search: Search) -> Selection
     # In the end the density is smoother and nowhere negative, which costs something by itself.
     explained = max(explained, plain.cost - model.cost, 0.0)
     scored, at = (start.left, best.left, best.family), (bench, projector, start.projector)
-    return Selection(tuple(causes), model, plain, *scored, *at, explained, finest, not search.has_time())
+    return Selection(tuple(causes), model, plain, *scored, *at, explained, finest)
 
 
 def _backward(
