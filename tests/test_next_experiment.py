@@ -227,6 +227,16 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     predictor = Predictor(made.bench, made.projector, hypotheses, [(0, 1)])
     expected = by_least_squares(made, *hypotheses, *program)
     assert predictor.predicted_z(*program) == pytest.approx(expected, rel=0.01)
+    # Of a rival only the last effect may have been fitted, the one before following along its tangent.
+    followed = replace(drift, laws=(*creep.laws, *drift.laws), x=(*creep.x, *drift.x))
+    two = replace(creep, laws=followed.laws, x=followed.x, tangent=np.hstack([creep.tangent, drift.tangent]))
+    other = replace(rival, refit=replace(followed, tangent=drift.tangent))
+    causes = (Cause("creep", 9.0, 1e-9, (), 81.0), Cause("aging", 9.0, 1e-9, (other,), 81.0))
+    asked = open_question(made, replace(plain, causes=causes, model=two), (found_cause("aging", "thermal_drift"),))
+    for hypothesis in asked[1]:
+        sizes = [law.size for law in hypothesis.laws]
+        assert [one.shape for one in hypothesis.covariances] == [(size, size) for size in sizes]
+        assert len(hypothesis.drawn(np.random.default_rng(0)).x) == len(sizes)
     # Without a cause, what has the largest score is suspected, unless chance explains it.
     alone = replace(plain, causes=(), model=plain.plain, left=plain.scores)
     names, (suspect, nothing), pairs = open_question(made, alone, ())

@@ -75,8 +75,8 @@ def compare_rivals(
 def _predicts_worse(before: np.ndarray, after: np.ndarray, one: Scored, thresholds: Thresholds) -> bool:
     """Whether what was held out says no: it must be predicted better by what hardly stands out of the misfit."""
     better = improvement_z(before, after)
-    if not one.robust_z > thresholds.determined_z:
-        return better < 0
+    if len(before) and not one.robust_z > thresholds.determined_z:
+        return better < thresholds.worse_z
     # What else is not simulated yet may make it a little worse.
     most = (1 + thresholds.model_error) * float(np.linalg.norm(before))
     return better < -thresholds.worse_z and float(np.linalg.norm(after)) > most

@@ -120,7 +120,7 @@ def open_question(ready: Prepared, found: Selection, causes: tuple[FoundCause, .
         taken = {other.name for k, other in enumerate(found.causes) if k != at}
         rivals = [rival for rival in cause.rivals[:MOST_RIVALS] if rival.name not in taken]
         if cause.name in named and rivals:
-            every = (best, *(_with_last(best, at, _hypothesis(rival.refit)) for rival in rivals))
+            every = (best, *(_with_last(best, at, rival.refit) for rival in rivals))
             # The cause and each rival, be the one or the other true: rivals among themselves may be alike for ever.
             pairs = tuple(pair for k in range(1, len(every)) for pair in ((0, k), (k, 0)))
             return tuple(h.names[at] for h in every), every, pairs
@@ -145,11 +145,15 @@ def _hypothesis(model: Refit) -> Hypothesis:
     return Hypothesis(model.laws, model.x, tuple(whole[block, block] for block in blocks))
 
 
-def _with_last(best: Hypothesis, at: int, other: Hypothesis) -> Hypothesis:
-    """The best with the last effect of another instead of one; what is before it may only have followed."""
-    laws = *best.laws[:at], other.laws[-1], *best.laws[at + 1 :]
-    x = *best.x[:at], other.x[-1], *best.x[at + 1 :]
-    return Hypothesis(laws, x, (*best.covariances[:at], other.covariances[-1], *best.covariances[at + 1 :]))
+def _with_last(best: Hypothesis, at: int, model: Refit) -> Hypothesis:
+    """The best with the last effect of a model instead of one.
+
+    What is before it may only have followed along its tangent, and then has no covariance.
+    """
+    law, size = model.laws[-1], model.laws[-1].size
+    laws, x = (*best.laws[:at], law, *best.laws[at + 1 :]), (*best.x[:at], model.x[-1], *best.x[at + 1 :])
+    covariances = *best.covariances[:at], model.covariance()[-size:, -size:], *best.covariances[at + 1 :]
+    return Hypothesis(laws, x, covariances)
 
 
 def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) -> tuple[np.ndarray, float]:

@@ -25,7 +25,8 @@ class Thresholds:
     chance_z
         Standard deviations by which a sum of squares exceeds its mean by chance.
     worse_z
-        Standard deviations by which an extension may predict held-out data worse.
+        Standard deviations by which an extension may predict held-out data worse, and by which one that hardly stands
+        out of the rest of the misfit must predict them better.
     strong_z
         Evidence, in standard deviations, that needs no support by other data.
     other_hold_z
