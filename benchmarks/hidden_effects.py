@@ -36,8 +36,8 @@ PAIRS = (
     ("creep", "offset_jumps"),
 )
 _NONE_PER_EFFECT = 4
-# A worker keeps every program that it has compiled, and is replaced before they fill the memory.
-_TASKS_PER_WORKER = 4
+# A worker keeps what it has compiled, and is replaced before that fills the memory or its mappings.
+_TASKS_PER_WORKER = 2
 
 
 def source_digest() -> str:

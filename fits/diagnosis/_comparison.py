@@ -55,12 +55,16 @@ def compare_rivals(
     before, first = projector.held_out(model.change_um), len(model.laws)
     fits = [(one, refit_beside(bench, projector, model, one)) for one in _leaders(scores)]
     least = min(found.cost for _, found in fits)
+    chance_z = thresholds.chance_z
+    noise = [found for _, found in fits if found.is_noise(projector, chance_z)]
+    # What ended at its bound is taken only where nothing else explains as much.
+    alone = not model.is_noise(projector, chance_z) and all(found.is_at_bound for found in noise)
     fitted: dict[type[AbstractEffect], Refit] = {}
     for one, found in fits if has_time() else ():
         scored = [other for other in scores if other.name == one.name]
         if found.cost - least < _PROMISING * (model.cost - least):
             found = relocate(bench, projector, found, first)
-        if not (_is_possible(bench, projector, model, found, thresholds) and has_occurred(bench, found)):
+        if not (_is_possible(projector, found, alone, thresholds) and has_occurred(bench, found)):
             continue
         if _predicts_worse(before, projector.held_out(found.change_um), one, thresholds):
             continue
@@ -97,12 +101,11 @@ def _leaders(scores: Sequence[Scored]) -> list[Scored]:
     return found
 
 
-def _is_possible(bench: Bench, projector: Projector, model: Refit, found: Refit, thresholds: Thresholds) -> bool:
-    """Whether an effect beside a model is of a strength that the records determine."""
+def _is_possible(projector: Projector, found: Refit, alone: bool, thresholds: Thresholds) -> bool:
+    """Whether the records determine a strength; at a bound an effect counts only where it `alone` leaves noise."""
     if not all(np.all(np.isfinite(change)) for change in found.change_um):
         return False
-    chance_z = thresholds.chance_z
-    alone = found.is_noise(projector, chance_z) and not model.is_noise(projector, chance_z)
+    alone = alone and found.is_noise(projector, thresholds.chance_z)
     return found.determined(thresholds.determined_z, False, alone)
 
 
