@@ -45,6 +45,7 @@ class Roughness(eqx.Module):
     along: Float[Array, "D D"]
     reversible: Float[Array, "D D"]
 
+    @eqx.filter_jit
     def precision(self, hyper: Hyper) -> Float[Array, "D D"]:
         """Prior precision of the columns in strokes, shape `(D, D)`; positive definite."""
         curvature = (

@@ -54,6 +54,11 @@ def resized(start: m.Staircase, size: int) -> m.Staircase:
     return m.Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
 
 
+@eqx.filter_jit
+def _refined(voltage_V: Float[Array, " n"], stride: int, hold: m.Hold) -> Float[Array, " m"]:
+    return m.refined(jnp.ones(()), voltage_V, stride, hold)[1]
+
+
 def refuse_many_steps(record: Record, stride: int) -> None:
     """Refuse, in a `DataError`, what would not fit into the memory."""
     if stride * len(record) > _MOST_STEPS:
@@ -171,7 +176,7 @@ class Run:
         beside = {name: np.interp(share, np.arange(n), v) for name, v in columns_beside(record).items()}
         return Samples(
             time_s=jnp.asarray(time),
-            voltage_V=m.refined(jnp.ones(()), voltage, stride, self.hold)[1],
+            voltage_V=_refined(voltage, stride, self.hold),
             displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
             weight=jnp.asarray(np.pad(self.fit_weight, pad)),
             start=m.Start(memory=resized(self.start, 512)),  # filtered multisines nest deeply

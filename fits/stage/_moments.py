@@ -114,9 +114,6 @@ def _rows(
     return system.gain * response + more, memory, (state, response[-1])
 
 
-_project_out = eqx.filter_jit(project_out)
-
-
 @dataclass(frozen=True)
 class RunSums:
     """What one run adds to the regression on columns and coordinates, its nuisance parameters eliminated.
@@ -151,7 +148,7 @@ def run_sums(
         energy, count = np.asarray(target @ target), np.asarray(weight[piece].sum())
         sums = sums + Moments(used.T @ used, used.T @ target, energy, count)
     reduced, _, _ = split_moments(sums, known, 0.0)
-    off = np.asarray(_project_out(jnp.asarray(nuisance), samples.weight, jnp.asarray(residual)))
+    off = np.asarray(project_out(jnp.asarray(nuisance), samples.weight, jnp.asarray(residual)))
     return RunSums(reduced, np.asarray(sums.gram)[:known, known] / weight.sum(), off[: len(run.record)])
 
 

@@ -29,6 +29,7 @@ def respond(stage: m.Stage, samples: Samples) -> Float[Array, " n"]:
     return stage(samples.time_s, samples.voltage_V, start, samples.beside)[:: samples.stride]
 
 
+@eqx.filter_jit
 def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, `(n, k)`: an offset in um, its past, and how the stage moved before.
 
@@ -52,6 +53,7 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     return jnp.concatenate([offset, jax.vmap(free)(jnp.eye(system.order)).T], axis=1)
 
 
+@eqx.filter_jit
 def project_out(
     columns: Float[Array, "n k"], weight: Float[Array, " n"], values: Float[Array, " n"]
 ) -> Float[Array, " n"]:
@@ -113,13 +115,19 @@ def gain_ahead(stage: m.Stage) -> float | None:
     place = place_of_hysteresis(stage)
     if place is None:
         return None
-    gain = math.prod(float(part.static_gain) for part in stage.parts[:place] if isinstance(part, m.AbstractLinear))
+    gain = float(_static_gain(stage.parts[:place]))
     if not (math.isfinite(gain) and gain > 0):
         raise DataError(
             f"the static gain ahead of {stage.names[place]!r} is {gain:g}, expected a positive one: turn the sign of "
             "the voltage column instead"
         )
     return gain
+
+
+@eqx.filter_jit
+def _static_gain(parts: Sequence[Any]) -> Float[Array, ""]:
+    linear = (part.static_gain for part in parts if isinstance(part, m.AbstractLinear))
+    return math.prod(linear, start=jnp.ones(()))
 
 
 def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
@@ -134,8 +142,12 @@ def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
 
 def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: float | None = None) -> Float[Array, " m"]:
     """Voltage at a part after a rest at the first command, or at another, at the refined times, in V, `(m,)`."""
-    rest = samples.voltage_V[0] if rest_V is None else jnp.asarray(rest_V)
-    signal = m.Signal(samples.voltage_V, rest, stage.hold)
+    return _ahead(stage, place, samples, samples.voltage_V[0] if rest_V is None else jnp.asarray(rest_V))
+
+
+@eqx.filter_jit
+def _ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""]) -> Float[Array, " m"]:
+    signal = m.Signal(samples.voltage_V, rest_V, stage.hold)
     for part in stage.parts[:place]:
         signal = part.run(samples.time_s, signal)
     return signal.values
