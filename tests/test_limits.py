@@ -223,6 +223,7 @@ def left(rig, programs):
     return found, count
 
 
+@pytest.mark.study
 def test_no_program_that_is_let_through_leaves_the_limits_on_the_bench(seed):
     rig = Rig(seed)
     print(rig.words, rig.guard.limits)
