@@ -147,7 +147,8 @@ def conclude(
         )
     faults = _standing(ready.faults, beside, extension.compared, thresholds.spike_z) if kept else ready.faults
     named = name_faults(faults, cyclic, thresholds)
-    causes = causes_of(kept, model, found, misfit.total, named, ready.faults)
+    removed = misfit.share, misfit.explained / misfit.count * noise_um**2
+    causes = causes_of(kept, model, found, removed, named, ready.faults)
     bound = {law.form.name for law, x in zip(model.laws, model.x, strict=True) if law.at_bound(x)}
     if bound:
         remarks.append(

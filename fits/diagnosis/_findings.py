@@ -36,14 +36,22 @@ _FAR_Z, _FAR_WITHIN = 3.0, 1.4
 
 
 def causes_of(
-    causes: Sequence[Cause], model: Refit, beside: Selection, misfit: float, faults: Sequence[Fault], noise: Faults
+    causes: Sequence[Cause],
+    model: Refit,
+    beside: Selection,
+    explained: tuple[float, float],
+    faults: Sequence[Fault],
+    noise: Faults,
 ) -> tuple[FoundCause, ...]:
-    """Describe the causes, the most important first: by the misfit that each removes."""
+    """Describe the causes, the most important first: by what each removes of what all have `explained`.
+
+    The latter are a part of the misfit, and a mean square in um^2.
+    """
     found: dict[str, FoundCause] = {}
     weight: defaultdict[str, float] = defaultdict(float)
     bench, projector = beside.bench, beside.projector
     covariance, at = model.covariance(), 0
-    total = float(np.mean([n.total_um**2 for n in projector.noise]))
+    whole = max(sum(cause.drop for cause in causes), 1e-300)
     for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
         block = covariance[at : at + law.size, at : at + law.size]
         at += law.size
@@ -51,8 +59,9 @@ def causes_of(
         alone = [a - b for a, b in zip(changed, bench.plain, strict=True)]
         joined = projector.join(alone)
         seen = float(np.linalg.norm(projector.off(joined)) / max(float(np.linalg.norm(joined)), 1e-300))
-        rms_um, share = seen * _rms(alone, projector), cause.drop / misfit
-        weight[cause.name] += cause.drop / projector.count * total
+        rms_um, part = seen * _rms(alone, projector), cause.drop / whole
+        share = part * explained[0]
+        weight[cause.name] += part * explained[1]
         parameters = _parameters(law, x, block, profile_likelihood(bench, projector, model, number, block))
         if cause.name in found:
             first, count = found[cause.name], [one.name for one in causes[: number + 1]].count(cause.name)
