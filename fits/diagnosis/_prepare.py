@@ -98,7 +98,7 @@ class _Fit:
 
     @cached_property
     def probed(self) -> tuple[list[Probe], list[tuple[str, str]]]:
-        return _probed(self.bench, self.scales)
+        return _probed(self.bench, self.scales, self.projector)
 
     @cached_property
     def left(self) -> np.ndarray:
@@ -214,7 +214,7 @@ def _covered(records: Sequence[Record], fraction: float) -> bool:
     return min(float(moves_V[moves_V > 0].sum()), -float(moves_V[moves_V < 0].sum())) > _HALF * span_V
 
 
-def _probed(bench: Bench, scales: Scales) -> tuple[list[Probe], list[tuple[str, str]]]:
+def _probed(bench: Bench, scales: Scales, projector: Projector) -> tuple[list[Probe], list[tuple[str, str]]]:
     """Simulate every probe of every effect that can be asked about, and say of the others why not."""
     probes: list[Probe] = []
     skipped = []
@@ -223,7 +223,7 @@ def _probed(bench: Bench, scales: Scales) -> tuple[list[Probe], list[tuple[str, 
         if reason is not None:
             skipped.append((form.name, reason))
             continue
-        found = list(probes_of(bench, form, scales))
+        found = list(probes_of(bench, form, scales, projector))
         if not found:
             why = "the runs are too short or too plain to show it"
             skipped.append((form.name, "nothing of it was found, sample by sample" if form.statistic else why))

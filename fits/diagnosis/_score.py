@@ -98,16 +98,19 @@ def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
     return None
 
 
-def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Iterator[Probe]:
-    """Simulate all probes of an effect."""
+def probes_of(
+    bench: Bench, form: type[AbstractEffect], scales: Scales, projector: Projector | None = None
+) -> Iterator[Probe]:
+    """Simulate all probes of an effect, and with a projector those that begin where the residual says, too."""
     place = host(form, bench.stage)
     inner = None if place is None else bench.stage.parts[place]
-    # The derivative of others is taken where they are weak.
-    share = 1.0 if form.finite else 1e-2
-    for group in form.probes(scales, inner):
+    groups = form.probes(scales, inner)
+    if projector is not None and groups and hasattr(groups[0][0], "after_s"):
+        groups = (*groups, *((effect,) for effect in _from_onsets(bench, projector, groups[0][0])))
+    for group in groups:
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
-            change = [c / share for c in bench.change([effect if form.finite else times(effect, share)])]
+            change = _change(bench, effect)
             if form.per_run and len(change) > 1:
                 nothing = [np.zeros_like(c) for c in change]
                 columns += [(*nothing[:k], own, *nothing[k + 1 :]) for k, own in enumerate(change)]
@@ -115,6 +118,34 @@ def probes_of(bench: Bench, form: type[AbstractEffect], scales: Scales) -> Itera
                 columns.append(tuple(change))
         if all(np.all(np.isfinite(c)) for column in columns for c in column):
             yield Probe(tuple(group), tuple(columns), one_sided(form))
+
+
+def _change(bench: Bench, effect: AbstractEffect) -> list[np.ndarray]:
+    """What an effect changes in each run; of one that grows with its strength, the derivative where it is weak."""
+    share = 1.0 if effect.finite else 1e-2
+    return [c / share for c in bench.change([effect if effect.finite else times(effect, share)])]
+
+
+def _from_onsets(bench: Bench, projector: Projector, effect: AbstractEffect) -> list[AbstractEffect]:
+    """The effect from that instant on from which it explains most of a run, for each run.
+
+    What begins at an instant is, to first order, what is always there less all before (matched filter).
+    """
+
+    def since(at_s: float) -> AbstractEffect:
+        return replace(effect, after_s=jnp.asarray(at_s))  # type: ignore[call-arg]
+
+    always = projector.split(projector.join(_change(bench, since(1e-9))))
+    left = projector.split(projector.off(projector.residual))
+    found = []
+    for signal, residual, mask, one in zip(always, left, projector.masks, bench.prepared, strict=True):
+        product, energy = (np.cumsum(x[::-1])[::-1] for x in (signal * residual, signal**2))
+        if one_sided(type(effect)):
+            product = np.maximum(product, 0.0)
+        gained = product**2 / np.maximum(energy, 1e-9 * energy[:1] + 1e-300)
+        time_s = one.run.record.time_s
+        found.append(since(float(time_s[mask][np.argmax(gained)] - time_s[0])))
+    return found
 
 
 def one_sided(form: type[AbstractEffect]) -> bool:
