@@ -105,6 +105,26 @@ def test_a_load_put_on_within_a_record_is_found_to_a_period_of_the_ringing(rng):
     assert 0.5 < float(effect.mass_ratio) / (mass - 1) < 2
 
 
+def test_a_loss_is_asked_about_from_its_own_sample_on(rng):
+    """Not only at the instants that are always tried: in a fast run what is there is seen nowhere else."""
+    lost = int(rng.integers(1500, 3500))
+
+    def plant(bench, entering_um):
+        k = np.arange(4000)
+        return [bench.plain[0], bench.plain[1][np.minimum(k + (k >= lost), 3999)]]
+
+    case = made(rng, plant)
+    [form] = (form for form in EFFECTS if form.name == "dropped_samples")
+    probes = [list(probes_of(case.bench, form, case.scales, *also)) for also in ((), (case.projector,))]
+    fixed, all_ = (
+        max(one.z for one in score(case.projector, p, nothing(case.bench, case.projector).residual)) for p in probes
+    )
+    instants = [float(probe.effects[0].after_s) * RATE_HZ for probe in probes[1][len(probes[0]) :]]
+    print(lost, instants, fixed, all_)
+    assert abs(instants[1] - lost) <= 10
+    assert all_ > fixed
+
+
 @pytest.mark.study
 def test_two_losses_are_no_drift_of_the_clock(rng):
     lost = np.sort(rng.choice(np.arange(600, 3400, 400), 2, replace=False))
