@@ -114,7 +114,7 @@ def test_new_files_of_lax_users_are_no_trouble(folder):
 def test_the_command_says_it_in_one_sentence(folder, tmp_path):
     group_writable(folder)
     done = subprocess.run(
-        [sys.executable, "-m", "fits", "info", "model.json"],
+        [sys.executable, "-m", "fits", "simulate", "model.json", "x.csv", "--out", "y.csv"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,

@@ -125,6 +125,20 @@ def test_json_and_info_agree(bench, tmp_path):
     assert fit.stdout.split("\n\nmodel ")[0] in words.stdout
 
 
+def test_info_does_not_wait_for_jax(bench):
+    asked = "import sys; from fits.cli._main import main; sys.argv[1:] = ['info', sys.argv[1]]; main()"
+    loaded = "import atexit, sys; atexit.register(lambda: print('jax' in sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{loaded}; {asked}", bench[0] / "model.json"],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("\nFalse\n")
+
+
 @pytest.mark.parametrize("step", ["loop._fit.fit", "plots._loop.plot_fit", "stage._model_file.model_text"])
 def test_an_interruption_leaves_nothing(bench, tmp_path, monkeypatch, step):
     folder, _, _ = bench

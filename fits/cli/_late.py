@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fits.io._atomic import finite_json, refuse_nonfinite, write_csv
     from fits.io._jax_setup import start_jax
     from fits.io._limits import allowed, check_command, joined, parse_limits, ranges_json, reached_in
+    from fits.io._model_text import read_model_text
     from fits.io._quantity import Quantity
     from fits.io._read_csv import read_csv, read_reference, read_runs
     from fits.io._record import Record
@@ -40,7 +41,8 @@ if TYPE_CHECKING:
     from fits.report._control import control_json, describe_control
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
-    from fits.report._fit import describe, fit_report
+    from fits.report._fit import fit_report
+    from fits.report._fit_words import describe
     from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._model_file import ModelFile, load_model, model_text
@@ -50,6 +52,6 @@ if TYPE_CHECKING:
     from fits.sweeps._show import describe_sweep, summarise
     from fits.sweeps._spec import read_sweep
     from fits.sweeps._store import RESULTS, TABLE
-    from microid import AXES, CONTROLLERS, MOTIONS, Hold, Preisach, Stage, parameter_table
+    from microid import AXES, CONTROLLERS, MOTIONS, Hold, Preisach, Stage
 else:
     __getattr__ = late(__name__, __file__)[1]

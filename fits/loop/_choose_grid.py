@@ -13,7 +13,8 @@ from fits.loop._moments import Data, gather, grid_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, LevelTrial
 from fits.loop._run import Progress, Run, simulate_run
-from fits.stats._noise import WHITE, correlation_samples, huber_weight, quantum_um
+from fits.stats._metrics import WHITE
+from fits.stats._noise import correlation_samples, huber_weight, quantum_um
 
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)

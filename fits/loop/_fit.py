@@ -22,7 +22,8 @@ from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import Progress, Run, command_range_V, prepare_run, simulate_run
 from fits.loop._shapes import solve_shape
 from fits.loop._uncertainty import Uncertainty
-from fits.stats._noise import LOSSES, WHITE
+from fits.stats._metrics import WHITE
+from fits.stats._noise import LOSSES
 from microid import FAMILIES, Preisach, Staircase
 
 # Families that are not grids are evaluated on at least this many levels.

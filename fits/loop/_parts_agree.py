@@ -13,7 +13,8 @@ from fits.loop._moments import gather, grid_of
 from fits.loop._prior import Hyper, Posterior, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, simulate_run
-from fits.stats._noise import WHITE, correlation_samples
+from fits.stats._metrics import WHITE
+from fits.stats._noise import correlation_samples
 from microid import Preisach
 
 # Levels on which parts are fitted alone: enough to see whether they agree.

@@ -21,8 +21,7 @@ from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simula
 from fits.stage._solve import Problem, Solved
 from fits.stage._steps import Plan, refine_problem, start_problem
 from fits.stage._uncertainty import Precision
-from fits.stats._metrics import TWO_SIDED_95
-from fits.stats._noise import WHITE
+from fits.stats._metrics import TWO_SIDED_95, WHITE
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
 
 

@@ -31,7 +31,6 @@ Without microid, the weights of Eq. 9 of a grid and the perturbations are read b
     columns_um = np.frombuffer(base64.b64decode(columns["float64_base64"]), "<f8").reshape(columns["shape"])
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -42,8 +41,8 @@ import equinox as eqx
 import jax
 
 from fits.io._atomic import atomic_write_text
-from fits.io._errors import AnyPath, DataError, shown
-from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
+from fits.io._errors import AnyPath, DataError
+from fits.io._model_text import SCHEMA, hash_of, pretty, read_model_text
 from fits.io._version import written_by
 from fits.loop._design import Grid
 from fits.loop._uncertainty import Uncertainty
@@ -52,9 +51,6 @@ from fits.stage._moments import offsets_out
 from fits.stage._uncertainty import StageUncertainty
 from microid import Preisach, Stage
 
-_FAMILY = "microid.model/"
-SCHEMA = f"{_FAMILY}1"
-_PARTS = ("schema", "sha256", "written_by", "model", "uncertainty", "fit")
 # One number per weight is worth reading; one per weight and perturbation is not.
 _PACKED = ("columns_um", "coordinates", "mean_um")
 
@@ -100,7 +96,7 @@ def model_text(
         "fit": dict(report),
     }
     try:
-        content["sha256"] = _hash(content)
+        content["sha256"] = hash_of(content)
         same_report = json.loads(json.dumps(content["fit"])) == content["fit"]
     except (TypeError, ValueError) as error:
         raise DataError(f"its report is not made of finite JSON values ({error})") from error
@@ -110,7 +106,7 @@ def model_text(
         # What a file would not give back must not be lost silently.
         if not eqx.tree_equal(value, decode(content[part], part)):
             raise DataError(f"the {part} holds something that the file would not give back")
-    return _pretty(content) + "\n"
+    return pretty(content) + "\n"
 
 
 def load_model(path: AnyPath) -> ModelFile:
@@ -122,7 +118,7 @@ def load_model(path: AnyPath) -> ModelFile:
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('model files hold float64: jax.config.update("jax_enable_x64", True)')
     name = os.fspath(path)
-    content = _read(name)
+    content = read_model_text(name)
     again = "write the file again with 'microid fit'"
     try:
         model, uncertainty = (decode(content[part], part) for part in ("model", "uncertainty"))
@@ -149,43 +145,3 @@ def _moves(model: eqx.Module, uncertainty: StageUncertainty) -> bool:
         return uncertainty.coordinates.shape[1] == offsets_out(model, on_grid).size
     except ValueError:
         return False
-
-
-def _read(name: str) -> dict[str, Any]:
-    what = "a model file"
-    content = parse_json(read_text(name, what, MOST_JSON_BYTES), name, what)
-    schema = content.get("schema") if isinstance(content, dict) else None
-    if not isinstance(schema, str) or not schema.startswith(_FAMILY):
-        raise DataError(f"{name}: expected a model written by 'microid fit', found other JSON; name such a file.")
-    if schema != SCHEMA:
-        raise DataError(
-            f"{name}: expected the format {SCHEMA}, found {shown(schema)}; "
-            "read it with the version of microid that wrote it, or fit again."
-        )
-    typed = isinstance(content.get("written_by"), str) and isinstance(content.get("fit"), dict)
-    if set(content) != set(_PARTS) or not typed:
-        raise DataError(f"{name}: expected the keys {', '.join(_PARTS)}; write the file again with 'microid fit'.")
-    if content["sha256"] != _hash(content):
-        raise DataError(
-            f"{name}: the content does not match its sha256, so it was changed after it was written; "
-            "restore the file, or write it again with 'microid fit'."
-        )
-    return content
-
-
-def _hash(content: Mapping[str, Any]) -> str:
-    rest = {key: value for key, value in content.items() if key != "sha256"}
-    text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode("ascii")).hexdigest()
-
-
-def _pretty(value: Any, indent: str = "") -> str:
-    """Write objects that hold objects over several lines, and arrays of numbers on one."""
-    inner = indent + " "
-    nested = isinstance(value, dict) and any(isinstance(item, dict | list) for item in value.values())
-    if nested and "unit" not in value:
-        items = [f"{inner}{json.dumps(key)}: {_pretty(item, inner)}" for key, item in value.items()]
-        return "{\n" + ",\n".join(items) + f"\n{indent}}}"
-    if isinstance(value, list) and any(isinstance(item, dict | str) for item in value):
-        return "[\n" + ",\n".join(inner + _pretty(item, inner) for item in value) + f"\n{indent}]"
-    return json.dumps(value, allow_nan=False)

@@ -16,7 +16,8 @@ from fits.loop._uncertainty import AbstractUncertainty, Prediction, Uncertainty
 from fits.stage._moments import Chain, RunSums, along, offsets_out
 from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
-from fits.stats._noise import WHITE, correlation_samples, shared_square
+from fits.stats._metrics import WHITE
+from fits.stats._noise import correlation_samples, shared_square
 from microid import Preisach, Stage
 
 # Levels on which predictions are perturbed; finer ones move no displacement.

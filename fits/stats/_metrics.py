@@ -7,6 +7,8 @@ import numpy as np
 
 # Half the width of a 95 % interval, in standard deviations.
 TWO_SIDED_95 = 1.959964
+# A residual whose neighbours are alike over fewer samples than this counts as white.
+WHITE = 1.2
 # A loop must span this fraction of the largest excursion to be measured.
 _SPAN = 0.95
 

@@ -10,8 +10,6 @@ from scipy.signal import lfilter
 
 # Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
 _HUBER = 1.345
-# A residual less correlated than this counts as white.
-WHITE = 1.2
 LOSSES = ("squares", "huber")
 
 
