@@ -116,7 +116,8 @@ def conclude(
     told = _in_noise(found, beside.noise)
     noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in beside.noise])))
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
-    rounded = ready.faults.quantum_um**2 / 12 > thresholds.minor_share * noise_um**2
+    rounding_um = ready.faults.quantum_um / 12**0.5
+    rounded = rounding_um**2 > thresholds.minor_share * noise_um**2
     misfit, repeated = _misfit(ready, told, rounded)
     rest_noise, left_over = misfit.rest_noise, misfit.is_left_over
     progress(Step.EXTENSION)
@@ -135,6 +136,8 @@ def conclude(
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
+    # Up to its own size rounding makes structure, too.
+    left_over = left_over and not (rounded and rest_noise * noise_um < rounding_um)
     cyclic = (
         not rounded
         and repeated.z > thresholds.cycles
