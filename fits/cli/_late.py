@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fits.io._jax_setup import start_jax
     from fits.io._limits import allowed, check_command, joined, parse_limits, ranges_json, reached_in
     from fits.io._quantity import Quantity
-    from fits.io._read_csv import read_csv, read_reference, read_runs
+    from fits.io._read_csv import read_reference, read_runs, read_table
     from fits.io._record import Record
     from fits.io._units import parse_columns
     from fits.loop._fit import fit
