@@ -186,7 +186,7 @@ class KnownColumns:
         else:
             count = np.arange(len(next(iter(found.values())))) if kept is None else np.flatnonzero(kept)
             # A quotient by a whole rate is rounded once, as those are that a file would have.
-            rate_Hz = sample_rate_Hz or round(1 / interval_s)
+            rate_Hz = sample_rate_Hz or round(1 / interval_s) or 1
             arrays["time_s"] = count / rate_Hz if 1 / rate_Hz == interval_s else count * interval_s
         return cls(table, sources, arrays, found, problems, left_out)
 
@@ -246,7 +246,7 @@ class KnownColumns:
         if np.ptp(voltage_V) == 0.0 or np.ptp(displacement_um) == 0.0:
             return
         ratio = float(np.ptp(displacement_um) / np.ptp(voltage_V))
-        if not _plausible(ratio):
+        if not likely_stroke(ratio):
             likely = " or ".join(self.likely_slips(ratio))
             remedy = f"perhaps {likely}" if likely else "check the units and the columns"
             yield (
@@ -278,7 +278,7 @@ class KnownColumns:
     def likely_slips(self, ratio_um_per_V: float) -> Iterator[str]:
         """Slips of a unit and swapped columns that would bring the stroke per volt between its limits."""
         for power in (-3, 3, -6, 6):
-            if not _plausible(ratio_um_per_V * 10.0**power):
+            if not likely_stroke(ratio_um_per_V * 10.0**power):
                 continue
             for column, shift in (("displacement_um", power), ("voltage_V", -power)):
                 quantity, source = known_quantity(column), self.sources[column]
@@ -287,7 +287,7 @@ class KnownColumns:
                     changed = f"{column}={source.spec(unit=unit)}"
                     yield f"the {quantity.stem} is in {unit} instead of {source.unit} (--columns {changed})"
             break
-        if ratio_um_per_V and _plausible(1.0 / ratio_um_per_V):
+        if ratio_um_per_V and likely_stroke(1.0 / ratio_um_per_V):
             yield f"voltage and displacement are swapped ({self.swap()})"
 
     def swap(self) -> str:
@@ -342,5 +342,6 @@ def _reversals(values: FloatArray) -> FloatArray:
     return values[moves[1:][rising[1:] != rising[:-1]]]
 
 
-def _plausible(ratio_um_per_V: float) -> bool:
+def likely_stroke(ratio_um_per_V: float) -> bool:
+    """Whether a piezo stage moves so far per volt."""
     return STROKE_PER_VOLT_MIN_um_per_V <= ratio_um_per_V <= STROKE_PER_VOLT_MAX_um_per_V

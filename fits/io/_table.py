@@ -115,8 +115,8 @@ def seconds(times: NDArray[Any]) -> FloatArray:
 
 def with_unit(name: str, unit: str | None) -> str:
     """A name that ends in its unit, if one is stated beside it and the name has none."""
-    plain = (unit or "").strip(" []()")
-    return name if not plain or plain in ("-", "1") or split_unit(name)[1] == plain else f"{name}[{plain}]"
+    plain = split_unit(f"x[{(unit or '').strip(' []()')}]")[1]
+    return name if plain in (None, "-", "1") or split_unit(name)[1] == plain else f"{name}[{plain}]"
 
 
 def gathered(path: str, what: str, found: Iterable[Found], interval_s: float | None = None) -> ArrayTable:
