@@ -7,6 +7,7 @@ import click
 from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
+from fits.io._printable import printable
 
 
 @click.command()
@@ -21,17 +22,16 @@ def inspect(given: common.Given) -> None:
     found = late.inspect_table(given.file)
     rate = "of unknown rate" if found.rate_Hz is None else f"{found.rate_Hz:.6g} Hz"
     rate += "" if found.rate_Hz is None or found.even else " in the median, uneven"
-    lines = [
-        f"{found.path}: {found.rows} rows, {rate}",
-        f"{'':>4} {'channel':28} {'unit':>5} {'from':>12} {'to':>12}  use",
-    ]
+    lines = [f"{found.path}: {found.rows} rows, {rate}", _row("", "channel", "unit", "from", "to", "use")]
     for each in found.channels:
         low, high = ("-" if value is None else f"{value:.6g}" for value in (each.lowest, each.highest))
         use = f"({each.use})" if each.guessed else each.use
         words = "; ".join(filter(None, [use, f"found {each.problem}" if each.problem else ""]))
-        lines.append(
-            f"{each.number:4} {each.name[:28]:28} {each.unit or '-':>5} {low:>12} {high:>12}  {words}".rstrip()
-        )
+        lines.append(_row(str(each.number), each.name, each.unit or "-", low, high, words))
     lines += [f"Note: {remark}" for remark in found.remarks]
     lines += ["", found.command or "no columns of voltage and displacement were found; name them with --columns"]
-    common.print_result(given, asdict(found), lines)
+    common.print_result(given, asdict(found), map(printable, lines))
+
+
+def _row(number: str, name: str, unit: str, low: str, high: str, use: str) -> str:
+    return f"{number:>4} {name[:28]:28} {unit:>5} {low:>12} {high:>12}  {use}".rstrip()

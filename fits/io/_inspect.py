@@ -28,7 +28,7 @@ class Channel:
     """A column of a file: its number from 1, its name, its unit if it states one, and its range in that unit.
 
     `use` is the column of a record that it probably is, such as `voltage_V`, or empty, and `guessed` says that its
-    name does not say so. The range is None where the column does not hold numbers alone; `problem` says what is there.
+    name does not say so. The range is None where it holds no numbers; `problem` is the first other thing in it.
     """
 
     number: int

@@ -37,7 +37,7 @@ class _Table(msgspec.Struct):
 
     files: Annotated[str | None, Meta(description="a pattern such as data/*.csv")] = None
     columns: str = ""
-    sample_rate_Hz: Annotated[float | None, Meta(gt=0, description="a rate above 0 Hz")] = None
+    sample_rate_Hz: float | None = None
     missing: Annotated[Literal["refuse", "drop"], Meta(description="refuse or drop")] = "refuse"
     noise_um: Annotated[float, Meta(ge=0, le=1e30, description="0 um or more")] = 0.01
 
