@@ -57,6 +57,7 @@ class Inspection:
     remarks: tuple[str, ...]
 
 
+@np.errstate(all="ignore")  # absurd magnitudes overflow here
 def inspect_table(path: AnyPath) -> Inspection:
     """Look at a file that `read_table` reads, and guess what is what; errors are those of `open_table`."""
     table = open_table(path)

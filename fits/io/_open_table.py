@@ -1,9 +1,12 @@
 """From a file of any format, or an object of another library, to a table of named columns."""
 
 import os
+import warnings
 import zlib
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from fits.io._errors import AnyPath, DataError
 from fits.io._frames import of_frame
@@ -28,7 +31,9 @@ def open_table(source: AnyPath | Any) -> Table:
         data = unpack(data, shown, MOST_CSV_BYTES)
     form = _format_of(shown, data)
     try:
-        return form.open(shown, data)
+        # What a library has to say of damage is said below, in one sentence.
+        with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
+            return form.open(shown, data)
     except (DataError, KeyboardInterrupt):
         raise
     except (Exception, zlib.error) as error:  # whatever the library of a format has against its bytes

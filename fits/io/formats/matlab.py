@@ -1,7 +1,6 @@
 """MATLAB files: up to version 7 by SciPy, from 7.3 on as HDF5; arrays, structures, and the captures of dSPACE."""
 
 import io
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,7 +8,8 @@ import numpy as np
 
 from fits.io._table import Found, Table, gathered
 from fits.io.formats._base import Format, register
-from fits.io.formats.hdf5 import open_hdf5, refuse_large
+from fits.io.formats._mat_elements import sound_variables
+from fits.io.formats.hdf5 import open_hdf5
 
 # How a signal is written as a structure: its name, its values and its unit.
 _SIGNAL = (("Name", "Data", "Unit"), ("label", "values", "unit"), ("name", "data", "unit"))
@@ -19,10 +19,11 @@ def open_matlab(path: str, data: bytes) -> Table:
     """Read all arrays of numbers of one length, also within structures."""
     from scipy import io as scipy_io
 
-    if data.startswith(b"MATLAB 7.3"):
+    if data[512:520] == b"\x89HDF\r\n\x1a\n":  # from version 7.3 on, behind MATLAB's own block
         return open_hdf5(path, data)
-    refuse_large(path, sum(8 * math.prod(map(int, shape)) for _, shape, _ in scipy_io.whosmat(io.BytesIO(data))))
-    variables = scipy_io.loadmat(io.BytesIO(data), simplify_cells=True)
+    # Files of version 4 begin with a number below 5,000.
+    names = None if 0 in data[:4] else sound_variables(path, data)
+    variables = scipy_io.loadmat(io.BytesIO(data), simplify_cells=True, variable_names=names)
     found = [each for name, value in variables.items() if name[:2] != "__" for each in _found((name,), value)]
     return gathered(path, "a MATLAB file", found)
 

@@ -1,6 +1,7 @@
 """TDMS files of LabVIEW: channels in groups, with their units and the interval of their waveforms."""
 
 import io
+import logging
 
 from fits.io._packages import need
 from fits.io._table import Found, Table, gathered
@@ -9,6 +10,8 @@ from fits.io.formats._base import Format, register
 
 def open_tdms(path: str, data: bytes) -> Table:
     """Read all channels of numbers and times of one length."""
+    # What it says of damage goes to stderr, where a command has one sentence.
+    need("nptdms.log", "io").log_manager.set_level(logging.CRITICAL)
     file = need("nptdms", "io").TdmsFile.read(io.BytesIO(data))
     found, intervals = list[Found](), set()
     for group in file.groups():
