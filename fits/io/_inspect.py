@@ -89,10 +89,11 @@ def inspect_table(path: AnyPath) -> Inspection:
         options += ["--missing", "drop"]
     if interval_s is None:
         options += ["--sample-rate", "HZ"]
-    command, remarks = _command(os.fspath(path), {*sources}, options), []
+    still = "voltage_V" in sources and not np.ptp(found[sources["voltage_V"].column])
+    command, remarks = _command(os.fspath(path), {*sources}, options, still), []
     if interval_s is None:
         remarks.append("no column is a time: write the rate of the samples in place of HZ")
-    elif command:
+    elif command and not still:
         remarks += _remarks(path, ",".join(pairs), options, {*sources})
     rate_Hz = 1 / interval_s if interval_s and interval_s > 0 else None
     rows = max(map(len, found.values()), default=0)
@@ -145,13 +146,16 @@ def _spec(table: Table, source: Source) -> str:
     return source.spec()
 
 
-def _command(path: str, there: set[str], options: list[str]) -> str:
+def _command(path: str, there: set[str], options: list[str], still: bool) -> str:
+    """What to paste; a record under a voltage that is `still` is of the noise."""
     moved, driven = "displacement_um" in there, "voltage_V" in there
     words = {
         (True, True): ["fit", path, *options, "--out", "model.json"],
         (True, False): ["compensate", "model.json", path, *options, "--out", "voltage.csv"],
         (False, True): ["simulate", "model.json", path, *options, "--out", "prediction.csv"],
     }.get((moved, driven), [])
+    if still and moved:
+        words = ["budget", "paper", "model.json", path, *options]
     return shlex.join(["microid", *words]) if words else ""
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from fits.io.formats.hdf5 import refuse_large
 
-# Bytes of a number of each type of data; 16 to 18 are characters. Matrices and what is packed have types of their own.
+# Bytes of a number of each type of data; 16 to 18 are characters. Matrices and what is packed have their own types.
 _BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
 _MATRIX, _PACKED, _DEEPEST = 14, 15, 16
 # Classes of matrices.
