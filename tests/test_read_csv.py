@@ -159,6 +159,15 @@ MAPPINGS = [
 ]
 
 
+def test_a_scale_says_what_one_is(tmp_path):
+    """A drive in %, of which 100 are 120 V, and a converter whose last digit is 0.25 nm."""
+    path = saved(tmp_path, csv_text("time_s,drive,counts"))
+    record = read_csv(path, parse_columns("voltage_V=drive[1.5V],displacement_um=-counts[2.5e-1 nm]"))
+    assert record.voltage_V.tolist() == [1.5 * v for v in VOLT]
+    assert record.displacement_um.tolist() == [-0.25 * y / 1e3 for y in DISP]
+    assert "out of V, mV" in refusal(path, columns=parse_columns("voltage_V=drive[0V],displacement_um=counts[um]"))
+
+
 @pytest.mark.parametrize(("columns", "time_divisor", "divisor"), MAPPINGS)
 def test_mapping_states_unit_and_sign(tmp_path, columns, time_divisor, divisor):
     record = read_csv(saved(tmp_path, FREE), columns)

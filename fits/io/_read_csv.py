@@ -45,8 +45,9 @@ def read_table(
         Name of the file, or the object.
     columns
         Canonical column to source column, for example ``{"voltage_V": "u1_V", "displacement_um": "-height[m]"}``:
-        the unit is the suffix of the source or stands in brackets, and a minus flips the sign. A source may also be
-        the number of a column, from 1, whose unit is then the canonical one if none is stated.
+        the unit is the suffix of the source or stands in brackets, and a minus flips the sign. ``drive[1.2V]`` says
+        what 1 in the column is, as in %. A source may also be the number of a column, from 1, whose unit is then the
+        canonical one if none is stated.
     required
         Canonical columns that must be there. Time and voltage always are; without ``displacement_um`` the file is
         a voltage programme, which may be short and may hold the voltage.
@@ -179,7 +180,7 @@ class KnownColumns:
         for name, source in sources.items():
             quantity = known_quantity(name)
             with np.errstate(over="ignore"):
-                arrays[name] = quantity.convert(source.sign * found[source.column], source.unit)
+                arrays[name] = quantity.convert(source.sign * source.scale * found[source.column], source.unit)
             check_size(table, source.column, arrays[name], quantity.unit, source.unit)
         if interval_s is None:
             _check_time(table, sources["time_s"].column, arrays["time_s"])

@@ -1,5 +1,6 @@
 """Names and units of columns: what a header means, and which source column serves which quantity."""
 
+import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,23 +17,27 @@ QUANTITIES = (
     *(column.quantity for column in COLUMNS.values()),
 )
 _NUMBERED = re.compile(r"-?\d+ *(\[[^\[\]]*\])?")
+# What 1 in a column is, such as 1.2V of a drive in %.
+_SCALED = re.compile(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) *([^\d\s].*)")
 # Other names of a quantity.
 _ALSO = {"timestamp": "time", "datetime": "time", "date_time": "time"}
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a canonical column comes from: the source column, its unit and its sign."""
+    """Where a canonical column comes from: the source column, its unit, how many of these its 1 is, and its sign."""
 
     column: str
     unit: str
     sign: int = 1
+    scale: float = 1.0
 
     def spec(self, flip: bool = False, unit: str | None = None) -> str:
         """Write the right-hand side of a mapping that reads this column, optionally changed."""
         sign = -self.sign if flip else self.sign
         unit = unit or self.unit
-        stated = "" if split_unit(self.column)[1] == unit else f"[{unit}]"
+        factor = "" if self.scale == 1 else f"{self.scale:.17g}"
+        stated = "" if split_unit(self.column)[1] == factor + unit else f"[{factor}{unit}]"
         return f"{'-' if sign < 0 else ''}{self.column}{stated}"
 
 
@@ -158,13 +163,16 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
             f"the nearest are {_listed(near)}."
         )
     unit = stated or split_unit(text)[1] or (quantity.unit if numbered else None)
-    if unit not in quantity.powers:
+    scaled = _SCALED.fullmatch(unit or "")
+    scale = float(scaled[1]) if scaled and scaled[2] in quantity.powers else 1.0
+    unit = scaled[2] if scaled and scaled[2] in quantity.powers else unit
+    if unit not in quantity.powers or not 0 < scale < math.inf:
         found = f"found unit '{unit}'" if unit else "found no unit"
         raise DataError(
             f"{place}, column '{text}': expected a unit out of {', '.join(quantity.powers)} for {column}, {found}; "
             f"state the unit with --columns {column}={text}[{quantity.unit}]."
         )
-    return Source(text, str(unit), sign)
+    return Source(text, str(unit), sign, scale)
 
 
 def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str, Source], place: str) -> str:
