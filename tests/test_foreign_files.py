@@ -235,6 +235,14 @@ def test_further_formats(tmp_path, name):
     assert_same(fits.read_table(tmp_path / name, parse_columns(named)))
 
 
+def test_several_tables_in_a_labview_file_are_told_apart(tmp_path):
+    path = tmp_path / "two.lvm"
+    labview(path, *signals())
+    path.write_text(path.read_text() + "\n" + LVM.partition("***End_of_Header***\t\n\t\n")[2] + "0\t1\t2\n")
+    with pytest.raises(fits.DataError, match=r"two\.lvm, line \d+: expected one table, found 2; split the file"):
+        fits.read_table(path)
+
+
 def test_missing_numbers_are_refused_or_dropped(tmp_path):
     t, v, y = signals()
     holes = y.copy()

@@ -18,7 +18,10 @@ def open_labview(path: str, data: bytes) -> Table:
     text = decode(path, data)
     lines = text.split("\n")
     separator = "," if any(line.startswith("Separator,") for line in lines[:40]) else "\t"
-    ends = [k for k, line in enumerate(lines[:200]) if line.startswith(_END)]
+    ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
+    if len(ends) > 2:
+        what = f"expected one table, found {len(ends) - 1}; split the file where the next header begins"
+        raise data_error(path, what, f"line {ends[2] + 1}")
     keys = {}
     for line in lines[: ends[-1]] if ends else ():
         key, *cells = line.split(separator)
