@@ -160,7 +160,7 @@ def test_everything_that_microid_defines_without_an_underscore_is_public():
 def test_modules_are_private():
     for package in PACKAGES:
         # Each file there is a plug-in, and named after what it adds.
-        public = ("cli", "columns", "control", "densities", "effects", "hysteresis", "kinds")
+        public = ("cli", "columns", "control", "densities", "effects", "formats", "hysteresis", "kinds")
         for path in (ROOT / package).rglob("*.py"):
             assert path.name.startswith("_") or path.parent.name in public, relative(path)
 

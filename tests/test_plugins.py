@@ -35,6 +35,19 @@ COMMAND = '''
 '''
 
 
+FORMAT = '''
+    """Channels one below the other: a name, and its numbers."""
+    from fits.io._table import gathered
+    from fits.io.formats._base import Format, register
+
+    def open_pairs(path, data):
+        rows = [line.split() for line in data.decode().splitlines()[1:]]
+        return gathered(path, "channels", [((name,), [float(cell) for cell in cells], None) for name, *cells in rows])
+
+    register(Format("a file of channels", (".pairs",), (b"PAIRS",), open_pairs))
+'''
+
+
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory):
     """A copy of the packages with a new file of each kind in its place."""
@@ -47,6 +60,7 @@ def copy(tmp_path_factory):
         "microid/effects/wrong_gain.py": EFFECT,
         "microid/effects/swelling.py": SWELLING,
         "fits/io/columns/humidity.py": COLUMN,
+        "fits/io/formats/pairs.py": FORMAT,
         "fits/cli/hello.py": COMMAND,
     }.items():
         (folder / place).write_text(textwrap.dedent(text).lstrip())
@@ -230,6 +244,12 @@ def test_a_controller_is_one_file_and_is_run_and_swept(copy):
     found = pd.read_parquet(copy / "results" / "results.parquet")
     expected = [integrated(rate, 20)[-1] for rate in (2000.0, 4000.0)]
     assert found["error_final_um"].tolist() == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_format_of_files_is_one_file(copy):
+    (copy / "run.pairs").write_text("PAIRS\ntime_s 0 1 2\nvoltage_V 5 7 6\n")
+    said = json.loads(python(copy, "-m", "fits", "inspect", "run.pairs", "--json"))
+    assert [(each["use"], each["highest"]) for each in said["channels"]] == [("time_s", 2.0), ("voltage_V", 7.0)]
 
 
 KIND = '''

@@ -98,6 +98,8 @@ ACCEPTED = {
     "rows of empty cells (Excel)": csv_text(rows=[*ROWS, ",,", ",,"]),
     "other order": csv_text("voltage_V,displacement_um,time_s", [re.sub("(.*?),(.*)", r"\2,\1", r) for r in ROWS]),
     "brackets": csv_text("Time [s],Voltage (V),Displacement [µm]"),
+    "preamble": "Model,TDS\nSerial,5\n\n" + csv_text(),
+    "units line": csv_text(rows=["s,V,um", *ROWS]),
     "plus signs and exponents": csv_text(rows=[f"+{t},{v:e},{y}" for t, v, y in zip(TIME, VOLT, DISP, strict=True)]),
 }  # fmt: skip
 
@@ -155,6 +157,15 @@ MAPPINGS = [
     ({"time_s": "t_ms", "voltage_V": "u1_V", "displacement_um": "height[nm]"}, 1e3, 1e3),
     ({"time_s": "t_ms[s]", "voltage_V": "u1_V", "displacement_um": "-height [ um ]"}, 1.0, -1.0),
 ]
+
+
+def test_a_scale_says_what_one_is(tmp_path):
+    """A drive in %, of which 100 are 120 V, and a converter whose last digit is 0.25 nm."""
+    path = saved(tmp_path, csv_text("time_s,drive,counts"))
+    record = read_csv(path, parse_columns("voltage_V=drive[1.5V],displacement_um=-counts[2.5e-1 nm]"))
+    assert record.voltage_V.tolist() == [1.5 * v for v in VOLT]
+    assert record.displacement_um.tolist() == [-0.25 * y / 1e3 for y in DISP]
+    assert "out of V, mV" in refusal(path, columns=parse_columns("voltage_V=drive[0V],displacement_um=counts[um]"))
 
 
 @pytest.mark.parametrize(("columns", "time_divisor", "divisor"), MAPPINGS)
@@ -221,19 +232,19 @@ REFUSED = {
     "binary without NUL": (b"\x89PNG\r\n\x1a\x01\xff", 2, None, "binary"),
     "Excel workbook": (b"PK\x03\x04abc", 1, None, "Excel workbook"),
     "cut UTF-16": (csv_text().encode("utf-16")[:-1], 1, None, "UTF-16"),
-    "no header": ("# a\n" + "\n".join(ROWS), 2, "0.0", "header such as time_s,voltage_V,displacement_um"),
+    "no header": ("# a\n" + "\n".join(ROWS), 2, None, "header such as time_s,voltage_V,displacement_um"),
     "missing column": (csv_text("time_s,u1_V,displacement_um"), 1, "voltage_V", "--columns voltage_V=u1_V"),
     "missing unit": (csv_text("time_s,voltage,displacement_um"), 1, "voltage_V", r"voltage_V=voltage\[V\]"),
     "unknown unit": (csv_text("time_s,voltage_V,displacement_inch"), 1, "displacement_um", "'inch' .*um, nm, mm"),
     "unknown separator": (csv_text().replace(",", " "), 1, "time_s", "separate the columns by commas"),
-    "preamble": ("Model,TDS\n" + csv_text(), 1, "time_s", "put # before this line"),
+    "preamble": ("Model,TDS\n" + with_row(2, "x,y,z"), 3, "time_s", "put # before the line"),
     "scope": (csv_text("TIME,CH1,CH2"), 1, "time_s", r"voltage_V=CH1\[V\],displacement_um=CH2\[um\]"),
     "two units": (with_column("voltage_mV", TIME), 1, "voltage_mV", "found also 'voltage_V'"),
     "duplicate": (with_column("voltage_V", TIME), 1, "voltage_V", "cells 2 and 4"),
     "duplicate extra": (csv_text("x,x," + HEAD), 1, "x", "cells 1 and 2"),
     "text": (with_row(9, "3.5,oops,1"), 9, "voltage_V", "found 'oops'; correct the cell"),
     "text in quotes": (with_row(9, '3.5,"oops",1'), 9, "voltage_V", "found 'oops'"),
-    "units line": (with_row(2, "s,V,um"), 2, "time_s", "put # before the line"),
+    "units line": (with_row(2, "s,V,oz"), 2, "time_s", "put # before the line"),
     "underscore": (with_row(9, "3.5,1_0,1"), 9, "voltage_V", "found '1_0'"),
     "empty cell": (with_row(9, "3.5,,1"), 9, "voltage_V", "an empty cell"),
     "NaN": (with_row(9, "3.5,1,NaN"), 9, "displacement_um", "finite number, found 'NaN'"),

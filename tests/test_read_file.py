@@ -16,8 +16,8 @@ from _sweeps import parsed, small
 
 import data_synth
 import fits
+import fits.io._open_table
 import fits.io._read_file
-import fits.io._table
 import microid as m
 from fits import DataError, Uncertainty
 from fits.control._gains import read_gains
@@ -75,7 +75,7 @@ def test_only_regular_files_are_read(tmp_path, name):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_no_more_is_read_or_unpacked_than_is_stated(tmp_path, monkeypatch, packed):
-    monkeypatch.setattr(fits.io._table, "MOST_CSV_BYTES", 3_000_000)
+    monkeypatch.setattr(fits.io._open_table, "MOST_CSV_BYTES", 3_000_000)
     text = rows(loop()).encode()
     path = tmp_path / ("run.csv.gz" if packed else "run.csv")
     for size, fits_in in ((2_999_999, True), (3_000_001, False)):
@@ -93,8 +93,8 @@ def test_a_small_file_that_unpacks_to_gigabytes_takes_little_memory(tmp_path):
     block = gzip.compress(b"0" * 50_000_000, 9)
     path.write_bytes(gzip.compress(HEAD.encode() + b"\n") + 100 * block)
     code = (
-        "import resource, sys, fits, fits.io._table\n"
-        "fits.io._table.MOST_CSV_BYTES = 50_000_000\n"
+        "import resource, sys, fits, fits.io._open_table\n"
+        "fits.io._open_table.MOST_CSV_BYTES = 50_000_000\n"
         "resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9, 3 * 10**9))\n"
         "try: fits.read_csv(sys.argv[1])\nexcept fits.DataError as error: print(error)"
     )

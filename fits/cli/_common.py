@@ -171,6 +171,12 @@ def print_result(given: Given, content: Any, lines: Iterable[str]) -> None:
     click.echo(late.finite_json(content) if given.as_json else "\n".join(lines))
 
 
+def reading(given: Given) -> dict[str, Any]:
+    """How files are to be read, as `read_table` takes it."""
+    columns = late.parse_columns(given.columns)
+    return {"columns": columns, "sample_rate_Hz": given.sample_rate, "missing": given.missing}
+
+
 def paths_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
     """Names of the files that were made for a folder, as the user named it."""
     return [str(Path(folder or "") / Path(file).name) for file in made]

@@ -16,11 +16,12 @@ if TYPE_CHECKING:
     from fits.diagnosis._diagnose import diagnose
     from fits.diagnosis._result import Diagnosis, Step
     from fits.io._atomic import finite_json, refuse_nonfinite, write_csv
+    from fits.io._inspect import inspect_table
     from fits.io._jax_setup import start_jax
     from fits.io._limits import allowed, check_command, joined, parse_limits, ranges_json, reached_in
     from fits.io._model_text import read_model_text
     from fits.io._quantity import Quantity
-    from fits.io._read_csv import read_csv, read_reference, read_runs
+    from fits.io._read_csv import read_reference, read_runs, read_table
     from fits.io._record import Record
     from fits.io._units import parse_columns
     from fits.loop._fit import fit

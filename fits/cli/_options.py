@@ -12,11 +12,25 @@ model = click.argument("model", metavar="MODEL.json")
 reference = click.argument("reference", metavar="REFERENCE.csv")
 runs = click.argument("runs", metavar="RUN.csv [MORE.csv ...]", nargs=-1, required=True)
 out_folder = click.option("--out", required=True, metavar="DIR", help="Folder to write to; it is made if need be.")
-columns = click.option(
+_columns = click.option(
     "--columns",
     metavar="NAME=SOURCE,...",
     default="",
-    help="Which columns to read, such as voltage_V=u1_V,displacement_um=-height[nm].",
+    help="Which columns to read, such as voltage_V=u1_V,displacement_um=-height[nm]; a source may be the number of a "
+    "column, from 1, and numbers alone, such as 1,4, are the columns that are needed, in their order.",
+)
+_sample_rate = click.option(
+    "--sample-rate",
+    type=float,
+    metavar="HZ",
+    help="Samples are even, so many a second, instead of a column of times.",
+)
+_missing = click.option(
+    "--missing",
+    type=click.Choice(["refuse", "drop"]),
+    default="refuse",
+    show_default=True,
+    help="What to do with rows in which a number is missing.",
 )
 limits = click.option("--limits", metavar="LOW,HIGH", help="Voltages allowed, in V; the model's range by default.")
 limit = click.option(
@@ -42,6 +56,11 @@ axis = click.option(
 )
 json_output = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")
+
+
+def columns(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Declare how files are read, the same for every command that reads some."""
+    return _columns(_sample_rate(_missing(command)))
 
 
 def out_csv(metavar: str) -> Callable[[Any], Any]:

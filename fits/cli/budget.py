@@ -51,7 +51,7 @@ def budget(given: common.Given) -> None:
         # Entered before the work, so that a place that cannot be written to is refused before the wait.
         unfinished, drawings = None if out is None else files.file(out), files.folder(given.plots)
         design = late.paper_design() if given.stage == "paper" else late.read_design(given.stage)
-        noise = late.idle_noise(late.read_idle(given.idle, late.parse_columns(given.columns)))
+        noise = late.idle_noise(late.read_idle(given.idle, **common.reading(given)))
         axes = tuple(name for name in late.AXES if given.axis in (name, "all"))
         how = {"measures": given.model_measures, "arm_mm": arm_mm, "zeroed": given.zeroed}
         found = late.budget(design, _law(given.model), noise, axes, **how)

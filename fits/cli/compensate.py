@@ -44,7 +44,7 @@ def compensate(given: common.Given) -> None:
             f"{given.model}: expected a model with mechanics for --dynamic, found a Preisach model, which has none; "
             "leave out --dynamic, or fit a whole stage."
         )
-    wanted = late.read_reference(given.reference, late.parse_columns(given.columns))
+    wanted = late.read_reference(given.reference, **common.reading(given))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)

@@ -118,7 +118,7 @@ def control(given: common.Given) -> None:
     known_gains = None if given.gains is None else late.read_gains(given.gains)
     loaded = late.load_model(given.model)
     plant = common.stage_or_preisach(given.model, loaded)
-    wanted = late.read_reference(given.reference, late.parse_columns(given.columns))
+    wanted = late.read_reference(given.reference, **common.reading(given))
     # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with file_set() as files:
         unfinished, drawings = files.file(given.out), files.folder(given.plots)

@@ -56,7 +56,7 @@ def diagnose(given: common.Given) -> None:
         raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {given.duration:g}.")
     if not 0 <= given.margin <= 10:
         raise DataError(f"--margin: expected a share of the ranges reached, 0 to 10, found {given.margin:g}.")
-    limits, mapping = late.parse_limits(given.limit), late.parse_columns(given.columns)
+    limits, how = late.parse_limits(given.limit), common.reading(given)
     fraction, files = common.fraction_or_files(given.holdout)
     for name in (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM):
         common.refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
@@ -64,8 +64,8 @@ def diagnose(given: common.Given) -> None:
     usable_folder(given.out, "--out")
     late.start_jax()
     progress = common.bar_to_stderr(given.quiet, tuple(late.Step))
-    records = late.read_runs(given.runs, mapping)
-    aside = [late.read_csv(file, mapping) for file in files]
+    records = late.read_runs(given.runs, **how)
+    aside = [late.read_table(file, **how) for file in files]
     diagnosis = late.diagnose(
         records,
         holdout=aside or fraction,

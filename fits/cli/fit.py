@@ -27,8 +27,7 @@ _HOLDS: dict[str, "late.Hold"] = {"lines": "first", "steps": "zero", "curves": "
 @click.option("--family", metavar="NAME", help="Density: grid, mixture or network (default grid).")
 @click.option("--levels", type=int, help="Number of switching voltages; found from the data by default.")
 @options.holdout(
-    "Fraction at the end of every run that is only predicted (default 0.2), or a CSV that is; give it again for more "
-    "files."
+    "Fraction at the end of every run that is only predicted (default 0.2), or a file that is; again for more files."
 )
 @options.columns
 @options.initial(
@@ -67,14 +66,14 @@ def fit(given: common.Given) -> None:
         estimate, draw, asked = late.fit, late.plot_fit, _for_loop(given)
     initial = list(given.initial) if len(given.initial) > 1 else (given.initial or ("unknown",))[0]
     progress = common.progress_to_stderr(given.quiet)
-    mapping = late.parse_columns(given.columns)
+    how = common.reading(given)
     fraction, files = common.fraction_or_files(given.holdout)
     common.refuse_overwriting(given.out, [*given.runs, *files])
     # Entered before the fit, so that a place that cannot be written to is refused before the wait.
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
-        records = late.read_runs(given.runs, mapping)
-        same = {"holdout": [late.read_csv(file, mapping) for file in files] or fraction, "initial": initial}
+        records = late.read_runs(given.runs, **how)
+        same = {"holdout": [late.read_table(file, **how) for file in files] or fraction, "initial": initial}
         asked |= {"levels": given.levels, "loss": given.loss or "squares", "progress": progress}
         result = estimate(records, **same, **asked)
         report, drawn = late.fit_report(result), []

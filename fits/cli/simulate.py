@@ -26,7 +26,7 @@ def simulate(given: common.Given) -> None:
     late.start_jax()
     common.refuse_overwriting(given.out, [given.model, given.program])
     loaded = late.load_model(given.model)
-    record = late.read_csv(given.program, late.parse_columns(given.columns), required=("time_s", "voltage_V"))
+    record = late.read_table(given.program, required=("time_s", "voltage_V"), **common.reading(given))
     prediction = common.predicted_by(given.model, loaded, record, given.initial)
     displacement_um, sd_um = prediction.displacement_um, prediction.displacement_sd_um
     known = loaded.uncertainty is not None

@@ -12,6 +12,25 @@ FloatArray = NDArray[np.float64]
 
 LENGTH = {"um": 0, "nm": -3, "mm": 3, "m": 6, "pm": -6}
 VOLTAGE = {"V": 0, "mV": -3, "uV": -6, "kV": 3}
+# Words for units, as programs of measurement have them.
+_WORDS = {
+    "second": "s",
+    "sec": "s",
+    "millisecond": "ms",
+    "msec": "ms",
+    "microsecond": "us",
+    "volt": "V",
+    "millivolt": "mV",
+}
+_WORDS |= {"kilovolt": "kV", "meter": "m", "metre": "m", "millimeter": "mm", "millimetre": "mm", "micron": "um"}
+_WORDS |= {
+    "micrometer": "um",
+    "micrometre": "um",
+    "nanometer": "nm",
+    "nanometre": "nm",
+    "kelvin": "K",
+    "celsius": "degC",
+}
 _PLAIN_SIGNS = {"µ": "u", "μ": "u", "°C": "degC"}  # both Unicode micro signs, and the degree sign
 BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]")
 
@@ -53,4 +72,4 @@ def split_unit(name: str) -> tuple[str, str | None]:
         stem, unit = (stem, unit) if stem else (name, "")
     for sign, plain in _PLAIN_SIGNS.items():
         unit = unit.replace(sign, plain)
-    return stem, unit or None
+    return stem, _WORDS.get(unit.lower().removesuffix("s"), unit) or None

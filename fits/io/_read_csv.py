@@ -1,17 +1,19 @@
-"""From a CSV file to a `Record`: what is read, what is refused and what is warned of."""
+"""From a file to a `Record`: what is read, what is refused and what is warned of."""
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from fits.io._errors import AnyPath, DataError
+from fits.io._open_table import open_table
 from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._quantity import FloatArray
 from fits.io._record import Record, Reference
-from fits.io._table import Problem, Table, open_table
-from fits.io._units import Source, find_sources, known_quantity
+from fits.io._table import Problem, Table
+from fits.io._units import Source, find_sources, known_quantity, recognise
 
 # Piezo stages move 0.01 um/V (stack on a 1000 V amplifier) to 15 um/V (voltage logged before an amplifier of
 # ten-fold gain). Of a typical 0.1 to 1 um/V, slips of 1e3 and 1e6 lie outside these limits.
@@ -20,32 +22,42 @@ STROKE_PER_VOLT_MAX_um_per_V = 50.0
 MIN_SAMPLES = 50
 
 
-def read_csv(
-    path: AnyPath,
+def read_table(
+    source: AnyPath | Any,
     columns: Mapping[str, str] | None = None,
     required: Iterable[str] = ("time_s", "voltage_V", "displacement_um"),
+    sample_rate_Hz: float | None = None,
+    missing: str = "refuse",
 ) -> Record:
-    """Read one run from a CSV file.
+    """Read one run from a file of any format, or take it from a `DataFrame`, a `Dataset` or a mapping of arrays.
 
-    The separator (comma, semicolon, tab), a decimal comma, the encoding (UTF-8, UTF-16 with a byte-order mark,
-    Latin-1) and gzip are recognised; lines that begin with ``#`` or ``%`` and blank lines are skipped. Headers
-    such as ``voltage_mV`` are recognised by stem and suffix and converted to the canonical unit: times are in s,
-    voltages in V and displacements in um, each of shape (n,), and all other numeric columns in `extra`. A `DataError`
-    says in one sentence with file, line and column what was expected and what to do.
+    Formats are those of `fits/io/formats`: text, LabVIEW, MATLAB, HDF5, NumPy, Parquet and TDMS. Of a text the
+    separator (comma, semicolon, tab), a decimal comma, the encoding (UTF-8, UTF-16 with a byte-order mark, Latin-1)
+    and gzip are recognised, and a line of units below the header, lines above it, and ISO 8601 time stamps; blank
+    lines and those that begin with ``#`` or ``%`` are skipped. Headers such as ``voltage_mV`` are recognised by stem
+    and suffix and converted to the canonical unit: times are in s, voltages in V and displacements in um, each of
+    shape (n,), and all other numeric columns in `extra`. A `DataError` says in one sentence with file, line and
+    column what was expected and what to do.
 
     Parameters
     ----------
-    path
-        File to read.
+    source
+        Name of the file, or the object.
     columns
         Canonical column to source column, for example ``{"voltage_V": "u1_V", "displacement_um": "-height[m]"}``:
-        the unit is the suffix of the source or stands in brackets, and a minus flips the sign.
+        the unit is the suffix of the source or stands in brackets, and a minus flips the sign. ``drive[1.2V]`` says
+        what 1 in the column is, as in %. A source may also be the number of a column, from 1, whose unit is then the
+        canonical one if none is stated.
     required
         Canonical columns that must be there. Time and voltage always are; without ``displacement_um`` the file is
         a voltage programme, which may be short and may hold the voltage.
+    sample_rate_Hz
+        Rate of even samples, in Hz, which takes the place of a column of times.
+    missing
+        ``refuse`` rows in which a required number is missing or NaN, or ``drop`` them, with a warning.
     """
     required = tuple(dict.fromkeys(("time_s", "voltage_V", *required)))
-    read = KnownColumns.read(path, columns, required)
+    read = KnownColumns.read(source, columns, required, sample_rate_Hz=sample_rate_Hz, missing=missing)
     table, sources, arrays = read.table, read.sources, dict(read.arrays)
     time_s, voltage_V = arrays.pop("time_s"), arrays.pop("voltage_V")
     displacement_um = arrays.pop("displacement_um", None)
@@ -57,17 +69,17 @@ def read_csv(
             array = read.found[sources[name].column]
             if array.min() == array.max():
                 what = (
-                    f"expected values that change, found {array[0]:.9g} in every line from here to line "
-                    f"{table.line(array.size - 1)}; choose another column with --columns, or check the wiring"
+                    f"expected values that change, found {array[0]:.9g} in every one from here to "
+                    f"{table.place(array.size - 1)}; choose another column with --columns, or check the wiring"
                 )
                 raise table.error(what, 0, sources[name].column)
 
     used = {*sources, *(source.column for source in sources.values())}
     extra = {name: array for name, array in read.found.items() if name not in used} | arrays
     warnings = [
-        f"{table.path}, line {line}, column '{name}': dropped, because {found} is not a number; correct the cell if "
+        f"{table.path}, {place}, column '{name}': dropped, because {found} is not a number; correct the cell if "
         "the column matters."
-        for name, (line, found) in read.problems.items()
+        for name, (place, found) in read.problems.items()
     ]
     # Further columns serve for little, and may hold anything that has a square and a cube.
     for name in [name for name, array in extra.items() if np.abs(array).max() > 1e30]:
@@ -77,25 +89,40 @@ def read_csv(
             "column matters."
         )
     with np.errstate(all="ignore"):  # absurd magnitudes overflow here, and then warn of nothing
-        warnings += [*read.odd_gaps(), *read.odd_voltage()]
+        warnings += [*read.left_out, *read.odd_gaps(), *read.odd_voltage()]
         if displacement_um is not None:
             warnings += [*read.odd_stroke(), *read.saturated()]
     return Record(time_s, voltage_V, displacement_um, extra, os.path.basename(table.path), tuple(warnings))
 
 
-def read_runs(paths: Iterable[AnyPath], columns: Mapping[str, str] | None = None) -> tuple[Record, ...]:
-    """Read several files as several runs of one rig; arguments and errors are those of `read_csv`."""
+# What it was called when it read CSV alone.
+read_csv = read_table
+
+
+def read_runs(
+    paths: Iterable[AnyPath],
+    columns: Mapping[str, str] | None = None,
+    sample_rate_Hz: float | None = None,
+    missing: str = "refuse",
+) -> tuple[Record, ...]:
+    """Read several files as several runs of one rig; arguments and errors are those of `read_table`."""
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not paths:
         raise DataError("Expected at least one CSV file, found none; name the files of the runs.")
-    return tuple(read_csv(path, columns) for path in paths)
+    return tuple(read_table(path, columns, sample_rate_Hz=sample_rate_Hz, missing=missing) for path in paths)
 
 
-def read_reference(path: AnyPath, columns: Mapping[str, str] | None = None) -> Reference:
-    """Read a displacement to follow: the columns `time_s` and `displacement_um`; see `read_csv` for all else."""
-    read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), alone=True)
+def read_reference(
+    path: AnyPath,
+    columns: Mapping[str, str] | None = None,
+    sample_rate_Hz: float | None = None,
+    missing: str = "refuse",
+) -> Reference:
+    """Read a displacement to follow: the columns `time_s` and `displacement_um`; see `read_table` for all else."""
+    needed = ("time_s", "displacement_um")
+    read = KnownColumns.read(path, columns, needed, (), True, sample_rate_Hz, missing)
     with np.errstate(all="ignore"):
-        warnings = tuple(read.odd_gaps())
+        warnings = (*read.left_out, *read.odd_gaps())
     source = os.path.basename(read.table.path)
     return Reference(read.arrays["time_s"], read.arrays["displacement_um"], source, warnings)
 
@@ -109,35 +136,66 @@ class KnownColumns:
     arrays: Mapping[str, FloatArray]
     found: Mapping[str, FloatArray]
     problems: Mapping[str, Problem]
+    left_out: tuple[str, ...] = ()
 
     @classmethod
     def read(
         cls,
-        path: AnyPath,
+        path: AnyPath | Any,
         columns: Mapping[str, str] | None,
         required: Sequence[str],
         more: Sequence[str] = (),
         alone: bool = False,
+        sample_rate_Hz: float | None = None,
+        missing: str = "refuse",
     ) -> "KnownColumns":
-        """Read the required columns; of all others, or of `more` alone, those that are there. See `read_csv`."""
-        table = open_table(path)
-        sources = find_sources(table.names, columns or {}, required, f"{table.path}, line {table.header_line}")
+        """Read the required columns; of all others, or of `more` alone, those that are there. See `read_table`."""
+        table, columns = open_table(path), columns or {}
+        if not (table.headed or columns):
+            what = (
+                "expected a header such as time_s,voltage_V,displacement_um, found numbers; insert the header above "
+                "this line, without # before it, or number the columns, as in --columns time_s=1,voltage_V=2"
+            )
+            raise table.error(what)
+        interval_s = _interval_s(table, columns, sample_rate_Hz)
+        needed = [name for name in required if name != "time_s" or interval_s is None]
+        place = ", ".join(filter(None, (table.path, table.place())))
+        sources = find_sources(table.names, columns, needed, place)
+        if interval_s is not None:
+            sources.pop("time_s", None)
         if alone:
             sources = {name: sources[name] for name in (*required, *more) if name in sources}
-        found, problems = table.read({source.column for source in sources.values()})
+        strict = {source.column for source in sources.values()}
+        left_out: tuple[str, ...] = ()
+        kept = None
+        if missing == "drop":
+            table, kept = table.without_missing(strict)
+            if not kept.all():
+                words = (
+                    f"{np.sum(~kept)} of {kept.size} rows were left out, as a number that is needed is missing there"
+                )
+                left_out = (f"{table.path}: {words}.",)
+        found, problems = table.read(strict)
         arrays = {}
         for name, source in sources.items():
             quantity = known_quantity(name)
             with np.errstate(over="ignore"):
-                arrays[name] = quantity.convert(source.sign * found[source.column], source.unit)
+                arrays[name] = quantity.convert(source.sign * source.scale * found[source.column], source.unit)
             check_size(table, source.column, arrays[name], quantity.unit, source.unit)
-        _check_time(table, sources["time_s"].column, arrays["time_s"])
-        return cls(table, sources, arrays, found, problems)
+        if interval_s is None:
+            _check_time(table, sources["time_s"].column, arrays["time_s"])
+        else:
+            count = np.arange(len(next(iter(found.values())))) if kept is None else np.flatnonzero(kept)
+            # A quotient by a whole rate is rounded once, as those are that a file would have.
+            rate_Hz = sample_rate_Hz or round(1 / interval_s) or 1
+            arrays["time_s"] = count / rate_Hz if 1 / rate_Hz == interval_s else count * interval_s
+        return cls(table, sources, arrays, found, problems, left_out)
 
     def place(self, column: str, row: int | None = None) -> str:
         """File, line and header of a canonical column, to begin a warning with."""
-        line = "" if row is None else f", line {self.table.line(row)}"
-        return f"{self.table.path}{line}, column '{self.sources[column].column}'"
+        words = [self.table.path, "" if row is None else self.table.place(row)]
+        words.append(f"column '{self.sources[column].column}'" if column in self.sources else "")
+        return ", ".join(filter(None, words))
 
     def odd_gaps(self) -> Iterator[str]:
         """Few long steps in an otherwise even time base; uneven sampling is legal."""
@@ -189,7 +247,7 @@ class KnownColumns:
         if np.ptp(voltage_V) == 0.0 or np.ptp(displacement_um) == 0.0:
             return
         ratio = float(np.ptp(displacement_um) / np.ptp(voltage_V))
-        if not _plausible(ratio):
+        if not likely_stroke(ratio):
             likely = " or ".join(self.likely_slips(ratio))
             remedy = f"perhaps {likely}" if likely else "check the units and the columns"
             yield (
@@ -221,7 +279,7 @@ class KnownColumns:
     def likely_slips(self, ratio_um_per_V: float) -> Iterator[str]:
         """Slips of a unit and swapped columns that would bring the stroke per volt between its limits."""
         for power in (-3, 3, -6, 6):
-            if not _plausible(ratio_um_per_V * 10.0**power):
+            if not likely_stroke(ratio_um_per_V * 10.0**power):
                 continue
             for column, shift in (("displacement_um", power), ("voltage_V", -power)):
                 quantity, source = known_quantity(column), self.sources[column]
@@ -230,7 +288,7 @@ class KnownColumns:
                     changed = f"{column}={source.spec(unit=unit)}"
                     yield f"the {quantity.stem} is in {unit} instead of {source.unit} (--columns {changed})"
             break
-        if ratio_um_per_V and _plausible(1.0 / ratio_um_per_V):
+        if ratio_um_per_V and likely_stroke(1.0 / ratio_um_per_V):
             yield f"voltage and displacement are swapped ({self.swap()})"
 
     def swap(self) -> str:
@@ -240,6 +298,18 @@ class KnownColumns:
             f"--columns voltage_V={Source(displacement.column, 'V').spec()},"
             f"displacement_um={Source(voltage.column, 'um').spec()}"
         )
+
+
+def _interval_s(table: Table, columns: Mapping[str, str], rate_Hz: float | None) -> float | None:
+    """Interval of even samples, as stated, or as the file says where no column holds the time; else None."""
+    if rate_Hz is not None:
+        if "time_s" in columns:
+            raise DataError("--sample-rate: --columns names the time already; leave one of them out.")
+        if not 0 < rate_Hz <= 1 / SHORTEST_STEP_s:
+            raise DataError(f"--sample-rate: expected a rate above 0 and up to 1e12 Hz, found {rate_Hz:g}.")
+        return 1 / rate_Hz
+    known = (found[0].column for found in map(recognise, table.names) if found)
+    return None if "time_s" in columns or "time_s" in known else table.interval_s
 
 
 def _check_time(table: Table, column: str, time_s: FloatArray) -> None:
@@ -273,5 +343,6 @@ def _reversals(values: FloatArray) -> FloatArray:
     return values[moves[1:][rising[1:] != rising[:-1]]]
 
 
-def _plausible(ratio_um_per_V: float) -> bool:
+def likely_stroke(ratio_um_per_V: float) -> bool:
+    """Whether a piezo stage moves so far per volt."""
     return STROKE_PER_VOLT_MIN_um_per_V <= ratio_um_per_V <= STROKE_PER_VOLT_MAX_um_per_V

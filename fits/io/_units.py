@@ -1,5 +1,7 @@
 """Names and units of columns: what a header means, and which source column serves which quantity."""
 
+import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
@@ -14,21 +16,28 @@ QUANTITIES = (
     Quantity("displacement", "um", LENGTH),
     *(column.quantity for column in COLUMNS.values()),
 )
+_NUMBERED = re.compile(r"-?\d+ *(\[[^\[\]]*\])?")
+# What 1 in a column is, such as 1.2V of a drive in %.
+_SCALED = re.compile(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) *([^\d\s].*)")
+# Other names of a quantity.
+_ALSO = {"timestamp": "time", "datetime": "time", "date_time": "time"}
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a canonical column comes from: the source column, its unit and its sign."""
+    """Where a canonical column comes from: the source column, its unit, how many of these its 1 is, and its sign."""
 
     column: str
     unit: str
     sign: int = 1
+    scale: float = 1.0
 
     def spec(self, flip: bool = False, unit: str | None = None) -> str:
         """Write the right-hand side of a mapping that reads this column, optionally changed."""
         sign = -self.sign if flip else self.sign
         unit = unit or self.unit
-        stated = "" if split_unit(self.column)[1] == unit else f"[{unit}]"
+        factor = "" if self.scale == 1 else f"{self.scale:.17g}"
+        stated = "" if split_unit(self.column)[1] == factor + unit else f"[{factor}{unit}]"
         return f"{'-' if sign < 0 else ''}{self.column}{stated}"
 
 
@@ -36,23 +45,36 @@ def recognise(name: str) -> tuple[Quantity, str] | None:
     """Quantity and unit of a header such as ``voltage_mV``, or None where either is unknown."""
     stem, unit = split_unit(name)
     plain = "_".join(stem.lower().split())
+    plain = _ALSO.get(plain, plain)
     for quantity in QUANTITIES:
         if quantity.stem == plain and unit in quantity.powers:
             return quantity, str(unit)
     return None
 
 
-def parse_columns(text: str) -> dict[str, str]:
-    """Read pairs such as ``voltage_V=u1_V,displacement_um=-height[m]`` of ``--columns``, as `read_csv` takes them.
+def known_unit(text: str) -> str | None:
+    """The unit that a cell states, such as `um` of `µm` or of `Micrometers`; None where it is no known one."""
+    unit = split_unit(f"x[{text}]")[1]
+    return unit if any(unit in quantity.powers for quantity in QUANTITIES) else None
 
-    A `DataError` refuses a pair without ``=``, and an unknown or a repeated column.
+
+def parse_columns(text: str) -> dict[str, str]:
+    """Read pairs such as ``voltage_V=u1_V,displacement_um=-height[m]`` of ``--columns``, as `read_table` takes them.
+
+    Numbers alone, such as ``1,4``, count columns from 1, and are those that are needed, in their order: they come
+    back under the keys "1", "2" and so on. A `DataError` refuses a pair without ``=``, and an unknown or a repeated
+    column.
     """
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if parts and all(_NUMBERED.fullmatch(part) for part in parts):
+        return {str(k): part for k, part in enumerate(parts, 1)}
     columns: dict[str, str] = {}
-    for pair in filter(str.strip, text.split(",")):
+    for pair in parts:
         column, equals, source = (part.strip() for part in pair.partition("="))
         if not (column and equals and source):
             raise DataError(
-                f"--columns: expected pairs such as voltage_V=u1_V separated by commas, found '{pair.strip()}'."
+                "--columns: expected pairs such as voltage_V=u1_V, or numbers alone, separated by commas, found "
+                f"'{pair}'."
             )
         if column in columns:
             raise DataError(f"--columns: {column} is given twice; keep one.")
@@ -77,6 +99,8 @@ def find_sources(
 
     A `DataError`, which begins with the place, refuses missing required columns, duplicates, and wrong units.
     """
+    if "1" in columns:
+        columns = _in_order(columns, names, required, place)
     sources = {column: _mapped(column, text, names, place) for column, text in columns.items()}
     taken = {source.column for source in sources.values()}
     for name in names:
@@ -98,6 +122,23 @@ def find_sources(
     return sources
 
 
+def _in_order(
+    columns: Mapping[str, str], names: Sequence[str], required: Collection[str], place: str
+) -> dict[str, str]:
+    """Numbers alone, given to the required columns in their order; the time may have been found by its header."""
+    order = list(required)
+    timed = any(found[0].column == "time_s" for found in map(recognise, names) if found)
+    if "time_s" in order and timed and len(columns) < len(order):
+        order.remove("time_s")
+    if len(columns) != len(order):
+        more = "" if "time_s" not in order else ", or state --sample-rate where no column holds the time"
+        raise DataError(
+            f"{place}: expected by --columns {len(order)} numbers, for {', '.join(order)}, found {len(columns)}; "
+            f"give one for each{more}."
+        )
+    return dict(zip(order, columns.values(), strict=True))
+
+
 def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
     quantity = known_quantity(column)
     text = text.strip()
@@ -109,20 +150,29 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
         match = BRACKETS.fullmatch(text)
         if match:
             text, stated = match["stem"], split_unit(text)[1]
+    numbered = text.isascii() and text.isdigit()
+    if text not in names:
+        # By its number, or without the unit that the file states elsewhere.
+        same = [name for name in names if BRACKETS.fullmatch(name) and split_unit(name)[0] == text]
+        at = int(text[:9]) if numbered else 0
+        text = same[0] if len(same) == 1 else names[at - 1] if 1 <= at <= len(names) else text
     if text not in names:
         near = get_close_matches(text, names, 3, 0.5) or names
         raise DataError(
             f"{place}, column '{text}': expected by --columns {column}={text}, found no such column; "
             f"the nearest are {_listed(near)}."
         )
-    unit = stated or split_unit(text)[1]
-    if unit not in quantity.powers:
+    unit = stated or split_unit(text)[1] or (quantity.unit if numbered else None)
+    scaled = _SCALED.fullmatch(unit or "")
+    scale = float(scaled[1]) if scaled and scaled[2] in quantity.powers else 1.0
+    unit = scaled[2] if scaled and scaled[2] in quantity.powers else unit
+    if unit not in quantity.powers or not 0 < scale < math.inf:
         found = f"found unit '{unit}'" if unit else "found no unit"
         raise DataError(
             f"{place}, column '{text}': expected a unit out of {', '.join(quantity.powers)} for {column}, {found}; "
             f"state the unit with --columns {column}={text}[{quantity.unit}]."
         )
-    return Source(text, str(unit), sign)
+    return Source(text, str(unit), sign, scale)
 
 
 def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str, Source], place: str) -> str:

@@ -11,7 +11,6 @@ from scipy import signal
 from fits.io._errors import DataError
 from fits.io._read_csv import KnownColumns
 from fits.io._record import Reference
-from fits.io._table import data_error
 from fits.stats._noise import correlation_samples
 from fits.stats._noise_spectrum import NoiseBand, NoiseLine, allan_deviation, find_lines, noise_bands
 
@@ -86,13 +85,20 @@ class IdleNoise:
         return float(random if zeroed else abs(self.mean_um) + random)
 
 
-def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> Reference:
+def read_idle(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, str] | None = None,
+    sample_rate_Hz: float | None = None,
+    missing: str = "refuse",
+) -> Reference:
     """Read what a sensor shows while the stage is at rest: `time_s`, `displacement_um` and perhaps `voltage_V`.
 
-    Units, separators and `columns` are as in `read_csv`. A `DataError`, with file, line and column, refuses a voltage
-    that changes, fewer than 100 samples, uneven time steps, a reading that never changes, or what `read_csv` refuses.
+    Units, separators and `columns` are as in `read_table`. A `DataError`, with file, line and column, refuses a
+    voltage that changes, fewer than 100 samples, uneven time steps, a reading that never changes, or what
+    `read_table` refuses.
     """
-    read = KnownColumns.read(path, columns, ("time_s", "displacement_um"), ("voltage_V",), alone=True)
+    needed = ("time_s", "displacement_um")
+    read = KnownColumns.read(path, columns, needed, ("voltage_V",), True, sample_rate_Hz, missing)
     table, sources, arrays = read.table, read.sources, read.arrays
     voltage_V = arrays.get("voltage_V", np.zeros(1))
     changes = np.flatnonzero(voltage_V != voltage_V[0])
@@ -101,11 +107,11 @@ def read_idle(path: str | os.PathLike[str], columns: Mapping[str, str] | None = 
             f"not idle: expected a constant voltage, found {voltage_V.min():.6g} to {voltage_V.max():.6g} V; cut out "
             "the part at rest, or drop the column if it is a noisy monitor of a constant voltage"
         )
-        raise data_error(table.path, what, table.line(int(changes[0])), sources["voltage_V"].column)
+        raise table.error(what, int(changes[0]), sources["voltage_V"].column)
     fault = _find_fault(arrays["time_s"], arrays["displacement_um"])
     if fault:
         what, row, name = fault
-        raise data_error(table.path, what, table.line(row), sources[name].column)
+        raise table.error(what, row, sources[name].column if name in sources else None)
     return Reference(arrays["time_s"], arrays["displacement_um"], os.path.basename(table.path))
 
 

@@ -15,7 +15,7 @@ import data_synth
 from data_synth import PaperBench
 from fits.control._compensate import compensate
 from fits.io._atomic import write_csv
-from fits.io._read_csv import read_csv
+from fits.io._read_csv import read_table
 from fits.io._record import Record, Reference
 from fits.loop._fit import fit
 from fits.loop._result import FitResult
@@ -119,7 +119,7 @@ def identify(piezo: data_synth.PaperPiezo, seeds: list[np.random.Generator], fol
     for rng in seeds:
         path = folder / "loops.csv"
         write_csv(path, data_synth.paper_loops(piezo, data_synth.PaperSensor(), rng))
-        record = read_csv(path)
+        record = read_table(path)
         result = fit([record], levels=LEVELS, holdout=0.0, initial="negative")
         assert record.displacement_um is not None
         slope = float(np.ptp(record.displacement_um) / np.ptp(record.voltage_V))

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
 from fits.io._errors import AnyPath, DataError
+from fits.io._open_table import open_table
 from fits.io._plausible import SHORTEST_STEP_s, check_size
-from fits.io._table import Table, open_table
+from fits.io._table import Table
 
 _REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
 _MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"

@@ -1,26 +1,18 @@
 """Packages that only sweeps need, and the versions that results depend on."""
 
 import hashlib
-import importlib
 import platform
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from fits.io._errors import DataError
+from fits.io import _packages
 
 
 def need(name: str) -> Any:
     """Import a package of the extras `sweep` and `cluster`; a `DataError` says what to run if it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        package = name.partition(".")[0]
-        extras = "sweep,cluster" if package == "distributed" else "sweep"
-        raise DataError(
-            f'this needs the package {package}, which is not installed; run: pip install "microid[{extras}]"'
-        ) from None
+    return _packages.need(name, "sweep,cluster" if name.partition(".")[0] == "distributed" else "sweep")
 
 
 @lru_cache(maxsize=1)

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Int
 from msgspec import Meta
 
 from fits.io._errors import DataError, shown
+from fits.io._open_table import open_table
 from fits.io._plausible import SHORTEST_STEP_s
-from fits.io._read_csv import read_csv, read_reference
-from fits.io._table import open_table
+from fits.io._read_csv import read_reference, read_table
 from fits.io._typed import check_keys, typed
 from fits.io._units import recognise
 from fits.sweeps._devices import by_rows, place
@@ -135,7 +135,7 @@ def _read_signal(path: Any, name: str, unit: str, load: Callable[[str], bytes]) 
             raise DataError(
                 f"{file}: expected the columns time_s and {column}, found none that is known; name another."
             )
-        record = read_csv(file, required=("time_s", column)) if unit == "V" else read_reference(file)
+        record = read_table(file, required=("time_s", column)) if unit == "V" else read_reference(file)
         return record.time_s, getattr(record, column)
 
     time_s, given = in_a_file(load(path), path, read)

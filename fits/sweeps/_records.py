@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from fits.io._errors import DataError, shown
-from fits.io._read_csv import read_csv
+from fits.io._read_csv import read_table
 from fits.io._record import Record
 from fits.io._typed import typed
 from fits.io._units import parse_columns
@@ -37,16 +37,18 @@ class _Table(msgspec.Struct):
 
     files: Annotated[str | None, Meta(description="a pattern such as data/*.csv")] = None
     columns: str = ""
+    sample_rate_Hz: float | None = None
+    missing: Annotated[Literal["refuse", "drop"], Meta(description="refuse or drop")] = "refuse"
     noise_um: Annotated[float, Meta(ge=0, le=1e30, description="0 um or more")] = 0.01
 
 
 @dataclass(frozen=True)
 class Files:
-    """Records in CSV files: their folder, their names in it, and the mapping of columns, as `read_csv` takes it."""
+    """Records in files: their folder, their names in it, and how they are read, as `read_table` takes it."""
 
     folder: Path
     sources: tuple[str, ...]
-    columns: dict[str, str]
+    how: dict[str, Any]
     # Nothing about a file can be varied.
     parameters: tuple[Parameter, ...] = ()
 
@@ -56,7 +58,7 @@ class Files:
         for source in set(block.sources.tolist()):
             path = self.folder / self.sources[source]
             try:
-                found[source] = read_csv(path, self.columns)
+                found[source] = read_table(path, **self.how)
             except DataError as error:
                 found[source] = str(error).replace(str(path), self.sources[source])
         return [found[source] for source in block.sources.tolist()]
@@ -119,7 +121,8 @@ def requested_records(request: Request) -> Files | Simulated:
         raise DataError(f"{expected} ({error}); correct it.") from None
     if not names:
         raise DataError(f"records.files: the axis is empty: no file matches {pattern}; correct the pattern.")
-    return Files(request.folder, names, parse_columns(table.columns))
+    how = {"columns": parse_columns(table.columns), "sample_rate_Hz": table.sample_rate_Hz, "missing": table.missing}
+    return Files(request.folder, names, how)
 
 
 def each_alone(

@@ -1,0 +1,171 @@
+"""What a file holds: its channels, what they are probably used for, and how to have it read so."""
+
+import os
+import re
+import shlex
+from dataclasses import dataclass
+
+import numpy as np
+
+from fits.io._errors import AnyPath, DataError
+from fits.io._open_table import open_table
+from fits.io._quantity import FloatArray, split_unit
+from fits.io._read_csv import likely_stroke, read_reference, read_table
+from fits.io._table import Table
+from fits.io._units import QUANTITIES, Source, known_quantity, parse_columns, recognise
+
+# Names by which rigs call the columns of a record, whole and in small letters; a minus is for readings of a command.
+_LIKELY = {
+    "time_s": r"t|x_value|sec|(time|elapsed|clock|zeit).*",
+    "voltage_V": r"[uv]\d*|ch1|ao\d*|.*(volt|drive|cmd|command|dac|input|pzt|piezo|spannung).*",
+    "displacement_um": r"[xyzdwh]\d*|ch2|ai\d*|.*(disp|pos|gauge|height|stroke|sensor|lvdt|interf|mirror|weg).*",
+}
+_READING = r".*(monitor|meas|readback).*"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A column of a file: its number from 1, its name, its unit if it states one, and its range in that unit.
+
+    `use` is the column of a record that it probably is, such as `voltage_V`, or empty, and `guessed` says that its
+    name does not say so. The range is None where it holds no numbers; `problem` is the first other thing in it.
+    """
+
+    number: int
+    name: str
+    unit: str | None
+    lowest: float | None
+    highest: float | None
+    use: str
+    guessed: bool
+    problem: str
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What a file holds, what was odd when it was read so, and the command to use, or nothing where none is known.
+
+    The rate in Hz is None where no time is known; `even` says whether steps of the time differ by less than 1 %.
+    """
+
+    path: str
+    rows: int
+    rate_Hz: float | None
+    even: bool
+    channels: tuple[Channel, ...]
+    command: str
+    remarks: tuple[str, ...]
+
+
+@np.errstate(all="ignore")  # absurd magnitudes overflow here
+def inspect_table(path: AnyPath) -> Inspection:
+    """Look at a file that `read_table` reads, and guess what is what; errors are those of `open_table`."""
+    table = open_table(path)
+    found, problems = table.read(())
+    # Where numbers are missing here and there, the others of the column still say what it is.
+    holes = [name for name, (_, words) in problems.items() if "nan" in words.lower() or words == "an empty cell"]
+    for name in holes:
+        left, kept = table.without_missing([name])
+        if kept.mean() > 0.5:
+            found |= {name: left.read(())[0].get(name, np.zeros(0))}
+    found = {name: found[name] for name in table.names if len(found.get(name, ()))}
+    known = {spoken[0].column: Source(name, spoken[1]) for name in found if (spoken := recognise(name))}
+    sources = known | _guessed(table, found, known)
+    interval_s, even = table.interval_s, table.interval_s is not None
+    if "time_s" in sources:
+        steps_s = np.diff(known_quantity("time_s").convert(found[sources["time_s"].column], sources["time_s"].unit))
+        interval_s = float(np.median(steps_s))
+        even = bool(np.ptp(steps_s) < 0.01 * interval_s)
+    uses = {source.column: column for column, source in sources.items()}
+    channels = []
+    for k, name in enumerate(table.names, 1):
+        values, use = found.get(name), uses.get(name, "")
+        low, high = (None, None) if values is None else (float(values.min()), float(values.max()))
+        problem = ", ".join(problems[name][::-1]) if name in problems else ""
+        channels.append(Channel(k, name, _unit(name), low, high, use, bool(use) and use not in known, problem))
+    pairs = [f"{column}={_spec(table, source)}" for column, source in sources.items() if column not in known]
+    options = ["--columns", ",".join(pairs)] if pairs else []
+    if any(source.column in holes for source in sources.values()):
+        options += ["--missing", "drop"]
+    if interval_s is None:
+        options += ["--sample-rate", "HZ"]
+    still = "voltage_V" in sources and not np.ptp(found[sources["voltage_V"].column])
+    command, remarks = _command(os.fspath(path), {*sources}, options, still), []
+    if interval_s is None:
+        remarks.append("no column is a time: write the rate of the samples in place of HZ")
+    elif command and not still:
+        remarks += _remarks(path, ",".join(pairs), options, {*sources})
+    rate_Hz = 1 / interval_s if interval_s and interval_s > 0 else None
+    rows = max(map(len, found.values()), default=0)
+    return Inspection(os.fspath(path), rows, rate_Hz, even, tuple(channels), command, tuple(remarks))
+
+
+def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source]) -> dict[str, Source]:
+    """Columns of a record that names do not state: by their units, by how rigs call them, else in their order."""
+    guessed: dict[str, Source] = {}
+    free = [name for name in found if name not in {source.column for source in known.values()}]
+    for column in ("time_s", "voltage_V", "displacement_um"):
+        if column in known or (column == "time_s" and table.interval_s is not None):
+            continue
+        fit = [
+            name for name in free if np.ptp(found[name]) > 0 and _unit(name) in (None, *known_quantity(column).powers)
+        ]
+        if column == "time_s":
+            fit = [name for name in fit if np.all(np.diff(found[name]) > 0)]
+        if fit:
+            best = max(fit, key=lambda name: _score(name, column))
+            free.remove(best)
+            guessed[column] = Source(best, _unit(best) or known_quantity(column).unit)
+    both = known | guessed
+    moved = guessed.get("displacement_um")
+    if moved and "voltage_V" in both and _unit(moved.column) is None:
+        volts = known_quantity("voltage_V").convert(np.ptp(found[both["voltage_V"].column]), both["voltage_V"].unit)
+        stroke = np.ptp(found[moved.column])
+        lengths = ("um", "nm", "mm", "m")
+        convert = known_quantity("displacement_um").convert
+        unit = next((unit for unit in lengths if likely_stroke(float(convert(stroke, unit) / volts))), "um")
+        guessed["displacement_um"] = Source(moved.column, unit)
+    return guessed
+
+
+def _score(name: str, column: str) -> int:
+    stem = "_".join(split_unit(name)[0].lower().split())
+    fits_name = re.fullmatch(_LIKELY[column], stem) is not None
+    return 4 * (_unit(name) is not None) + 2 * fits_name - (re.fullmatch(_READING, stem) is not None)
+
+
+def _unit(name: str) -> str | None:
+    unit = split_unit(name)[1]
+    return unit if any(unit in quantity.powers for quantity in QUANTITIES) else None
+
+
+def _spec(table: Table, source: Source) -> str:
+    """How `--columns` names a source: by its number where the name would not pass."""
+    if set(source.column) & set(",=") or source.column != source.column.strip():
+        return f"{table.names.index(source.column) + 1}[{source.unit}]"
+    return source.spec()
+
+
+def _command(path: str, there: set[str], options: list[str], still: bool) -> str:
+    """What to paste; a record under a voltage that is `still` is of the noise."""
+    moved, driven = "displacement_um" in there, "voltage_V" in there
+    words = {
+        (True, True): ["fit", path, *options, "--out", "model.json"],
+        (True, False): ["compensate", "model.json", path, *options, "--out", "voltage.csv"],
+        (False, True): ["simulate", "model.json", path, *options, "--out", "prediction.csv"],
+    }.get((moved, driven), [])
+    if still and moved:
+        words = ["budget", "paper", "model.json", path, *options]
+    return shlex.join(["microid", *words]) if words else ""
+
+
+def _remarks(path: AnyPath, columns: str, options: list[str], there: set[str]) -> list[str]:
+    """What is said when the file is read so."""
+    missing = "drop" if "drop" in options else "refuse"
+    try:
+        if "voltage_V" not in there:
+            return list(read_reference(path, parse_columns(columns), missing=missing).warnings)
+        required = ("displacement_um",) if "displacement_um" in there else ()
+        return list(read_table(path, parse_columns(columns), required, missing=missing).warnings)
+    except DataError as error:
+        return [str(error)]

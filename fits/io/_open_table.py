@@ -1,0 +1,73 @@
+"""From a file of any format, or an object of another library, to a table of named columns."""
+
+import os
+import warnings
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fits.io._errors import AnyPath, DataError
+from fits.io._frames import of_frame
+from fits.io._read_file import MOST_CSV_BYTES, read_bytes, unpack
+from fits.io._table import ArrayTable, Table, gathered
+from fits.io.formats import FORMATS, Format
+
+_CSV = "a CSV file"
+
+
+def open_table(source: AnyPath | Any) -> Table:
+    """Read a file, or take a pandas `DataFrame`, an xarray `Dataset` or a mapping of arrays.
+
+    Formats are known by their first bytes and by the ending of the name, text by neither. A `DataError` says that it
+    cannot be read, or has no columns.
+    """
+    if not isinstance(source, str | os.PathLike):
+        return _of_object(source)
+    shown = os.fspath(source)
+    data = read_bytes(shown, _what(shown), MOST_CSV_BYTES)
+    if data.startswith(b"\x1f\x8b") or shown.lower().endswith(".gz"):
+        data = unpack(data, shown, MOST_CSV_BYTES)
+    form = _format_of(shown, data)
+    try:
+        # What a library has to say of damage is said below, in one sentence.
+        with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
+            return form.open(shown, data)
+    except (DataError, KeyboardInterrupt):
+        raise
+    except (Exception, zlib.error) as error:  # whatever the library of a format has against its bytes
+        if form.name == _CSV:
+            raise
+        why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        raise DataError(
+            f"{shown}: expected {form.name}, found a damaged one, or a kind that cannot be read ({why}); export it "
+            "again, or as CSV."
+        ) from None
+
+
+def _format_of(path: str, data: bytes) -> Format:
+    ending = os.path.splitext(path.lower().removesuffix(".gz"))[1]
+    by_start = (form for form in FORMATS.values() if form.starts and data.startswith(form.starts))
+    by_ending = (form for form in FORMATS.values() if ending in form.endings)
+    return next(by_start, None) or next(by_ending, FORMATS[_CSV])
+
+
+def _what(path: str) -> str:
+    return _format_of(path, b"").name
+
+
+def _of_object(source: Any) -> ArrayTable:
+    """Columns of a `DataFrame`, of what makes one, or of a mapping of arrays."""
+    import pandas as pd
+
+    if hasattr(source, "to_dataframe"):  # xarray
+        source = source.to_dataframe()
+    if isinstance(source, Mapping):
+        return gathered("mapping", "a mapping", [((str(name),), values, None) for name, values in source.items()])
+    if not isinstance(source, pd.DataFrame):
+        raise DataError(
+            f"expected the name of a file, a DataFrame or a mapping of arrays, found {type(source).__name__}; "
+            "give one of these."
+        )
+    return of_frame("DataFrame", source)

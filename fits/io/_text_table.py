@@ -1,0 +1,255 @@
+"""Columns in text: from lines to numbers, with line numbers as an editor shows them."""
+
+import csv
+import io
+import itertools
+import math
+import re
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.io._errors import DataError
+from fits.io._quantity import FloatArray
+from fits.io._table import MOST_COLUMNS, Problem, Table, data_error, seconds
+
+_COMMENT = re.compile(r"^ *[#%].*\n?", re.MULTILINE)
+_CLOCK = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)? ?(Z|[+-]\d\d:?\d\d)?")
+_MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none", "-nan", "-nan(ind)", "1.#qnan", "-1.#ind", "--"}
+
+
+@dataclass(frozen=True)
+class TextTable(Table):
+    r"""A text whose header is read, without quotes and spaces, and whose body is text whose lines end in `\n`.
+
+    `clocks` are the columns whose cells are ISO 8601 time stamps.
+    """
+
+    path: str
+    names: tuple[str, ...]
+    header_line: int
+    separator: str
+    body: str
+    interval_s: float | None = None
+    headed: bool = True
+    clocks: frozenset[str] = field(default_factory=frozenset)
+
+    def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
+        """Parse all columns; see `Table`."""
+        if next(self._lines(), None) is None:
+            what = "expected rows of numbers below the header, found none; export again"
+            raise self.error(what)
+        columns = self._read_fast()
+        if columns is None or not all(name in columns for name in strict):
+            return self._read_slowly(strict)
+        problems = {name: self._first_problem(i) for i, name in enumerate(self.names) if name not in columns}
+        return columns, problems
+
+    def place(self, row: int | None = None) -> str:
+        """The physical line, from 1."""
+        if row is None and self.headed:
+            return f"line {self.header_line}"
+        return f"line {next(itertools.islice(self._lines(), row or 0, None))[0]}"
+
+    def without_missing(self, strict: Collection[str]) -> tuple[Table, NDArray[np.bool_]]:
+        """Leave out rows with an empty cell, or a NaN of some spelling; see `Table`."""
+        lines, kept = io.StringIO(self.body, newline="\n").readlines(), []
+        at = [i for i, name in enumerate(self.names) if name in strict]
+        for number, cells in self._rows():
+            missing = any(cells[i].lower() in _MISSING for i in at if i < len(cells))
+            kept.append(not missing)
+            if missing:  # a blank line, so that those below keep their numbers
+                lines[number - self.header_line - 1] = "\n"
+        return replace(self, body="".join(lines)), np.array(kept, dtype=bool)
+
+    @cached_property
+    def decimal(self) -> str:
+        """Decimal mark: that of the first cell which has one."""
+        if self.separator == ",":
+            return "."
+        edge = re.escape(self.separator)
+        cell = rf'(?:^|{edge})[ "]*[+-]?\d*([.,])\d+(?:[eE][+-]?\d+)?[ "]*(?={edge}|$)'
+        match = re.search(cell, self.body, re.MULTILINE)
+        return match[1] if match else "."
+
+    def _lines(self) -> Iterator[tuple[int, str]]:
+        """Physical line numbers and texts of the rows; comments and rows of empty cells are skipped."""
+        empty = " \t\r\n" + self.separator
+        # StringIO splits at \n only; str.splitlines would also split at characters that editors do not count.
+        for number, text in enumerate(io.StringIO(self.body, newline="\n"), self.header_line + 1):
+            start = text.strip(empty)
+            if start and not text.lstrip(" ").startswith(("#", "%")):
+                yield number, text.removesuffix("\n")
+
+    def cells(self) -> Iterator[list[str]]:
+        """Cells of the rows."""
+        return (cells for _, cells in self._rows())
+
+    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Physical line numbers and cells; empty cells after the last column (trailing separators) are cut."""
+        n = len(self.names)
+        for number, text in self._lines():
+            cells = split_cells(text, self.separator)
+            while len(cells) > n and not cells[-1]:
+                cells.pop()
+            yield number, cells
+
+    def _read_fast(self) -> dict[str, FloatArray] | None:
+        """Columns that pandas finds finite and numeric, or None where the rows need a closer look."""
+        import pandas as pd
+
+        n = len(self.names)
+        text = self.body
+        if '"' in text:
+            return None
+        if "#" in text or "%" in text:
+            text = _COMMENT.sub("", text)
+        width = next(self._lines())[1].count(self.separator) + 1
+        if width > MOST_COLUMNS:
+            return None
+        options: dict[str, Any] = {}
+        if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
+            options["float_precision"] = "round_trip"  # the only mode from 3.1 on, where naming it warns
+        try:
+            frame = pd.read_csv(
+                io.BytesIO(text.encode()),
+                sep=self.separator,
+                decimal=self.decimal,
+                header=None,
+                names=list(range(max(n, width))),
+                index_col=False,
+                na_filter=False,
+                low_memory=False,
+                skipinitialspace=True,
+                **options,
+            )
+        except (pd.errors.ParserError, ValueError):
+            return None
+        # pandas pads short rows without a word; counting the separators finds them.
+        if width < n or text.count(self.separator) != (width - 1) * len(frame):
+            return None
+        if any((frame[i] != "").any() for i in range(n, width)):
+            return None
+        columns = {}
+        for i, name in enumerate(self.names):
+            dtype = frame[i].dtype
+            if name in self.clocks:
+                try:
+                    columns[name] = _clock(frame[i].to_list())
+                except (ValueError, TypeError):
+                    return None
+            if isinstance(dtype, np.dtype) and dtype.kind in "iuf":
+                values = frame[i].to_numpy(dtype=np.float64)
+                if np.isfinite(values).all():
+                    columns[name] = values
+        return columns
+
+    def _read_slowly(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
+        """Parse cell by cell, so that the first fault in the file can be named."""
+        values: list[list[Any]] = [[] for _ in self.names]
+        problems: dict[str, Problem] = {}
+        for line, cells in self._rows():
+            if len(cells) != len(self.names):
+                raise self._wrong_length(line, len(cells))
+            for name, column, cell in zip(self.names, values, cells, strict=True):
+                if name in problems:
+                    continue
+                if name in self.clocks and _CLOCK.fullmatch(cell):
+                    column.append(cell)
+                    continue
+                number = self._number(cell) if name not in self.clocks else f"'{cell[:30]}'"
+                if isinstance(number, float):
+                    column.append(number)
+                elif name in strict:
+                    raise self._bad_cell(line, name, cell, number)
+                else:
+                    problems[name] = f"line {line}", number
+        columns = {}
+        for name, column in zip(self.names, values, strict=True):
+            if name not in problems:
+                try:
+                    columns[name] = _clock(column) if name in self.clocks else np.array(column)
+                except ValueError as error:
+                    raise self.error(
+                        f"expected time stamps, found one that is none ({error}); correct it", 0, name
+                    ) from None
+        return columns, problems
+
+    def _first_problem(self, i: int) -> Problem:
+        found = ((line, self._number(cells[i])) for line, cells in self._rows())
+        other = f"line {self.header_line + 1}", "a number that pandas does not read"
+        return next(((f"line {line}", text) for line, text in found if isinstance(text, str)), other)
+
+    def _number(self, cell: str) -> float | str:
+        """Value of a cell, or what was found instead of a finite number."""
+        if not cell:
+            return "an empty cell"
+        found = f"'{cell if len(cell) <= 30 else cell[:27] + '...'}'"
+        if "_" in cell or (self.decimal == "," and "." in cell):
+            return found
+        try:
+            number = float(cell.replace(",", ".") if self.decimal == "," else cell)
+        except ValueError:
+            return found
+        return number if math.isfinite(number) else found
+
+    def _bad_cell(self, line: int, name: str, cell: str, found: str) -> DataError:
+        remedy = "correct the cell, or remove its line or a column that is not needed"
+        if re.fullmatch(r"[+-]?\d+[.,]\d+(?:[eE][+-]?\d+)?", cell):
+            remedy = "write all numbers with one decimal mark, and separate cells by ; or tab where it is a comma"
+        elif cell.lower() in _MISSING:
+            remedy = "correct the cell, or leave out such lines with --missing drop"
+        elif self.place(0) == f"line {line}":
+            remedy = "correct the cell, or put # before the line if it is not data"
+        expected = "a time stamp" if name in self.clocks else "a finite number"
+        return data_error(self.path, f"expected {expected}, found {found}; {remedy}", f"line {line}", name)
+
+    def _first(self) -> str:
+        return f"the {'header' if self.headed else 'first row'} in {self.place()}"
+
+    def _wrong_length(self, line: int, found: int) -> DataError:
+        n = len(self.names)
+        which = "missing" if found < n else "surplus"
+        column = self.names[found] if found < n else self.names[-1]
+        hint = " (decimal commas need ; or tab between cells)" if self.separator == "," and found > n else ""
+        what = (
+            f"expected {n} cells as in {self._first()}, found {found}; "
+            f"correct the {which} cells{hint} or remove the line"
+        )
+        return data_error(self.path, what, f"line {line}", column)
+
+
+def _clock(cells: list[str]) -> FloatArray:
+    """Seconds after the first of some time stamps, shape (n,)."""
+    import pandas as pd
+
+    stamps = pd.to_datetime([cell.strip().replace(",", ".") for cell in cells], format="ISO8601", utc=True)
+    return seconds(stamps.tz_localize(None).to_numpy())
+
+
+def is_clock(cell: str) -> bool:
+    """Whether a cell is an ISO 8601 time stamp of date and time."""
+    return _CLOCK.fullmatch(cell) is not None
+
+
+def looks_numeric(cell: str) -> bool:
+    """Whether a cell is a number, with a point or a comma, or empty."""
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return not cell
+    return True
+
+
+def split_cells(line: str, separator: str) -> list[str]:
+    """Cells of one line, without the spaces and quotes around them."""
+    cells = line.split(separator)
+    if '"' in line:
+        with suppress(csv.Error):  # a cell beyond 128 KiB is no number either way
+            cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [cell.strip() for cell in cells]

@@ -1,0 +1,163 @@
+"""Text of numbers between commas, semicolons or tabs: with or without a header, and perhaps with lines above it."""
+
+import io
+import itertools
+import re
+
+from fits.io._table import MOST_COLUMNS, Table, data_error, with_unit
+from fits.io._text_table import TextTable, is_clock, looks_numeric, split_cells
+from fits.io._units import known_unit, recognise
+from fits.io.formats._base import Format, register
+
+_EXCEL_SEPARATOR = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
+_CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")
+_BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+_EXPORT = "export it as CSV text (UTF-8)"
+# So many lines are looked at for the first rows of numbers, and so many of these in a row are a table.
+_HEAD, _ENOUGH = 300, 3
+
+# Number from 1, beginning and text of a line that is neither blank nor a comment.
+_Line = tuple[int, int, str]
+
+
+def open_csv(path: str, data: bytes) -> Table:
+    """Find the header in a text; a `DataError` says that this is none, or has no rows."""
+    text = decode(path, data)
+    separator, lines = _first_lines(text)
+    if not lines:
+        raise data_error(path, "expected a header and rows of numbers, found only comments; export again", "line 1")
+    k, units = 0, False
+    if not separator:
+        k, separator, units = _header(lines)
+    number, start, line = lines[k]
+    names = cut(split_cells(line, separator))
+    if all(looks_numeric(name) or is_clock(name) for name in names):
+        numbered = tuple(str(i) for i in range(1, len(names) + 1))
+        return checked(TextTable(path, numbered, number - 1, separator, text[start:], None, False))
+    if len(names) > MOST_COLUMNS:
+        what = f"expected up to {MOST_COLUMNS:,} columns, found {len(names):,}; write a row per sample"
+        raise data_error(path, what, f"line {number}")
+    names = [name or f"column_{i}" for i, name in enumerate(names, 1)]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            first = names.index(name) + 1
+            what = f"expected each header once, found it in cells {first} and {i + 1}; rename or remove one"
+            raise data_error(path, what, f"line {number}", name)
+    body = text[start + len(line) + 1 :]
+    if units:
+        _, below, line = lines[k + 1]
+        names = [
+            with_unit(name, unit)
+            for name, unit in itertools.zip_longest(names, split_cells(line, separator)[: len(names)])
+        ]
+        # A blank line in its place, so that those below keep their numbers.
+        body = text[start + len(lines[k][2]) + 1 : below] + text[below + len(line) :]
+    return checked(TextTable(path, tuple(names), number, separator, body))
+
+
+def checked(table: TextTable) -> TextTable:
+    """A table of which it is known which columns are time stamps, and end so in the unit s."""
+    first = next(table.cells(), [])
+    clocks = {name for name, cell in zip(table.names, first, strict=False) if is_clock(cell)}
+    names = tuple(with_unit(name, "s") if name in clocks and table.headed else name for name in table.names)
+    clocks = {new for old, new in zip(table.names, names, strict=True) if old in clocks}
+    return TextTable(
+        table.path,
+        names,
+        table.header_line,
+        table.separator,
+        table.body,
+        table.interval_s,
+        table.headed,
+        frozenset(clocks),
+    )
+
+
+def decode(path: str, data: bytes) -> str:
+    r"""Text of a file, whose lines end in `\n`."""
+    if not data.strip():
+        raise data_error(path, "expected a header and rows of numbers, found an empty file; export again", "line 1")
+    if data.startswith(b"PK\x03\x04"):
+        raise data_error(path, f"expected text, found an Excel workbook or zip archive; {_EXPORT}", "line 1")
+    encoding = next((name for bom, name in _BOMS.items() if data.startswith(bom)), "utf-8")
+    control = _CONTROL.search(data, 0, 65536)
+    first = control.start() if control else data.find(b"\0")
+    if encoding != "utf-16" and first >= 0:
+        line = data.count(b"\n", 0, first) + 1
+        raise data_error(path, f"expected text, found binary data (byte {first}); {_EXPORT}", f"line {line}")
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError:
+        if encoding == "utf-16":
+            raise data_error(path, f"expected UTF-16 text, found damaged characters; {_EXPORT}", "line 1") from None
+        text = data.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def cut(cells: list[str]) -> list[str]:
+    """Cells without the empty ones at the end, which trailing separators make."""
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _first_lines(text: str) -> tuple[str, list[_Line]]:
+    """The separator, if a line declares it, and the first lines that are neither blank nor comments."""
+    separator, lines, start = "", list[_Line](), 0
+    for number, line in enumerate(io.StringIO(text, newline="\n"), 1):
+        stripped = line.strip(" \n")
+        declared = _EXCEL_SEPARATOR.fullmatch(stripped)
+        if declared and not lines:
+            separator = declared[1]
+        elif line.strip() and not stripped.startswith(("#", "%")):
+            lines.append((number, start, line.removesuffix("\n")))
+            if len(lines) == _HEAD:
+                break
+        start += len(line)
+    return separator, lines
+
+
+def _header(lines: list[_Line]) -> tuple[int, str, bool]:
+    """Which line is the header, what separates its cells, and whether a line of units is below it.
+
+    It is the first line, unless rows of numbers are found below others that are no rows of theirs: then the first of
+    the lines above them, of as many cells, that names a known quantity, or the last that holds no units.
+    """
+    for i in range(len(lines)):
+        separator = _separator(lines[i][2])
+        rows = [cut(split_cells(line, separator)) for _, _, line in lines[i : i + _ENOUGH]]
+        if not all(len(row) == len(rows[0]) and _numeric(row) for row in rows):
+            continue
+        width, first = len(rows[0]), i
+        while first and len(_names(lines[first - 1][2], separator)) == width:
+            first -= 1
+        above = [_names(line, separator) for _, _, line in lines[first:i]]
+        if not above:
+            break
+        units = [all(map(_is_unit, names)) for names in above]
+        known = [k for k, names in enumerate(above) if any(map(recognise, names))]
+        k = known[0] if known else max((k for k in range(len(above)) if not units[k]), default=0)
+        return first + k, separator, k + 1 < len(above) and units[k + 1]
+    return 0, _separator(lines[0][2]), False
+
+
+def _names(line: str, separator: str) -> list[str]:
+    return cut(split_cells(line, separator))
+
+
+def _separator(line: str) -> str:
+    unquoted = re.sub(r'"[^"]*"', "", line.strip())
+    # Names in a semicolon file may hold commas; the reverse is rare.
+    return next((mark for mark in "\t;" if mark in unquoted), ",")
+
+
+def _numeric(cells: list[str]) -> bool:
+    fine = all(looks_numeric(cell) or is_clock(cell) for cell in cells)
+    return fine and any(cells)
+
+
+def _is_unit(cell: str) -> bool:
+    return cell.strip(" []()") in ("", "-", "1", "%") or known_unit(cell.strip(" []()")) is not None
+
+
+CSV = register(Format("a CSV file", (".csv", ".txt", ".dat", ".asc", ".tsv"), (), open_csv))

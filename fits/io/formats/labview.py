@@ -1,0 +1,64 @@
+"""LabVIEW measurement files (.lvm): a header that states separator, units and sampling, then columns."""
+
+import itertools
+import math
+from contextlib import suppress
+
+from fits.io._table import Table, data_error, with_unit
+from fits.io._text_table import TextTable, looks_numeric
+from fits.io.formats._base import Format, register
+from fits.io.formats.csv import checked, cut, decode
+
+_END = "***End_of_Header***"
+_START = "LabVIEW Measurement"
+
+
+def open_labview(path: str, data: bytes) -> Table:
+    """Read the two headers; a `DataError` says that the second, or the line of names, is missing."""
+    text = decode(path, data)
+    lines = text.split("\n")
+    separator = "," if any(line.startswith("Separator,") for line in lines[:40]) else "\t"
+    ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
+    if len(ends) > 2:
+        what = f"expected one table, found {len(ends) - 1}; split the file where the next header begins"
+        raise data_error(path, what, f"line {ends[2] + 1}")
+    keys = {}
+    for line in lines[: ends[-1]] if ends else ():
+        key, *cells = line.split(separator)
+        keys[key] = [cell.strip() for cell in cells]
+    head = next((k for k in range(ends[-1] + 1, len(lines)) if lines[k].strip()), None) if ends else None
+    if head is None:
+        raise data_error(path, f"expected {_END} and a line of names below it, found none; export it again", "line 1")
+    names = [name.strip() for name in lines[head].split(separator)]
+    names = names[: names.index("Comment")] if "Comment" in names else cut(names)
+    units = iter(cut(keys.get("Y_Unit_Label", [])))
+    timed = keys.get("X_Dimension", ["Time"])[0] == "Time"
+    for k, name in enumerate(names):
+        # A column of x stands before all others, or before each.
+        if name == "X_Value":
+            names[k] = "time[s]" if timed else name
+        else:
+            names[k] = with_unit(name or f"column_{k + 1}", next(units, None))
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            names[k] = f"{name} {k + 1}" if name != "time[s]" else f"X_Value {k + 1}"
+    interval_s = None
+    if keys.get("X_Columns", [""])[0] == "No" and timed:
+        with suppress(ValueError, IndexError):
+            interval_s = float(keys["Delta_X"][0].replace(",", "."))
+            interval_s = interval_s if math.isfinite(interval_s) and interval_s > 0 else None
+    # Without a column of x its cells are there, and empty.
+    skip = int(keys.get("X_Columns", [""])[0] == "No" and names[:1] in (["time[s]"], ["X_Value"]))
+    ends_at = sum(len(line) + 1 for line in itertools.islice(lines, head + 1))
+    body = "\n".join(_cells_of(line, separator, skip, len(names)) for line in text[ends_at:].split("\n"))
+    return checked(TextTable(path, tuple(names[skip:]), head + 1, separator, body, interval_s))
+
+
+def _cells_of(line: str, separator: str, skip: int, width: int) -> str:
+    """A row without cells that it begins with, and without the comment that may end it."""
+    cells = line.split(separator)
+    commented = len(cells) == width + 1 and not looks_numeric(cells[width])
+    return separator.join(cells[skip : width if commented else None])
+
+
+register(Format("a LabVIEW measurement file", (".lvm",), (_START.encode(),), open_labview))
