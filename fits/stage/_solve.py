@@ -277,7 +277,7 @@ def _step(
     size = 0 if hyper is None else chain.size
     reduced, step, follow = split_moments(total, size, damping)
     if hyper is not None and chain.grid is not None:
-        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, 1.0, hyper)
+        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, hyper)
         columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
         step = step - follow @ columns
         variance = float(jnp.exp(hyper.log_variance)) * stroke_um**2
