@@ -139,6 +139,8 @@ def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
     """
     scale = np.sqrt(np.diagonal(posterior.precision))
     lowest = np.asarray(posterior.mean) * scale
+    if not np.all(np.isfinite(lowest)):  # rounding left no Cholesky factor
+        return jnp.zeros_like(posterior.mean), False
     size = len(lowest)
     bounded = 64
     while True:
