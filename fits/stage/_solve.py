@@ -286,7 +286,7 @@ def _step(
             raise FitError(FitStatus.NONFINITE)
         prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)
     information = marginal_information(total, size, prior, variance)
-    return step, columns, hyper, variance, float(step @ information @ step / len(step)) ** 0.5
+    return step, columns, hyper, variance, max(float(step @ information @ step) / len(step), 0.0) ** 0.5
 
 
 def marginal_information(total: Moments, size: int, prior: np.ndarray | None, variance: float) -> np.ndarray:
