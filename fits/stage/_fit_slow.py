@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,9 +19,7 @@ from fits.stage._fit import default_stage, summarise
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem, solve_chain
 from fits.stage._uncertainty import Precision
-from microid import AbstractPart, Stage
-from microid.effects.creep import KelvinVoigtCreep
-from microid.effects.sensor_lowpass import SensorLowpass
+from microid import EFFECTS, AbstractEffect, AbstractPart, Stage
 
 # Relaxations begin so many intervals long, and end at such a part of the longest run.
 _SHORTEST, _LONGEST = 20.0, 1 / 4
@@ -82,10 +80,9 @@ def fit_slow(
         columns, hyper, stage = solved.columns_um, solved.hyper, solved.stage
         for name, part in unseen:
             # What moves before the runs leave to it stays.
-            stage = stage.swap(name, eqx.tree_at(lambda p: p.gain, part, jnp.asarray(0.0))).freeze(name)
-            remarks.append(
-                f"a relaxation of {float(part.time_constant_s):.3g} s is not seen in these runs, and was left out"
-            )
+            stage = stage.swap(name, replace(part, **{part.strength[0]: jnp.asarray(0.0)})).freeze(name)
+            constant_s = float(getattr(part, part.relaxation))
+            remarks.append(f"a relaxation of {constant_s:.3g} s is not seen in these runs, and was left out")
     progress("comparing with the measurement")
     found = summarise(Precision(solved), [prepare(record, 1.0) for record in aside])
     left = misfits(solved.runs, solved.residuals_um)
@@ -100,18 +97,23 @@ def _stage(records: Sequence[Record], lag: bool, relaxations: int) -> Stage:
     interval = min(float(np.median(np.diff(record.time_s))) for record in records)
     longest = _LONGEST * max(record.duration_s for record in records)
     constants = np.geomspace(min(_SHORTEST * interval, longest), longest, relaxations)
+    relaxing: Any = next(form for form in EFFECTS if form.relaxation)
+    lagging: Any = next(form for form in EFFECTS if form.lag)
     parts: dict[str, AbstractPart] = {"hysteresis": default_stage()["hysteresis"]}
     for k, constant in enumerate(constants):
-        parts[f"relaxation_{k + 1}"] = KelvinVoigtCreep(jnp.asarray(_GAIN), jnp.asarray(constant))
-    held = [f"{name}.{field}" for name in [*parts][1:] for field in ("time_constant_s", "before_um")]
+        parts[f"relaxation_{k + 1}"] = relaxing(
+            **{relaxing.strength[0]: jnp.asarray(_GAIN), relaxing.relaxation: jnp.asarray(constant)}
+        )
+    held = [f"{name}.{field}" for name in [*parts][1:] for field in (relaxing.relaxation, *relaxing.history)]
     if lag:
-        parts["lag"] = SensorLowpass(jnp.asarray(_LAG * interval))
+        parts["lag"] = lagging(**{lagging.lag: jnp.asarray(_LAG * interval)})
     return Stage(tuple(parts.values()), tuple(parts), frozen=tuple(held))
 
 
-def _unseen(stage: Stage) -> list[tuple[str, KelvinVoigtCreep]]:
+def _unseen(stage: Stage) -> list[tuple[str, Any]]:
     """Relaxations that may take any part."""
-    return [(name, part) for name, part in named_parts(stage, KelvinVoigtCreep) if float(part.gain) > _ANY]
+    effects = named_parts(stage, AbstractEffect)
+    return [(name, p) for name, p in effects if p.relaxation and float(getattr(p, p.strength[0])) > _ANY]
 
 
 def _seen(stage: Stage) -> Stage:

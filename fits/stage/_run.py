@@ -18,7 +18,6 @@ from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._past import past_columns
 from fits.loop._run import Run, Samples, command_range_V, known_samples, prepare_run
 from fits.loop._uncertainty import refuse_outside
-from microid.effects.creep import KelvinVoigtCreep
 
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
@@ -47,7 +46,8 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
         time = samples.time_s - samples.time_s.ravel()[0]
         if samples.time_s.ndim == 0:
             time = samples.time_s * jnp.arange(samples.voltage_V.shape[0], dtype=time.dtype)
-        late = [jnp.exp(-time / part.time_constant_s) for part in behind if isinstance(part, KelvinVoigtCreep)]
+        relaxing = [p for p in behind if isinstance(p, m.AbstractEffect) and p.relaxation]
+        late = [jnp.exp(-time / getattr(part, part.relaxation)) for part in relaxing]
         offset = jnp.concatenate([offset, *(one[:: samples.stride, None] for one in late)], axis=1)
     system = joined(behind)
     if not samples.moving or system is None or system.order == 0:
