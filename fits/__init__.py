@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from fits.report._fit_words import describe
     from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
     from fits.stage._fit import default_stage, fit_stage
+    from fits.stage._fit_slow import fit_slow
     from fits.stage._frequency import Multisine, ResponseData, estimate_response, read_multisine, read_response
     from fits.stage._modal_fit import ModalFit, fit_hysteresis, fit_response, relative_error
     from fits.stage._model_file import ModelFile, load_model, save_model

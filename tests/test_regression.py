@@ -51,8 +51,9 @@ def test_moments_of_the_compressed_record_are_those_of_all_samples(problem):
     assert float(data.total.count) == len(target)
 
 
-def test_blocks_add_up_to_consecutive_fifths(problem):
-    _, runs, data = problem
+def test_blocks_of_as_many_pieces_are_consecutive_fifths(problem):
+    grid, runs, _ = problem
+    data = gather(grid, runs, pieces=5)
     counts = [float(block.count) for block in data.blocks]
     assert counts == [2 * 140.0] * 5
     one = runs[0].displacement_um[:140], runs[1].displacement_um[:140]

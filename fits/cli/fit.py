@@ -26,6 +26,15 @@ _HOLDS: dict[str, "late.Hold"] = {"lines": "first", "steps": "zero", "curves": "
 )
 @click.option("--family", metavar="NAME", help="Density: grid, mixture or network (default grid).")
 @click.option("--levels", type=int, help="Number of switching voltages; found from the data by default.")
+@click.option("--lag", is_flag=True, help="Fit a lag of the readings beside a hysteresis alone.")
+@click.option(
+    "--relaxation",
+    "relaxations",
+    type=click.IntRange(0, 6),
+    default=0,
+    metavar="N",
+    help="Fit so many relaxations beside a hysteresis alone, for creep.",
+)
 @options.holdout(
     "Fraction at the end of every run that is only predicted (default 0.2), or a file that is; again for more files."
 )
@@ -62,6 +71,8 @@ def fit(given: common.Given) -> None:
     draw: Any
     if given.model == "stage":
         estimate, draw, asked = late.fit_stage, late.plot_stage, _for_stage(given)
+    elif given.lag or given.relaxations:
+        estimate, draw, asked = late.fit_slow, late.plot_stage, _for_slow(given)
     else:
         estimate, draw, asked = late.fit, late.plot_fit, _for_loop(given)
     initial = list(given.initial) if len(given.initial) > 1 else (given.initial or ("unknown",))[0]
@@ -99,19 +110,27 @@ def _for_loop(given: common.Given) -> dict[str, Any]:
     return {"family": given.family or "grid", "starts": given.starts or 8, "seed": given.seed or 0}
 
 
-def _for_stage(given: common.Given) -> dict[str, Any]:
-    """What `fit_stage` is asked for, beside what `fit` is too; what it cannot honour is refused."""
+def _for_slow(given: common.Given) -> dict[str, Any]:
+    """What `fit_slow` is asked for, beside what `fit` is too; what it cannot honour is refused."""
+    _for_loop(given)
+    _refuse_random(given, "beside a lag or relaxations")
+    return {"lag": given.lag, "relaxations": given.relaxations}
+
+
+def _refuse_random(given: common.Given, where: str) -> None:
+    """Refuse densities other than a grid, and starts at random."""
     if given.family not in (None, "grid"):
-        raise DataError(
-            f"--family {given.family}: the hysteresis of a stage is fitted on a grid; leave out --family, or use "
-            "--model loop."
-        )
+        raise DataError(f"--family {given.family}: the hysteresis {where} is fitted on a grid; leave out --family.")
     for name, value in (("starts", given.starts), ("seed", given.seed)):
         if value is not None:
-            raise DataError(
-                f"--{name} {value}: a stage starts from what the runs show, not at random; leave out --{name}, or "
-                "use --model loop."
-            )
+            raise DataError(f"--{name} {value}: a fit {where} does not start at random; leave out --{name}.")
+
+
+def _for_stage(given: common.Given) -> dict[str, Any]:
+    """What `fit_stage` is asked for, beside what `fit` is too; what it cannot honour is refused."""
+    if given.lag or given.relaxations:
+        raise DataError("--lag, --relaxation: a stage has a driver and mechanics that lag; leave them out.")
+    _refuse_random(given, "of a stage")
     if len(given.initial) not in (0, 1, len(given.runs)):
         raise DataError(
             f"--initial: {len(given.initial)} states were given for {len(given.runs)} runs; give one for all, or one "

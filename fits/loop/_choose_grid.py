@@ -8,8 +8,8 @@ import numpy as np
 from scipy import signal
 
 from fits.io._errors import DataError
-from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, relaxation_of, solve_grid
-from fits.loop._moments import Data, gather, grid_of
+from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, relaxation_of, solve_coloured, solve_grid
+from fits.loop._moments import BLOCKS, PIECES, Data, gather, grid_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitError, LevelTrial
 from fits.loop._run import Progress, Run, simulate_run
@@ -82,7 +82,7 @@ def try_grid(
 ) -> GridTrial:
     grid = data.grid
     correlation = 1.0
-    solution = solve_grid(data, stroke, correlation, hyper)
+    solution = solve_grid(data, stroke, hyper)
     model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
     off = [run.without_nuisance(run.displacement_um - simulate_run(model, run), run.fitted) for run in runs]
@@ -90,8 +90,10 @@ def try_grid(
     found = correlation_samples(left)
     if found > WHITE:
         correlation = found
-        relaxation = relaxation_of(runs, stroke, correlation, hyper) if alone else 0.0
-        solution = solve_grid(data, stroke, correlation, hyper, relaxation)
+        pieces = int(np.clip(sum(map(len, left)) / correlation, BLOCKS, PIECES))
+        data = data if pieces == PIECES else gather(grid, runs, pieces)
+        relaxation = relaxation_of(data, stroke, solution.hyper) if alone else -float(np.log(correlation))
+        solution = solve_coloured(data, stroke, correlation, solution.hyper, relaxation)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
     return GridTrial(data, solution, correlation, error, discrepancy)
@@ -158,7 +160,7 @@ def weigh_robustly(runs: Sequence[Run], progress: Progress) -> list[Run]:
     stroke = max(_stroke(run) for run in runs)
     grid, hyper = grid_of(runs, LADDER[0]), Hyper.start()
     for _ in range(8):  # outliers have settled by then
-        solution = solve_grid(gather(grid, runs), stroke, 1.0, hyper)
+        solution = solve_grid(gather(grid, runs), stroke, hyper)
         hyper = solution.hyper
         model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
         left = [run.displacement_um - simulate_run(model, run) for run in runs]

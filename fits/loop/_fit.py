@@ -15,6 +15,7 @@ from fits.io._record import Record, refuse_repeats
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits.loop._design import Grid, columns_of
 from fits.loop._grid import Estimate, grid_estimate
+from fits.loop._left_over import suggestions
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._prior import interpolation
@@ -101,6 +102,9 @@ def fit(
     if found.correlation > WHITE:
         remarks.append(correlated(found.correlation, "creep, rate, drift or a density this family cannot follow"))
     model = found.model
+    if found.correlation > WHITE:
+        progress("looking for lags and relaxations")
+        remarks += suggestions(runs, model, stroke, tried.solution.hyper)
     progress("checking the records")
     miss, told = check_loops(runs, prepare, model, stroke, tried.solution.hyper, loss == "huber")
     columns = np.asarray(columns_of(model))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import nnls
 
-from fits.loop._moments import BLOCKS, Data, Moments, blocks_of, gather, grid_of
+from fits.loop._moments import Data, Moments, blocks_of
 from fits.loop._prior import Hyper, Posterior, effective, interpolation, maximise_evidence, renew_noise, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
@@ -25,6 +25,8 @@ EVIDENCE_LEVELS = 16
 # And this many to say how sure predictions are; finer perturbations move no displacement.
 BELIEF_LEVELS = 24
 _ATOL = 1e-6
+# By so many e-folds the smoothness may differ from what the evidence has.
+_FARTHEST = 14.0
 
 
 @dataclass(frozen=True)
@@ -53,20 +55,17 @@ class GridSolution:
     hyper: Hyper
 
 
-def solve_grid(
-    data: Data, stroke_um: float, correlation: float, start: Hyper, relaxation: float = 0.0
-) -> GridSolution:
+def solve_grid(data: Data, stroke_um: float, start: Hyper) -> GridSolution:
     """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on.
 
-    So many samples as `correlation` are worth one independent one. Curvature counts less by so many e-folds as
-    `relaxation` says than the evidence has it. A `FitError` if the regression does not converge.
+    All samples are taken for independent ones. A `FitError` if the regression does not converge.
     """
-    moments = data.total.scaled(1 / correlation, stroke_um)
+    moments = data.total.scaled(1.0, stroke_um)
     rough = roughness(data.grid.levels)
     if data.grid.levels > EVIDENCE_LEVELS:
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
         few, even = moments.project(basis), rough.project(basis)
-        hyper = maximise_evidence(few, even, start).relaxed(relaxation)
+        hyper = maximise_evidence(few, even, start)
         posterior = Posterior.of(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
         determined = effective(even, hyper, Posterior.of(few, even, hyper))
@@ -74,8 +73,12 @@ def solve_grid(
         if abs(float(renewed.log_variance - hyper.log_variance)) > 0.02:  # worth another factorisation
             hyper, posterior = renewed, Posterior.of(moments, rough, renewed)
     else:
-        hyper = maximise_evidence(moments, rough, start).relaxed(relaxation)
+        hyper = maximise_evidence(moments, rough, start)
         posterior = Posterior.of(moments, rough, hyper)
+    return _bounded(posterior, hyper)
+
+
+def _bounded(posterior: Posterior, hyper: Hyper) -> GridSolution:
     if np.all(np.asarray(posterior.mean) >= 0):
         return GridSolution(posterior.mean, posterior, hyper)
     columns, found = non_negative(posterior)
@@ -84,33 +87,48 @@ def solve_grid(
     return GridSolution(columns, posterior, hyper)
 
 
-def relaxation_of(runs: Sequence[Run], stroke_um: float, correlation: float, start: Hyper) -> float:
+def solve_coloured(data: Data, stroke_um: float, correlation: float, white: Hyper, relaxation: float) -> GridSolution:
+    """Find the columns where only one in so many samples as `correlation` is independent; errors of `solve_grid`.
+
+    Curvature counts less by so many e-folds as `relaxation` says than the evidence has it that takes all samples for
+    independent ones; `white` is what it found. The covariance is larger by the `correlation` than theirs.
+    """
+    moments, rough = data.total.scaled(1.0, stroke_um), roughness(data.grid.levels)
+    hyper = white.relaxed(relaxation)
+    posterior = Posterior.of(moments, rough, hyper)
+    renewed = renew_noise(moments, hyper, posterior, effective(rough, hyper, posterior))
+    # The columns stay what they are: curvature counts less by what the noise is greater.
+    hyper = renewed.relaxed(float(np.log(correlation) + renewed.log_variance - hyper.log_variance))
+    return _bounded(Posterior.of(moments.scaled(1 / correlation, 1.0), rough, hyper), hyper)
+
+
+def relaxation_of(data: Data, stroke_um: float, white: Hyper) -> float:
     """By how many e-folds curvature counts less than the evidence has it, so that blocks are predicted best.
 
-    The evidence takes what a model cannot follow for noise, and smooths away what it could. Blocks are made of short
-    pieces of the whole record: consecutive fifths of a record that swings ever farther would ask what lies beyond.
+    The evidence takes what neighbouring samples share for the density's, or what a model cannot follow for noise:
+    the blocks may want more smoothness than it found, or less.
     """
-    count = sum(float(run.fitted.sum()) for run in runs)
-    pieces = int(np.clip(count / correlation, BLOCKS, 40))
-    data = gather(grid_of(runs, EVIDENCE_LEVELS), runs, pieces)
-    rough = roughness(EVIDENCE_LEVELS)
-    hyper = maximise_evidence(data.total.scaled(1 / correlation, stroke_um), rough, start)
-    whole = reduce(operator.add, data.blocks)
+    rough, blocks = roughness(data.grid.levels), data.blocks
+    if data.grid.levels > BELIEF_LEVELS:
+        basis = interpolation(BELIEF_LEVELS, data.grid.levels)
+        rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
+    whole = reduce(operator.add, blocks)
 
     def error(efolds: float) -> float:
-        square = 0.0
-        for block in data.blocks:
-            rest = jax.tree.map(operator.sub, whole, block)
-            posterior = Posterior.of(rest.scaled(1 / correlation, stroke_um), rough, hyper.relaxed(efolds))
-            columns, found = non_negative(posterior)
+        square, hyper = 0.0, white.relaxed(efolds)
+        for block in blocks:
+            columns, _ = non_negative(Posterior.of((whole - block).scaled(1.0, stroke_um), rough, hyper))
             one = block.scaled(1.0, stroke_um)
-            off = one.energy_um2 - 2 * columns @ one.cross_um + columns @ one.gram @ columns
-            square += float(off) if found else np.inf
+            square += float(one.energy_um2 - 2 * columns @ one.cross_um + columns @ one.gram @ columns)
         return square
 
-    errors = {efolds: error(efolds) for efolds in (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0)}
-    best = min(errors, key=lambda efolds: errors[efolds])
-    return best if errors[best] < 0.99 * errors[0.0] else 0.0
+    best, least = 0.0, error(0.0)
+    for step in (2.0, -2.0):
+        while abs(best + step) <= _FARTHEST and (square := error(best + step)) < 0.998 * least:
+            best, least = best + step, square
+        if best != 0.0:
+            break
+    return best
 
 
 def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
@@ -121,6 +139,8 @@ def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
     """
     scale = np.sqrt(np.diagonal(posterior.precision))
     lowest = np.asarray(posterior.mean) * scale
+    if not np.all(np.isfinite(lowest)):  # rounding left no Cholesky factor
+        return jnp.zeros_like(posterior.mean), False
     size = len(lowest)
     bounded = 64
     while True:
@@ -223,13 +243,14 @@ def cross_validate(
         basis = interpolation(levels, data.grid.levels)
         rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
     whole = reduce(operator.add, blocks)
-    labels = [blocks_of(run) for run in runs]
+    labels = [blocks_of(run, data.pieces) for run in runs]
     squares = shared = expected = count = 0.0
     for number, block in enumerate(blocks):
         if not block.count > 0:
             continue
         posterior = Posterior.of((whole - block).scaled(1 / correlation, stroke_um), rough, hyper)
-        columns = np.asarray(posterior.mean if basis is None else basis @ posterior.mean)
+        columns = np.asarray(non_negative(posterior)[0])
+        columns = columns if basis is None else basis @ columns
         model = data.grid.model(columns * stroke_um, np.zeros(()))
         # A short run may have no sample in a block.
         off = []

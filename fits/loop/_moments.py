@@ -25,6 +25,8 @@ from microid import Staircase
 _SLOTS = 4
 _NEGLIGIBLE = 1e-14
 BLOCKS = 5
+# Short enough for each block to have seen all of a record: fifths of one that swings ever farther would not.
+PIECES = 40
 
 
 @dataclass(frozen=True)
@@ -172,16 +174,20 @@ class RunMean:
 
 @dataclass(frozen=True)
 class Data:
-    """Moments of all runs, over all fitted samples and over fifths of every run's, each from its own mean."""
+    """Moments of all runs, over all fitted samples and over blocks of them, each from its own mean.
+
+    A block is every fifth of so many `pieces` of every run.
+    """
 
     grid: Grid
     total: Moments
     blocks: tuple[Moments, ...]
     means: tuple[RunMean, ...]
+    pieces: int = PIECES
 
 
-def blocks_of(run: Run, pieces: int = BLOCKS) -> np.ndarray:
-    """Number fifths of the fitted samples, -1 elsewhere, shape `(n,)`: each is every fifth of so many pieces."""
+def blocks_of(run: Run, pieces: int) -> np.ndarray:
+    """Number blocks of the fitted samples, -1 elsewhere, shape `(n,)`: each is every fifth of so many pieces."""
     order = np.cumsum(run.fitted) - 1
     return np.where(run.fitted, order * pieces // max(1, run.fitted.sum()) % BLOCKS, -1)
 
@@ -191,7 +197,7 @@ def grid_of(runs: Sequence[Run], levels: int) -> Grid:
     return Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), levels)
 
 
-def gather(grid: Grid, runs: Sequence[Run], pieces: int = BLOCKS) -> Data:
+def gather(grid: Grid, runs: Sequence[Run], pieces: int = PIECES) -> Data:
     """Pass runs with displacement through the regression once; blocks are made of so many pieces of each run."""
     centred: list[list[Moments]] = []
     means = []
@@ -207,7 +213,7 @@ def gather(grid: Grid, runs: Sequence[Run], pieces: int = BLOCKS) -> Data:
         centred.append([total, *(_without_nuisance(part, grid.columns)[0] for part in sums)])
         means.append(mean)
     whole, *blocks = (reduce(operator.add, parts) for parts in zip(*centred, strict=True))
-    return Data(grid, whole, tuple(blocks), tuple(means))
+    return Data(grid, whole, tuple(blocks), tuple(means), pieces)
 
 
 def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) -> list[Moments]:

@@ -61,7 +61,7 @@ class SeparateFits:
     def fit(self, runs: Sequence[Run]) -> Preisach:
         """Fit a hysteresis to some runs; a `FitError` where that fails."""
         data = gather(grid_of(runs, _LEVELS), runs)
-        solution = solve_grid(data, self.stroke_um, 1.0, self.hyper)
+        solution = solve_grid(data, self.stroke_um, self.hyper)
         return data.grid.model(np.asarray(solution.columns) * self.stroke_um, np.zeros(()))
 
     def left(self, run: Run) -> np.ndarray:

@@ -141,6 +141,8 @@ class Posterior(eqx.Module):
         """Condition the prior on the data."""
         variance = jnp.exp(hyper.log_variance)
         precision = jnp.asarray(moments.gram / variance + rough.precision(hyper))
+        # What rounding leaves of what a past has taken off may be negative.
+        precision += 1e-14 * jnp.max(jnp.diagonal(precision)) * jnp.eye(precision.shape[0])
         root = jnp.linalg.cholesky(precision)
         mean = jax.scipy.linalg.cho_solve((root, True), moments.cross_um / variance)
         return cls(mean, precision, root)

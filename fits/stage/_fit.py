@@ -196,7 +196,9 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
         ParameterEstimate(name, unit, *map(float, figures))
         for (name, unit), *figures in zip(names, value, width, *ends, strict=True)
     )
-    unseen = unseen_directions(precision.information, [name for name, _ in names], slope / value)
+    unseen = unseen_directions(
+        precision.information, [name for name, _ in names], slope / np.where(value == 0, np.inf, value)
+    )
     reports = []
     weighing = solved.weighing
     for run, noise_um, correlation in zip(solved.runs, weighing.noise_um, weighing.correlation, strict=True):

@@ -33,15 +33,23 @@ def respond(stage: m.Stage, samples: Samples) -> Float[Array, " n"]:
 def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, `(n, k)`: an offset in um, its past, and how the stage moved before.
 
-    The latter are free motions of what follows the hysteresis, or of the whole chain without one. What still settles
-    ahead of the hysteresis when the record begins is not among them.
+    The latter are free motions of what follows the hysteresis, or of the whole chain without one, and of relaxations
+    behind it. What still settles ahead of the hysteresis when the record begins is not among them.
     """
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
     if samples.has_past and place is not None:
         past = past_columns(ahead(stage, place, samples)[:: samples.stride])
         offset = jnp.concatenate([offset, past], axis=1)
-    system = joined(stage.parts[0 if place is None else place + 1 :])
+    behind = stage.parts[0 if place is None else place + 1 :]
+    if samples.moving:
+        time = samples.time_s - samples.time_s.ravel()[0]
+        if samples.time_s.ndim == 0:
+            time = samples.time_s * jnp.arange(samples.voltage_V.shape[0], dtype=time.dtype)
+        relaxing = [p for p in behind if isinstance(p, m.AbstractEffect) and p.relaxation]
+        late = [jnp.exp(-time / getattr(part, part.relaxation)) for part in relaxing]
+        offset = jnp.concatenate([offset, *(one[:: samples.stride, None] for one in late)], axis=1)
+    system = joined(behind)
     if not samples.moving or system is None or system.order == 0:
         return offset
     nothing = jnp.zeros_like(samples.voltage_V)

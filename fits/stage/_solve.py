@@ -277,7 +277,7 @@ def _step(
     size = 0 if hyper is None else chain.size
     reduced, step, follow = split_moments(total, size, damping)
     if hyper is not None and chain.grid is not None:
-        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, 1.0, hyper)
+        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, hyper)
         columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
         step = step - follow @ columns
         variance = float(jnp.exp(hyper.log_variance)) * stroke_um**2
@@ -286,7 +286,7 @@ def _step(
             raise FitError(FitStatus.NONFINITE)
         prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)
     information = marginal_information(total, size, prior, variance)
-    return step, columns, hyper, variance, float(step @ information @ step / len(step)) ** 0.5
+    return step, columns, hyper, variance, max(float(step @ information @ step) / len(step), 0.0) ** 0.5
 
 
 def marginal_information(total: Moments, size: int, prior: np.ndarray | None, variance: float) -> np.ndarray:

@@ -126,6 +126,9 @@ class AbstractEffect(AbstractPart):
     delay
         For a pure delay of the readings, the strength that is its time in s, as steps of a held command resemble one;
         empty for all others.
+    lag, relaxation
+        For a lag of the first order of the readings, and for one relaxation behind the hysteresis, the parameter that
+        is its time constant in s, as slow loops are fitted with both; empty for all others.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -154,6 +157,8 @@ class AbstractEffect(AbstractPart):
     universal: ClassVar[bool] = False
     held: ClassVar[str] = ""
     delay: ClassVar[str] = ""
+    lag: ClassVar[str] = ""
+    relaxation: ClassVar[str] = ""
 
     @classmethod
     @abc.abstractmethod

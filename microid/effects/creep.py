@@ -160,6 +160,7 @@ class KelvinVoigtCreep(AbstractEffect):
     view: ClassVar[View] = "since_move"
     column: ClassVar[str] = "temperature_degC"
     universal: ClassVar[bool] = True
+    relaxation: ClassVar[str] = "time_constant_s"
     held: ClassVar[str] = "gain_per_decade"
     gain: Float[Array, ""] = param(unit="1", lower=0.0, upper=_MOST_IN_ALL)
     time_constant_s: Float[Array, ""] = param(unit="s", lower=0.02, upper=1e5)

@@ -43,6 +43,7 @@ class SensorLowpass(AbstractEffect):
     source: ClassVar[str] = "first-order lag; corners of 10 Hz to 10 kHz in capacitive controllers (estimate)"
     view: ClassVar[View] = "velocity"
     column: ClassVar[str] = "drive_monitor_V"
+    lag: ClassVar[str] = "time_constant_s"
     time_constant_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
 
     @classmethod

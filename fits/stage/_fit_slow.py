@@ -1,0 +1,123 @@
+"""A hysteresis with a lag and relaxations behind it, fitted jointly to slow loops."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from fits.io._errors import DataError
+from fits.io._record import Record
+from fits.loop._choose_grid import choose_grid, weigh_robustly
+from fits.loop._fit import check_fit
+from fits.loop._misfit import misfits, remarks_on, worst
+from fits.loop._prior import Hyper
+from fits.loop._result import FitResult
+from fits.loop._run import Progress, Run, prepare_run
+from fits.stage._fit import default_stage, summarise
+from fits.stage._run import named_parts
+from fits.stage._solve import Problem, solve_chain
+from fits.stage._uncertainty import Precision
+from microid import EFFECTS, AbstractEffect, AbstractPart, Stage
+
+# Relaxations begin so many intervals long, and end at such a part of the longest run.
+_SHORTEST, _LONGEST = 20.0, 1 / 4
+# Gain of a relaxation, and a lag in intervals, to start from.
+_GAIN, _LAG = 0.1, 2.0
+MOST_RELAXATIONS = 6
+# A relaxation is not seen whose gain ends near its bound.
+_ANY = 0.49
+
+
+def fit_slow(
+    records: Sequence[Record],
+    *,
+    lag: bool = False,
+    relaxations: int = 0,
+    levels: int | None = None,
+    holdout: float | Sequence[Record] = 0.2,
+    initial: str = "unknown",
+    loss: str = "squares",
+    progress: Progress = lambda _: None,
+) -> FitResult[Stage]:
+    """Fit a Preisach operator to slow loops as `fit` does, together with what lags and relaxes behind it.
+
+    Errors are those of `fit`. The stage has no mechanics; what moves before a run leave to relax is estimated for
+    each run by itself, and is no part of the model.
+
+    Parameters
+    ----------
+    lag
+        Whether readings follow the displacement with a lag of the first order, whose time constant is fitted.
+    relaxations
+        Number of Kelvin-Voigt elements behind the hysteresis, at most 6. Their time constants are spread evenly over
+        the logarithm, from 20 samples to a quarter of the longest run, and their gains are fitted; those that the
+        runs do not show are left out.
+    records, levels, holdout, initial, loss, progress
+        See `fit`; a number of levels of at most 32 is chosen.
+    """
+    fraction, aside, range_V = check_fit(records, holdout, loss)
+    if not 0 <= relaxations <= MOST_RELAXATIONS:
+        raise DataError(f"{relaxations} relaxations were asked for: choose between 0 and {MOST_RELAXATIONS}")
+    stage = _stage(records, lag, relaxations)
+
+    def prepare(record: Record, holdout: float) -> Run:
+        return replace(prepare_run(record, range_V, initial, holdout, 1, 1.0, stage.hold), moving=True)
+
+    runs = [prepare(record, fraction) for record in records]
+    weighed = weigh_robustly(runs, progress) if loss == "huber" else runs
+    stroke, tried, _ = choose_grid(weighed, levels, progress, finest=32)
+    columns = np.asarray(tried.solution.columns) * stroke
+    hyper: Hyper | None = tried.solution.hyper
+    remarks = list[str]()
+    while True:
+        problem = Problem.of(stage, tried.data.grid, columns, hyper, stroke)
+        solved = solve_chain(problem, runs, loss, progress, accept_best=True)
+        unseen = _unseen(solved.stage)
+        if not unseen:
+            break
+        columns, hyper, stage = solved.columns_um, solved.hyper, solved.stage
+        for name, part in unseen:
+            # What moves before the runs leave to it stays.
+            stage = stage.swap(name, replace(part, **{part.strength[0]: jnp.asarray(0.0)})).freeze(name)
+            constant_s = float(getattr(part, part.relaxation))
+            remarks.append(f"a relaxation of {constant_s:.3g} s is not seen in these runs, and was left out")
+    progress("comparing with the measurement")
+    found = summarise(Precision(solved), [prepare(record, 1.0) for record in aside])
+    left = misfits(solved.runs, solved.residuals_um)
+    odd = remarks_on(solved.runs, solved.residuals_um, robust=loss == "huber")
+    notes = [warning for record in (*records, *aside) for warning in record.warnings]
+    told = tuple(dict.fromkeys((*odd, *notes, *remarks, *found.remarks)))
+    return replace(found, model=_seen(found.model), misfit=worst(left), remarks=told)
+
+
+def _stage(records: Sequence[Record], lag: bool, relaxations: int) -> Stage:
+    """A hysteresis, as many relaxations, and a lag of the first order."""
+    interval = min(float(np.median(np.diff(record.time_s))) for record in records)
+    longest = _LONGEST * max(record.duration_s for record in records)
+    constants = np.geomspace(min(_SHORTEST * interval, longest), longest, relaxations)
+    relaxing: Any = next(form for form in EFFECTS if form.relaxation)
+    lagging: Any = next(form for form in EFFECTS if form.lag)
+    parts: dict[str, AbstractPart] = {"hysteresis": default_stage()["hysteresis"]}
+    for k, constant in enumerate(constants):
+        parts[f"relaxation_{k + 1}"] = relaxing(
+            **{relaxing.strength[0]: jnp.asarray(_GAIN), relaxing.relaxation: jnp.asarray(constant)}
+        )
+    held = [f"{name}.{field}" for name in [*parts][1:] for field in (relaxing.relaxation, *relaxing.history)]
+    if lag:
+        parts["lag"] = lagging(**{lagging.lag: jnp.asarray(_LAG * interval)})
+    return Stage(tuple(parts.values()), tuple(parts), frozen=tuple(held))
+
+
+def _unseen(stage: Stage) -> list[tuple[str, Any]]:
+    """Relaxations that may take any part."""
+    effects = named_parts(stage, AbstractEffect)
+    return [(name, p) for name, p in effects if p.relaxation and float(getattr(p, p.strength[0])) > _ANY]
+
+
+def _seen(stage: Stage) -> Stage:
+    """The same without relaxations that were left out."""
+    kept = {n: part for n, part in zip(stage.names, stage.parts, strict=True) if n not in stage.frozen}
+    frozen = tuple(path for path in stage.frozen if path.split(".")[0] in kept)
+    return Stage(tuple(kept.values()), tuple(kept), stage.hold, stage.substeps, frozen)
