@@ -92,8 +92,12 @@ def try_grid(
         correlation = found
         pieces = int(np.clip(sum(map(len, left)) / correlation, BLOCKS, PIECES))
         data = data if pieces == PIECES else gather(grid, runs, pieces)
-        relaxation = relaxation_of(data, stroke, solution.hyper) if alone else -float(np.log(correlation))
-        solution = solve_coloured(data, stroke, correlation, solution.hyper, relaxation)
+        if alone:
+            relaxation = relaxation_of(data, stroke, solution.hyper)
+            solution = solve_coloured(data, stroke, correlation, solution.hyper, relaxation)
+        else:
+            # What a stage adds is not there yet, and must not become roughness of the density.
+            solution = solve_grid(data, stroke, hyper, correlation)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
     return GridTrial(data, solution, correlation, error, discrepancy)

@@ -55,12 +55,13 @@ class GridSolution:
     hyper: Hyper
 
 
-def solve_grid(data: Data, stroke_um: float, start: Hyper) -> GridSolution:
+def solve_grid(data: Data, stroke_um: float, start: Hyper, correlation: float = 1.0) -> GridSolution:
     """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on.
 
-    All samples are taken for independent ones. A `FitError` if the regression does not converge.
+    One in so many samples as `correlation` is taken for an independent one. A `FitError` if the regression does not
+    converge.
     """
-    moments = data.total.scaled(1.0, stroke_um)
+    moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
     if data.grid.levels > EVIDENCE_LEVELS:
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
