@@ -5,6 +5,7 @@ import gc
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -93,8 +94,11 @@ def _few_mappings_before_a_module() -> None:
 
 @pytest.fixture(autouse=True)
 def _few_mappings() -> Iterator[None]:
+    began = time.monotonic()
     yield
-    _forget_beyond(_BETWEEN_TESTS)
+    # To count them takes a while, too, and what is quick has compiled little.
+    if time.monotonic() - began > 1:
+        _forget_beyond(_BETWEEN_TESTS)
 
 
 @pytest.fixture(scope="module")

@@ -58,7 +58,9 @@ def test_one_axis_has_lagranges_closed_form(rng, axis, limit):
     assert {n: found.design.tolerance[n] for n in kept} == {n: stage.tolerance[n] for n in kept}
 
 
-@pytest.mark.parametrize(("limit", "most_mm"), [("three_sigma", 0.06), ("worst_case", 0.02)])
+@pytest.mark.parametrize(
+    ("limit", "most_mm"), [pytest.param("three_sigma", 0.06, marks=pytest.mark.study), ("worst_case", 0.02)]
+)
 def test_several_axes_meet_the_optimality_conditions(rng, limit, most_mm):
     """With bounds that hold some tolerances; slopes by finite differences of NumPy's formulas."""
     stage = paper_design()
@@ -173,6 +175,7 @@ def test_a_tolerance_of_zero_has_no_cost():
         allocate(stage, {"x": 1.0})
 
 
+@pytest.mark.study
 def test_what_is_allocated_keeps_to_the_budget_in_a_draw():
     """Also where a slope nearly vanishes, as that of alpha1 does."""
     found = fits.allocate(fits.paper_design(), {"x": 1.0, "gamma": 1.0})

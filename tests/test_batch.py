@@ -26,7 +26,7 @@ def stages_of(rng, rows, hold, shared):
     return m.Stage((joined(drivers), laws, joined(masses)), ("driver", "law", "mechanics"), hold)
 
 
-@pytest.mark.parametrize(("hold", "shared"), [("first", True), ("zero", False)])
+@pytest.mark.parametrize(("hold", "shared"), [pytest.param("first", True, marks=pytest.mark.study), ("zero", False)])
 def test_rows_are_those_of_stages_by_themselves(rng, hold, shared):
     stages, voltage = stages_of(rng, 3, hold, shared), jnp.asarray(rng.uniform(0, 100, (3, 40)).cumsum(axis=1) % 100)
     memory = m.demagnetised(0.0, 100.0, size=9) if shared else None

@@ -210,6 +210,7 @@ def _both(numbers, delay):
     return _figures(numbers, delay), jax.jacrev(lambda x: _figures(x, delay))(numbers)
 
 
+@pytest.mark.study
 def test_derivatives_are_those_of_finite_differences(rng):
     gains, filter_s, plant, delay = stable_loop(rng)
     numbers = np.concatenate([gains, [filter_s], plant])

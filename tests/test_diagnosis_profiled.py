@@ -61,6 +61,7 @@ def followed(case):
     return covariance, along, [law.effect(there, 0) for _, there in along], law, x
 
 
+@pytest.mark.study
 def test_a_lag_that_does_not_show_is_followed_as_far_as_it_may_be(rng):
     case = drifting(rng, 0.004, 5.0)
     covariance, along, effects, law, x = followed(case)

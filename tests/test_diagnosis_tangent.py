@@ -135,6 +135,7 @@ def test_a_baseline_moves_no_farther_than_its_tangent_holds(rng):
     assert np.all(np.abs(moved.z - asleep.z) < 4)
 
 
+@pytest.mark.study
 def test_a_driver_that_was_fitted_away_comes_back_beside_the_cause(rng):
     truth, late = baseline_of(rng), ClockMismatch(jnp.asarray(rng.uniform(500.0, 1000.0)))
     records = [

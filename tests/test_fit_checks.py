@@ -49,6 +49,7 @@ def test_two_rigs_in_two_files(slow):
     assert first.startswith("FAR FROM NOISE")
 
 
+@pytest.mark.study
 def test_two_rigs_joined_in_one_file(slow):
     result = fit(joined(slow, bench(stroke_um=26.0, rig=1)[0]))
     remark = said(result, "something changed")

@@ -1,11 +1,13 @@
 """Records with cells that no converter writes: fitted without a warning, or refused."""
 
 import numpy as np
+import pytest
 from _fuzz_files import LEVELS, loops
 
 import fits
 
 
+@pytest.mark.study
 def test_a_voltage_beside_zero_is_zero():
     """Between 0 and 1e-300 V the operator goes nowhere, and no power of that is infinite."""
     run = loops()

@@ -212,6 +212,7 @@ def test_a_run_sampled_too_slowly_for_its_mode_is_refused(rig, rng):
         fits.fit_stage([rig.records["slow"], thinned], levels=8, initial="negative", holdout=0.0)
 
 
+@pytest.mark.study
 def test_runs_of_different_rigs_are_refused(rig):
     fast = rig.records["fast"]
     other = Record(fast.time_s, fast.voltage_V, 1.4 * fast.displacement_um, source="other.csv")
@@ -226,6 +227,7 @@ def test_runs_of_different_rigs_are_refused(rig):
         pytest.param(1e-4, id="driver faster than a sample"),
     ],
 )
+@pytest.mark.study
 def test_a_command_held_in_steps_is_fitted(tau, seed):
     """Slow loops lag by what a slow driver takes, and whole samples see nothing of a quick one."""
     text = SCENARIO.format(tau=tau, frequency=120.0, damping=0.05).replace("[plant]", '[plant]\nhold = "zero"')

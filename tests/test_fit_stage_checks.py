@@ -65,6 +65,7 @@ def test_a_delay_that_ruins_the_fit_is_refused_by_its_size(runs):
     ("late", "where"),
     [pytest.param(1, "AFTER", id="late", marks=pytest.mark.study), pytest.param(-3, "BEFORE", id="acausal")],
 )
+@pytest.mark.study
 def test_a_delay_is_named_and_the_intervals_own_up_to_it(runs, late, where):
     slow, fast = runs
     told, result = named(slow, delayed(fast, late), where)
@@ -77,6 +78,7 @@ def test_a_delay_is_named_and_the_intervals_own_up_to_it(runs, late, where):
     assert fits.describe(fits.fit_report(result)).startswith("FAR FROM NOISE")
 
 
+@pytest.mark.study
 def test_a_fast_run_sampled_below_its_resonance_is_refused(runs):
     slow, fast = runs
     with pytest.raises(fits.DataError, match=r"fast\.csv: sampled at 135\.1 Hz, .*too slow"):

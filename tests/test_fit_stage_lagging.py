@@ -35,6 +35,7 @@ def triangle(rng, frequency_Hz, periods, noise_um=2e-4):
         pytest.param((100.0,), (15,), id="one", marks=pytest.mark.study),
     ],
 )
+@pytest.mark.study
 def test_a_lag_is_found_whatever_came_before(rng, frequencies_Hz, periods):
     records = [triangle(rng, *each) for each in zip(frequencies_Hz, periods, strict=True)]
     result = fits.fit_stage(records, levels=24)

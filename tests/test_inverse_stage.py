@@ -161,6 +161,7 @@ def gradient(stage, vector, time_s, reference_um, weight):
     return jax.grad(lambda v, r: weigh(stage, v, time_s, r, weight), argnums=(0, 1))(vector, reference_um)
 
 
+@pytest.mark.study
 def test_derivatives_are_those_of_finite_differences(rng):
     stage = m.Stage.of(
         driver=m.Driver(2e-3, 5.0),

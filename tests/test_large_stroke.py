@@ -103,6 +103,7 @@ def test_small_strokes_are_those_of_the_linear_form(axis, rng):
         assert slope == pytest.approx(float(m.gain(axis, g, constants)), rel=1e-9)
 
 
+@pytest.mark.study
 def test_what_the_large_stroke_costs_is_what_finite_elements_say():
     """Error of the linear form against co-rotational finite elements, read off a table to two digits."""
     g = m.Geometry()

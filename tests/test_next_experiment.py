@@ -202,6 +202,7 @@ def by_least_squares(made, true, other, time_s, voltage_V):
     return float(np.linalg.norm(target - block / scale @ answer))
 
 
+@pytest.mark.study
 def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     monkeypatch.setattr(_baseline, "_FINEST", 16)
     bench = data_synth.simulate(data_synth.parse_scenario(SCENARIO), seed)

@@ -172,6 +172,7 @@ def short(tmp_path_factory):
     return out, result, json.loads((out / "paper.json").read_text())
 
 
+@pytest.mark.study
 def test_what_is_calibrated_is_within_five_percent(short):
     _, _, content = short
     rows = [content["table2"]["HC"], content["table3"]["OPEN"]]

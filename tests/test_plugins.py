@@ -75,11 +75,14 @@ from fits.cli._main import cli
 for arguments in json.loads(sys.argv[1]):
     done = CliRunner().invoke(cli, arguments)
     assert done.exit_code == 0, (arguments, done.output)
+    print(json.dumps(done.stdout))
 """
 
 
-def commands(folder, *each):
-    python(folder, "-c", COMMANDS, json.dumps(each))
+def commands(folder, *each, first=""):
+    """What each command printed; `first` is Python to run before them."""
+    said = python(folder, "-c", first + COMMANDS, json.dumps(each))
+    return [json.loads(line) for line in said.splitlines()]
 
 
 def python(folder, *arguments, code=0):
@@ -225,22 +228,23 @@ def integrated(rate_V_per_um_s, samples, wanted_um=2.0):
 
 def test_a_controller_is_one_file_and_is_run_and_swept(copy):
     (copy / "microid/control/integrator.py").write_text(textwrap.dedent(CONTROLLER).lstrip())
-    assert "|integrator|" in python(copy, "-m", "fits", "control", "--help")
-    python(copy, "-c", LINEAR)
     rows = [f"{k * 1e-3},{2.0 if k else 0.0}" for k in range(20)]
     (copy / "step.csv").write_text("\n".join(["time_s,displacement_um", *rows]) + "\n")
-    control = ("control", "linear.json", "step.csv", "--controller", "integrator", "--feedforward", "none", "--json")
-    told = python(copy, "-m", "fits", *control, "--gains", "0,4000,0", "--out", "run.csv")
+    (copy / "sweep.toml").write_text(SWEEP)
+    control = ["control", "linear.json", "step.csv", "--controller", "integrator", "--feedforward", "none", "--json"]
+    words, told = commands(
+        copy, ["control", "--help"], [*control, "--gains", "0,4000,0", "--out", "run.csv"], first=LINEAR
+    )
+    assert "|integrator|" in words
     assert json.loads(told)["gains"]["gain_V_per_um_s"] == 4000.0
+    # What is printed, changed, is what runs.
+    (copy / "gains.json").write_text(told.replace("4000.0", "2000.0"))
+    again = [*control, "--gains", "gains.json", "--out", "again.csv"]
+    told, _ = commands(copy, again, ["sweep", "sweep.toml", "--out", "results"])
+    assert json.loads(told)["gains"]["gain_V_per_um_s"] == 2000.0
     header, *lines = (copy / "run.csv").read_text().splitlines()
     errors = [float(line.split(",")[header.split(",").index("error_um")]) for line in lines]
     assert errors == pytest.approx([0.0, *integrated(4000.0, 19)], abs=1e-12)
-    # What is printed, changed, is what runs.
-    (copy / "gains.json").write_text(told.replace("4000.0", "2000.0"))
-    told = python(copy, "-m", "fits", *control, "--gains", "gains.json", "--out", "again.csv")
-    assert json.loads(told)["gains"]["gain_V_per_um_s"] == 2000.0
-    (copy / "sweep.toml").write_text(SWEEP)
-    python(copy, "-m", "fits", "sweep", "sweep.toml", "--out", "results")
     found = pd.read_parquet(copy / "results" / "results.parquet")
     expected = [integrated(rate, 20)[-1] for rate in (2000.0, 4000.0)]
     assert found["error_final_um"].tolist() == pytest.approx(expected, abs=1e-12)

@@ -124,6 +124,7 @@ def test_no_guess_is_needed(rng, damping_ratio):
         assert abs(result[NAMES[1]].value - truth["natural_frequency_Hz"]) < 6 * result[NAMES[1]].sd
 
 
+@pytest.mark.study
 def test_a_profile_is_that_of_scipy_with_one_parameter_held(rng):
     # Hardly seen beside the delay of the mechanics, so that its profile is no parabola.
     truth = TRUTH | {"time_constant_s": 2e-5}

@@ -95,7 +95,11 @@ def stated_of(kind):
     return {name: float(value) for name, value in (line.split(" = ") for line in CASES[kind][0].splitlines())}
 
 
-@pytest.mark.parametrize("kind", sorted(CASES))
+# Those that learn take a while to compile.
+KINDS = ["pid", "resonant", *(pytest.param(kind, marks=pytest.mark.study) for kind in ("bp-pid", "cmac-pid"))]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_rows_agree_with_loops_by_themselves(kind, rng):
     nominal, values = nominal_stage(), drawn(kind, rng, 3)
     found = compute_chunk(parsed(HEAD.format(kind=kind, stated=CASES[kind][0]) + axes(values)), 0)
@@ -121,7 +125,7 @@ def test_rows_agree_with_loops_by_themselves(kind, rng):
         assert found.outputs["pole_radius"][row] == pytest.approx(radius, rel=1e-4)
 
 
-@pytest.mark.parametrize("kind", sorted(CASES))
+@pytest.mark.parametrize("kind", KINDS)
 def test_rows_do_not_depend_on_chunks(kind, rng):
     text = HEAD.format(kind=kind, stated=CASES[kind][0]) + axes(drawn(kind, rng, 520))
     small, large = (parsed(f"{text}[run]\nchunk_rows = {rows}\n") for rows in (256, 1024))
@@ -142,6 +146,7 @@ def made(
     return parsed(f"{TABLE.format(kind=kind, stated=stated)}[reference]\n{reference}\n[[axis]]\n{axis}\n", **files)
 
 
+@pytest.mark.study
 def test_learning_controllers_are_laid_out_for_the_way_from_rest(rng):
     """A step at the first sample is none in the reference, but from where the stage stands."""
     numbers = made("bp-pid", reference=STEP).job.controllers.numbers

@@ -156,5 +156,6 @@ def test_several_devices_give_the_same_bits(tmp_path, seed, devices, told, kinds
         assert (here["status"] == 1).sum() > len(here) / 2
 
 
+@pytest.mark.study
 def test_rows_are_sharded_over_the_devices():
     on_devices(2, _SHARDED)

@@ -224,6 +224,7 @@ def test_diagnoses_go_one_by_one_and_a_refused_record_fails_alone(monkeypatch, s
     assert strokes == sorted(strokes)
 
 
+@pytest.mark.study
 def test_two_workers_give_the_same_bits(tmp_path, seed):
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
     sweep = parsed(small(seed, rows=300))

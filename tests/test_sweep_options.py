@@ -69,6 +69,7 @@ def batch_of(record, levels, initial, smoothness=0.01, holdout=0.2):
     return fit_batch(levels, jnp.asarray(branch_table(levels)), roughness(levels), *rows, start)
 
 
+@pytest.mark.study
 def test_rows_of_a_batch_have_their_own_levels_and_initial_state(seed):
     sweep = parsed(text(seed, words(WORDS), LEVELS.format(levels=[5, 8])))
     found = compute_chunk(sweep, 0)

@@ -196,6 +196,7 @@ print(killed)
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a process that is killed here is a forked one")
 @pytest.mark.parametrize("kills", [3, pytest.param(10, marks=pytest.mark.study)])
+@pytest.mark.study
 def test_killed_at_random_moments_no_row_is_lost_or_doubled(finished, tmp_path, seed, kills):
     sweep, whole = finished
     file, out = tmp_path / "sweep.toml", tmp_path / "killed"

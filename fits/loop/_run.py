@@ -23,6 +23,8 @@ _PIECE = 8192
 _STAIRCASES = (64, 512, 4096)
 # Samples that a run must leave to fit.
 _FEWEST = 50
+# Samples that a shorter run is padded to, so that runs of many lengths share what is compiled.
+_SHORTEST = 4096
 # Told what is being done, a sentence at a time.
 Progress = Callable[[str], None]
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
@@ -162,7 +164,7 @@ class Run:
         record, stride = self.record, self.stride
         refuse_many_steps(record, stride)
         n, time_s = len(record), record.time_s
-        pad = (0, max(1024, 1 << (n - 1).bit_length()) - n)
+        pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
         step = (time_s[-1] - time_s[0]) / (n - 1)
         share = np.arange((n + pad[1] - 1) * stride + 1) / stride
         voltage = jnp.asarray(np.pad(record.voltage_V, pad, mode="edge"))
