@@ -61,6 +61,7 @@ def test_one_axis_has_lagranges_closed_form(rng, axis, limit):
 @pytest.mark.parametrize(
     ("limit", "most_mm"), [pytest.param("three_sigma", 0.06, marks=pytest.mark.study), ("worst_case", 0.02)]
 )
+@pytest.mark.study
 def test_several_axes_meet_the_optimality_conditions(rng, limit, most_mm):
     """With bounds that hold some tolerances; slopes by finite differences of NumPy's formulas."""
     stage = paper_design()

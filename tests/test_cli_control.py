@@ -133,6 +133,7 @@ def test_a_tuned_loop_follows_better_than_its_start_and_says_what_noise_hides(fo
 @pytest.mark.parametrize(
     "kind", [*(pytest.param(k, marks=pytest.mark.study) for k in ("bp-pid", "cmac-pid")), "resonant"]
 )
+@pytest.mark.study
 def test_the_other_controllers_run_on_a_hysteresis(folder, tmp_path, kind):
     result = run(
         *("control", folder / "loop.json", folder / "sine.csv", "--out", tmp_path / "r.csv", "--json", "--quiet"),

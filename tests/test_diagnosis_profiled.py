@@ -87,6 +87,7 @@ def test_a_lag_that_does_not_show_is_followed_as_far_as_it_may_be(rng):
     assert expansion.upper >= expansion.value + 1.9 * above
 
 
+@pytest.mark.study
 def test_what_shows_well_is_not_followed(rng):
     case = drifting(rng, 2.0, 5.0)
     covariance, along, _, law, x = followed(case)

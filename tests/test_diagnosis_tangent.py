@@ -176,6 +176,7 @@ def answer_um(tau_s, natural_Hz, damping, lag_s, late_s, time_s, voltage_V):
     return np.concatenate([np.zeros(behind), out])[: len(out) : many]
 
 
+@pytest.mark.study
 def test_a_delay_and_a_lag_are_told_apart_by_as_much_as_is_predicted(rng):
     interval_s, noise_um = 1e-3, 0.01
     # Nothing but an offset is seen in the runs at hand, and the density is known.

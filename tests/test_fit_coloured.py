@@ -22,6 +22,7 @@ def displacement(voltage_V):
 
 
 @pytest.mark.parametrize("memory", [pytest.param(0.9, marks=pytest.mark.study), 0.99])
+@pytest.mark.study
 def test_wandering_noise_leaves_the_density_as_rough_as_it_is(rng, memory):
     path = np.r_[0, np.cumsum(np.abs(np.diff(TURNS_V)))]
     voltage_V = np.interp(np.linspace(0, path[-1], SAMPLES), path, TURNS_V)

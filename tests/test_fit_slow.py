@@ -66,6 +66,7 @@ def test_the_model_is_saved_simulated_and_inverted(record, result, tmp_path):
     assert np.std(off_um[50:]) < 3 * NOISE_um
 
 
+@pytest.mark.study
 def test_the_command_takes_both(record, tmp_path):
     path = tmp_path / "relaxing.csv"
     table = np.c_[record.time_s, record.voltage_V, record.displacement_um]

@@ -43,6 +43,7 @@ def holds_the_truth(result):
         assert result[name].lower - 5e-3 * value < value < result[name].upper + 5e-3 * value
 
 
+@pytest.mark.study
 def test_a_clean_rig_gets_no_such_remark(runs):
     result = fit(*runs)
     assert not [remark for remark in result.remarks if any(word in remark for word in ALARMS)]

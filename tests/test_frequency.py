@@ -238,6 +238,7 @@ def test_a_search_that_does_not_arrive_has_no_answer(rng, monkeypatch):
     assert caught.value.status is fits.FitStatus.MAX_STEPS
 
 
+@pytest.mark.study
 def test_the_measured_mirror_held_out():
     path = DATA / "fsm_cubespec_100mV_train.csv"
     if not path.exists():

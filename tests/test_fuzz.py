@@ -177,9 +177,8 @@ def empty(folder):
 
 def test_good_files_are_taken(good, tmp_path):
     for name, path in good.items():
-        for k in range(3):
-            found = tried(good, name, path, empty(tmp_path / "out"), np.random.default_rng(k))
-            assert found.startswith("taken"), (name, found)
+        found = tried(good, name, path, empty(tmp_path / "out"), np.random.default_rng(0))
+        assert found.startswith("taken"), (name, found)
 
 
 def test_spoilt_files_are_refused_in_one_sentence_or_taken(good, tmp_path, seed):

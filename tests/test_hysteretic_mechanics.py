@@ -104,6 +104,7 @@ def test_at_rest_force_and_spring_are_in_balance(rng):
     assert still[0] - yields == pytest.approx(0.5 * rest_V, abs=1e-9)
 
 
+@pytest.mark.study
 def test_derivatives_are_those_of_finite_differences(rng):
     voltage_V = jnp.asarray(60 * np.sin(2 * np.pi * 35 * np.arange(60) * T))
 

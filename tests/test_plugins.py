@@ -104,11 +104,16 @@ def test_a_command_is_one_file(copy):
 
 
 def test_a_density_is_one_file_and_is_saved_and_read(copy):
-    fit = ["fit", "data/train.csv", "--family", "flat", "--starts", "1", "--levels", "8", "--out", "flat.json"]
-    simulate = ["simulate", "flat.json", "data/heldout.csv", "--out", "out.csv"]
-    commands(copy, ["synth", "quickstart", "--out", "data"], fit, simulate)
+    # Two full loops of a constant density: between ends 10 V apart, u volts from the last one give u^2 / 100 of all.
+    voltage_V = [10 - abs(k % 40 - 20) / 2 for k in range(121)]
+    part = [(v / 10) ** 2 if k % 40 < 20 else 1 - (1 - v / 10) ** 2 for k, v in enumerate(voltage_V)]
+    rows = [f"{0.1 * k},{v},{3 * p}" for k, (v, p) in enumerate(zip(voltage_V, part, strict=True))]
+    (copy / "loops.csv").write_text("\n".join(["time_s,voltage_V,displacement_um", *rows]) + "\n")
+    fit = ["fit", "loops.csv", "--family", "flat", "--starts", "1", "--levels", "4", "--out", "flat.json"]
+    commands(copy, fit, ["simulate", "flat.json", "loops.csv", "--out", "out.csv"])
     assert "FlatDensity" in (copy / "flat.json").read_text()
-    assert (copy / "out.csv").read_text().startswith("time_s,voltage_V,displacement_um")
+    found = pd.read_csv(copy / "out.csv")["displacement_um"]
+    assert found.max() - found.min() == pytest.approx(3, rel=1e-3)
 
 
 SAVE = """
@@ -123,16 +128,14 @@ fits.save_model("spring.json", stage, None, {})
 
 
 def test_a_hysteresis_law_and_an_effect_are_one_file_each_and_are_saved_and_read(copy):
-    python(copy, "-c", SAVE)
     (copy / "program.csv").write_text("time_s,voltage_V\n0,0\n1,8\n2,4\n")
-    python(copy, "-m", "fits", "simulate", "spring.json", "program.csv", "--out", "moved.csv")
+    commands(copy, ["simulate", "spring.json", "program.csv", "--out", "moved.csv"], first=SAVE)
     rows = [line.split(",") for line in (copy / "moved.csv").read_text().splitlines()[1:]]
     assert [float(row[2]) for row in rows] == pytest.approx([1.5, 4.5, 3.0])
 
 
 def test_a_column_is_one_file_and_an_effect_uses_it(copy):
     save = SAVE.replace("wrong_gain", "swelling").replace("spring.json", "swelling.json")
-    python(copy, "-c", save)
     rows = "time_s,voltage_V,{}\n0,0,30\n1,8,40\n2,4,50\n"
     # Of its own name, converted; of a name that its file recognises; chosen by the user.
     given = (("humidity_permille", "", 0.1), ("hum_lab", "", 1.0), ("rh", "humidity_pct=rh[permille]", 0.1))
@@ -142,7 +145,7 @@ def test_a_column_is_one_file_and_an_effect_uses_it(copy):
         ["simulate", "swelling.json", f"{header}.csv", "--columns", columns, "--out", f"{header}_swollen.csv"]
         for header, columns, _ in given
     ]
-    commands(copy, *simulate)
+    commands(copy, *simulate, first=save)
     for header, _, factor in given:
         found = [float(line.split(",")[2]) for line in (copy / f"{header}_swollen.csv").read_text().splitlines()[1:]]
         # The spring, 0.25 um/V and 1 um, times 1 + 0.5 per percent beyond the first reading.

@@ -175,6 +175,7 @@ def test_resonators_are_at_the_frequency_of_the_reference(rng):
     assert float(own.at({}).lead_deg[0]) == 30.0
 
 
+@pytest.mark.study
 def test_gains_that_nothing_can_be_learnt_around_and_unstable_loops_fail_as_rows(rng):
     values = drawn("bp-pid", rng, 3)
     values["controller.integral_V_per_um_s"][[0, 2]] = 0.0, 9000.0

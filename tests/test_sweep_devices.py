@@ -144,6 +144,7 @@ def texts(seed):
         pytest.param(3, "768 256", ["simulate", "control", "sensitivity", "fit"], marks=pytest.mark.study),
     ],
 )
+@pytest.mark.study
 def test_several_devices_give_the_same_bits(tmp_path, seed, devices, told, kinds):
     chosen = {kind: text for kind, text in texts(seed).items() if kind in kinds}
     for kind, text in chosen.items():

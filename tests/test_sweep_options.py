@@ -86,6 +86,7 @@ def test_rows_of_a_batch_have_their_own_levels_and_initial_state(seed):
     assert noise["negative"] < 0.9 * noise["positive"]
 
 
+@pytest.mark.study
 def test_rows_do_not_depend_on_chunks_and_words_are_kept_as_such(tmp_path, seed):
     noise = '[[axis]]\nparameter = "records.noise_um"\nlow = 0.01\nhigh = 0.1\ncount = 20\n'
     whole = text(seed, noise, words(["negative", "unknown"]), LEVELS.format(levels=[5, 8]))

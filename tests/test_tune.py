@@ -239,6 +239,7 @@ def test_an_integral_controller_of_a_gain_is_that_of_the_closed_form(rng):
     assert set(result.gains) == {"integral_V_per_um_s"}
 
 
+@pytest.mark.study
 def test_a_reference_that_stands_still_can_be_tuned_for(rng):
     """It has no range to overshoot; what is left of the error is the noise that the controller lets through."""
     stage, noise = m.Stage.of(piezo=m.Piezo(0.2)), rng.normal(0, 0.1, 60)
