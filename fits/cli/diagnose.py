@@ -127,7 +127,12 @@ def _lines(diagnosis: "late.Diagnosis") -> list[str]:
             lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
         for each in cause.parameters:
             unit = "" if each.unit == "1" else f" {each.unit}"
-            lines.append(f"    {each.name:24} {each.value:.4g} +- {each.sd:.2g}{unit}")
+            below, above = each.value - each.lower, each.upper - each.value
+            # An interval that ends at a bound, or reaches farther to one side, is no standard deviation.
+            spread = f"+- {each.sd:.2g}{unit}"
+            if not min(below, above) > 0.8 * max(below, above):
+                spread = f"(95 %: {each.lower:.3g} to {each.upper:.3g}){unit}"
+            lines.append(f"    {each.name:24} {each.value:.4g} {spread}")
     if diagnosis.unexplained_rms_um > 0:
         lines.append(f"  unexplained: {diagnosis.unexplained_rms_um:.3g} um")
     gain = diagnosis.gain

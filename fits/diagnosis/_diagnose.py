@@ -1,7 +1,7 @@
 """From records to a diagnosis: what is wrong, why, and what is gained by adding it."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -15,8 +15,9 @@ from fits.diagnosis._result import Diagnosis, Step
 from fits.diagnosis._select import Selection, select
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._errors import DataError
+from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._limits import MARGIN, UNITS
-from fits.io._record import Record, refuse_repeats
+from fits.io._record import refuse_repeats
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
@@ -29,9 +30,9 @@ _ALL = (
 
 
 def diagnose(
-    records: Sequence[Record],
+    records: AnyRuns,
     *,
-    holdout: float | Sequence[Record] = 0.2,
+    holdout: float | AnyRuns = 0.2,
     false_alarm: float = 0.01,
     duration_s: float | None = None,
     initial: str = "unknown",
@@ -51,7 +52,7 @@ def diagnose(
     Parameters
     ----------
     records
-        Runs of one rig, slow and fast ones together.
+        Runs of one rig, slow and fast ones together, as for `fit`.
     holdout
         Fraction at the end of every run that is only predicted, or records that are.
     false_alarm
@@ -91,6 +92,7 @@ def diagnose(
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
+    records, holdout = records_given(records), holdout_given(holdout)
     if not records:
         raise DataError("there is no record to diagnose")
     if not 0 < false_alarm <= 0.5:

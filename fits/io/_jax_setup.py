@@ -11,7 +11,6 @@ import jax
 
 from fits.io._errors import DataError
 
-
 # A first run spends most of its time compiling. With these flags it takes half as long, and what is compiled is as
 # fast, within a tenth, for all but loops of a millisecond.
 _QUICK_TO_COMPILE = {

@@ -29,7 +29,8 @@ class Record:
     displacements in um, or None for a voltage programme, shape (n,) each. `extra` holds all other numeric columns by
     name, each of shape (n,), such as ``temperature_degC``; `source` is the name of the file, without its folder, and
     `warnings` say what looked odd when it was read, one sentence each; what cannot be printed of them is kept as
-    codes. A `ValueError` says that the arrays are not one-dimensional or differ in length.
+    codes. A `DataError` says that the arrays are not one-dimensional or differ in length, that one of the three holds
+    what is no finite number, or that times do not increase.
     """
 
     time_s: FloatArray
@@ -46,8 +47,10 @@ class Record:
             arrays["displacement_um"] = _read_only(self.displacement_um)
         for name, array in (arrays | extra).items():
             if array.shape != (arrays["time_s"].size,):
-                raise ValueError(f"{name} has shape {array.shape}, expected ({arrays['time_s'].size},) as time_s.")
+                raise DataError(f"{name} has shape {array.shape}, expected ({arrays['time_s'].size},) as time_s.")
         for name, array in arrays.items():
+            if name not in extra:
+                _refuse_odd(self.source, name, array)
             object.__setattr__(self, name, array)
         object.__setattr__(self, "extra", MappingProxyType(extra))
         _make_printable(self)
@@ -91,13 +94,32 @@ class Reference:
         for name in ("time_s", "displacement_um"):
             object.__setattr__(self, name, _read_only(getattr(self, name)))
         if self.displacement_um.shape != (self.time_s.size,):
-            raise ValueError(
+            raise DataError(
                 f"displacement_um has shape {self.displacement_um.shape}, expected ({self.time_s.size},)."
             )
+        for name in ("time_s", "displacement_um"):
+            _refuse_odd(self.source, name, getattr(self, name))
         _make_printable(self)
 
     def __len__(self) -> int:
         return self.time_s.size
+
+
+def _refuse_odd(source: str, name: str, array: FloatArray) -> None:
+    """Refuse what no model could be fitted to, or follow."""
+    place = f"{printable(source)}: " if source else ""
+    odd = np.flatnonzero(~np.isfinite(array))
+    if len(odd):
+        raise DataError(
+            f"{place}{name}[{odd[0]}]: expected a finite number, found {array[odd[0]]} ({len(odd)} such in all); "
+            "leave these samples out"
+        )
+    if name == "time_s" and np.any(np.diff(array) <= 0):
+        at = int(np.argmax(np.diff(array) <= 0)) + 1
+        raise DataError(
+            f"{place}time_s[{at}]: expected a time after {array[at - 1]:.9g} s, found {array[at]:.9g} s; sort the "
+            "samples, and keep one of each time"
+        )
 
 
 def _make_printable(record: Record | Reference) -> None:

@@ -11,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
+from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record, refuse_repeats
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits.loop._design import Grid, columns_of
@@ -36,11 +37,11 @@ _SIZE = 64
 
 
 def fit(
-    records: Sequence[Record],
+    records: AnyRuns,
     *,
     family: str = "grid",
     levels: int | None = None,
-    holdout: float | Sequence[Record] = 0.2,
+    holdout: float | AnyRuns = 0.2,
     initial: str = "unknown",
     loss: str = "squares",
     starts: int = 8,
@@ -58,7 +59,7 @@ def fit(
     Parameters
     ----------
     records
-        Runs of one rig. Each has its own sensor offset.
+        Runs of one rig, or one: records, or what `read_table` takes. Each has its own sensor offset.
     family, levels
         Name in `microid.FAMILIES`, and number of switching voltages, chosen from the data by default.
     holdout
@@ -72,7 +73,8 @@ def fit(
     progress
         Told what is being done, a sentence at a time.
     """
-    fraction, aside, range_V = check_fit(records, holdout, loss)
+    records = records_given(records)
+    fraction, aside, range_V = check_fit(records, holdout_given(holdout), loss)
     if family not in FAMILIES:
         raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
     if levels is not None and not 4 <= levels <= 100:

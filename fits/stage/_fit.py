@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
+from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record
 from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
@@ -42,11 +43,11 @@ def default_stage(hold: Hold = "first") -> Stage:
 
 
 def fit_stage(
-    records: Sequence[Record],
+    records: AnyRuns,
     *,
     stage: Stage | None = None,
     levels: int | None = None,
-    holdout: float | Sequence[Record] = 0.2,
+    holdout: float | AnyRuns = 0.2,
     initial: str | Sequence[str] = "unknown",
     loss: str = "squares",
     progress: Progress = lambda _: None,
@@ -63,7 +64,7 @@ def fit_stage(
     Parameters
     ----------
     records
-        Runs of one rig, at whatever rates. Each has its own sensor offset.
+        Runs of one rig, at whatever rates, as for `fit`. Each has its own sensor offset.
     stage
         What is fitted: all its parameters that are not frozen. A `Preisach` operator on a grid is fitted as `fit`
         does, whatever its present values; drivers and mechanics start from the data; other parts start from their
@@ -76,6 +77,7 @@ def fit_stage(
     holdout, loss, progress
         See `fit`, as for what is returned.
     """
+    records, holdout = records_given(records), holdout_given(holdout)
     found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
     solved, runs = found.solved, found.solved.runs
     left, simplified = misfits(runs, solved.residuals_um), solved.problem.least_noise_share > 0

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
+from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid, weigh_robustly
 from fits.loop._fit import check_fit
@@ -31,12 +32,12 @@ _ANY = 0.49
 
 
 def fit_slow(
-    records: Sequence[Record],
+    records: AnyRuns,
     *,
     lag: bool = False,
     relaxations: int = 0,
     levels: int | None = None,
-    holdout: float | Sequence[Record] = 0.2,
+    holdout: float | AnyRuns = 0.2,
     initial: str = "unknown",
     loss: str = "squares",
     progress: Progress = lambda _: None,
@@ -57,7 +58,8 @@ def fit_slow(
     records, levels, holdout, initial, loss, progress
         See `fit`; a number of levels of at most 32 is chosen.
     """
-    fraction, aside, range_V = check_fit(records, holdout, loss)
+    records = records_given(records)
+    fraction, aside, range_V = check_fit(records, holdout_given(holdout), loss)
     if not 0 <= relaxations <= MOST_RELAXATIONS:
         raise DataError(f"{relaxations} relaxations were asked for: choose between 0 and {MOST_RELAXATIONS}")
     stage = _stage(records, lag, relaxations)

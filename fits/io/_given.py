@@ -1,0 +1,40 @@
+"""Runs as a user has them: records, tables of other libraries, or names of files."""
+
+import os
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from fits.io._errors import AnyPath, DataError
+from fits.io._read_csv import read_table
+from fits.io._record import Record
+
+# One run: a record, the name of a file, or what else `read_table` takes, such as a DataFrame.
+AnyRun = Record | AnyPath | Mapping[str, Any] | Any
+AnyRuns = Any  # one of them, or several: an iterable
+
+
+def records_given(given: AnyRuns) -> tuple[Record, ...]:
+    """One run or several as records of a measured displacement.
+
+    A `DataError` says which cannot be read, has no samples, or was only commanded.
+    """
+    each: Iterable[AnyRun] = (given,) if _is_one(given) else given
+    found = tuple(one if isinstance(one, Record) else read_table(one) for one in each)
+    for number, record in enumerate(found, 1):
+        name = record.source or f"run {number}"
+        if len(record) == 0:
+            raise DataError(f"{name}: there are no samples; give a run that has some")
+        if record.displacement_um is None:
+            raise DataError(f"{name}: a displacement column is needed here")
+    return found
+
+
+def holdout_given(holdout: float | AnyRuns) -> float | tuple[Record, ...]:
+    """Fraction held out of every run, or runs that are held out as a whole; see `records_given`."""
+    return holdout if isinstance(holdout, int | float) else records_given(holdout)
+
+
+def _is_one(given: Any) -> bool:
+    # Tables of pandas and of xarray are iterables of their columns.
+    is_table = hasattr(given, "columns") or hasattr(given, "to_dataframe")
+    return is_table or isinstance(given, Record | str | os.PathLike | Mapping) or not isinstance(given, Iterable)
