@@ -254,3 +254,51 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     assert not after.causes[0].rivals
     # Nothing is open any more.
     assert suggest(both, after, (found_cause("creep", ""),), Request(), told.append) is None
+
+
+@pytest.mark.parametrize("over_after", [1, 3])
+def test_once_the_time_is_over_the_best_program_so_far_is_taken(over_after, monkeypatch):
+    played = []
+
+    class Counting:
+        present_z = 0.0
+
+        def __init__(self, *given):
+            pass
+
+        def predicted_z(self, time_s, voltage_V):
+            played.append(float(voltage_V[0]))
+            return 10 + float(voltage_V[0])
+
+    def program(number):
+        samples, bounds = (np.arange(2.0), np.full(2, float(number))), (np.zeros(1), np.ones(1), np.full(1, 0.5))
+        return SimpleNamespace(
+            words=f"program {number}",
+            limits=SimpleNamespace(duration_s=1.0),
+            samples=lambda _: samples,
+            **dict(zip(("lower", "upper", "start"), bounds, strict=True)),
+        )
+
+    programs = tuple(map(program, (0, 0.1, 0.2, 0.3)))
+    guard = SimpleNamespace(
+        narrowed=lambda limits: SimpleNamespace(duration_s=1.0),
+        menu=lambda *_: programs,
+        allows=lambda _: True,
+        extremes=lambda _: (),
+    )
+    question = ("one", "other"), (None, None), ((0, 1),)
+    replacements = {
+        "open_question": lambda *_: question,
+        "guard_of": lambda *_: guard,
+        "limits_of": lambda *_: None,
+        "Predictor": Counting,
+        "further_column": lambda *_: "",
+        "repeated": lambda *_: None,
+    }
+    for name, replacement in replacements.items():
+        monkeypatch.setattr(f"fits.diagnosis._experiment.{name}", replacement)
+    ready = SimpleNamespace(baseline=SimpleNamespace(runs=(), range_V=(0.0, 1.0), resonance_Hz=None))
+    request = Request(has_time=lambda: len(played) < over_after)
+    found = suggest(ready, SimpleNamespace(bench=None, projector=None), (), request, lambda _: None)
+    assert played == [0, 0.1, 0.2][:over_after]
+    assert found.kind == f"program {played[-1]:g}"

@@ -127,5 +127,5 @@ def diagnose(
         if max((cause.z for cause in shown.causes), default=0.0) > thresholds.strong_z:
             baseline = replace(whole.baseline, remarks=(*whole.baseline.remarks, _ALL))
             ready, found = replace(whole, baseline=baseline), shown
-    request = Request(duration_s, limits, margin) if has_time() else None
+    request = Request(duration_s, limits, margin, has_time) if has_time() else None
     return conclude(ready, found, [*records, *aside], false_alarm, progress, request)

@@ -44,11 +44,13 @@ class Request:
     """What is asked of the next experiment: its duration, that of the longest run if None, and the limits of the rig.
 
     A quantity of which no limit is stated may go beyond what the records reached by the part `margin` of its range.
+    Where it no longer `has_time`, the best program so far is taken.
     """
 
     duration_s: float | None = None
     limits: RangeMap = field(default_factory=dict)
     margin: float = MARGIN
+    has_time: Callable[[], bool] = lambda: True
 
 
 def suggest(
@@ -77,7 +79,12 @@ def suggest(
     programs = guard.menu(limits, _MOST_SAMPLES)
     if not programs:
         return None
-    scores = [predictor.predicted_z(*program.samples(program.start)) for program in programs]
+    scores = []
+    for program in programs:
+        scores.append(predictor.predicted_z(*program.samples(program.start)))
+        if not request.has_time():
+            break
+    programs = programs[: len(scores)]
     column = further_column(names, records)
     asked = predictor
     if column and max(scores) < 1.0:
@@ -90,7 +97,7 @@ def suggest(
 
     def gain(parameters: np.ndarray) -> float:
         played = program.samples(parameters)
-        return asked.predicted_z(*played) if guard.allows(played) else float("nan")
+        return asked.predicted_z(*played) if request.has_time() and guard.allows(played) else float("nan")
 
     parameters, z = refine(program, gain, z)
     once, words = program.samples(parameters), program.words
