@@ -12,7 +12,7 @@ import jax
 from fits.io._errors import DataError
 
 # A first run spends most of its time compiling. With these flags it takes half as long, and what is compiled is as
-# fast, within a tenth, for all but loops of a millisecond.
+# fast, within 15 %, for all but loops that take less than a millisecond.
 _QUICK_TO_COMPILE = {
     "xla_cpu_use_fusion_emitters": "false",
     "xla_cpu_parallel_codegen_split_count": "1",
