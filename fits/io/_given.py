@@ -4,13 +4,12 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from fits.io._errors import AnyPath, DataError
+from fits.io._errors import DataError
 from fits.io._read_csv import read_table
 from fits.io._record import Record
 
-# One run: a record, the name of a file, or what else `read_table` takes, such as a DataFrame.
-AnyRun = Record | AnyPath | Mapping[str, Any] | Any
-AnyRuns = Any  # one of them, or several: an iterable
+# One run or an iterable of several: records, names of files, or what else `read_table` takes, such as a DataFrame.
+AnyRuns = Any
 
 
 def records_given(given: AnyRuns) -> tuple[Record, ...]:
@@ -18,7 +17,7 @@ def records_given(given: AnyRuns) -> tuple[Record, ...]:
 
     A `DataError` says which cannot be read, has no samples, or was only commanded.
     """
-    each: Iterable[AnyRun] = (given,) if _is_one(given) else given
+    each: Iterable[Any] = (given,) if _is_one(given) else given
     found = tuple(one if isinstance(one, Record) else read_table(one) for one in each)
     for number, record in enumerate(found, 1):
         name = record.source or f"run {number}"
