@@ -14,7 +14,7 @@ from fits.diagnosis._conclude import Misfit
 from fits.diagnosis._effects import Law
 from fits.diagnosis._extension import Compared, gain_of, predicts_worse, shared_effects
 from fits.diagnosis._prepare import _covered
-from fits.diagnosis._protocol import _regressed, _stretches_at_rest
+from fits.stats._held import _regressed, _stretches_at_rest
 from microid.effects import EFFECTS
 
 

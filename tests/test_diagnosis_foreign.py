@@ -9,13 +9,14 @@ import pytest
 from scipy.signal import fftconvolve, lsim
 
 from fits import Record, diagnose
-from fits.diagnosis._noise import Floor, pooled
-from fits.diagnosis._protocol import held_gain
 from fits.diagnosis._regression import _without_decayed
+from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop import _grid as grid
 from fits.loop._prior import Posterior
 from fits.loop._run import known_samples
+from fits.stats._held import held_gain
 from fits.stats._noise import Noise
+from fits.stats._sensor_noise import Floor, pooled
 
 RATE_Hz, FINE = 1000.0, 16
 
@@ -132,10 +133,10 @@ def test_one_noise_for_one_sensor(rng):
     level = rng.uniform(0.01, 0.1)
     few = [Floor(Noise(level * (1 + 0.5 / n**0.5), np.zeros(0)), n) for n in (200, 20_000)]
     assert few[0].noise.innovation_um != few[1].noise.innovation_um
-    same = pooled(few)
+    same = pooled(few, THRESHOLDS.apart_z)
     assert same[0].noise.innovation_um == same[1].noise.innovation_um == pytest.approx(level, rel=0.01)
     other = [few[0], Floor(Noise(2 * level, np.zeros(0)), 20_000)]
-    assert pooled(other) == other
+    assert pooled(other, THRESHOLDS.apart_z) == other
 
 
 def test_an_end_of_the_range_that_peaks_miss_by_a_little():

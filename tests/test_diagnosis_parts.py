@@ -14,12 +14,13 @@ from scipy.signal import lfilter
 from fits import Record
 from fits.diagnosis import _effects
 from fits.diagnosis._effects import drop_programs
-from fits.diagnosis._noise import floor_of, jitter_s, spikes
 from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
 from fits.diagnosis._score import Family, Probe, evidence, score
+from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stage._motion import pass_signal
 from fits.stats._noise import Noise, learn_noise, quantum_um
 from fits.stats._noise_spectrum import band_of
+from fits.stats._sensor_noise import floor_of, jitter_s, spikes
 from microid import EFFECTS, AbstractPart, Scene, Signal
 
 WHITE = np.zeros(0)
@@ -169,17 +170,19 @@ def test_noise_behind_noise_is_whitened_by_both(rng):
     np.testing.assert_allclose(first.followed_by(second).whiten(values), second.whiten(first.whiten(values)))
 
 
-def run_of(voltage_V, displacement_um, rate_Hz=1000.0):
-    time_s = np.arange(len(voltage_V)) / rate_Hz
-    record = SimpleNamespace(voltage_V=voltage_V, time_s=time_s, displacement_um=displacement_um)
-    fitted = np.ones(len(voltage_V), dtype=bool)
-    return SimpleNamespace(record=record, displacement_um=displacement_um, fitted=fitted, rate_Hz=rate_Hz)
+def floor_in(voltage_V, residual_um, rate_Hz=1000.0):
+    used = np.ones(len(voltage_V), dtype=bool)
+    return floor_of(voltage_V, residual_um, used, rate_Hz, 0.01, 1e-9, THRESHOLDS.apart_z, THRESHOLDS.minor_share)
+
+
+def spikes_in(voltage_V, residual_um):
+    return np.flatnonzero(spikes(voltage_V, residual_um, 0.0, THRESHOLDS.spike_z))
 
 
 def test_the_floor_is_read_off_idle_stretches(rng):
     voltage = np.concatenate([np.linspace(0, 100, 1000), np.full(1000, 100.0), np.linspace(100, 0, 1000)])
     left = 0.05 * rng.standard_normal(3000) + 2 * np.sin(np.arange(3000) / 30) * (np.arange(3000) % 2000 < 1000)
-    floor = floor_of(run_of(voltage, left), left, 0.01)
+    floor = floor_in(voltage, left)
     assert floor.idle
     assert floor.noise.total_um == pytest.approx(0.05, rel=0.15)
 
@@ -188,13 +191,13 @@ def test_spikes_are_found_and_ringing_is_not(rng):
     time = np.arange(4000) / 1000
     ringing = 0.5 * np.exp(-(time % 1.0) / 0.05) * np.sin(2 * np.pi * 100 * time)
     left = 0.02 * rng.standard_normal(4000) + ringing
-    assert spikes(run_of(np.sin(time), left), left).sum() == 0
+    assert len(spikes_in(np.sin(time), left)) == 0
     where = 300 + 400 * np.arange(8)
     left[where] += rng.choice([-1, 1], 8) * rng.uniform(0.6, 3.0, 8)
-    assert set(np.flatnonzero(spikes(run_of(np.sin(time), left), left))) == set(where)
+    assert set(spikes_in(np.sin(time), left)) == set(where)
     # By chance, one has another close by.
     left[where[::3] + 7] += 1.0
-    assert set(np.flatnonzero(spikes(run_of(np.sin(time), left), left))) == {*where, *(where[::3] + 7)}
+    assert set(spikes_in(np.sin(time), left)) == {*where, *(where[::3] + 7)}
 
 
 def test_a_last_digit_is_found_and_noise_has_none(rng):
@@ -207,9 +210,10 @@ def test_jitter_is_noise_that_grows_with_the_speed(rng):
     time = np.arange(20_000) / 1000
     speed = 500 * np.cos(2 * np.pi * time)
     quiet = 0.02 * rng.standard_normal(len(time))
-    assert jitter_s(quiet, speed)[1] < 8
-    assert jitter_s(quiet, speed)[2] < 0.5e-4
-    size, z, most = jitter_s(quiet + 1e-4 * speed * rng.standard_normal(len(time)), speed)
+    _, z, most = jitter_s(quiet, speed, 0.0, THRESHOLDS.apart_z)
+    assert z < 8
+    assert most < 0.5e-4
+    size, z, most = jitter_s(quiet + 1e-4 * speed * rng.standard_normal(len(time)), speed, 0.0, THRESHOLDS.apart_z)
     assert z > 8
     assert size == pytest.approx(1e-4, rel=0.25)
     assert most > 1e-4
@@ -227,9 +231,9 @@ def test_hum_is_no_part_of_the_floor(rng):
             + 0.3 * np.sin(2 * np.pi * mains * time + rng.uniform(0, 6))
             + 0.1 * np.cos(4 * np.pi * mains * time)
         )
-        found = floor_of(run_of(voltage, left, rate), left, 0.01).noise
+        found = floor_in(voltage, left, rate).noise
         assert found.total_um == pytest.approx(0.05, rel=0.2)
-    assert floor_of(run_of(voltage, noise), noise, 0.01).noise.total_um == pytest.approx(0.05, rel=0.15)
+    assert floor_in(voltage, noise).noise.total_um == pytest.approx(0.05, rel=0.15)
 
 
 def narrow(rng, frequency_Hz, quality, rate_Hz, n):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.signal import lfilter
-from test_diagnosis_parts import WHITE, regression, run_of
+from test_diagnosis_parts import WHITE, regression
 from test_diagnosis_tangent import baseline_of
 
 from fits import Record
@@ -25,6 +25,13 @@ from fits.diagnosis._residual_tests import (
 )
 from fits.stats._noise import Noise
 from fits.stats._noise_spectrum import Band
+
+
+def run_of(voltage_V, displacement_um, rate_Hz=1000.0):
+    time_s = np.arange(len(voltage_V)) / rate_Hz
+    record = SimpleNamespace(voltage_V=voltage_V, time_s=time_s, displacement_um=displacement_um)
+    fitted = np.ones(len(voltage_V), dtype=bool)
+    return SimpleNamespace(record=record, displacement_um=displacement_um, fitted=fitted, rate_Hz=rate_Hz)
 
 
 def plain_projector(lengths=(600, 800)):

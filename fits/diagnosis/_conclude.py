@@ -16,11 +16,10 @@ from fits.diagnosis._extension import (
     plain_steps,
     predicts_worse,
 )
-from fits.diagnosis._findings import bounds, causes_of
+from fits.diagnosis._findings import bounds, causes_of, with_held_gain
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._protocol import held_gain, with_held_gain
 from fits.diagnosis._refit import nothing, refit
 from fits.diagnosis._residual_tests import (
     Cycles,
@@ -37,6 +36,7 @@ from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from fits.loop._run import known_samples
+from fits.stats._held import held_gain
 from fits.stats._noise import Noise
 from microid.effects import card_of
 

@@ -17,9 +17,10 @@ from fits.diagnosis._refit import Refit, refit
 from fits.diagnosis._result import Bound, EffectParameter, FoundCause
 from fits.diagnosis._score import Scored, best_of
 from fits.diagnosis._select import Cause, Selection
+from fits.stats._held import Held
 from fits.stats._metrics import TWO_SIDED_95
 from microid import EFFECTS, AbstractEffect
-from microid.effects import Statistic
+from microid.effects import Statistic, card_of
 
 # Standard deviations from zero beyond which a run shows an effect.
 _SHOWS = 2.0
@@ -84,6 +85,19 @@ def causes_of(
         chance, share = float(2 * stats.norm.sf(fault.z)), fault.variance_um2 / max(total, fault.variance_um2, 1e-300)
         found[form.name] = described(form, (), fault.z, chance, parameters, share, fault.variance_um2**0.5)
     return tuple(sorted(found.values(), key=lambda cause: -weight[cause.name]))
+
+
+def with_held_gain(held: Held, causes: Sequence[FoundCause]) -> tuple[FoundCause, ...]:
+    """Put the gain that a hold shows into the cause that shows there, ahead of the parameters of its fit."""
+    out = []
+    for cause in causes:
+        if name := card_of(cause.name).held:
+            low, high = (max(held.gain_per_decade + way * TWO_SIDED_95 * held.sd, 0.0) for way in (-1, 1))
+            shown = EffectParameter(name, held.gain_per_decade, held.sd, "1", low, high)
+            fitted = (replace(one, name=f"{one.name}, of the fit") for one in cause.parameters)
+            cause = replace(cause, parameters=(shown, *fitted))
+        out.append(cause)
+    return tuple(out)
 
 
 def described(

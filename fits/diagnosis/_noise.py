@@ -4,163 +4,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter, rank_filter
 
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
-from fits.loop._run import Run
-from fits.stats._noise import Noise, idle_stretches, learn_noise, quantum_um, rough_noise_um, stretches
-from fits.stats._noise_spectrum import DRIFT, Band, MAINS_Hz, band_of
+from fits.stats._noise import Noise, quantum_um, rough_noise_um
+from fits.stats._noise_spectrum import Band, band_of
+from fits.stats._sensor_noise import floor_of, jitter_s, pooled, spikes, white_noise
 from microid.effects import Statistic
 
-# So many samples at rest are enough to read the noise from.
-_IDLE = 150
-# Lines of mains are looked for in stretches of at least so many samples, and no longer than stay in step, in s.
-_LONG, _STEADY_s = 60, 1.5
-# At most so many spikes stand together, and the other samples up to so far away are much smaller.
-_MOST_TOGETHER, _COMPARED_SAMPLES = 3, 16
-# A command that moves, or turns, by more than these parts of its range within so many samples may cause what looks
-# like a spike.
-_MOVED_SHARE, _TURNED_SHARE, _SAMPLES_AROUND = 0.02, 0.004, 6
-# There a spike is larger than this multiple of what is usual.
-_OUTLYING = 2.0
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
-# Jitter beside rounding has at least so many times its variance.
-_ROUNDING = 10.0
 # A band is one of a resonance from this quality on; what is broader wanders, or jumps.
 _NARROW = 1.5
-
-
-@dataclass(frozen=True)
-class Floor:
-    """What a run's noise is, whatever a model leaves, and how many `idle` samples it was read off; 0 for none."""
-
-    noise: Noise
-    idle: int
-
-
-def floor_of(run: Run, residual_um: np.ndarray, settling_s: float, thresholds: Thresholds = THRESHOLDS) -> Floor:
-    """Read the noise of a run off its idle stretches, or off the fastest changes of the residual.
-
-    A stretch is idle once the stage has settled, which takes it `settling_s`.
-    """
-    pieces = []
-    for stretch in idle_stretches(run.record.voltage_V, round(settling_s * run.rate_Hz)):
-        piece = residual_um[stretch]
-        time = np.linspace(-1, 1, len(piece))
-        # What settles is no noise.
-        pieces.append(piece - np.polyval(np.polyfit(time, piece, min(3, len(piece) // 12)), time))
-    if sum(len(piece) for piece in pieces) >= _IDLE:
-        pieces = _without_mains(pieces, 1 / run.rate_Hz, 1 - thresholds.minor_share)
-        joined = np.concatenate(pieces)
-        if (rough_um := rough_noise_um(joined)) > 0:
-            joined = joined[np.abs(joined) < 8 * rough_um + 1e-300]
-        freedom = 4.0 * len(pieces)
-        level = float(np.std(joined)) * (len(joined) / max(len(joined) - freedom, 1)) ** 0.5
-        correlation = float(np.mean(joined[1:] * joined[:-1]) / max(np.mean(joined**2), 1e-300))
-        if level > 0:
-            correlated = abs(correlation) * len(joined) ** 0.5 > thresholds.apart_z
-            return Floor(learn_noise(joined, freedom) if correlated else _white(level), len(joined))
-    used = residual_um[run.fitted]
-    return Floor(_white(max(rough_noise_um(used), 1e-9 * float(np.ptp(run.displacement_um)))), 0)
-
-
-def _white(level_um: float) -> Noise:
-    return Noise(level_um, np.zeros(0))
-
-
-def pooled(floors: Sequence[Floor], same_z: float = THRESHOLDS.apart_z) -> list[Floor]:
-    """Floors of one sensor: white noise that was read off idle stretches, and is the same in all runs by chance."""
-    white = [floor.idle > 0 and len(floor.noise.past) == 0 for floor in floors]
-    if sum(white) < 2:
-        return list(floors)
-    counts = np.array([floor.idle for floor in floors])[white]
-    levels = np.array([floor.noise.innovation_um for floor in floors])[white]
-    level = float(np.sqrt(np.average(levels**2, weights=counts)))
-    if np.any(np.abs(levels / level - 1) > same_z / np.sqrt(2 * counts)):
-        return list(floors)
-    return [replace(one, noise=_white(level)) if own else one for one, own in zip(floors, white, strict=True)]
-
-
-def _without_mains(pieces: list[np.ndarray], interval_s: float, most_left: float) -> list[np.ndarray]:
-    """Take the lines of mains out of stretches, where they are most of what is there: hum is a cause, not noise."""
-    most, long = max(round(_STEADY_s / interval_s), _LONG), []
-    for piece in pieces:
-        if len(piece) >= _LONG:
-            long += np.array_split(piece, max(len(piece) // most, 1))
-    if sum(len(piece) for piece in long) < _IDLE:
-        return pieces
-    best, found = most_left * sum(float(piece @ piece) for piece in long), pieces
-    for mains in MAINS_Hz:
-        for frequency in mains * (1 + np.linspace(-DRIFT, DRIFT, 9)):
-            left = []
-            for piece in long:
-                phase = 2 * np.pi * frequency * interval_s * np.arange(len(piece))
-                lines = np.stack([wave(h * phase) for h in (1, 2, 3) for wave in (np.cos, np.sin)], axis=1)
-                left.append(piece - lines @ np.linalg.lstsq(lines, piece, rcond=None)[0])
-            rest = sum(float(piece @ piece) for piece in left)
-            if rest < best:
-                best, found = rest, left
-    return found
-
-
-def spikes(
-    run: Run, residual_um: np.ndarray, least_um: float = 0.0, spike_z: float = THRESHOLDS.spike_z
-) -> np.ndarray:
-    """Samples that stand alone, far off their neighbours, where the command gives no reason; shape `(n,)`."""
-    size = np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
-    spread = np.maximum(1.4826 * median_filter(size, 101, mode="nearest"), 1.4826 * float(np.median(size)))
-    far = size > np.maximum(spike_z * spread, least_um + 1e-300)
-    # What rings has neighbours as large; what is alone has none, or one of its kind by chance.
-    # In two dimensions: in one, SciPy 1.17 takes a footprint with a gap for one without.
-    beside = np.abs(np.arange(-_COMPARED_SAMPLES, _COMPARED_SAMPLES + 1))[None] > _MOST_TOGETHER
-    far &= size > 3 * rank_filter(size[None], -2, footprint=beside, mode="nearest")[0]
-    voltage = run.record.voltage_V
-    change = np.diff(voltage, prepend=voltage[0])
-    turned = np.abs(np.diff(change, append=change[-1])) > _TURNED_SHARE * float(np.ptp(voltage))
-    moved = (np.abs(change) > _MOVED_SHARE * float(np.ptp(voltage))) | turned
-    width = 2 * _SAMPLES_AROUND + 1
-    near = np.convolve(moved, np.ones(width), mode="same") > 0.5
-    # Where it may, others do so, too: one sample in fifty, and one in a tenth of the places.
-    places = [slice(k, min(k + width, stop)) for first, stop in stretches(near) for k in range(first, stop, width)]
-    if places:
-        usual = _OUTLYING * float(np.quantile(size[near], 0.98))
-        usual = max(usual, float(np.quantile([size[place].max() for place in places], 0.9)))
-        far &= ~near | (size > _OUTLYING * usual)
-    for first, stop in stretches(far):
-        if stop - first > _MOST_TOGETHER:
-            far[first:stop] = False
-    return far
-
-
-def jitter_s(
-    residual_um: np.ndarray, rate_um_per_s: np.ndarray, least_um: float = 0.0, apart_z: float = THRESHOLDS.apart_z
-) -> tuple[float, float, float]:
-    """Jitter of the instants of sampling, its evidence in standard deviations, and the most that it may be.
-
-    It is noise that grows with the speed: the variance about the neighbours is compared with the square of the speed.
-    """
-    bent = residual_um[1:-1] - (residual_um[2:] + residual_um[:-2]) / 2
-    square = bent**2 / 1.5
-    speed = rate_um_per_s[1:-1] ** 2
-    order = np.argsort(speed)
-    slow, quick = order[: len(order) // 2], order[-len(order) // 10 :]
-    base = max(float(np.median(square[slow])) / 0.4549, least_um**2)
-    more = float(np.median(square[quick])) / 0.4549 - base
-    # The slower half jitters, too.
-    faster = float(np.median(speed[quick]) - np.median(speed[slow]))
-    if base <= 0 or faster <= 0:
-        return 0.0, 0.0, float("inf")
-    # The median of a chi-square variable has a relative standard error of about 1.6 / sqrt(n).
-    error = 1.65 * np.hypot(base / len(slow) ** 0.5, (base + more) / len(quick) ** 0.5)
-    most = float((max(more + apart_z * error, 0.0) / faster) ** 0.5)
-    # Rounding is less where nothing moves, and there its median is not that of normal noise.
-    if more <= _ROUNDING * least_um**2:
-        return 0.0, 0.0, most
-    return float((more / faster) ** 0.5), float(more / error), most
 
 
 @dataclass(frozen=True)
@@ -210,7 +67,7 @@ def find_faults(
         regression = replace(regression, residuals=left)
     baseline = regression.baseline
     used = (left[mask] for left, mask in zip(regression.residuals, regression.masks, strict=True))
-    guess = [_white(max(rough_noise_um(left), 1e-9 * baseline.stroke_um)) for left in used]
+    guess = [white_noise(max(rough_noise_um(left), 1e-9 * baseline.stroke_um)) for left in used]
     projector = Projector(regression, guess)
     dz, dw = projector.step(projector.residual)
     quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
@@ -225,18 +82,20 @@ def find_faults(
         moved = residual - rows @ np.concatenate([dw, dz])
         mask = run.fitted
         left = moved - nuisance @ np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
-        bad = spikes(run, left, 2 * quantum, thresholds.spike_z)
+        voltage_V = run.record.voltage_V
+        bad = spikes(voltage_V, left, 2 * quantum, thresholds.spike_z)
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)
         heights.append(np.where(bad, left - smooth, 0.0))
-        floors.append(floor_of(run, smooth, settling_s, thresholds))
+        settings = settling_s, 1e-9 * float(np.ptp(run.displacement_um)), thresholds.apart_z, thresholds.minor_share
+        floors.append(floor_of(voltage_V, smooth, mask, run.rate_Hz, *settings))
         rate = np.gradient(run.displacement_um - left, run.record.time_s)
         size, z, most = jitter_s(smooth[mask], rate[mask], least, thresholds.apart_z)
         jitters.append((z, size, np.abs(rate), most))
         interval = float(np.median(np.diff(run.record.time_s)))
-        bands.append(band_of(smooth[mask], interval, run.record.voltage_V[mask]))
+        bands.append(band_of(smooth[mask], interval, voltage_V[mask]))
     floors = pooled(floors, thresholds.apart_z)
-    noise = [one.noise if one.noise.total_um > least else _white(least) for one in floors]
+    noise = [one.noise if one.noise.total_um > least else white_noise(least) for one in floors]
     z, size, _, _ = max(jitters, key=lambda j: j[0])
     # One recorder took all runs: what only one of them shows is something else.
     z = z if size / 2 < min(most for _, _, _, most in jitters) else 0.0

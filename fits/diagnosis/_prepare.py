@@ -10,13 +10,13 @@ from fits.diagnosis._baseline import Baseline, fit_baseline, simulate
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
 from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
-from fits.diagnosis._protocol import held_gain
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
 from fits.stage._solve import Problem
+from fits.stats._held import held_gain
 from microid import EFFECTS, Hold, Scales
 
 # A delay below this part of the sampling interval is no effect, but one of each run's own.

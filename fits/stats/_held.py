@@ -1,15 +1,12 @@
-"""Runs that were taken under a controller that held the displacement."""
+"""Creep as runs show it in which a controller held the displacement: in what it took back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from fits.diagnosis._result import EffectParameter, FoundCause
 from fits.io._record import Record
-from fits.stats._metrics import TWO_SIDED_95
-from microid.effects import card_of
 
 # A hold lasts so long and has so many samples.
 _LONG_s, _SAMPLES = 1.0, 200
@@ -42,19 +39,6 @@ class Held:
             f"went back by {self.gain_per_decade:.2%} of the step before with each decade of time; that is the gain "
             "of its creep, which the fit cannot tell from a density without slope there"
         )
-
-
-def with_held_gain(held: Held, causes: Sequence[FoundCause]) -> tuple[FoundCause, ...]:
-    """Put the gain that a hold shows into the cause that shows there, ahead of the parameters of its fit."""
-    out = []
-    for cause in causes:
-        if name := card_of(cause.name).held:
-            low, high = (max(held.gain_per_decade + way * TWO_SIDED_95 * held.sd, 0.0) for way in (-1, 1))
-            shown = EffectParameter(name, held.gain_per_decade, held.sd, "1", low, high)
-            fitted = (replace(one, name=f"{one.name}, of the fit") for one in cause.parameters)
-            cause = replace(cause, parameters=(shown, *fitted))
-        out.append(cause)
-    return tuple(out)
 
 
 def held_gain(records: Sequence[Record]) -> Held | None:
