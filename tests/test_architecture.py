@@ -322,6 +322,7 @@ for wrong in (voltage[None], voltage[0], np.arange(3)):
 """
 
 
+@pytest.mark.study
 def test_shapes_are_as_annotated():
     """All of `microid` under a run-time type checker; tracing is enough, nothing is compiled for it."""
     done = run_python(SHAPES)

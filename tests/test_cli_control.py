@@ -96,6 +96,7 @@ def test_given_gains_are_run_as_scipy_runs_them(folder, tmp_path):
     assert "margins     1 plants" in again.stdout
 
 
+@pytest.mark.study
 def test_a_tuned_loop_follows_better_than_its_start_and_says_what_noise_hides(folder, tmp_path):
     options = ["--noise", "0.5", "--delay", "1", "--resolution", "0.001", "--skip", "0.02", "--starts", "1"]
     result = run(

@@ -105,6 +105,7 @@ def test_a_load_put_on_within_a_record_is_found_to_a_period_of_the_ringing(rng):
     assert 0.5 < float(effect.mass_ratio) / (mass - 1) < 2
 
 
+@pytest.mark.study
 def test_a_loss_is_asked_about_from_its_own_sample_on(rng):
     """Not only at the instants that are always tried: in a fast run what is there is seen nowhere else."""
     lost = int(rng.integers(1500, 3500))

@@ -64,7 +64,10 @@ EFFECTS = {
 }
 
 
-@pytest.mark.parametrize("name", list(EFFECTS))
+@pytest.mark.parametrize(
+    "name",
+    ["driver_saturation", *(pytest.param(name, marks=pytest.mark.study) for name in ("backlash", "slew_limit"))],
+)
 def test_the_tangent_goes_through_what_levels_off(name, rng):
     baseline, effect = baseline_of(rng), EFFECTS[name]
     dressed, plain = (regress(baseline, kinds, [own, own]) for kinds, own in ((None, [effect]), ((), [])))
@@ -93,6 +96,7 @@ def test_the_tangent_goes_through_what_levels_off(name, rng):
         assert said < 0.5 * without
 
 
+@pytest.mark.study
 def test_what_is_finer_than_the_grid_goes_through_it_too(rng):
     baseline, effect = baseline_of(rng), EFFECTS["driver_saturation"]
     dressed, plain = (regress(baseline, None, [own, own]) for own in ([effect], []))
@@ -109,7 +113,10 @@ def test_only_effects_that_level_off_ahead_of_the_mechanics_are_gone_through():
     assert saturating([*EFFECTS.values(), late]) == tuple(EFFECTS.values())
 
 
-@pytest.mark.parametrize("effect", [TransportDelay(jnp.asarray(5e-4)), SensorLowpass(jnp.asarray(5e-4))])
+@pytest.mark.parametrize(
+    "effect",
+    [TransportDelay(jnp.asarray(5e-4)), pytest.param(SensorLowpass(jnp.asarray(5e-4)), marks=pytest.mark.study)],
+)
 def test_derivatives_along_the_driver_go_through_what_comes_after(effect, rng):
     baseline = baseline_of(rng)
     p = len(baseline.z)
@@ -215,6 +222,7 @@ def test_a_delay_and_a_lag_are_told_apart_by_as_much_as_is_predicted(rng):
     assert said == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.study
 def test_what_readings_at_jittering_instants_change_in_the_mean_is_followed(rng):
     """Many readings of SciPy's spline through the response, each at an instant of its own, and their mean."""
     baseline = replace(baseline_of(rng), blurred=True)

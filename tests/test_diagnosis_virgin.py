@@ -62,6 +62,7 @@ def test_samples_known_whatever_was_before():
     assert known_samples(voltage_V / 2 + 10, 0.0, 100.0, "negative").all()
 
 
+@pytest.mark.study
 def test_a_coordinate_at_its_bound_holds_no_other_back(rng):
     baseline = baseline_of(rng)
     bench, truth_um = Bench(baseline), 0.03

@@ -286,7 +286,7 @@ def test_second_modes_are_sought_wherever_samples_show_them():
         assert at_Hz.max() < 450
 
 
-@pytest.mark.parametrize("mains_Hz", [50, 60])
+@pytest.mark.parametrize("mains_Hz", [50, pytest.param(60, marks=pytest.mark.study)])
 def test_lines_that_samples_turn_into_a_drift_are_left_out(mains_Hz, rng):
     """How often each line seems to go round is counted at the samples, for mains as slow and fast as they come."""
     hum = BY_NAME["mains_hum", f"{mains_Hz}_Hz"](jnp.ones(3), jnp.ones(3), jnp.asarray(float(mains_Hz)))

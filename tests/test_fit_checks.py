@@ -77,6 +77,7 @@ def test_readings_of_a_coarse_sensor_and_a_backlash_are_not_stuck(slow):
     assert told_stuck(coarse) == []
 
 
+@pytest.mark.study
 def test_outliers_are_counted_and_the_robust_loss_gets_past_them(slow, rng):
     spoilt, hit = with_outliers(rng, slow)
     result = fit(spoilt)

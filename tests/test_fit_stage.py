@@ -192,6 +192,7 @@ def test_a_voltage_beyond_the_fitted_range_is_refused(fitted):
         fitted.predict(Record(time, np.where(time < 0.05, 0.0, 130.0), None, source="prog.csv"))
 
 
+@pytest.mark.study
 def test_slow_runs_alone_do_not_show_the_dynamics(rng):
     time = np.arange(2400) / 100.0
     voltage = 60 - 60 * np.cos(2 * np.pi * 0.25 * time)

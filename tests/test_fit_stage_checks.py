@@ -86,6 +86,7 @@ def test_a_fast_run_sampled_below_its_resonance_is_refused(runs):
         fit(slow, thinned(fast, 37))
 
 
+@pytest.mark.study
 def test_times_in_ms_are_told_by_the_resonance(runs):
     result = fit(*map(in_ms, runs))
     assert "in ms instead of s" in said(result, "another unit")
@@ -94,6 +95,7 @@ def test_times_in_ms_are_told_by_the_resonance(runs):
         assert 0.995 * result[name].lower < value < 1.005 * result[name].upper
 
 
+@pytest.mark.study
 def test_outliers_are_named_and_the_intervals_reach_the_truth(runs, rng):
     slow, fast = runs
     spoilt, hit = with_outliers(rng, fast)

@@ -123,6 +123,7 @@ def test_a_record_at_rest_has_finite_derivatives(rng):
         np.testing.assert_allclose(matrix(forward), matrix(reverse), rtol=0, atol=1e-11)
 
 
+@pytest.mark.study
 def test_float32_gradients_of_many_models_and_many_voltages_at_once(rng):
     """Single precision and two nested vmaps below a gradient, against one double precision Jacobian at a time."""
     models = [jax.tree.map(lambda x: np.asarray(x, np.float32), random_model(rng)) for _ in range(2)]

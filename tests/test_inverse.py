@@ -133,6 +133,7 @@ def spread_references(rng, model):
     return play(model, voltage_V)[0]
 
 
+@pytest.mark.study
 def test_both_modes_agree_with_central_differences(rng):
     model = random_model(rng, levels=4)
     at = (model, spread_references(rng, model))

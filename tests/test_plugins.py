@@ -229,6 +229,7 @@ def integrated(rate_V_per_um_s, samples, wanted_um=2.0):
     return errors
 
 
+@pytest.mark.study
 def test_a_controller_is_one_file_and_is_run_and_swept(copy):
     (copy / "microid/control/integrator.py").write_text(textwrap.dedent(CONTROLLER).lstrip())
     rows = [f"{k * 1e-3},{2.0 if k else 0.0}" for k in range(20)]

@@ -171,6 +171,7 @@ def test_a_list_may_hold_words(seed):
         parsed(listed, rows=b"fit.initial,fit.levels\npositive,5.5\n")
 
 
+@pytest.mark.study
 def test_numbers_of_levels_out_of_bounds_fail_as_rows(seed):
     found = compute_chunk(parsed(text(seed, LEVELS.format(levels=[5, 64]))), 0)
     assert found.reasons[0] == ""

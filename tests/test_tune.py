@@ -224,6 +224,7 @@ def test_loops_that_are_unstable_and_limits_that_cannot_be_kept_are_refused(tune
             fits.tune_controller(**given)
 
 
+@pytest.mark.study
 def test_an_integral_controller_of_a_gain_is_that_of_the_closed_form(rng):
     """Without inertia a step leaves `(1 - k)^n`, and the gain margin is `2 / k`: one of 4 wants `k` to be a half."""
     gain = rng.uniform(0.05, 0.5)
