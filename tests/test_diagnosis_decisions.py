@@ -111,9 +111,15 @@ def test_an_extended_stage_has_what_all_runs_share():
 
 def test_what_is_fitted_must_go_both_ways():
     there = np.linspace(0, 10, 500)
-    loop = Record(np.arange(1000.0), np.r_[there, there[::-1]], np.zeros(1000))
-    assert _covered([loop], 0.2)
+    loop, twice = (
+        Record(np.arange(k * 1000.0), np.tile(np.r_[there, there[::-1]], k), np.zeros(k * 1000)) for k in (1, 2)
+    )
+    assert _covered([twice], 0.2)
+    assert _covered([loop, twice], 0.2)
+    # Half of the way back says nothing of the other half, which is not known to be as it was on the way there.
+    assert not _covered([loop], 0.2)
     assert not _covered([loop], 0.5)
+    assert _covered([loop], 0.0)
     assert not _covered([Record(np.arange(500.0), there, np.zeros(500))], 0.0)
     # The other way may be in another run.
     back = Record(np.arange(500.0), there[::-1], np.zeros(500))

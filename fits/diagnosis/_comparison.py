@@ -53,7 +53,10 @@ def compare_rivals(
     misfit unless it predicts better.
     """
     before, first = projector.held_out(model.change_um), len(model.laws)
-    fits = [(one, refit_beside(bench, projector, model, one)) for one in _leaders(scores)]
+    fits = list[tuple[Scored, Refit]]()
+    for one in _leaders(scores):
+        if not fits or has_time():
+            fits.append((one, refit_beside(bench, projector, model, one)))
     least = min(found.cost for _, found in fits)
     chance_z = thresholds.chance_z
     noise = [found for _, found in fits if found.is_noise(projector, chance_z)]

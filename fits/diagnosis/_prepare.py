@@ -39,11 +39,11 @@ _CLOSED = (
     "a controller held the displacement, and what bends a loop cannot be told from a density there, which is asked "
     "only along the way that it took"
 )
-# Part of its range through which the voltage goes up, and down, in what is fitted.
+# Part of the samples held out at voltages through which it goes both ways in what is fitted.
 _HALF = 0.5
 ONE_WAY = (
-    "nothing was held out, since the voltage goes through its range both ways only in what would have been: the gain "
-    "is not measured"
+    "nothing was held out, since most of that would have been at voltages through which the rest does not go both "
+    "ways, where no fit predicts anything: the gain is not measured"
 )
 _RUNS: dict[Hold, tuple[str, str]] = {"smooth": ("along curves", _CURVES), "zero": ("held in steps", _STEPS)}
 
@@ -207,11 +207,20 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:
-    """Whether the voltage goes both ways through much of its range in what is not held out."""
-    parts = [record.voltage_V[: len(record) - round(fraction * len(record))] for record in records]
-    span_V = float(np.ptp(np.concatenate([record.voltage_V for record in records])))
-    moves_V = np.concatenate([np.diff(part) for part in parts])
-    return min(float(moves_V[moves_V > 0].sum()), -float(moves_V[moves_V < 0].sum())) > _HALF * span_V
+    """Whether most of what is held out is at voltages through which the rest goes up and down; of all, if nothing."""
+    kept = [len(record) - round(fraction * len(record)) for record in records]
+    parts = [record.voltage_V[:stop] for record, stop in zip(records, kept, strict=True)]
+    asked = [record.voltage_V[stop if fraction else 0 :] for record, stop in zip(records, kept, strict=True)]
+    inside = np.ones(sum(map(len, asked)), dtype=bool)
+    for way in (1, -1):
+        steps = [way * np.diff(part) > 0 for part in parts]
+        passed_V = np.concatenate(
+            [part[np.r_[step, False] | np.r_[False, step]] for part, step in zip(parts, steps, strict=True)]
+        )
+        if len(passed_V) == 0:
+            return False
+        inside &= (np.concatenate(asked) >= passed_V.min()) & (np.concatenate(asked) <= passed_V.max())
+    return float(np.mean(inside)) > _HALF
 
 
 def _probed(bench: Bench, scales: Scales, projector: Projector) -> tuple[list[Probe], list[tuple[str, str]]]:
