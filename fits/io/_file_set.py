@@ -13,7 +13,7 @@ from typing import overload
 from fits.io._errors import AnyPath, DataError, reason_of
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
-_DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 
 
 def usable_folder(path: AnyPath, option: str) -> tuple[Path, Path]:
@@ -232,7 +232,7 @@ class FileSet:
         for each in self._all():
             if f"{name}{os.sep}".startswith(f"{each.staged}{os.sep}"):
                 return each.refused(error)
-        if error.errno in _DISK_TROUBLE and self._all():
+        if error.errno in DISK_TROUBLE and self._all():
             first = self._all()[0]
             return _Move(None, first.target, first.shown).refused(error)
         return None
