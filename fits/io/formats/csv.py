@@ -152,4 +152,4 @@ def _is_unit(cell: str) -> bool:
     return cell.strip(" []()") in ("", "-", "1", "%") or known_unit(f"x[{cell.strip(' []()')}]") is not None
 
 
-CSV = register(Format("a CSV file", (".csv", ".txt", ".dat", ".asc", ".tsv"), (), open_csv))
+register(Format("a CSV file", (".csv", ".txt", ".dat", ".asc", ".tsv"), (), open_csv))
