@@ -76,10 +76,10 @@ def test_what_a_worker_cannot_read_refuses_that_worker(monkeypatch):
 
     monkeypatch.setattr("distributed.get_worker", lambda: type("Worker", (), {"name": "w", "address": "tcp://w:1"}))
     monkeypatch.setattr(_cluster, "_sweep", full)
-    answer = _cluster.work(_cluster._Payload("", "", {}, "", "", _cluster.versions()), 0)
-    assert answer.rows is None
-    assert "worker w on" in answer.refused
-    assert "No space left" in answer.refused
+    address, refused = _cluster.work(_cluster._Payload("", "", {}, "", "", _cluster.versions()), 0)
+    assert address == "tcp://w:1"
+    assert "worker w on" in refused
+    assert "No space left" in refused
 
 
 @pytest.mark.study

@@ -241,11 +241,6 @@ def stage_or_preisach(path: str, loaded: "late.ModelFile") -> "late.Preisach | l
     raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
 
 
-def hysteresis(model: "late.Preisach | late.Stage") -> "late.Preisach":
-    """The hysteresis of a model, as slow voltages see it."""
-    return late.static_equivalent(model) if isinstance(model, late.Stage) else model
-
-
 def predicted_by(path: str, loaded: "late.ModelFile", program: "late.Record", initial: str) -> "late.Prediction":
     """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
     model = stage_or_preisach(path, loaded)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from fits.control._export_c import export_c
     from fits.control._gains import read_gains
     from fits.control._make import Loop, Maker
-    from fits.control._setup import held, setup
+    from fits.control._setup import setup
     from fits.control._tune_problem import Goal, passed_limits
     from fits.diagnosis._diagnose import diagnose
     from fits.diagnosis._result import Diagnosis, Step
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from fits.plots._stage import plot_stage
     from fits.plots._sweep import plot_sweep
     from fits.report._control import control_json, describe_control
-    from fits.report._diagnosis import report_html
+    from fits.report._diagnosis import KINDS, report_html
     from fits.report._diagnosis_json import diagnosis_json
     from fits.report._fit import fit_report
     from fits.report._fit_words import describe

@@ -70,6 +70,6 @@ def _law(path: str) -> "late.Preisach":
     """The hysteresis of a model file, as slow voltages see it."""
     model = common.stage_or_preisach(path, late.load_model(path))
     try:
-        return common.hysteresis(model)
+        return late.static_equivalent(model)
     except DataError as error:
         raise DataError(f"{path}: {error}" if error.of_model else str(error)) from error

@@ -71,7 +71,7 @@ def compensate(given: common.Given) -> None:
         "clipped": int(found.clipped.sum()),
         "voltage_min_V": float(found.voltage_V.min()),
         "voltage_max_V": float(found.voltage_V.max()),
-        "offset_um": float(common.hysteresis(stage).offset_um),
+        "offset_um": float(late.static_equivalent(stage).offset_um),
         "error_max_um": float(off.max()),
         "error_max_within_reach_um": float(off[~found.clipped].max(initial=0.0)),
         "displacement_sd_median_um": None if sd_um is None else float(np.median(sd_um)),

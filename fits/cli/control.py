@@ -133,8 +133,8 @@ def control(given: common.Given) -> None:
             longest = f"the reference's {wanted.time_s[-1]:g} s"
             raise DataError(f"--skip: expected less than {longest}, found {given.skip:g} s.")
         count = given.plants or (1 if loaded.uncertainty is None else 4)
-        nominal = late.held(plant) if isinstance(plant, late.Stage) else plant
-        stages = [late.held(one) for one in late.draw_plants(nominal, loaded.uncertainty, count, seed=given.seed)]
+        plants = late.draw_plants(plant, loaded.uncertainty, count, seed=given.seed)
+        stages = [one.with_hold("zero") for one in plants]
         limits_of = {field: bound for name, field in _LIMITS.items() if (bound := getattr(given, name)) is not None}
         goal = late.Goal(given.effort, given.rate, **limits_of)
         rng = np.random.default_rng(given.seed)
@@ -153,7 +153,7 @@ def control(given: common.Given) -> None:
             )
         progress("run")
         heard = rng.normal(0, given.noise, len(wanted)) if given.noise else None
-        played = [loop.run(made.controller, heard, given.resolution_voltage, k) for k in range(len(loop.plants))]
+        played = [loop.run(made.controller, heard, given.resolution_voltage, one) for one in loop.plants]
         run = played[0]
         if not all(np.all(np.isfinite(one.error_um)) for one in played):
             raise DataError(f"{given.model}: the loop is unstable, its displacement has no bounds; lower --gains.")

@@ -118,8 +118,7 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
 
 def _lines(diagnosis: "late.Diagnosis") -> list[str]:
     """What a terminal shows: the verdict, the causes with their parameters, and the gain."""
-    found = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
-    lines = [f"{found[diagnosis.verdict]}; noise {diagnosis.noise_um:.3g} um, {diagnosis.noise_source}"]
+    lines = [f"{late.KINDS[diagnosis.verdict]}; noise {diagnosis.noise_um:.3g} um, {diagnosis.noise_source}"]
     for cause in diagnosis.causes:
         also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
         lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {cause.p_family:.1g}")

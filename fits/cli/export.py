@@ -23,7 +23,7 @@ def export(given: common.Given) -> None:
     late.start_jax()
     stage = common.stage_or_preisach(given.model, late.load_model(given.model))
     limits_V = common.parse_limits_V(given.limits)
-    made = late.export_c(common.hysteresis(stage), given.out, given.name, size=given.memory, limits_V=limits_V)
+    made = late.export_c(late.static_equivalent(stage), given.out, given.name, size=given.memory, limits_V=limits_V)
     files = [str(file) for file in made]
     # The inverse of mechanics needs the samples to come, which a controller does not have.
     static = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."

@@ -79,7 +79,7 @@ def compensate(
     if isinstance(model, Stage) and (plain := plain_of(model)) is not model:
         without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
         return _beside_effects(model, plain, reference, initial, without)
-    law = static_equivalent(model) if isinstance(model, Stage) else model
+    law = static_equivalent(model)
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":
         if not isinstance(model, Stage):

@@ -59,12 +59,14 @@ def gains_of(stage: Stage) -> tuple[float, float, float]:
     return ahead, behind, offset
 
 
-def static_equivalent(stage: Stage) -> Preisach:
+def static_equivalent(model: Preisach | Stage) -> Preisach:
     """Return the hysteresis between command and sensor, as slow commands see it: the static gains folded in.
 
     A `DataError` refuses a stage without a Preisach hysteresis, or with a static gain that is not positive.
     """
-    stage = plain_of(stage)
+    if isinstance(model, Preisach):
+        return model
+    stage = plain_of(model)
     law, (ahead, behind, offset_um) = hysteresis_of(stage), gains_of(stage)
     lower, upper = law.density.lower_V / ahead, law.density.upper_V / ahead
     weights = law.weights_um[np.tril_indices(law.density.levels)]

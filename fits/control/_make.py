@@ -71,12 +71,12 @@ class Loop:
         self,
         controller: m.AbstractController,
         noise_um: np.ndarray | None,
-        resolution_V: float | None = None,
-        plant: int = 0,
+        resolution_V: float | None,
+        plant: m.Stage,
     ) -> m.ControlledRun:
         return m.simulate_loop(
             controller,
-            self.plants[plant],
+            plant,
             jnp.asarray(self.ready.reference_um),
             feedforward_V=None if self.ready.feedforward_V is None else jnp.asarray(self.ready.feedforward_V),
             noise_um=None if noise_um is None else jnp.asarray(noise_um),

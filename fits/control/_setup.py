@@ -21,9 +21,8 @@ _FEWEST = 16
 
 @dataclass(frozen=True)
 class Setup:
-    """What a loop needs beside its controller: a held stage at rest where the reference begins; signals `(t,)`."""
+    """What a loop needs beside its stage and controller, at rest where the reference begins; signals `(t,)`."""
 
-    stage: Stage
     interval_s: float
     reference_um: np.ndarray
     feedforward_V: np.ndarray | None
@@ -31,11 +30,6 @@ class Setup:
     start: Start
     static_V: np.ndarray  # would hold the stage at the reference
     remarks: tuple[str, ...]
-
-
-def held(stage: Stage) -> Stage:
-    """The same stage under a zero-order hold of its command."""
-    return stage.with_hold("zero")
 
 
 def setup(
@@ -52,7 +46,7 @@ def setup(
     those of the model. A `DataError` says that the times are uneven or too few, that the stage cannot be stepped or
     inverted, or that the limits are not within the model's range.
     """
-    stage = held(as_stage(model))
+    stage = as_stage(model).with_hold("zero")
     interval = _interval_s(reference)
     try:
         sampled = SampledStage(stage, interval)
@@ -101,7 +95,7 @@ def setup(
             ahead_V, remarks = led.voltage_V, [*remarks, *led.remarks]
     start = Start(jnp.asarray(float(ahead_V[0])), memory)
     fed_V = None if feedforward == "none" else ahead_V
-    return Setup(stage, interval, wanted, fed_V, limits, start, static_V, tuple(remarks))
+    return Setup(interval, wanted, fed_V, limits, start, static_V, tuple(remarks))
 
 
 def _interval_s(reference: Reference) -> float:

@@ -23,6 +23,11 @@ class DataError(ValueError):
         super().__init__(without_middle(str(sentence)))
 
 
+def reason_of(error: Exception) -> str:
+    """Say why, as the system does."""
+    return str(getattr(error, "strerror", None) or error)
+
+
 def without_middle(sentence: str) -> str:
     """Leave out what a sentence has beyond 1,000 characters, in its middle."""
     return sentence if len(sentence) <= _SENTENCE else f"{sentence[: _SENTENCE - _END - 5]} ... {sentence[-_END:]}"

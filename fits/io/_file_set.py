@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
 
-from fits.io._errors import AnyPath, DataError
+from fits.io._errors import AnyPath, DataError, reason_of
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
-_DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 
 
 def usable_folder(path: AnyPath, option: str) -> tuple[Path, Path]:
@@ -63,11 +63,6 @@ def check_file(path: AnyPath, shown: str | None = None) -> Path:
     if mode is not None and not os.access(target, os.W_OK):
         raise DataError(f"{shown}: the file is write-protected; choose another name or allow writing.")
     return target
-
-
-def reason_of(error: Exception) -> str:
-    """Say why, as the system does."""
-    return str(getattr(error, "strerror", None) or error)
 
 
 @dataclass(frozen=True)
@@ -237,7 +232,7 @@ class FileSet:
         for each in self._all():
             if f"{name}{os.sep}".startswith(f"{each.staged}{os.sep}"):
                 return each.refused(error)
-        if error.errno in _DISK_TROUBLE and self._all():
+        if error.errno in DISK_TROUBLE and self._all():
             first = self._all()[0]
             return _Move(None, first.target, first.shown).refused(error)
         return None

@@ -12,7 +12,7 @@ from fits.io._open_table import open_table
 from fits.io._quantity import FloatArray, split_unit
 from fits.io._read_csv import likely_stroke, read_reference, read_table
 from fits.io._table import Table
-from fits.io._units import QUANTITIES, Source, known_quantity, parse_columns, recognise
+from fits.io._units import Source, known_quantity, known_unit, parse_columns, recognise
 
 # Names by which rigs call the columns of a record, whole and in small letters; a minus is for readings of a command.
 _LIKELY = {
@@ -82,7 +82,7 @@ def inspect_table(path: AnyPath) -> Inspection:
         values, use = found.get(name), uses.get(name, "")
         low, high = (None, None) if values is None else (float(values.min()), float(values.max()))
         problem = ", ".join(problems[name][::-1]) if name in problems else ""
-        channels.append(Channel(k, name, _unit(name), low, high, use, bool(use) and use not in known, problem))
+        channels.append(Channel(k, name, known_unit(name), low, high, use, bool(use) and use not in known, problem))
     pairs = [f"{column}={_spec(table, source)}" for column, source in sources.items() if column not in known]
     options = ["--columns", ",".join(pairs)] if pairs else []
     if any(source.column in holes for source in sources.values()):
@@ -108,17 +108,19 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
         if column in known or (column == "time_s" and table.interval_s is not None):
             continue
         fit = [
-            name for name in free if np.ptp(found[name]) > 0 and _unit(name) in (None, *known_quantity(column).powers)
+            name
+            for name in free
+            if np.ptp(found[name]) > 0 and known_unit(name) in (None, *known_quantity(column).powers)
         ]
         if column == "time_s":
             fit = [name for name in fit if np.all(np.diff(found[name]) > 0)]
         if fit:
             best = max(fit, key=lambda name: _score(name, column))
             free.remove(best)
-            guessed[column] = Source(best, _unit(best) or known_quantity(column).unit)
+            guessed[column] = Source(best, known_unit(best) or known_quantity(column).unit)
     both = known | guessed
     moved = guessed.get("displacement_um")
-    if moved and "voltage_V" in both and _unit(moved.column) is None:
+    if moved and "voltage_V" in both and known_unit(moved.column) is None:
         volts = known_quantity("voltage_V").convert(np.ptp(found[both["voltage_V"].column]), both["voltage_V"].unit)
         stroke = np.ptp(found[moved.column])
         lengths = ("um", "nm", "mm", "m")
@@ -131,12 +133,7 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
 def _score(name: str, column: str) -> int:
     stem = "_".join(split_unit(name)[0].lower().split())
     fits_name = re.fullmatch(_LIKELY[column], stem) is not None
-    return 4 * (_unit(name) is not None) + 2 * fits_name - (re.fullmatch(_READING, stem) is not None)
-
-
-def _unit(name: str) -> str | None:
-    unit = split_unit(name)[1]
-    return unit if any(unit in quantity.powers for quantity in QUANTITIES) else None
+    return 4 * (known_unit(name) is not None) + 2 * fits_name - (re.fullmatch(_READING, stem) is not None)
 
 
 def _spec(table: Table, source: Source) -> str:

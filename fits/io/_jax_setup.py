@@ -34,6 +34,12 @@ def start_jax() -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+def require_float64(what: str) -> None:
+    """Raise a `RuntimeError` where JAX is in single precision, in which `what` begins, as `sweeps need`."""
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(f'{what} float64: jax.config.update("jax_enable_x64", True)')
+
+
 def _cache_folder() -> Path | None:
     """Make the folder for compiled functions; None where there is none or it cannot be written to.
 

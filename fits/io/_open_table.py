@@ -26,7 +26,7 @@ def open_table(source: AnyPath | Any) -> Table:
     if not isinstance(source, str | os.PathLike):
         return _of_object(source)
     shown = os.fspath(source)
-    data = read_bytes(shown, _what(shown), MOST_CSV_BYTES)
+    data = read_bytes(shown, _format_of(shown, b"").name, MOST_CSV_BYTES)
     if data.startswith(b"\x1f\x8b") or shown.lower().endswith(".gz"):
         data = unpack(data, shown, MOST_CSV_BYTES)
     form = _format_of(shown, data)
@@ -51,10 +51,6 @@ def _format_of(path: str, data: bytes) -> Format:
     by_start = (form for form in FORMATS.values() if form.starts and data.startswith(form.starts))
     by_ending = (form for form in FORMATS.values() if ending in form.endings)
     return next(by_start, None) or next(by_ending, FORMATS[_CSV])
-
-
-def _what(path: str) -> str:
-    return _format_of(path, b"").name
 
 
 def _of_object(source: Any) -> ArrayTable:

@@ -120,7 +120,7 @@ def read_reference(
 ) -> Reference:
     """Read a displacement to follow: the columns `time_s` and `displacement_um`; see `read_table` for all else."""
     needed = ("time_s", "displacement_um")
-    read = KnownColumns.read(path, columns, needed, (), True, sample_rate_Hz, missing)
+    read = KnownColumns.read(path, columns, needed, (), sample_rate_Hz, missing)
     with np.errstate(all="ignore"):
         warnings = (*read.left_out, *read.odd_gaps())
     source = os.path.basename(read.table.path)
@@ -144,12 +144,11 @@ class KnownColumns:
         path: AnyPath | Any,
         columns: Mapping[str, str] | None,
         required: Sequence[str],
-        more: Sequence[str] = (),
-        alone: bool = False,
+        more: Sequence[str] | None = None,
         sample_rate_Hz: float | None = None,
         missing: str = "refuse",
     ) -> "KnownColumns":
-        """Read the required columns; of all others, or of `more` alone, those that are there. See `read_table`."""
+        """Read the required columns, and of all others, or of `more`, those that are there; see `read_table`."""
         table, columns = open_table(path), columns or {}
         if not (table.headed or columns):
             what = (
@@ -163,7 +162,7 @@ class KnownColumns:
         sources = find_sources(table.names, columns, needed, place)
         if interval_s is not None:
             sources.pop("time_s", None)
-        if alone:
+        if more is not None:
             sources = {name: sources[name] for name in (*required, *more) if name in sources}
         strict = {source.column for source in sources.values()}
         left_out: tuple[str, ...] = ()

@@ -10,7 +10,7 @@ import tomllib
 import zlib
 from typing import Any
 
-from fits.io._errors import AnyPath, DataError, shown
+from fits.io._errors import AnyPath, DataError, reason_of, shown
 
 # Each is many times what real files need, and fits in the memory of a small computer.
 MOST_CSV_BYTES = 512_000_000
@@ -37,8 +37,7 @@ def read_bytes(path: AnyPath, what: str, most: int) -> bytes:
     except (FileNotFoundError, NotADirectoryError):
         raise DataError(f"{name}: no such file; check the name and the folder.") from None
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise DataError(f"{name}: cannot be read ({reason}); check the name and the permissions.") from None
+        raise DataError(f"{name}: cannot be read ({reason_of(error)}); check the name and the permissions.") from None
 
 
 def read_text(path: AnyPath, what: str, most: int) -> str:
@@ -141,9 +140,14 @@ def _bounded(file: Any, name: str, most: int) -> bytes:
     while piece := file.read(1 << 20):
         pieces.append(piece)
         size += len(piece)
-        if size > most:
-            raise DataError(
-                f"{name}: expected at most {most / 1e6:,.0f} MB, unpacked if it is packed, found more; "
-                "split the file or name another."
-            )
+        refuse_large(name, size, most)
     return b"".join(pieces)
+
+
+def refuse_large(path: str, size: int, most: int = MOST_CSV_BYTES) -> None:
+    """Refuse more bytes than are read of a file, or unpacked from it."""
+    if size > most:
+        raise DataError(
+            f"{path}: expected at most {most / 1e6:,.0f} MB, unpacked if it is packed, found more; split the file or "
+            "name another."
+        )

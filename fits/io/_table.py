@@ -69,11 +69,9 @@ class ArrayTable(Table):
 
     @property
     def names(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the columns."""
         return tuple(self.arrays)
 
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
-        """Take what is finite; see `Table`."""
         columns, problems = {}, {}
         for name, array in self.arrays.items():
             good = np.isfinite(array)

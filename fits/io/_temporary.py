@@ -88,9 +88,8 @@ def _lives(pid: int, start: int) -> bool:
 def _started(pid: int) -> int | None:
     """Starting time of a process in the system's ticks; -1 if it has ended, None where it is not known."""
     try:
-        with open(f"/proc/{pid}/stat", "rb") as file:
-            # The second field is a name in brackets, which may hold anything.
-            fields = file.read().decode("ascii", "replace").rpartition(")")[2].split()
+        # The second field is a name in brackets, which may hold anything.
+        fields = Path(f"/proc/{pid}/stat").read_text("ascii", "replace").rpartition(")")[2].split()
         return -1 if fields[0] in ("Z", "X", "x") else int(fields[19])  # listed, but ended
     except (OSError, ValueError, IndexError):
         return None

@@ -40,7 +40,6 @@ class TextTable(Table):
     clocks: frozenset[str] = field(default_factory=frozenset)
 
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
-        """Parse all columns; see `Table`."""
         if next(self._lines(), None) is None:
             what = "expected rows of numbers below the header, found none; export again"
             raise self.error(what)
@@ -60,7 +59,7 @@ class TextTable(Table):
         """Leave out rows with an empty cell, or a NaN of some spelling; see `Table`."""
         lines, kept = io.StringIO(self.body, newline="\n").readlines(), []
         at = [i for i, name in enumerate(self.names) if name in strict]
-        for number, cells in self._rows():
+        for number, cells in self.rows():
             missing = any(cells[i].lower() in _MISSING for i in at if i < len(cells))
             kept.append(not missing)
             if missing:  # a blank line, so that those below keep their numbers
@@ -86,11 +85,7 @@ class TextTable(Table):
             if start and not text.lstrip(" ").startswith(("#", "%")):
                 yield number, text.removesuffix("\n")
 
-    def cells(self) -> Iterator[list[str]]:
-        """Cells of the rows."""
-        return (cells for _, cells in self._rows())
-
-    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Physical line numbers and cells; empty cells after the last column (trailing separators) are cut."""
         n = len(self.names)
         for number, text in self._lines():
@@ -153,7 +148,7 @@ class TextTable(Table):
         """Parse cell by cell, so that the first fault in the file can be named."""
         values: list[list[Any]] = [[] for _ in self.names]
         problems: dict[str, Problem] = {}
-        for line, cells in self._rows():
+        for line, cells in self.rows():
             if len(cells) != len(self.names):
                 raise self._wrong_length(line, len(cells))
             for name, column, cell in zip(self.names, values, cells, strict=True):
@@ -181,7 +176,7 @@ class TextTable(Table):
         return columns, problems
 
     def _first_problem(self, i: int) -> Problem:
-        found = ((line, self._number(cells[i])) for line, cells in self._rows())
+        found = ((line, self._number(cells[i])) for line, cells in self.rows())
         other = f"line {self.header_line + 1}", "a number that pandas does not read"
         return next(((f"line {line}", text) for line, text in found if isinstance(text, str)), other)
 
@@ -209,18 +204,13 @@ class TextTable(Table):
         expected = "a time stamp" if name in self.clocks else "a finite number"
         return data_error(self.path, f"expected {expected}, found {found}; {remedy}", f"line {line}", name)
 
-    def _first(self) -> str:
-        return f"the {'header' if self.headed else 'first row'} in {self.place()}"
-
     def _wrong_length(self, line: int, found: int) -> DataError:
         n = len(self.names)
         which = "missing" if found < n else "surplus"
         column = self.names[found] if found < n else self.names[-1]
         hint = " (decimal commas need ; or tab between cells)" if self.separator == "," and found > n else ""
-        what = (
-            f"expected {n} cells as in {self._first()}, found {found}; "
-            f"correct the {which} cells{hint} or remove the line"
-        )
+        first = f"the {'header' if self.headed else 'first row'} in {self.place()}"
+        what = f"expected {n} cells as in {first}, found {found}; correct the {which} cells{hint} or remove the line"
         return data_error(self.path, what, f"line {line}", column)
 
 

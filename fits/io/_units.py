@@ -52,9 +52,9 @@ def recognise(name: str) -> tuple[Quantity, str] | None:
     return None
 
 
-def known_unit(text: str) -> str | None:
-    """The unit that a cell states, such as `um` of `µm` or of `Micrometers`; None where it is no known one."""
-    unit = split_unit(f"x[{text}]")[1]
+def known_unit(name: str) -> str | None:
+    """The unit that a name ends in, such as `um` of `x[µm]` or of `x_Micrometers`; None where it is no known one."""
+    unit = split_unit(name)[1]
     return unit if any(unit in quantity.powers for quantity in QUANTITIES) else None
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._given import AnyRuns, holdout_given, records_given
+from fits.io._jax_setup import require_float64
 from fits.io._record import Record, refuse_repeats
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits.loop._design import Grid, columns_of
@@ -21,7 +22,7 @@ from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._prior import interpolation
 from fits.loop._result import FitResult, FitStatus, RunReport
-from fits.loop._run import Progress, Run, command_range_V, prepare_run, simulate_run
+from fits.loop._run import Progress, Run, command_range_V, prepare_run, resized, simulate_run
 from fits.loop._shapes import solve_shape
 from fits.loop._uncertainty import Uncertainty
 from fits.stats._metrics import WHITE
@@ -142,8 +143,7 @@ def check_fit(
     records: Sequence[Record], holdout: float | Sequence[Record], loss: str
 ) -> tuple[float, tuple[Record, ...], tuple[float, float]]:
     """Check what a fit is given; the fraction and the records held out, and the range of all voltages."""
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
+    require_float64("estimation needs")
     if loss not in LOSSES:
         raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
     fraction, aside = (float(holdout), ()) if isinstance(holdout, int | float) else (0.0, tuple(holdout))
@@ -214,9 +214,7 @@ def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Arr
     maxima = high - (high - first_V) * jnp.cumsum(above)[:-1]
     inner = jnp.stack([maxima, minima], axis=1).ravel()
     extremes = jnp.concatenate([low[None], inner, first_V[None]])
-    count = extremes.shape[0]
-    padded = jnp.concatenate([extremes, jnp.broadcast_to(first_V, (_SIZE - count,))])
-    return Staircase(padded, jnp.asarray(count, dtype=jnp.int32))
+    return resized(Staircase(extremes, jnp.asarray(len(extremes), dtype=jnp.int32)), _SIZE)
 
 
 def _residual(

@@ -162,6 +162,12 @@ class Moments(eqx.Module):
         """Keep only combinations of columns."""
         return Moments(basis.T @ self.gram @ basis, basis.T @ self.cross_um, self.energy_um2, self.count)
 
+    def reduced(self, size: int, answer: np.ndarray, follow: np.ndarray) -> "Moments":
+        """Keep the first `size` unknowns, the others being best at `answer - follow @ first`, of the shape `(p,)`."""
+        gram, cross = np.asarray(self.gram), np.asarray(self.cross_um)
+        beside, energy = gram[:size, size:], np.asarray(self.energy_um2) - cross[size:] @ answer
+        return Moments(gram[:size, :size] - beside @ follow, cross[:size] - beside @ answer, energy, self.count)
+
 
 @dataclass(frozen=True)
 class RunMean:
@@ -268,10 +274,4 @@ def _without_nuisance(sums: Moments, size: int) -> tuple[Moments, RunMean]:
     # A past that has ended before a block is not seen in it.
     inverse = np.linalg.pinv(block, rcond=1e-11, hermitian=True) / scale / scale[:, None]
     follow, answer = inverse @ gram[size:, :size], inverse @ cross[size:]
-    reduced = Moments(
-        gram[:size, :size] - gram[:size, size:] @ follow,
-        cross[:size] - gram[:size, size:] @ answer,
-        sums.energy_um2 - cross[size:] @ answer,
-        sums.count,
-    )
-    return reduced, RunMean(follow[-1], float(answer[-1]), float(sums.count))
+    return sums.reduced(size, answer, follow), RunMean(follow[-1], float(answer[-1]), float(sums.count))

@@ -65,7 +65,6 @@ class Uncertainty(AbstractUncertainty):
         return np.concatenate(out)[: len(run.record)]
 
     def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
-        """Predict the displacement of a voltage program; see `fits.predict`."""
         if not isinstance(model, Preisach):
             raise DataError("the uncertainty is that of a hysteresis, and the model is a stage: fit it again")
         range_V = float(model.density.lower_V), float(model.density.upper_V)

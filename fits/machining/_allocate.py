@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import NonlinearConstraint, minimize, nnls
 
 from fits.io._errors import DataError
+from fits.io._quantity import FloatArray
 from fits.machining._design import Design, lever_mm
 from fits.machining._gains import gain_model, gradient, hessian, inputs_of, twin
 from fits.machining._tolerances import check, check_independent, tolerances
@@ -18,7 +18,6 @@ Limit = Literal["three_sigma", "worst_case"]
 _POWERS: dict[Limit, int] = {"three_sigma": 2, "worst_case": 1}
 # Of the logarithms of errors over budgets, and of the optimality conditions, whose terms are parts of the cost.
 _SLACK, _STATIONARY = 1e-7, 1e-5
-_Vector = NDArray[np.float64]
 
 
 class AllocationError(RuntimeError):
@@ -134,29 +133,29 @@ def allocate(
 class _Problem:
     """In the logarithms of tolerances over the present ones; errors are in budgets."""
 
-    price: _Vector
-    effect: _Vector
-    lower: _Vector
-    upper: _Vector
+    price: FloatArray
+    effect: FloatArray
+    lower: FloatArray
+    upper: FloatArray
     power: int
 
-    def terms(self, logarithm: _Vector) -> _Vector:
+    def terms(self, logarithm: FloatArray) -> FloatArray:
         return (np.abs(self.effect) * np.exp(logarithm)) ** self.power
 
-    def excess(self, logarithm: _Vector) -> _Vector:
+    def excess(self, logarithm: FloatArray) -> FloatArray:
         """Logarithm of each error over its budget."""
         return np.log(self.terms(logarithm).sum(axis=1)) / self.power
 
-    def shares(self, logarithm: _Vector) -> _Vector:
+    def shares(self, logarithm: FloatArray) -> FloatArray:
         """Derivative of `excess`."""
         terms = self.terms(logarithm)
         return terms / terms.sum(axis=1, keepdims=True)
 
-    def log_cost(self, logarithm: _Vector) -> tuple[float, _Vector]:
+    def log_cost(self, logarithm: FloatArray) -> tuple[float, FloatArray]:
         each = self.price * np.exp(-logarithm)
         return float(np.log(each.sum())), -each / each.sum()
 
-    def solve(self) -> tuple[_Vector, dict[int, float]]:
+    def solve(self) -> tuple[FloatArray, dict[int, float]]:
         """The minimum, and the multipliers of the constraints that hold it."""
         # All tolerances alike, as large as the worst error lets them be.
         start = np.full_like(self.lower, -max(self.excess(np.zeros_like(self.lower))))

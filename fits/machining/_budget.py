@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 import microid as m
 from fits.control._compensate_stage import static_equivalent
 from fits.io._errors import DataError
+from fits.io._jax_setup import require_float64
 from fits.machining._design import Design
-from fits.machining._gains import once_per_function, quick_jit, require_float64
+from fits.machining._gains import once_per_function, quick_jit
 from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import derivatives_of, output_scale, refuse_infinite
 
@@ -141,7 +142,7 @@ def budget(
     A `DataError` says that the model does not move, is a stage without hysteresis, or measures a rotation at no arm,
     a `RuntimeError` that JAX is not in double precision.
     """
-    require_float64("budgets")
+    require_float64("budgets need")
     if arm_mm is not None and not (math.isfinite(arm_mm) and arm_mm > 0):
         raise DataError(f"expected an arm above 0 mm, found {arm_mm:g}; give the distance from the axis of rotation.")
     driving = _driving(design, model, measures, arm_mm)
@@ -155,7 +156,7 @@ def budget(
 
 def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, arm_mm: float | None) -> Driving:
     """Driving error in um of the piezo."""
-    law = static_equivalent(model) if isinstance(model, m.Stage) else model
+    law = static_equivalent(model)
     lower_V, upper_V = float(law.density.lower_V), float(law.density.upper_V)
     # The largest error is a maximum, where a step this small changes it by a millionth of the loop.
     rise = np.linspace(lower_V, upper_V, 1001)

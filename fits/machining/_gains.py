@@ -32,12 +32,6 @@ def once_per_function(axes: Iterable[m.Axis], compute: Callable[[m.Axis], Any]) 
     return {axis: dataclasses.replace(found[twin(axis)], axis=axis) for axis in axes}
 
 
-def require_float64(what: str) -> None:
-    """Raise a `RuntimeError` where JAX is not in double precision."""
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError(f'{what} need float64: jax.config.update("jax_enable_x64", True)')
-
-
 def check_axes(axes: Iterable[str]) -> None:
     """Raise a `DataError` for the first axis that does not exist."""
     for axis in axes:

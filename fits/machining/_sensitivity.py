@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import microid as m
 from fits.io._errors import DataError
+from fits.io._jax_setup import require_float64
 from fits.machining._design import Design, uniform_tolerance
 from fits.machining._gains import (
     check_axes,
@@ -20,7 +21,6 @@ from fits.machining._gains import (
     gains_of_few,
     once_per_function,
     quick_jit,
-    require_float64,
     twin,
 )
 from fits.machining._tolerances import tolerances
@@ -110,7 +110,7 @@ def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> Sensitivit
     erratum 6). A `DataError` says that the dimensions are such that no finite number comes out, a `RuntimeError` that
     JAX is not in double precision.
     """
-    require_float64("sensitivities")
+    require_float64("sensitivities need")
     chosen: Sequence[m.Axis] = (axes,) if isinstance(axes, str) else axes  # type: ignore[assignment]
     check_axes(chosen)
     return SensitivityReport(design.level, once_per_function(chosen, lambda axis: _of_axis(design, axis)))

@@ -7,8 +7,9 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from fits.io._errors import DataError
+from fits.io._jax_setup import require_float64
 from fits.machining._design import Design
-from fits.machining._gains import check_axes, require_float64
+from fits.machining._gains import check_axes
 from microid import DIMENSIONS, MOTIONS, Axis
 
 Distribution = Literal["normal", "uniform", "triangular"]
@@ -22,7 +23,7 @@ _MOMENTS: dict[Distribution, tuple[float, float]] = {
 
 def check(design: Design, axes: tuple[Axis, ...], distribution: str) -> None:
     """Refuse unknown axes and distributions, no tolerances at all, and draws that reach a dimension of zero."""
-    require_float64("tolerances")
+    require_float64("tolerances need")
     if distribution not in _MOMENTS:
         raise DataError(f"there is no distribution {distribution!r}: choose one of {', '.join(_MOMENTS)}")
     check_axes(axes or ("",))

@@ -46,9 +46,7 @@ def _svg(picture: Figure, prefix: str, words: str) -> str:
     """Write a figure as one `svg` element whose names do not meet those of other figures."""
     for axes in picture.axes:
         axes.tick_params(width=0.6, length=2.5, color=INK)
-        for spine in axes.spines.values():
-            spine.set_linewidth(0.6)
-            spine.set_color(INK)
+        axes.spines[:].set(linewidth=0.6, color=INK)
     for each in picture.findobj(Text):
         each.set_fontsize(8.5)
         if each.get_color() in ("black", "k"):

@@ -10,16 +10,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from fits.control._compensate_stage import static_equivalent
 from fits.io._errors import AnyPath
 from fits.io._record import Record
 from fits.loop._result import FitResult
-from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
+from fits.loop._run import command_range_V, prepare_run
 from fits.plots._runs import Drawn, held_out, loops, over_time
 from fits.plots._style import WIDE_in, label, legend, panels, save, verbatim
-from fits.stage._run import gain_ahead, hysteresis_of, residual_of
+from fits.stage._checks import speed_Hz
+from fits.stage._run import gain_ahead, residual_of
 from fits.stage._start import MeasuredResponse, measure_response
-from microid import AbstractLinear, Preisach, Stage
+from fits.stage._steps import hysteresis_alone
+from microid import AbstractLinear, Stage
 
 # How far beyond the measured frequencies the model's response is drawn.
 _BEYOND = 1.3
@@ -65,50 +66,23 @@ def plot_stage(
     ]
     fitted, predicted = drawn[: len(records)], drawn[len(records) :]
     pictures: dict[str, Figure] = {}
-    response = _measured(stage, runs[: len(records)], states, fraction)
-    if response is not None:
-        pictures["response"] = _response(stage, *response)
+    behind = float(stage.static_gain) / (gain or 1.0)
+    static_um = [behind * one for one in hysteresis_alone(stage, runs[: len(records)])]
+    found = [(run.record.source, measure_response(run, drive)) for run, drive in zip(runs, static_um, strict=False)]
+    if seen := [each for each in found if len(each[1].frequency_Hz)]:
+        # Of the run that shows the highest frequencies.
+        pictures["response"] = _response(stage, *max(seen, key=lambda each: _highest_Hz(each[1])))
     pictures["runs"] = over_time(fitted)
     if predicted:
         pictures["heldout"] = over_time(predicted)
-    pictures["loop"] = loops([min(fitted, key=lambda each: _speed_per_s(each.run.record))])
+    pictures["loop"] = loops([min(fitted, key=lambda each: speed_Hz(each.run.record))])
     return [save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
-
-
-def _speed_per_s(record: Record) -> float:
-    """Root mean square rate of a voltage over its range, per s."""
-    rate = np.diff(record.voltage_V) / np.diff(record.time_s)
-    return float(np.sqrt(np.mean(rate**2)) / np.ptp(record.voltage_V))
-
-
-def _measured(
-    stage: Stage, runs: Sequence[Run], states: Sequence[str], fraction: float
-) -> tuple[str, MeasuredResponse] | None:
-    """Frequency response behind the hysteresis, from the run that shows the highest frequencies."""
-    found = []
-    for run, state in zip(runs, states, strict=True):
-        response = measure_response(run, _static_um(stage, run.record, state, fraction))
-        if len(response.frequency_Hz):
-            found.append((run.record.source, response))
-    return max(found, key=lambda each: _highest_Hz(each[1]), default=None)
 
 
 def _highest_Hz(measured: MeasuredResponse) -> float:
     """The highest frequency that a run surely shows; that of its last line if it shows none surely."""
     sure = measured.frequency_Hz[measured.coherence > _COHERENT]
     return float((sure if len(sure) else measured.frequency_Hz).max())
-
-
-def _static_um(stage: Stage, record: Record, state: str, fraction: float) -> np.ndarray:
-    """Displacement that the stage would have without delay, shape `(n,)`."""
-    law = hysteresis_of(stage)
-    if isinstance(law, Preisach):
-        static = static_equivalent(stage)
-        range_V = float(static.density.lower_V), float(static.density.upper_V)
-        return simulate_run(static, prepare_run(record, range_V, state, fraction))
-    if law is None:
-        return float(stage.static_gain) * record.voltage_V
-    return float(stage.static_gain) * np.asarray(law(jnp.asarray(record.voltage_V)))
 
 
 def _linear(stage: Stage, frequency_Hz: np.ndarray) -> np.ndarray:

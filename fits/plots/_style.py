@@ -88,8 +88,7 @@ def save(picture: Figure, path: Path) -> Path:
     """Write a figure, whole or not at all."""
     for axes in picture.axes:
         axes.tick_params(labelsize=_FONT_pt, width=0.6, length=2.5)
-        for spine in axes.spines.values():
-            spine.set_linewidth(0.6)
+        axes.spines[:].set_linewidth(0.6)
     for text in picture.findobj(Text):
         text.set_fontsize(min(_FONT_pt, text.get_fontsize()))
     with atomic_path(path) as unfinished:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fits.io._errors import AnyPath
-from fits.plots._style import WIDE_in, figure, label, save, verbatim
+from fits.plots._style import WIDE_in, label, panels, save, verbatim
 from fits.sweeps._show import open_sweep, readable, summarise
 from fits.sweeps._store import about_of
 from fits.sweeps._types import DONE
@@ -54,8 +54,7 @@ def _parallel(path: Path, rows: _Rows) -> Path:
     columns = np.stack([*rows.swept.values(), rows.values], axis=1)[::every]
     low, high = columns.min(axis=0), columns.max(axis=0)
     scaled = (columns - low) / np.where(high > low, high - low, 1)
-    picture = figure(WIDE_in, _HIGH_in)
-    axes = picture.add_subplot()
+    picture, axes = panels(WIDE_in, _HIGH_in)
     colours = np.argsort(np.argsort(columns[:, -1])) / max(1, len(columns) - 1)
     for line, colour in zip(scaled, colours, strict=True):
         axes.plot(line, color=(colour, 0.25, 1 - colour), linewidth=0.4, alpha=0.6)
@@ -75,8 +74,7 @@ def _heat(path: Path, rows: _Rows, pair: tuple[str, str]) -> Path:
     total, *_ = np.histogram2d(x, y, bins=edges, weights=rows.values)
     with np.errstate(invalid="ignore"):
         mean = np.where(count > 0, total / np.maximum(count, 1), math.nan)
-    picture = figure(WIDE_in / 2, _HIGH_in)
-    axes = picture.add_subplot()
+    picture, axes = panels(WIDE_in / 2, _HIGH_in)
     corners = [10**ends if log else ends for ends, log in zip(edges, logs, strict=True)]
     drawn = axes.pcolormesh(*corners, mean.T, cmap="viridis")
     axes.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")

@@ -24,7 +24,7 @@ from fits.report._words import (
     sigmas,
 )
 
-_KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
+KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
 
 
 def report_html(diagnosis: Diagnosis) -> str:
@@ -57,7 +57,7 @@ def report_html(diagnosis: Diagnosis) -> str:
         length=length,
         ahead=ahead,
         style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
-        kind=_KINDS[diagnosis.verdict],
+        kind=KINDS[diagnosis.verdict],
         sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
         tiles=_tiles(diagnosis, length),
         residuals=residuals(diagnosis, length.per_um, length.unit),

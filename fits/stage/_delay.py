@@ -8,7 +8,7 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.loop._design import columns_of
-from fits.loop._misfit import Misfit, misfits, outlying
+from fits.loop._misfit import Misfit, outlying
 from fits.loop._result import FitResult
 from fits.loop._run import Run
 from fits.stage._moments import along, linearise, pieces
@@ -121,10 +121,6 @@ class WithoutDelays:
 
     delays: tuple[Delay, ...]
     solved: Solved
-
-    def left(self) -> list[Misfit]:
-        """What stays of each run without its delay."""
-        return misfits(self.solved.runs, self.solved.residuals_um)
 
     def words(self) -> str:
         """Say what the columns of the runs look like."""

@@ -84,7 +84,7 @@ def fit_stage(
     progress("looking for delays")
     undelayed = fit_without_delays(found.plan, solved, found.precision, left)
     # What is sampled too slowly may look late; a delay is believed that leaves little else.
-    if undelayed is None or any(one.far for one in undelayed.left()):
+    if undelayed is None or any(one.far for one in misfits(undelayed.solved.runs, undelayed.solved.residuals_um)):
         refuse_undersampled(solved.stage, runs, left)
     if undelayed is not None and (found.failure is not None or simplified):
         raise undelayed.refused()

@@ -62,8 +62,8 @@ def fit_response(data: ResponseData, modes: int = 2, band_Hz: _Band = None, coup
     variance = np.full(gain.shape, np.mean(np.abs(gain) ** 2)) if known is None else known[band]
     # Without plays every pair of input and output is a response of its own to the same poles.
     wanted, variance = (values.reshape(len(gain), 1, -1) for values in (gain, variance))
-    drive = np.ones((len(gain), 1, 1), dtype=complex)
-    spectra = _spectra(frequency, drive, wanted, variance, coupled)
+    drive = jnp.ones((len(gain), 1, 1), dtype=complex)
+    spectra = _Spectra(jnp.asarray(frequency), drive, jnp.asarray(wanted), jnp.asarray(variance), coupled)
     found = _fit(_start(spectra, gain, modes), spectra, known is not None)
     model, sd = (_reshaped(modes, gain.shape[1:]) for modes in (found.model, found.sd))
     return ModalFit(model, sd, found.covariance, found.misfit, found.band_Hz)
@@ -96,8 +96,8 @@ def fit_hysteresis(
     drive = np.stack([with_plays(jnp.asarray(v), jnp.asarray(threshold)) for v in voltage])
     lines = np.rint(frequency[band] * samples * record.interval_s).astype(int)
     drive = np.moveaxis(np.fft.rfft(drive, axis=1)[:, lines] / samples, 1, 0)
-    wanted = np.mean(y, axis=2)[band]
-    spectra = _spectra(frequency[band], drive, wanted, variance, coupled)
+    wanted = jnp.asarray(np.mean(y, axis=2)[band])
+    spectra = _Spectra(jnp.asarray(frequency[band]), jnp.asarray(drive), wanted, jnp.asarray(variance), coupled)
     # Solved for first of all, so what they start from does not matter.
     zero = jnp.zeros((len(modes.damping_ratio), y.shape[3], drive.shape[2]))
     modes = Modes(modes.natural_frequency_Hz, modes.damping_ratio, zero, zero, zero[0], modes.delay_s)
@@ -143,7 +143,7 @@ class _Spectra(eqx.Module):
 
     def eliminated(self, model: Modes | HystereticModes) -> tuple[Float[Array, "p n"], Float[Array, "p b m"]]:
         """Residuals under the best gains, and these gains. The Jacobian of the former is that of Kaufman (1975)."""
-        basis = _basis(_modes(model), self.coupled)(self.frequency_Hz)
+        basis = _basis(_modes(model), self.coupled, self.frequency_Hz)
         column = basis[:, None, :, None] * self.drive[:, :, None, :]
         column = column.reshape(*column.shape[:2], 1, -1)
         design = jax.vmap(self._white, -1, -1)(jnp.broadcast_to(column, (*self.wanted.shape, column.shape[-1])))
@@ -160,23 +160,17 @@ class _Spectra(eqx.Module):
         return scaled.reshape(scaled.shape[0], -1)
 
 
-def _spectra(frequency_Hz: Any, drive: Any, wanted: Any, variance: Any, coupled: bool) -> _Spectra:
-    return _Spectra(
-        jnp.asarray(frequency_Hz), jnp.asarray(drive), jnp.asarray(wanted), jnp.asarray(variance), coupled=coupled
-    )
-
-
 def _modes(model: Modes | HystereticModes) -> Modes:
     return model if isinstance(model, Modes) else model.modes
 
 
-def _basis(modes: Modes, coupled: bool) -> Any:
+def _basis(modes: Modes, coupled: bool, frequency_Hz: Float[Array, " f"]) -> Complex[Array, "f b"]:
     """Responses to one gain after the other, shape `(f, b)`: of the modes, in quadrature if coupled, and residual."""
     k = modes.damping_ratio.shape[0]
     one = jnp.eye((2 * k if coupled else k) + 1, dtype=modes.damping_ratio.dtype)[:, :, None]
     quadrature = one[k : 2 * k] if coupled else jnp.zeros_like(one[:k])
     unit = Modes(modes.natural_frequency_Hz, modes.damping_ratio, one[:k], quadrature, one[-1], modes.delay_s)
-    return lambda frequency_Hz: unit.frequency_response(frequency_Hz)[..., 0]
+    return unit.frequency_response(frequency_Hz)[..., 0]
 
 
 def _with_gains(model: _M, gains: Float[Array, "p b m"], coupled: bool) -> _M:

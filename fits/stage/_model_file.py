@@ -38,10 +38,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
-import jax
 
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import AnyPath, DataError
+from fits.io._jax_setup import require_float64
 from fits.io._model_text import SCHEMA, hash_of, pretty, read_model_text
 from fits.io._version import written_by
 from fits.loop._design import Grid
@@ -115,8 +115,7 @@ def load_model(path: AnyPath) -> ModelFile:
     A `DataError` says that the file cannot be read, is of another version, was changed after it was written, or makes
     no sense, and a `RuntimeError` that JAX computes in single precision.
     """
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError('model files hold float64: jax.config.update("jax_enable_x64", True)')
+    require_float64("model files hold")
     name = os.fspath(path)
     content = read_model_text(name)
     again = "write the file again with 'microid fit'"

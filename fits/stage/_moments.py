@@ -221,10 +221,4 @@ def split_moments(total: Moments, size: int, damping: float) -> tuple[Moments, n
     block = gram[size:, size:]
     block = block + damping * np.diag(np.diagonal(block)) + 1e-14 * np.trace(block) * np.eye(len(block))
     answer, follow = np.linalg.solve(block, cross[size:]), np.linalg.solve(block, gram[size:, :size])
-    reduced = Moments(
-        gram[:size, :size] - gram[:size, size:] @ follow,
-        cross[:size] - gram[:size, size:] @ answer,
-        np.asarray(total.energy_um2) - cross[size:] @ answer,
-        total.count,
-    )
-    return reduced, answer, follow
+    return total.reduced(size, answer, follow), answer, follow

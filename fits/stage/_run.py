@@ -148,14 +148,10 @@ def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
     return total
 
 
-def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: float | None = None) -> Float[Array, " m"]:
-    """Voltage at a part after a rest at the first command, or at another, at the refined times, in V, `(m,)`."""
-    return _ahead(stage, place, samples, samples.voltage_V[0] if rest_V is None else jnp.asarray(rest_V))
-
-
 @eqx.filter_jit
-def _ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""]) -> Float[Array, " m"]:
-    signal = m.Signal(samples.voltage_V, rest_V, stage.hold)
+def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""] | None = None) -> Float[Array, " m"]:
+    """Voltage at a part after a rest at the first command, or at another, at the refined times, in V, `(m,)`."""
+    signal = m.Signal(samples.voltage_V, samples.voltage_V[0] if rest_V is None else rest_V, stage.hold)
     for part in stage.parts[:place]:
         signal = part.run(samples.time_s, signal)
     return signal.values
@@ -171,7 +167,7 @@ def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
     if not place or initial != "unknown":
         return everything
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.
-    rests_V = run.lower_V / run.gain, run.upper_V / run.gain
+    rests_V = (jnp.asarray(end_V / run.gain) for end_V in (run.lower_V, run.upper_V))
     low_V, high_V = (np.asarray(ahead(stage, place, run.samples, rest))[:: run.stride][:n] for rest in rests_V)
     begun = int(np.argmax(np.abs(high_V - low_V) < 1e-3 * (run.upper_V - run.lower_V)))
     settled = np.arange(n) >= begun

@@ -42,7 +42,6 @@ class StageUncertainty(AbstractUncertainty):
     grid: Grid | None
 
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
-        """Standard deviation of the predicted displacement of a run, shape `(n,)`."""
         stage = _stage(model)
         chain = Chain.of(stage, self.grid)
         mean = np.asarray(self.mean_um)
@@ -55,7 +54,6 @@ class StageUncertainty(AbstractUncertainty):
         return np.sqrt(square + float(self.discrepancy_um) ** 2)
 
     def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
-        """Predict the displacement of a voltage program; see `fits.predict`."""
         stage, run = prepare_program(_stage(model), record, initial)
         return Prediction(simulate_stage(stage, run), self.sd_um(stage, run))
 

@@ -36,15 +36,6 @@ class _Payload:
     versions: dict[str, str]
 
 
-@dataclass(frozen=True)
-class _Answer:
-    """A chunk, or why this worker cannot compute it."""
-
-    worker: str
-    rows: Rows | None
-    refused: str = ""
-
-
 @contextmanager
 def connected(address: str) -> Iterator[Any]:
     """Connect to a scheduler by its address, or to N processes of this machine by `local:N`, and give its client."""
@@ -104,7 +95,7 @@ def on_cluster(
             for future in ready:
                 chunk = futures.pop(future)
                 try:
-                    answer: _Answer = future.result()
+                    worker, found = future.result()
                 except (distributed.KilledWorker, ImportError) as error:
                     losses[chunk] += 1
                     if losses[chunk] > _MOST_LOSSES:
@@ -113,11 +104,11 @@ def on_cluster(
                     continue
                 finally:
                     future.release()
-                if answer.rows is None:
-                    workers.ban(answer.worker, answer.refused)
+                if isinstance(found, str):
+                    workers.ban(worker, found)
                     waiting.append(chunk)
                 else:
-                    yield chunk, answer.rows
+                    yield chunk, found
     except (OSError, distributed.client.FuturesCancelledError, distributed.CancelledError) as error:
         raise DataError(
             f"--cluster: the scheduler was lost ({type(error).__name__}); what was computed is kept: start it again, "
@@ -178,8 +169,8 @@ def _often(chunk: int, error: Exception) -> str:
     )
 
 
-def work(payload: _Payload, chunk: int) -> _Answer:
-    """Compute a chunk; this runs on a worker."""
+def work(payload: _Payload, chunk: int) -> tuple[str, Rows | str]:
+    """Compute a chunk; this runs on a worker, whose address comes back, with the reason where it cannot."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -187,11 +178,11 @@ def work(payload: _Payload, chunk: int) -> _Answer:
     mine = versions()
     for package, version in payload.versions.items():
         if mine.get(package) != version:
-            return _Answer(worker.address, None, f"{name} has {package} {mine.get(package)}, and {version} is needed")
+            return worker.address, f"{name} has {package} {mine.get(package)}, and {version} is needed"
     try:
-        return _Answer(worker.address, compute_chunk(_sweep(payload), chunk))
+        return worker.address, compute_chunk(_sweep(payload), chunk)
     except (DataError, OSError, ImportError) as error:
-        return _Answer(worker.address, None, f"{name} cannot compute ({type(error).__name__}: {error})")
+        return worker.address, f"{name} cannot compute ({type(error).__name__}: {error})"
 
 
 def _sweep(payload: _Payload) -> Sweep:

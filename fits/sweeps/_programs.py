@@ -98,10 +98,8 @@ class Program:
         return np.asarray(self.signal({}, given), dtype=np.float64)
 
 
-def read_program(table: Any, name: str, unit: str, load: Callable[[str], bytes]) -> Program:
+def read_program(table: Mapping[str, Any], name: str, unit: str, load: Callable[[str], bytes]) -> Program:
     """Read the table `[program]` or `[reference]` of a sweep; a `DataError` says what is wrong with it."""
-    if not isinstance(table, dict):
-        raise DataError(f"{name}: expected a table, found {shown(table)}; write [{name}] and its keys below.")
     shape = one_of(SHAPES, table.get("shape", "file" if "file" in table else None), f"{name}.shape", "choose one.")
     nominal = {f"offset_{unit}": 0.0, "gain": 1.0}
     if shape != "file":

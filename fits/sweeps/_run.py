@@ -7,10 +7,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 
 from fits.io._atomic import atomic_path
+from fits.io._jax_setup import require_float64
 from fits.sweeps._chunks import chunk_count, compute_chunk, rows_of
 from fits.sweeps._packages import need
 from fits.sweeps._spec import Sweep
@@ -67,8 +67,7 @@ def run_sweep(
     A `DataError` says that the folder, the disk or the cluster does not allow it, a `RuntimeError` that JAX computes
     in single precision. Rows that fail do not raise: they are kept with the reason.
     """
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError('sweeps need float64: jax.config.update("jax_enable_x64", True)')
+    require_float64("sweeps need")
     began = time.monotonic()
     need("pyarrow")
     with ExitStack() as stack:

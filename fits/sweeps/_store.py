@@ -20,7 +20,7 @@ import numpy as np
 
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import DataError
-from fits.io._file_set import flush, usable_folder
+from fits.io._file_set import DISK_TROUBLE, flush, usable_folder
 from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
 from fits.io._temporary import is_temporary
 from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of
@@ -32,8 +32,7 @@ SCHEMA = "microid.sweep.results/1"
 ABOUT, RESULTS, LEDGER, TEXT, TABLE = "about.json", "results.zarr", "ledger", "sweep.toml", "results.parquet"
 _STATUS = Output("status", "1", "of the row: 0 pending, 1 done, 2 failed", dtype="i1")
 # What the user can do something about: a full or a broken disk, permissions, and folders that are gone.
-_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
-_TROUBLE |= {errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR}
+_TROUBLE = DISK_TROUBLE | {errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR}
 
 
 class _About(TypedDict):

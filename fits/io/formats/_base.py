@@ -24,7 +24,6 @@ class Format:
 FORMATS: dict[str, Format] = {}
 
 
-def register(form: Format) -> Format:
+def register(form: Format) -> None:
     """Make a format known."""
     FORMATS[form.name] = form
-    return form

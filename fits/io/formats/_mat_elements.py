@@ -5,7 +5,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 
-from fits.io.formats.hdf5 import refuse_large
+from fits.io._read_file import refuse_large
 
 # Bytes of a number of each type of data; 16 to 18 are characters. Matrices and what is packed have their own types.
 _BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}

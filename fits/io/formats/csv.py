@@ -3,6 +3,7 @@
 import io
 import itertools
 import re
+from dataclasses import replace
 
 from fits.io._table import MOST_COLUMNS, Table, data_error, with_unit
 from fits.io._text_table import TextTable, is_clock, looks_numeric, split_cells
@@ -30,7 +31,7 @@ def open_csv(path: str, data: bytes) -> Table:
     if not separator:
         k, separator, units = _header(lines)
     number, start, line = lines[k]
-    names = cut(split_cells(line, separator))
+    names = _names(line, separator)
     if all(looks_numeric(name) or is_clock(name) for name in names):
         numbered = tuple(str(i) for i in range(1, len(names) + 1))
         return checked(TextTable(path, numbered, number - 1, separator, text[start:], None, False))
@@ -57,20 +58,11 @@ def open_csv(path: str, data: bytes) -> Table:
 
 def checked(table: TextTable) -> TextTable:
     """A table of which it is known which columns are time stamps, and end so in the unit s."""
-    first = next(table.cells(), [])
+    _, first = next(table.rows(), (0, []))
     clocks = {name for name, cell in zip(table.names, first, strict=False) if is_clock(cell)}
     names = tuple(with_unit(name, "s") if name in clocks and table.headed else name for name in table.names)
-    clocks = {new for old, new in zip(table.names, names, strict=True) if old in clocks}
-    return TextTable(
-        table.path,
-        names,
-        table.header_line,
-        table.separator,
-        table.body,
-        table.interval_s,
-        table.headed,
-        frozenset(clocks),
-    )
+    timed = frozenset(new for old, new in zip(table.names, names, strict=True) if old in clocks)
+    return replace(table, names=names, clocks=timed)
 
 
 def decode(path: str, data: bytes) -> str:
@@ -125,7 +117,7 @@ def _header(lines: list[_Line]) -> tuple[int, str, bool]:
     """
     for i in range(len(lines)):
         separator = _separator(lines[i][2])
-        rows = [cut(split_cells(line, separator)) for _, _, line in lines[i : i + _ENOUGH]]
+        rows = [_names(line, separator) for _, _, line in lines[i : i + _ENOUGH]]
         if not all(len(row) == len(rows[0]) and _numeric(row) for row in rows):
             continue
         width, first = len(rows[0]), i
@@ -157,7 +149,7 @@ def _numeric(cells: list[str]) -> bool:
 
 
 def _is_unit(cell: str) -> bool:
-    return cell.strip(" []()") in ("", "-", "1", "%") or known_unit(cell.strip(" []()")) is not None
+    return cell.strip(" []()") in ("", "-", "1", "%") or known_unit(f"x[{cell.strip(' []()')}]") is not None
 
 
-CSV = register(Format("a CSV file", (".csv", ".txt", ".dat", ".asc", ".tsv"), (), open_csv))
+register(Format("a CSV file", (".csv", ".txt", ".dat", ".asc", ".tsv"), (), open_csv))

@@ -4,9 +4,8 @@ import io
 from collections.abc import Iterator
 from typing import Any
 
-from fits.io._errors import DataError
 from fits.io._packages import need
-from fits.io._read_file import MOST_CSV_BYTES
+from fits.io._read_file import refuse_large
 from fits.io._table import Found, Table, gathered
 from fits.io.formats._base import Format, register
 
@@ -35,15 +34,6 @@ def _found(path: str, file: Any, h5py: Any) -> Iterator[Found]:
                 each[()],
                 unit.decode() if isinstance(unit, bytes) else unit if isinstance(unit, str) else None,
             )
-
-
-def refuse_large(path: str, size: int) -> None:
-    """Refuse what unpacks to more than is read of any file."""
-    if size > MOST_CSV_BYTES:
-        raise DataError(
-            f"{path}: expected at most {MOST_CSV_BYTES / 1e6:,.0f} MB, unpacked if it is packed, found more; split "
-            "the file or name another."
-        )
 
 
 register(Format("an HDF5 file", (".h5", ".hdf5", ".hdf", ".nxs"), (b"\x89HDF\r\n\x1a\n",), open_hdf5))

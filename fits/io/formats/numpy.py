@@ -5,9 +5,9 @@ import zipfile
 
 import numpy as np
 
+from fits.io._read_file import refuse_large
 from fits.io._table import ArrayTable, Table, gathered
 from fits.io.formats._base import Format, register
-from fits.io.formats.hdf5 import refuse_large
 
 _NPY = b"\x93NUMPY"
 

@@ -72,7 +72,7 @@ class FitJob(AbstractJob):
         """What is known before it runs."""
         outputs = list(_OUTPUTS)
         if self.options.weights:
-            size = len(_packed(self.options.levels or 0)[0])
+            size = len(np.tril_indices(self.options.levels or 0)[0])
             outputs.append(Output("weights_um", "um", "weights of Eq. 9, packed row by row", (("weight", size),)))
         parameters = [*self.records.parameters, Parameter("fit.holdout", "1", self.options.holdout, 0.0, 0.9)]
         parameters.append(choice("fit.initial", INITIAL_STATES, self.initial))
@@ -149,7 +149,7 @@ def _alone(record: Record, levels: int | None, holdout: float, initial: str) -> 
         "noise_um": result.noise_um,
         "loops_um": float(weights.sum()),
         "levels": len(weights),
-        "weights_um": weights[_packed(len(weights))],
+        "weights_um": weights[np.tril_indices(len(weights))],
     }
     for start, figures in (("", run.in_sample), ("heldout_", run.held_out)):
         if figures is not None:
@@ -165,16 +165,11 @@ def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[An
         return fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
 
     found = in_turn(regress, *rows) if jax.default_backend() == "cpu" else regress(*map(place, rows))
-    packed = _packed(levels)
+    packed = np.tril_indices(levels)
     weights = np.asarray(found.columns_um)[:, : len(packed[0])] * node_areas(levels)[packed]
     same = {name: np.asarray(getattr(found, name)) for name in ("offset_um", "noise_um", "predicted_um", "success")}
     numbers = np.full(len(weights), float(levels))
     return same | {"loops_um": weights.sum(axis=1), "levels": numbers, "weights_um": weights}
-
-
-def _packed(levels: int) -> tuple[NDArray[np.int64], ...]:
-    """Places of the weights in their square array, row by row."""
-    return tuple(np.tril_indices(levels))
 
 
 def _errors(measured: FloatArray, predicted: FloatArray, samples: Any, known: Any) -> tuple[float, float]:
