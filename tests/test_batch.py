@@ -37,6 +37,7 @@ def test_rows_are_those_of_stages_by_themselves(rng, hold, shared):
         np.testing.assert_allclose(found[row], alone, rtol=0, atol=1e-11)
 
 
+@pytest.mark.study
 def test_rows_may_differ_in_the_offset_alone(rng):
     stages, voltage = stages_of(rng, 1, "first", True), jnp.asarray(rng.uniform(0, 100, (2, 20)))
     offsets = jnp.asarray(rng.uniform(-1, 1, 2))

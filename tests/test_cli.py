@@ -278,6 +278,7 @@ def test_double_precision_is_on(bench):
     assert np.any(values.astype(np.float32).astype(float) != values)
 
 
+@pytest.mark.study
 def test_a_name_is_shown_as_it_is_whatever_is_in_it(bench, tmp_path):
     """A formula for Matplotlib, a command for a terminal, a tag, and a byte that is no character."""
     folder, _, _ = bench

@@ -288,6 +288,7 @@ def test_choices_in_the_help_are_those_of_the_library():
     assert sorted(kinds) == sorted(m.CONTROLLERS)
 
 
+@pytest.mark.study
 def test_a_loop_that_rings_beyond_a_limit_between_its_samples_is_refused(tmp_path):
     # Read every second period, a light resonance seems to stand still.
     natural_Hz, interval_s, step_um = 200.0, 0.01, 5.0

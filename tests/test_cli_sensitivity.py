@@ -25,6 +25,7 @@ def stage(tmp_path):
     return path
 
 
+@pytest.mark.study
 def test_the_papers_stage_is_ranked_and_compared_with_the_papers_words(tmp_path):
     result = run("sensitivity", "--json", tmp_path / "s.json")
     assert result.exit_code == 0, result.stderr

@@ -166,6 +166,7 @@ def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(m
     ]
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("gain", "before_um"), [pytest.param(0.1, 0.5, marks=pytest.mark.study), (0.0, 30.0)])
 def test_a_settling_mount_is_no_creep_from_before(rng, gain, before_um):
     constant_s = float(rng.uniform(3, 8))

@@ -16,11 +16,9 @@ from fits.diagnosis import _effects
 from fits.diagnosis._effects import drop_programs
 from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
 from fits.diagnosis._score import Family, Probe, evidence, score
-from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stage._motion import pass_signal
-from fits.stats._noise import Noise, learn_noise, quantum_um
+from fits.stats._noise import Noise, learn_noise
 from fits.stats._noise_spectrum import band_of
-from fits.stats._sensor_noise import floor_of, jitter_s, spikes
 from microid import EFFECTS, AbstractPart, Scene, Signal
 
 WHITE = np.zeros(0)
@@ -168,72 +166,6 @@ def test_noise_behind_noise_is_whitened_by_both(rng):
     first, second = Noise(0.5, np.array([0.6])), Noise(3.0, np.array([-0.3, 0.2]))
     values = rng.standard_normal(500)
     np.testing.assert_allclose(first.followed_by(second).whiten(values), second.whiten(first.whiten(values)))
-
-
-def floor_in(voltage_V, residual_um, rate_Hz=1000.0):
-    used = np.ones(len(voltage_V), dtype=bool)
-    return floor_of(voltage_V, residual_um, used, rate_Hz, 0.01, 1e-9, THRESHOLDS.apart_z, THRESHOLDS.minor_share)
-
-
-def spikes_in(voltage_V, residual_um):
-    return np.flatnonzero(spikes(voltage_V, residual_um, 0.0, THRESHOLDS.spike_z))
-
-
-def test_the_floor_is_read_off_idle_stretches(rng):
-    voltage = np.concatenate([np.linspace(0, 100, 1000), np.full(1000, 100.0), np.linspace(100, 0, 1000)])
-    left = 0.05 * rng.standard_normal(3000) + 2 * np.sin(np.arange(3000) / 30) * (np.arange(3000) % 2000 < 1000)
-    floor = floor_in(voltage, left)
-    assert floor.idle
-    assert floor.noise.total_um == pytest.approx(0.05, rel=0.15)
-
-
-def test_spikes_are_found_and_ringing_is_not(rng):
-    time = np.arange(4000) / 1000
-    ringing = 0.5 * np.exp(-(time % 1.0) / 0.05) * np.sin(2 * np.pi * 100 * time)
-    left = 0.02 * rng.standard_normal(4000) + ringing
-    assert len(spikes_in(np.sin(time), left)) == 0
-    where = 300 + 400 * np.arange(8)
-    left[where] += rng.choice([-1, 1], 8) * rng.uniform(0.6, 3.0, 8)
-    assert set(spikes_in(np.sin(time), left)) == set(where)
-    # By chance, one has another close by.
-    left[where[::3] + 7] += 1.0
-    assert set(spikes_in(np.sin(time), left)) == {*where, *(where[::3] + 7)}
-
-
-def test_a_last_digit_is_found_and_noise_has_none(rng):
-    values = 20 * np.sin(np.arange(6000) / 300) + 0.01 * rng.standard_normal(6000)
-    assert quantum_um(values) == 0
-    assert quantum_um(np.round(values / 0.076) * 0.076) == pytest.approx(0.076, rel=1e-3)
-
-
-def test_jitter_is_noise_that_grows_with_the_speed(rng):
-    time = np.arange(20_000) / 1000
-    speed = 500 * np.cos(2 * np.pi * time)
-    quiet = 0.02 * rng.standard_normal(len(time))
-    _, z, most = jitter_s(quiet, speed, 0.0, THRESHOLDS.apart_z)
-    assert z < 8
-    assert most < 0.5e-4
-    size, z, most = jitter_s(quiet + 1e-4 * speed * rng.standard_normal(len(time)), speed, 0.0, THRESHOLDS.apart_z)
-    assert z > 8
-    assert size == pytest.approx(1e-4, rel=0.25)
-    assert most > 1e-4
-
-
-def test_hum_is_no_part_of_the_floor(rng):
-    mains = rng.choice([50.0, 60.0]) * (1 + rng.uniform(-1e-3, 1e-3))
-    voltage = np.concatenate([np.linspace(0, 100, 1000), np.full(3000, 100.0)])
-    noise = 0.05 * rng.standard_normal(4000)
-    # Sampled at 70 Hz, hum is a line of another frequency.
-    for rate in (1000.0, 70.0):
-        time = np.arange(4000) / rate
-        left = (
-            noise
-            + 0.3 * np.sin(2 * np.pi * mains * time + rng.uniform(0, 6))
-            + 0.1 * np.cos(4 * np.pi * mains * time)
-        )
-        found = floor_in(voltage, left, rate).noise
-        assert found.total_um == pytest.approx(0.05, rel=0.2)
-    assert floor_in(voltage, noise).noise.total_um == pytest.approx(0.05, rel=0.15)
 
 
 def narrow(rng, frequency_Hz, quality, rate_Hz, n):

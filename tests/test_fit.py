@@ -110,7 +110,7 @@ def test_an_unknown_past_is_estimated(rng):
     assert any("late.csv: the first" in remark for remark in found.remarks)
 
 
-@pytest.mark.parametrize("family", ["mixture", pytest.param("network", marks=pytest.mark.study)])
+@pytest.mark.parametrize("family", [pytest.param(name, marks=pytest.mark.study) for name in ("mixture", "network")])
 def test_other_families_reach_the_noise(bench, family):
     train, heldout = records(bench)
     found = fits.fit([train], holdout=[heldout], family=family, levels=LEVELS, starts=3, initial="negative", seed=1)

@@ -180,6 +180,7 @@ def test_second_derivatives_agree_with_differences_of_the_first(rng):
     np.testing.assert_allclose(curved, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.study
 def test_derivatives_at_rests_and_ends_are_finite(rng):
     model = random_model(rng, levels=4)
     lowest_um, highest_um = ends_um(model)

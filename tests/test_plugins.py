@@ -134,6 +134,7 @@ def test_a_hysteresis_law_and_an_effect_are_one_file_each_and_are_saved_and_read
     assert [float(row[2]) for row in rows] == pytest.approx([1.5, 4.5, 3.0])
 
 
+@pytest.mark.study
 def test_a_column_is_one_file_and_an_effect_uses_it(copy):
     save = SAVE.replace("wrong_gain", "swelling").replace("spring.json", "swelling.json")
     rows = "time_s,voltage_V,{}\n0,0,30\n1,8,40\n2,4,50\n"

@@ -44,6 +44,7 @@ def test_steps_and_tips_keep_their_corners(rng):
         np.testing.assert_allclose(curves(values, 4), np.interp(fine, np.arange(len(values)), values), atol=1e-9)
 
 
+@pytest.mark.study
 def test_a_stage_under_a_smooth_command(rng):
     natural, damping, lag, interval = 2 * np.pi * rng.uniform(150, 250), 0.05, 4e-4, 1e-3
     swept = rng.uniform(300, 400)

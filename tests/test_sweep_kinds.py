@@ -79,6 +79,7 @@ def closed_loop(stage, integral, proportional, samples, interval_s, wanted_um):
     return np.array(errors)
 
 
+@pytest.mark.study
 def test_closed_loops_agree_with_a_loop_of_scipy_and_relays(rng):
     chosen = rng.uniform(20, 200, 3), rng.uniform(0, 0.5, 3)
     sweep = parsed(CONTROL.format(integral=chosen[0].tolist(), proportional=chosen[1].tolist()))

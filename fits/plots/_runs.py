@@ -43,11 +43,11 @@ def loops(runs: Sequence[Drawn]) -> Figure:
     picture, axes = _columns(runs, style.NARROW_in if len(runs) == 1 else style.WIDE_in)
     for each, (loop, error) in zip(runs, axes.T, strict=False):
         voltage, known = each.run.record.voltage_V, each.run.known
-        # Nested loops lie close together, so the lines are thinner than elsewhere.
-        style.curve(loop, voltage, each.run.displacement_um, "measured", **style.MEASURED | {"linewidth": 1.1})
-        style.curve(loop, voltage, each.predicted_um, "model", **style.MODEL | {"linewidth": 0.3})
+        # Loops run over each other many times: lines of one kind would hide those of the other.
+        style.curve(loop, voltage, each.predicted_um, "model", color=style.LIGHT, linewidth=2.0)
+        style.dots(loop, voltage, each.run.displacement_um, "measured")
         error.axhline(0.0, color=style.LIGHT, linewidth=0.6)
-        style.curve(error, voltage[known], each.off_um[known], color=style.DARK, linewidth=0.25)
+        style.dots(error, voltage[known], each.off_um[known])
         style.label(error, "voltage (V)")
         style.label(loop, title=_caption(each.report))
     style.legend(picture, axes[:1, 0])

@@ -84,6 +84,12 @@ def curve(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "", **style: Any
     axes.plot(x[keep], y[keep], label=name, **style)
 
 
+def dots(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "") -> None:
+    """Draw samples, shape `(n,)`, as dots, of many every other or fewer."""
+    every = -(-len(x) // _POINTS) or 1
+    axes.plot(x[::every], y[::every], ".", label=name, color=DARK, markersize=1.2, markeredgewidth=0, rasterized=True)
+
+
 def save(picture: Figure, path: Path) -> Path:
     """Write a figure, whole or not at all."""
     for axes in picture.axes:
