@@ -161,6 +161,41 @@ def test_a_record_gives_its_response_and_its_variance(rng):
     assert np.mean(off / data.noise_variance_um2_per_V2) == pytest.approx(1, rel=0.3)
 
 
+def test_neighbouring_lines_are_fitted_together(rng):
+    parts = plant(rng)
+    # More noise than bias, which is left where the modes are sharp.
+    measured = record(rng, parts, realizations=8, noise=20.0)
+    learnt, tested = measured.take(slice(0, 5)), measured.take(slice(5, 8))
+    data = fits.estimate_response(learnt, 3)
+    off = np.abs(data.response_um_per_V - response(FREQUENCY_Hz, *state_space(*parts), DELAY_s)) ** 2
+    assert np.mean(off / data.variance_um2_per_V2) == pytest.approx(1, rel=0.3)
+    # One line by a plain regression on its own and the six around it.
+    k = int(rng.integers(3, len(LINES) - 3))
+    u, y = (
+        np.fft.rfft(x.mean(axis=1), axis=1)[:, LINES[k - 3 : k + 4]]
+        for x in (learnt.voltage_V, learnt.displacement_um)
+    )
+    away = np.tile(np.arange(-3, 4) / 3, 5)[:, None]
+    columns = np.concatenate([u.reshape(-1, 2) * away**power for power in range(3)], axis=1)
+    expected = np.linalg.lstsq(columns, y.reshape(-1, 2), rcond=None)[0][:2].T
+    np.testing.assert_allclose(data.response_um_per_V[k], expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+    alone, chosen = (fits.relative_error(fits.estimate_response(learnt, n), tested) for n in (0, None))
+    assert chosen < alone
+    with pytest.raises(fits.DataError, match="expected 0 to 94 neighbours for 190 lines, found 95"):
+        fits.estimate_response(learnt, 95)
+
+
+@pytest.mark.parametrize(("level_mV", "most"), [(100, 0.050), (300, 0.039)])
+def test_the_measured_mirror_without_a_model(level_mV, most):
+    path = DATA / f"fsm_cubespec_{level_mV}mV_train.csv"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not at hand: measured records are kept beside the repository")
+    measured = fits.read_multisine(path)
+    learnt, tested = measured.take(slice(0, 4)), measured.take(slice(4, 6))
+    alone, together = (fits.relative_error(fits.estimate_response(learnt, n), tested) for n in (0, None))
+    assert together < min(most, 0.8 * alone)
+
+
 def test_plays_are_recovered_and_win_on_held_out_realizations(rng):
     threshold_V = np.array([0.3, 1.0])
     weight = rng.uniform(0.1, 0.4, (2, 2))

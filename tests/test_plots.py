@@ -87,7 +87,7 @@ def test_several_runs_and_an_unknown_start(tmp_path, rng, model, monkeypatch):
 
     # Three of four runs side by side, values above errors; the curves lie within the noise of each other.
     assert len(drawn["loops"]) == 6
-    measured, fitted = drawn["loops"][0]
+    fitted, measured = drawn["loops"][0]
     assert len(measured) == 2000
     assert np.abs(measured[:, 1] - first.displacement_um).max() == 0
     assert np.abs(fitted[:, 1] - measured[:, 1]).max() < 6 * 0.05

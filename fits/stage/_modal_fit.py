@@ -104,14 +104,22 @@ def fit_hysteresis(
     return _fit(HystereticModes(modes, jnp.asarray(threshold)), spectra, True)
 
 
-def relative_error(model: Modes | HystereticModes, record: Multisine, band_Hz: _Band = None) -> float:
-    """Norm of what a model leaves of the averaged output spectra in a band, over their own norm."""
-    frequency, _, y = record.spectra()
+def relative_error(model: Modes | HystereticModes | ResponseData, record: Multisine, band_Hz: _Band = None) -> float:
+    """Norm of what a model leaves of the averaged output spectra in a band, over their own norm.
+
+    A measured response is one, too; a `DataError` if it is not of the lines of the record.
+    """
+    frequency, u, y = record.spectra()
     band, samples = _in_band(frequency, band_Hz, 0), record.voltage_V.shape[2]
+    wanted = np.mean(y, axis=2)[band]
+    if isinstance(model, ResponseData):
+        if len(model.frequency_Hz) != len(frequency) or not np.allclose(model.frequency_Hz, frequency):
+            raise DataError(f"{record.source}: expected the lines of the measured response; record the same program.")
+        found = np.einsum("fpm,frm->frp", model.response_um_per_V[band], np.mean(u, axis=2)[band])
+        return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
     voltage = np.mean(record.voltage_V, axis=1)
     moved = np.stack([model.respond_periodically(jnp.asarray(v), record.interval_s) for v in voltage])
     lines = np.rint(frequency[band] * samples * record.interval_s).astype(int)
-    wanted = np.mean(y, axis=2)[band]
     found = np.moveaxis(np.fft.rfft(moved, axis=1)[:, lines] / samples, 1, 0)
     return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
 
