@@ -125,18 +125,33 @@ def test_json_and_info_agree(bench, tmp_path):
     assert fit.stdout.split("\n\nmodel ")[0] in words.stdout
 
 
-def test_info_does_not_wait_for_jax(bench):
-    asked = "import sys; from fits.cli._main import main; sys.argv[1:] = ['info', sys.argv[1]]; main()"
+def without_jax(*arguments):
+    """Run a command, which prints at its end whether it loaded JAX."""
+    asked = "import sys; from fits.cli._main import main; sys.argv[0] = 'microid'; main()"
     loaded = "import atexit, sys; atexit.register(lambda: print('jax' in sys.modules))"
     done = subprocess.run(
-        [sys.executable, "-c", f"{loaded}; {asked}", bench[0] / "model.json"],
+        [sys.executable, "-c", f"{loaded}; {asked}", *map(str, arguments)],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=False,
     )
+    assert done.stdout.endswith("False\n"), done.stderr
+    return done
+
+
+def test_info_does_not_wait_for_jax(bench):
+    done = without_jax("info", bench[0] / "model.json")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.endswith("\nFalse\n")
+
+
+@pytest.mark.parametrize("command", ["fit", "diagnose"])
+def test_what_cannot_be_read_is_refused_without_jax(command, tmp_path):
+    bad = tmp_path / "bad.csv"
+    bad.write_text("time_s,voltage_V,displacement_um\n0,1,2\n1,x,3\n")
+    done = without_jax(command, bad, "--out", tmp_path / "out.json")
+    assert done.returncode == 2
+    assert "bad.csv, line 3, column 'voltage_V'" in done.stderr
 
 
 @pytest.mark.parametrize("step", ["loop._fit.fit", "plots._loop.plot_fit", "stage._model_file.model_text"])

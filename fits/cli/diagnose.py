@@ -62,10 +62,11 @@ def diagnose(given: common.Given) -> None:
         common.refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
     # Before the work, so that a place that cannot be written to is refused before the wait.
     usable_folder(given.out, "--out")
-    late.start_jax()
-    progress = common.bar_to_stderr(given.quiet, tuple(late.Step))
     records = late.read_runs(given.runs, **how)
     aside = [late.read_table(file, **how) for file in files]
+    # Only now, so that what cannot be read is refused at once.
+    late.start_jax()
+    progress = common.bar_to_stderr(given.quiet, tuple(late.Step))
     diagnosis = late.diagnose(
         records,
         holdout=aside or fraction,

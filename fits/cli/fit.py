@@ -66,15 +66,8 @@ def fit(given: common.Given) -> None:
     The files are runs of one rig, with the columns time_s, voltage_V and displacement_um. A stage needs a slow run
     over the whole range, and one with steps, a chirp or a multisine beyond the resonance.
     """
-    late.start_jax()
-    estimate: Any
-    draw: Any
-    if given.model == "stage":
-        estimate, draw, asked = late.fit_stage, late.plot_stage, _for_stage(given)
-    elif given.lag or given.relaxations:
-        estimate, draw, asked = late.fit_slow, late.plot_stage, _for_slow(given)
-    else:
-        estimate, draw, asked = late.fit, late.plot_fit, _for_loop(given)
+    slow = given.model == "loop" and bool(given.lag or given.relaxations)
+    asked = _for_stage(given) if given.model == "stage" else _for_slow(given) if slow else _for_loop(given)
     initial = list(given.initial) if len(given.initial) > 1 else (given.initial or ("unknown",))[0]
     progress = common.progress_to_stderr(given.quiet)
     how = common.reading(given)
@@ -85,6 +78,15 @@ def fit(given: common.Given) -> None:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         records = late.read_runs(given.runs, **how)
         same = {"holdout": [late.read_table(file, **how) for file in files] or fraction, "initial": initial}
+        # Only now, so that what cannot be read is refused at once.
+        late.start_jax()
+        estimate: Any
+        draw: Any
+        if given.model == "stage":
+            estimate, draw = late.fit_stage, late.plot_stage
+            asked["stage"] = late.default_stage(_HOLDS[given.hold or "lines"])
+        else:
+            estimate, draw = (late.fit_slow, late.plot_stage) if slow else (late.fit, late.plot_fit)
         asked |= {"levels": given.levels, "loss": given.loss or "squares", "progress": progress}
         result = estimate(records, **same, **asked)
         report, drawn = late.fit_report(result), []
@@ -127,7 +129,7 @@ def _refuse_random(given: common.Given, where: str) -> None:
 
 
 def _for_stage(given: common.Given) -> dict[str, Any]:
-    """What `fit_stage` is asked for, beside what `fit` is too; what it cannot honour is refused."""
+    """Nothing that `fit` is not asked for; what the fit of a stage cannot honour is refused."""
     if given.lag or given.relaxations:
         raise DataError("--lag, --relaxation: a stage has a driver and mechanics that lag; leave them out.")
     _refuse_random(given, "of a stage")
@@ -136,4 +138,4 @@ def _for_stage(given: common.Given) -> dict[str, Any]:
             f"--initial: {len(given.initial)} states were given for {len(given.runs)} runs; give one for all, or one "
             "for each in their order."
         )
-    return {"stage": late.default_stage(_HOLDS[given.hold or "lines"])}
+    return {}
