@@ -1,6 +1,6 @@
 """Causes and the baseline fitted to each other by turns, beside what noise and roughness there is."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -79,17 +79,23 @@ def alternate(bench: Bench, projector: Projector, model: Refit, rounds: Sequence
     return bench, projector, model
 
 
-def refine(bench: Bench, projector: Projector, model: Refit) -> tuple[Bench, Projector, Refit, bool]:
+def refine(
+    bench: Bench, projector: Projector, model: Refit, has_time: Callable[[], bool]
+) -> tuple[Bench, Projector, Refit, bool]:
     """Refit the causes that were selected where the fits on the way were coarse, and say whether steps are many now.
 
     In turn: larger strengths, a density as rough and as smooth as it is beside the causes, many steps between
-    samples, strengths that ended at a bound, and a density that is nowhere negative.
+    samples, strengths that ended at a bound, and a density that is nowhere negative. Where it no longer `has_time`,
+    only the steps and the density are seen to.
     """
-    state = relearn_smoothness(*relearn_roughness(*try_larger_strengths(bench, projector, model)))
+    state = bench, projector, model
+    for improved in (try_larger_strengths, relearn_roughness, relearn_smoothness):
+        state = improved(*state) if has_time() else state
     model, finest = refine_steps(*state)
     # What is asked of the causes from here on is asked as they were fitted.
     bench, projector = Bench(state[0].baseline, finest=True) if finest else state[0], state[1]
-    return *keep_density_positive(*leave_bounds(bench, projector, model, finest), finest), finest
+    inside = leave_bounds(bench, projector, model, finest) if has_time() else (bench, projector, model)
+    return *keep_density_positive(*inside, finest), finest
 
 
 def try_larger_strengths(bench: Bench, projector: Projector, model: Refit) -> State:

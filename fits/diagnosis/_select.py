@@ -250,7 +250,7 @@ def _refined(best: Explanation, start: Explanation, search: Search) -> Selection
     plain, tie = start.model, search.thresholds.tie
     causes, model = _backward(best.bench, best.projector, list(best.causes), best.model, tie)
     explained = plain.cost - model.cost
-    bench, projector, model, finest = refine(best.bench, best.projector, model)
+    bench, projector, model, finest = refine(best.bench, best.projector, model, search.has_time)
     # One may have become unnecessary since.
     causes, model = _backward(bench, projector, causes, model, tie)
     # In the end the density is smoother and nowhere negative, which costs something by itself.
