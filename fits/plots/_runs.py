@@ -44,7 +44,7 @@ def loops(runs: Sequence[Drawn]) -> Figure:
     for each, (loop, error) in zip(runs, axes.T, strict=False):
         voltage, known = each.run.record.voltage_V, each.run.known
         # Loops run over each other many times: lines of one kind would hide those of the other.
-        style.curve(loop, voltage, each.predicted_um, "model", color=style.LIGHT, linewidth=2.0)
+        style.curve(loop, voltage, each.predicted_um, "model", color=style.LIGHT, linewidth=1.4)
         style.dots(loop, voltage, each.run.displacement_um, "measured")
         error.axhline(0.0, color=style.LIGHT, linewidth=0.6)
         style.dots(error, voltage[known], each.off_um[known])
