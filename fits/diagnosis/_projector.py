@@ -212,10 +212,11 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
 
     By a pivoted Cholesky factor of their Gram matrix, twice: the first time rounding leaves them a little askew.
     """
-    found = columns / (np.linalg.norm(columns, axis=0) + 1e-300)
     for _ in range(2):
-        found = found @ _inverse_root(found.T @ found)
-    return found
+        gram = columns.T @ columns
+        scale = 1 / (np.sqrt(np.diagonal(gram)) + 1e-300)
+        columns = columns @ (scale[:, None] * _inverse_root(scale[:, None] * gram * scale))
+    return columns
 
 
 def _inverse_root(gram: np.ndarray) -> np.ndarray:
@@ -230,8 +231,12 @@ def _inverse_root(gram: np.ndarray) -> np.ndarray:
 
 def along_all(projector: Projector, candidates: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     """Orthonormal columns, off the tangent, that span what candidates change in each run, shape `(rows, k)`."""
-    joined = [projector.join(candidate) for candidate in candidates]
-    return orthonormal(projector.off(np.stack(joined, axis=1))) if joined else np.zeros((len(projector.residual), 0))
+    joined = np.empty((len(projector.residual), len(candidates)))
+    for k, candidate in enumerate(candidates):
+        joined[:, k] = projector.join(candidate)
+    # In place: of long records these are hundreds of megabytes.
+    joined -= projector.orthonormal @ (projector.orthonormal.T @ joined)
+    return orthonormal(joined)
 
 
 def learn_roughness(
