@@ -129,7 +129,7 @@ def _refuse_random(given: common.Given, where: str) -> None:
 
 
 def _for_stage(given: common.Given) -> dict[str, Any]:
-    """Nothing that `fit` is not asked for; what the fit of a stage cannot honour is refused."""
+    """No further settings; what the fit of a stage cannot honour is refused."""
     if given.lag or given.relaxations:
         raise DataError("--lag, --relaxation: a stage has a driver and mechanics that lag; leave them out.")
     _refuse_random(given, "of a stage")

@@ -85,7 +85,7 @@ def curve(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "", **style: Any
 
 
 def dots(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "") -> None:
-    """Draw samples, shape `(n,)`, as dots, of many every other or fewer."""
+    """Draw samples, shape `(n,)`, as dots; of many some, evenly chosen."""
     every = -(-len(x) // _POINTS) or 1
     axes.plot(x[::every], y[::every], ".", label=name, color=DARK, markersize=1.2, markeredgewidth=0, rasterized=True)
 

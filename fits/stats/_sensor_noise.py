@@ -45,8 +45,8 @@ def floor_of(
     """Read the noise of a run off its idle stretches, or off the fastest changes of the residual where it is `used`.
 
     A stretch is idle once the stage has settled, which takes it `settling_s`. Neighbours that agree by less than
-    `same_z` standard deviations do so by chance, and hum is at least `hum_share` of the variance. No noise that is
-    not read off idle stretches is below `least_um`.
+    `same_z` standard deviations do so by chance, and hum is at least `hum_share` of the variance. Where nothing is
+    idle, the noise is `least_um` at least.
     """
     pieces = []
     for stretch in idle_stretches(voltage_V, round(settling_s * rate_Hz)):
