@@ -120,8 +120,8 @@ def _glide(hysteresis: Hysteresis, voltage_V: FloatArray, spacing_V: float) -> F
     sign = 1.0 if voltage_V[-1] >= voltage_V[0] else -1.0
     way = sign * (voltage_V - voltage_V[0])
     cells = np.floor(way / spacing_V)
-    asked = np.flatnonzero(np.diff(cells, prepend=-1.0, append=np.inf)[: len(way)])
-    asked = np.union1d(asked, [0, len(way) - 1])
+    asked = np.ones(len(way), bool)
+    asked[1:-1] = cells[1:-1] != cells[:-2]
     return np.interp(way, way[asked], hysteresis.glide(voltage_V[asked]))
 
 

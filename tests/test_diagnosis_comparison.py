@@ -204,6 +204,7 @@ def test_hum_raises_no_bar_for_what_the_command_makes(rng):
     assert found.causes[1].z < THRESHOLDS.model_error * found.causes[0].z
 
 
+@pytest.mark.study
 def test_no_cause_is_sought_once_the_time_is_over(rng):
     def plant(bench, entering_um):
         times = [np.asarray(one.run.record.time_s) for one in bench.prepared]

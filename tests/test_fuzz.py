@@ -212,6 +212,7 @@ def through_the_command(good, name, path, out):
     return judged(done.returncode, done.stdout, done.stderr, out)
 
 
+@pytest.mark.study
 def test_the_command_refuses_them_with_status_2_or_writes_finite_files(good, tmp_path, seed):
     names = np.random.default_rng(seed).permutation([name for name in sorted(good) if name not in NO_COMMAND])
     some = {name: good[name] for name in names[:COMMANDS].tolist()}

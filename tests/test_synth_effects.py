@@ -20,7 +20,7 @@ NOISE_UM = 0.03
 
 def bench(*effects, seed, **settings):
     """A small stage of 40 um."""
-    usual = {"slow_samples": 1000, "fast_samples": 1500, "holdout": False, "stroke_um": 40.0, "noise_um": NOISE_UM}
+    usual = {"slow_samples": 1000, "fast_samples": 1000, "holdout": False, "stroke_um": 40.0, "noise_um": NOISE_UM}
     usual |= {"kind": "plays", "roughness": 0.3, "plays": 60, "temperature": False, "other_axis": False}
     return ds.hidden(effects, seed=seed, **(usual | settings))
 
@@ -48,7 +48,7 @@ def test_a_command_held_in_steps_comes_half_a_sample_later(seed):
 
 @pytest.mark.parametrize("name", ALL)
 def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed):
-    hidden = bench(name, seed=seed, fast_samples=1000, rms_per_noise=3.0, temperature=name == "thermal_drift")
+    hidden = bench(name, seed=seed, rms_per_noise=3.0, temperature=name == "thermal_drift")
     plain = without(hidden)
     (truth,) = hidden.effects
     assert truth.name == name
