@@ -78,7 +78,7 @@ def asked(case, *names):
 
 def first_of(case, *names):
     model = nothing(case.bench, case.projector)
-    scores = score(case.projector, asked(case, *names), model.residual)
+    scores = score(case.projector, asked(case, *names), model.residual).each
     return compare_rivals(case.bench, case.projector, model, scores, 8)[0]
 
 
@@ -118,7 +118,8 @@ def test_a_loss_is_asked_about_from_its_own_sample_on(rng):
     [form] = (form for form in EFFECTS if form.name == "dropped_samples")
     probes = [list(probes_of(case.bench, form, case.scales, *also)) for also in ((), (case.projector,))]
     fixed, all_ = (
-        max(one.z for one in score(case.projector, p, nothing(case.bench, case.projector).residual)) for p in probes
+        max(one.z for one in score(case.projector, p, nothing(case.bench, case.projector).residual).each)
+        for p in probes
     )
     instants = [float(probe.effects[0].after_s) * RATE_HZ for probe in probes[1][len(probes[0]) :]]
     print(lost, instants, fixed, all_)
@@ -197,7 +198,7 @@ def test_hum_raises_no_bar_for_what_the_command_makes(rng):
 
     case = made(rng, plant)
     probes = asked(case, "mains_hum", "transport_delay")
-    plain = best_of(score(case.projector, probes, nothing(case.bench, case.projector).residual))
+    plain = best_of(score(case.projector, probes, nothing(case.bench, case.projector).residual).each)
     found = select(case.bench, case.projector, probes, 0.01, rng, lambda _: None)
     print({name: one.z for name, one in plain.items()}, [(cause.name, cause.z) for cause in found.causes])
     assert [cause.name for cause in found.causes] == ["mains_hum", "transport_delay"]

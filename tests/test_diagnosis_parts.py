@@ -94,7 +94,7 @@ def test_scores_are_standard_normal_where_there_is_nothing(rng):
     for _ in range(200):
         reg.residuals = tuple(rng.standard_normal(n) for n in (300, 400))
         projector = Projector(reg, noise)
-        (found,) = score(projector, [one], projector.off(projector.residual))
+        (found,) = score(projector, [one], projector.off(projector.residual)).each
         draws.append(found.z * np.sign(found.coefficients[0]))
     assert stats.kstest(draws, "norm").pvalue > 1e-4
 
@@ -113,7 +113,7 @@ def test_family_wise_probabilities_are_uniform_where_there_is_nothing(rng):
         projector = Projector(reg, noise)
         residual = projector.off(projector.residual)
         scored = score(projector, probes, residual)
-        found.append(Family(scored, rng).p(max(one.z for one in scored)))
+        found.append(Family(scored, rng).p(max(one.z for one in scored.each)))
     # One-sided tests that are all below zero give a probability of one.
     assert stats.binomtest(int(np.sum(np.array(found) < 0.05)), len(found), 0.05).pvalue > 1e-4
     assert stats.binomtest(int(np.sum(np.array(found) < 0.3)), len(found), 0.3).pvalue > 1e-4
@@ -229,7 +229,7 @@ def test_evidence_beside_a_misfit_is_worth_less(rng):
     for left, trusted in ((rng.standard_normal(n), True), (rng.standard_normal(n) + steps, False)):
         reg.residuals = (left + 0.5 * shape,)
         projector = Projector(reg, [Noise(1.0, WHITE)])
-        (found,) = score(projector, [probe([(shape,)])], projector.off(projector.residual))
+        (found,) = score(projector, [probe([(shape,)])], projector.off(projector.residual)).each
         assert found.z > 4
         assert (found.robust_z > 0.6 * found.z) == trusted
 

@@ -147,7 +147,7 @@ def ready(records, noise_um):
 
 def fitted(made, name):
     target = made.projector.off(made.projector.residual)
-    asked = score(made.projector, [probe for probe in made.probes if probe.name == name], target)
+    asked = score(made.projector, [probe for probe in made.probes if probe.name == name], target).each
     best = max(asked, key=lambda one: one.z)
     law = law_of(best, len(made.bench.prepared))
     return refit(made.bench, made.projector, [law], [law.start])

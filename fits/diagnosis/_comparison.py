@@ -9,7 +9,7 @@ from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State, fit_jointly
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
-from fits.diagnosis._score import Scored, best_of, improvement_z, rescore
+from fits.diagnosis._score import Scored, best_of, improvement_z, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from microid import EFFECTS, AbstractEffect
 
@@ -133,7 +133,7 @@ def _add_occurrences(
 
 
 def _one_more(bench: Bench, projector: Projector, model: Refit, scored: Sequence[Scored]) -> Refit:
-    left = rescore(scored, model.basis(), model.residual)
+    left = score(projector, [one.probe for one in scored], model.residual, model.basis()).each
     more = refit_beside(bench, projector, model, max(left, key=lambda one: one.z))
     return relocate(bench, projector, more, len(model.laws))
 

@@ -225,13 +225,12 @@ def bounds(found: Selection, ready: Prepared, left: Sequence[Scored], named: Col
     for name, one in best_of(left).items():
         if name in named:
             continue
-        size = float(np.linalg.norm(one.columns))
-        if size == 0:
+        if one.size == 0:
             out.append(Bound(name, 0.0, 1.0, np.nan, blind))
             continue
         # The largest multiple that would not have been noticed, by the size that it has in the displacement.
         raw = float(np.linalg.norm([_rms(column, found.first) for column in one.probe.signatures]))
-        bound = (one.z + TWO_SIDED_95) / size * raw
+        bound = (one.z + TWO_SIDED_95) / one.size * raw
         out.append(Bound(name, one.z, 1.0 - one.share_left, bound))
     asked = {bound.name for bound in out} | set(named)
     skipped = dict(ready.skipped).items()

@@ -109,7 +109,7 @@ class _Fit:
         """Decrease of that, or of what is `left` otherwise, by a delay, and the delay in s."""
         left = self.left if left is None else left
         form = next(form for form in EFFECTS if form.delay)
-        scores = score(self.projector, list(probes_of(self.bench, form, self.scales)), left)
+        scores = score(self.projector, list(probes_of(self.bench, form, self.scales)), left).each
         if not scores:
             return 0.0, 0.0
         best = max(scores, key=lambda one: one.drop)
@@ -145,7 +145,7 @@ class _Fit:
 
     def largest_z(self, left: np.ndarray | None = None) -> float:
         """Evidence of the effect that has most, in what is `left`."""
-        scores = score(self.projector, self.probed[0], self.left if left is None else left)
+        scores = score(self.projector, self.probed[0], self.left if left is None else left).each
         return max((one.z for one in scores), default=0.0)
 
 

@@ -17,6 +17,8 @@ from microid import AbstractEffect, Coordinates, Scales, host
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
+# Signatures that are projected at once.
+_AT_ONCE = 64
 # Stretches of held-out data that are taken to err by themselves.
 _BLOCKS = 24
 # Samples that are taken to err alike.
@@ -158,15 +160,15 @@ def one_sided(form: type[AbstractEffect]) -> bool:
 class Scored:
     """One probe, asked.
 
-    `columns` are its signatures off the baseline's tangent space, whitened and joined, shape `(rows, k)`, and
-    `coefficients` their best multiples, shape `(k,)`; `share_left` is the norm of the columns over that of the raw
-    signatures. `z` is the evidence in standard deviations, `drop` the decrease of the sum of squares in noise
-    variances. `robust_z` is the evidence where what is left counts as noise that stays alike for a while: little for
-    an effect that only comes nearest to a misfit of another shape.
+    `size` is the norm of its signatures off the baseline's tangent space, whitened, `share_left` that over the norm
+    of the raw signatures, and `coefficients` are their best multiples, shape `(k,)`. `z` is the evidence in standard
+    deviations, `drop` the decrease of the sum of squares in noise variances. `robust_z` is the evidence where what is
+    left counts as noise that stays alike for a while: little for an effect that only comes nearest to a misfit of
+    another shape.
     """
 
     probe: Probe
-    columns: np.ndarray
+    size: float
     z: float
     robust_z: float
     coefficients: np.ndarray
@@ -184,24 +186,40 @@ class Scored:
         return self.probe.form
 
 
-def score(projector: Projector, probes: Sequence[Probe], residual: np.ndarray) -> tuple[Scored, ...]:
-    """Ask about probes; `residual` is joined and off the tangent already."""
+@dataclass(frozen=True)
+class Scores:
+    """Probes asked together, and the `gram` matrix of all their signatures off the tangent, shape `(k, k)`."""
+
+    each: tuple[Scored, ...]
+    gram: np.ndarray
+
+
+def score(
+    projector: Projector, probes: Sequence[Probe], residual: np.ndarray, basis: np.ndarray | None = None
+) -> Scores:
+    """Ask about probes, beside effects that are fitted already where a `basis` spans their tangent.
+
+    `residual` and `basis`, shape `(rows, k)`, are joined and off the baseline's tangent.
+    """
     signals = [column for probe in probes for column in probe.signatures]
-    if not signals:
-        return ()
-    # Columns that lie together are projected all at once, and taken out without a copy.
+    # Columns that lie together are projected in place and many at once: of long records they fill the memory.
     joined = np.empty((len(residual), len(signals)), order="F")
     for k, column in enumerate(signals):
         joined[:, k] = projector.join(column)
-    off = np.asfortranarray(projector.off(joined))
-    found, cuts = [], np.cumsum([len(probe.signatures) for probe in probes])[:-1]
-    each = zip(probes, np.split(off, cuts, axis=1), np.split(_squares(joined), cuts), strict=True)
-    for probe, columns, raw in each:
+    raw = _squares(joined)
+    for at in range(0, len(signals), _AT_ONCE):
+        columns = joined[:, at : at + _AT_ONCE]
+        columns -= projector.orthonormal @ (projector.orthonormal.T @ columns)
         # A line that sampling turns into a constant, for example: what is left of it is rounding. Or what has died
         # away so far that its square is nothing.
-        columns[:, _squares(columns) <= _BLIND**2 * raw] = 0.0
-        found.append(_scored(probe, columns, residual, float(np.sum(raw)) ** 0.5))
-    return tuple(found)
+        columns[:, _squares(columns) <= _BLIND**2 * raw[at : at + _AT_ONCE]] = 0.0
+        if basis is not None:
+            columns -= basis @ (basis.T @ columns)
+    found, stop = [], 0
+    for probe in probes:
+        own = slice(stop, stop := stop + len(probe.signatures))
+        found.append(_scored(probe, joined[:, own], residual, float(np.sum(raw[own])) ** 0.5))
+    return Scores(tuple(found), joined.T @ joined)
 
 
 def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
@@ -212,23 +230,15 @@ def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
     return found
 
 
-def rescore(scores: Sequence[Scored], basis: np.ndarray, residual: np.ndarray) -> tuple[Scored, ...]:
-    """Ask again beside effects that are fitted already; `basis` spans their tangent, off the baseline's."""
-    found = []
-    for one in scores:
-        columns = one.columns - basis @ (basis.T @ one.columns)
-        raw = float(np.sum(_squares(one.columns))) ** 0.5 / max(one.share_left, 1e-300)
-        found.append(_scored(one.probe, columns, residual, raw))
-    return tuple(found)
-
-
 def _scored(probe: Probe, columns: np.ndarray, residual: np.ndarray, raw: float) -> Scored:
-    left = float(np.sum(_squares(columns))) ** 0.5 / raw if raw > 0 else 0.0
+    size = float(np.sum(_squares(columns))) ** 0.5
+    left = size / raw if raw > 0 else 0.0
     if left < _BLIND:
         # What the baseline follows but for rounding cannot be asked about.
-        return Scored(probe, np.zeros_like(columns), 0.0, 0.0, np.zeros(columns.shape[1]), 0.0, left)
+        columns[:] = 0.0
+        return Scored(probe, 0.0, 0.0, 0.0, np.zeros(columns.shape[1]), 0.0, left)
     z, coefficients, drop = evidence(columns, residual, probe.positive, probe.most)
-    return Scored(probe, columns, z, _robust_z(columns @ coefficients, residual), coefficients, drop, left)
+    return Scored(probe, size, z, _robust_z(columns @ coefficients, residual), coefficients, drop, left)
 
 
 def _squares(columns: np.ndarray) -> np.ndarray:
@@ -289,17 +299,15 @@ def _size(gram: np.ndarray, cross: np.ndarray, multiples: np.ndarray) -> tuple[n
 class Family:
     """The largest evidence of all probes, where there is no effect: by simulation."""
 
-    def __init__(self, scored: Sequence[Scored], rng: np.random.Generator):
-        columns = np.concatenate([one.columns for one in scored], axis=1)
-        scale = np.linalg.norm(columns, axis=0)
+    def __init__(self, scores: Scores, rng: np.random.Generator):
+        scale = np.sqrt(np.diagonal(scores.gram))
         scale = np.where(scale > 0, scale, 1.0)
-        columns = columns / scale
-        gram = columns.T @ columns
+        gram = scores.gram / scale / scale[:, None]
         value, vector = np.linalg.eigh(gram)
         draws = vector * np.sqrt(np.maximum(value, 0)) @ rng.standard_normal((len(value), _DRAWS))
         at, largest = 0, np.zeros(_DRAWS)
-        for one in scored:
-            stop = at + one.columns.shape[1]
+        for one in scores.each:
+            stop = at + len(one.coefficients)
             own, cross = gram[at:stop, at:stop], draws[at:stop]
             multiples = _multiples(own, cross, one.probe.positive, one.probe.most * scale[at:stop])
             largest = np.maximum(largest, _size(own, cross, multiples)[0])

@@ -17,7 +17,7 @@ from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State, is_smoothness_confirmed, refine, relearn_noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
-from fits.diagnosis._score import Family, Probe, Scored, rescore, score
+from fits.diagnosis._score import Family, Probe, Scored, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from microid import EFFECTS
 from microid.effects import card_of
@@ -101,8 +101,8 @@ class Explanation:
     def of(cls, causes: Sequence[Cause], state: State, search: Search) -> "Explanation":
         """Ask for all effects beside these causes."""
         bench, projector, model = state
-        left = rescore(score(projector, search.probes, model.residual), model.basis(), model.residual)
-        return cls(tuple(causes), bench, projector, model, left, Family(left, search.rng))
+        scores = score(projector, search.probes, model.residual, model.basis())
+        return cls(tuple(causes), bench, projector, model, scores.each, Family(scores, search.rng))
 
     @property
     def state(self) -> State:
