@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
@@ -147,34 +148,49 @@ def parameter_table(model: PyTree) -> tuple[ParameterInfo, ...]:
 
 def _constrain(spec: ParameterSpec, z: Float[Array, "..."]) -> Float[Array, "..."]:
     low, high = math.isfinite(spec.lower), math.isfinite(spec.upper)
-    if low and high:
-        return spec.lower + (spec.upper - spec.lower) * jax.nn.sigmoid(z)
-    if low:
-        return spec.lower + spec.scale * jax.nn.softplus(z)
-    if high:
-        return spec.upper - spec.scale * jax.nn.softplus(-z)
-    return spec.scale * z
+    return _constrained(z, spec.scale, spec.lower if low else None, spec.upper if high else None)
+
+
+def _unconstrain(spec: ParameterSpec, value: Float[Array, "..."]) -> Float[Array, "..."]:
+    low, high = math.isfinite(spec.lower), math.isfinite(spec.upper)
+    return _unconstrained(value, spec.scale, spec.lower if low else None, spec.upper if high else None)
+
+
+# One program for all parameters of a kind: one by one, their operations would each be compiled.
+@partial(jax.jit, inline=True)
+def _constrained(
+    z: Float[Array, "..."], scale: float, lower: float | None, upper: float | None
+) -> Float[Array, "..."]:
+    if lower is not None and upper is not None:
+        return lower + (upper - lower) * jax.nn.sigmoid(z)
+    if lower is not None:
+        return lower + scale * jax.nn.softplus(z)
+    if upper is not None:
+        return upper - scale * jax.nn.softplus(-z)
+    return scale * z
 
 
 def _softplus_inverse(x: Float[Array, "..."]) -> Float[Array, "..."]:
     return x + jnp.log(-jnp.expm1(-x))
 
 
-def _unconstrain(spec: ParameterSpec, value: Float[Array, "..."]) -> Float[Array, "..."]:
-    low, high = math.isfinite(spec.lower), math.isfinite(spec.upper)
+@partial(jax.jit, inline=True)
+def _unconstrained(
+    value: Float[Array, "..."], scale: float, lower: float | None, upper: float | None
+) -> Float[Array, "..."]:
     # A value on its bound lies at infinity; a millionth of the scale inside is where solvers can start.
     margin = 1e-6
-    if low and high:
-        width = spec.upper - spec.lower
-        fraction = (value - spec.lower) / width
+    if lower is not None and upper is not None:
+        width = upper - lower
+        fraction = (value - lower) / width
         # Bounds may be many decades apart, as those of a time constant.
-        fraction = jnp.clip(fraction, margin * min(1.0, spec.scale / width), 1 - margin)
+        fraction = jnp.clip(fraction, margin * jnp.minimum(1.0, scale / width), 1 - margin)
         return jnp.log(fraction) - jnp.log1p(-fraction)
-    if low:
-        return _softplus_inverse(jnp.maximum((value - spec.lower) / spec.scale, margin))
-    if high:
-        return -_softplus_inverse(jnp.maximum((spec.upper - value) / spec.scale, margin))
-    return value / spec.scale
+    if lower is not None:
+        return _softplus_inverse(jnp.maximum((value - lower) / scale, margin))
+    if upper is not None:
+        return -_softplus_inverse(jnp.maximum((upper - value) / scale, margin))
+    return value / scale
 
 
 class Coordinates(eqx.Module, Generic[_Model]):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import data_synth as ds
+from data_synth.__main__ import main
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
@@ -162,11 +163,13 @@ def test_the_command_writes_a_scenario(seed, tmp_path):
         (["major_loops", "out", "--seed", "-3"], "the seed must be zero or positive, got -3"),
     ],
 )
-def test_the_command_says_what_is_wrong_in_one_sentence(arguments, sentence):
-    done = command(*arguments)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(sentence)
-    assert done.stderr.count("\n") == 1
+def test_the_command_says_what_is_wrong_in_one_sentence(arguments, sentence, capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(sentence)
+    assert err.count("\n") == 1
 
 
 def test_the_package_imports_numpy_scipy_and_the_standard_library_only():

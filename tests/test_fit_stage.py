@@ -158,6 +158,7 @@ def test_gains_stay_in_the_operator(fitted):
         fitted["driver.gain"]
 
 
+@pytest.mark.study
 def test_an_amplifier_of_known_gain_scales_the_command_and_nothing_else(rig, fitted):
     commands = {name: dataclasses.replace(r, voltage_V=r.voltage_V / 10) for name, r in rig.records.items()}
     amplified = fits.default_stage().swap("driver", m.Driver(jnp.asarray(1e-3), jnp.asarray(10.0)))

@@ -38,7 +38,9 @@ def test_a_law_by_the_step_is_the_law_along_the_record(name, rng):
     voltage_V = np.cumsum(rng.normal(0, 8, 40))
     voltage_V[rng.integers(1, 40, 4)] = voltage_V[3]
     first, rest = step_by_step(law, jnp.asarray(voltage_V), jnp.asarray(start))
-    np.testing.assert_allclose(np.append(first, rest), law(jnp.asarray(voltage_V), start), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.append(first, rest), compiled(law)(jnp.asarray(voltage_V), start), rtol=0, atol=1e-12
+    )
 
 
 def integrated_um(stage, law_rate, voltage_V):
@@ -97,7 +99,7 @@ def test_at_rest_force_and_spring_are_in_balance(rng):
     law = m.PrandtlIshlinskii(0.1, rng.uniform(0.05, 0.2, 3), rng.uniform(0, 10, 3), 0.0)
     stage = m.Stage.of(piezo=m.Piezo(0.5), mechanics=m.HystereticMechanics(m.Mechanics(80.0, 0.2), law))
     rest_V = rng.uniform(20, 60)
-    still = np.asarray(stage(jnp.asarray(T), jnp.full(50, rest_V)))
+    still = np.asarray(compiled(stage)(jnp.asarray(T), jnp.full(50, rest_V)))
     assert np.ptp(still) < 1e-9
     plays = play_positions(still[:1], np.asarray(law.threshold_V), np.zeros(3))
     yields = 0.1 * still[0] + float(plays[0] @ np.asarray(law.weight_um_per_V))
@@ -157,5 +159,5 @@ def test_the_official_multisine_is_met_by_bench_and_model():
         hold="smooth",
         substeps=20,
     )
-    twice = stage(jnp.asarray(1 / 750), jnp.asarray(np.tile(force_N, 2)), m.Start(jnp.asarray(0.0)))
+    twice = compiled(stage)(jnp.asarray(1 / 750), jnp.asarray(np.tile(force_N, 2)), m.Start(jnp.asarray(0.0)))
     assert np.sqrt(np.mean((1e-6 * np.asarray(twice)[8192:] - official_m) ** 2)) < 5e-7

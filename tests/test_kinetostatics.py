@@ -136,8 +136,8 @@ def test_derivatives_are_those_of_finite_differences(axis, level, rng):
         assert value == pytest.approx(by, rel=1e-9, abs=1e-12 * abs(float(found.output)) / size)
 
 
-# One of each form; the others are of the same kind.
-FIRST = ("x", "beam"), ("z", "pseudo_rigid")
+# The others are of the same kind.
+FIRST = (("z", "pseudo_rigid"),)
 
 
 @pytest.mark.parametrize(
@@ -254,14 +254,15 @@ def test_driving_error_is_what_a_proportional_piezo_leaves(rng):
         density, m.Reversible(jnp.full(8, 0.2), jnp.asarray(0.0), jnp.asarray(120.0)), jnp.asarray(3.0)
     )
     voltage = jnp.concatenate([jnp.linspace(0, 120, 100), jnp.linspace(119, 0, 100)])
-    found = m.driving_error(model, voltage)
-    elongation = np.asarray(model(voltage)) - float(model(voltage)[0])
+    found = compiled(m.driving_error)(model, voltage)
+    elongation = np.asarray(compiled(model)(voltage))
+    elongation = elongation - elongation[0]
     fitted = np.linalg.lstsq(np.asarray(voltage)[:, None], elongation, rcond=None)[0]
     np.testing.assert_allclose(found.slope_um_per_V, fitted[0], rtol=1e-12)
     np.testing.assert_allclose(found.signed_um, elongation - fitted[0] * np.asarray(voltage), atol=1e-12)
     np.testing.assert_allclose(found.absolute_um, np.abs(found.signed_um))
     assert found.signed_um.min() < 0 < found.signed_um.max()
-    given = m.driving_error(model, voltage, 0.3)
+    given = compiled(m.driving_error)(model, voltage, 0.3)
     np.testing.assert_allclose(given.signed_um, elongation - 0.3 * np.asarray(voltage), atol=1e-12)
 
 

@@ -31,6 +31,7 @@ def test_sine_of_a_picma_stack_held_out():
     assert any("neighbouring residuals agree" in remark for remark in found.remarks)
 
 
+@pytest.mark.study
 def test_amplitudes_of_a_picma_stack_held_out():
     found = fits.fit([measured("picma_p885_amplitude_modulated.csv")], holdout=0.3, levels=16)
     assert found.held_out.e_rms_pct < 1.2

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 from fits import Record
 from fits.diagnosis._baseline import has_known_loop
@@ -63,6 +64,18 @@ def test_relays_not_yet_swept_add_what_the_columns_span(rng, way):
     assert np.std(difference) > 0.01
     # What is left is the relays' own coarseness, and what a sum of two functions misses.
     assert np.std(left) < 0.05 * np.std(difference)
+
+
+def test_columns_are_the_b_splines_of_scipy(rng):
+    voltage = np.cumsum(rng.normal(0, 1, 200))
+    for reached, columns in zip(
+        (np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)),
+        np.split(np.asarray(past_columns(jnp.asarray(voltage))), 2, axis=1),
+        strict=True,
+    ):
+        left = (reached[-1] - reached) / (reached[-1] - reached[0])
+        knots = np.r_[np.zeros(4), 0.2, 0.4, 0.6, 0.8, np.ones(4)]
+        np.testing.assert_allclose(columns, BSpline.design_matrix(left, knots, 3).toarray()[:, 1:], atol=1e-13)
 
 
 def test_a_past_is_estimated_where_a_loop_is_left_beside_it():

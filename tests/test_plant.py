@@ -184,9 +184,11 @@ def test_transfer_functions_are_those_of_scipy(rng):
     }
     for model, over, under in stages.values():
         expected = freqs(over, under, 2 * np.pi * frequency_Hz)[1]
-        np.testing.assert_allclose(model.frequency_response(frequency_Hz), expected, rtol=1e-10)
+        np.testing.assert_allclose(compiled(model.frequency_response)(frequency_Hz), expected, rtol=1e-10)
         s = rng.normal(size=9) * 1e3 + 1j * rng.normal(size=9) * 1e3
-        np.testing.assert_allclose(model.transfer(s), np.polyval(over, s) / np.polyval(under, s), rtol=1e-10)
+        np.testing.assert_allclose(
+            compiled(model.transfer)(s), np.polyval(over, s) / np.polyval(under, s), rtol=1e-10
+        )
         np.testing.assert_allclose(model.static_gain, over[0] / under[-1], rtol=1e-13)
         # Of a pair rounding alone decides which comes first, by its real part.
         roots, wanted = (np.sort_complex(-1j * np.asarray(x)) for x in (model.poles_rad_per_s, np.roots(under)))
@@ -255,9 +257,10 @@ def test_whole_volts_are_no_integers():
     """An interval rounded to a whole number of seconds is none."""
     system, before = m.Driver(1e-3).system(), np.asarray(0.0)
     whole_V = np.array([0, 3, -2, 5])
-    expected = system.respond(np.asarray(1e-3), whole_V.astype(float), before)
-    np.testing.assert_array_equal(system.respond(np.asarray(1e-3), whole_V, before), expected)
-    stage = m.Stage.of(driver=m.Driver(1e-3), piezo=m.Piezo(1.0))
+    respond = compiled(system.respond)
+    expected = respond(np.asarray(1e-3), whole_V.astype(float), before)
+    np.testing.assert_array_equal(respond(np.asarray(1e-3), whole_V, before), expected)
+    stage = compiled(m.Stage.of(driver=m.Driver(1e-3), piezo=m.Piezo(1.0)))
     np.testing.assert_array_equal(stage(np.asarray(1e-3), whole_V, m.Start(rest_V=before)), expected)
 
 

@@ -110,6 +110,7 @@ def largest_pole(stage, integral, proportional, interval_s, slope_um_per_V):
     return np.abs(np.linalg.eigvals(loop)).max()
 
 
+@pytest.mark.study
 def test_loops_whose_largest_pole_is_outside_fail_and_others_do_not(rng):
     import fits
 

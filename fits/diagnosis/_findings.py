@@ -4,9 +4,11 @@ from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy import stats
 
 from fits.diagnosis._effects import Bench, Law
@@ -19,7 +21,7 @@ from fits.diagnosis._score import Scored, best_of
 from fits.diagnosis._select import Cause, Selection
 from fits.stats._held import Held
 from fits.stats._metrics import TWO_SIDED_95
-from microid import EFFECTS, AbstractEffect
+from microid import EFFECTS, AbstractEffect, Coordinates
 from microid.effects import Statistic, card_of
 
 # Standard deviations from zero beyond which a run shows an effect.
@@ -131,7 +133,8 @@ def _parameters(
     shared: list[EffectParameter] = []
     own: list[list[EffectParameter]] = []
     for run in range(runs):
-        slope = np.asarray(jax.jacfwd(lambda v, run=run: law.maps[run].values(v[law.places[run]]))(jnp.asarray(x)))
+        slope = np.zeros((len(law.places[run]), len(x)))
+        slope[:, law.places[run]] = _slope(law.maps[run], jnp.asarray(law.vector(x, run)))
         values = law.values(x, run)
         sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
         below = above = sd
@@ -212,6 +215,11 @@ def _profile_to(
         else:
             inside, last, step = place, there, 2 * step
     return found
+
+
+@eqx.filter_jit
+def _slope(coordinates: Coordinates[AbstractEffect], vector: Float[Array, " k"]) -> Float[Array, "k k"]:
+    return jax.jacfwd(coordinates.values)(vector)
 
 
 def _coordinates(model: Refit, which: int, like: Law) -> np.ndarray:

@@ -6,23 +6,42 @@ to first order in how much farther it goes each time. Both are cubic splines her
 does not go any farther; what is left then is a constant, which the sensor's offset takes up.
 """
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-# Pieces of the splines.
-_PIECES = 5
+_DEGREE, _PIECES = 3, 5
+_KNOTS = np.concatenate([np.zeros(_DEGREE), np.linspace(0.0, 1.0, _PIECES + 1), np.ones(_DEGREE)])
 
 
+@jax.jit
 def past_columns(voltage_V: Float[Array, " n"]) -> Float[Array, "n k"]:
     """Signals of the unknown past of a hysteresis under a voltage, shape `(n, k)`."""
     return jnp.concatenate([_spline(lax.cummax(voltage_V)), _spline(lax.cummin(voltage_V))], axis=1)
 
 
 def _spline(reached_V: Float[Array, " n"]) -> Float[Array, "n k"]:
-    """Cubic splines of how far a run has still to go, shape `(n, k)`; zero where it goes no farther."""
+    """Cubic splines of how far a run has still to go, shape `(n, k)`; zero where it goes no farther.
+
+    B-splines, by the recurrence of C. de Boor, A Practical Guide to Splines (1978): sums over a run of truncated
+    powers are so nearly singular that rounding decides what is fitted.
+    """
     first, last = reached_V[0], reached_V[-1]
-    way = jnp.where(first == last, 1.0, last - first)
-    left = (last - reached_V) / way
-    powers = [left, left**2, *(jnp.maximum(left - k / _PIECES, 0.0) ** 3 for k in range(_PIECES))]
-    return jnp.stack(powers, axis=1)
+    left = (last - reached_V) / jnp.where(first == last, 1.0, last - first)
+    # The last piece has its end, too.
+    piece = jnp.minimum(jnp.floor(left * _PIECES), _PIECES - 1)[:, None]
+    splines = (piece == np.arange(-_DEGREE, len(_KNOTS) - 1.0 - _DEGREE)[None]).astype(left.dtype)
+    for degree in range(1, _DEGREE + 1):
+        begins, ends = _KNOTS[: -degree - 1], _KNOTS[degree + 1 :]
+        rise = (left[:, None] - begins[None]) * _inverse(_KNOTS[degree:-1] - begins)
+        fall = (ends[None] - left[:, None]) * _inverse(ends - _KNOTS[1:-degree])
+        splines = rise * splines[:, :-1] + fall * splines[:, 1:]
+    # All but the first vanish where nothing is left.
+    return splines[:, 1:]
+
+
+def _inverse(width: np.ndarray) -> np.ndarray:
+    """One over widths, in a row; nothing where knots meet."""
+    return np.divide(1.0, width, out=np.zeros_like(width), where=width > 0)[None]

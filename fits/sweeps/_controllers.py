@@ -81,22 +81,10 @@ def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, ref
     stated = {each: number(given[each], f"controller.{each}") for each in settings if each in given}
     limits = dict(zip(("lower_V", "upper_V"), range_of(stage) or (-1e3, 1e3), strict=True))
     task = _task(stage, initial, reference)
+    # Before the defaults, some of which take seconds to find.
+    _check(limits | stated, settings, reference.interval_s)
     numbers, _ = with_defaults(settings.values(), limits | stated, task, lambda each: f"controller.{each}")
-    for each, value in numbers.items():
-        # Out of its bounds none may be, varied or not.
-        place, setting = f"controller.{each}", settings[each]
-        parameter = _parameter(setting, value, reference.interval_s)
-        if setting.above and not value > setting.lower:
-            raise DataError(f"{place}: expected more than {setting.lower:g}, found {value:g}; correct it.")
-        if not parameter.lower <= value <= parameter.upper:
-            raise DataError(f"{place}: expected {parameter.range_words}, found {value:g}; correct it.")
-        check_plain(parameter, np.array([value]), False, place)
-        partner = each.replace("lower_", "upper_", 1)
-        if partner != each and not value < numbers.get(partner, math.inf):
-            raise DataError(
-                f"{place}: expected less than {partner}, which is {numbers[partner]:g} {each[6:]}, found {value:g}; "
-                "correct one of them."
-            )
+    _check(numbers, settings, reference.interval_s)
     left = [each for each in settings if each not in numbers]
     found = Controllers(
         kind,
@@ -113,6 +101,24 @@ def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, ref
             f"{' and '.join(left) or 'another kind'}."
         ) from error
     return found
+
+
+def _check(numbers: Mapping[str, float], settings: Mapping[str, m.Setting], interval_s: float) -> None:
+    """Refuse what is out of its bounds, whether it varies or not."""
+    for each, value in numbers.items():
+        place, setting = f"controller.{each}", settings[each]
+        parameter = _parameter(setting, value, interval_s)
+        if setting.above and not value > setting.lower:
+            raise DataError(f"{place}: expected more than {setting.lower:g}, found {value:g}; correct it.")
+        if not parameter.lower <= value <= parameter.upper:
+            raise DataError(f"{place}: expected {parameter.range_words}, found {value:g}; correct it.")
+        check_plain(parameter, np.array([value]), False, place)
+        partner = each.replace("lower_", "upper_", 1)
+        if partner != each and not value < numbers.get(partner, math.inf):
+            raise DataError(
+                f"{place}: expected less than {partner}, which is {numbers[partner]:g} {each[6:]}, found {value:g}; "
+                "correct one of them."
+            )
 
 
 def _task(stage: m.Stage, initial: str, reference: Program) -> m.ControlTask:
