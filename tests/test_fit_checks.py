@@ -33,6 +33,7 @@ def test_a_clean_record_gets_no_such_remark_and_its_noise_is_known(slow):
     assert "times the sensor's noise" in first
 
 
+@pytest.mark.study
 def test_two_rigs_in_two_files(slow):
     other = bench(stroke_um=34.0, rig=1)[0]
     second = read(other, other.displacement_um, "second.csv")

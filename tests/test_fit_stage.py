@@ -118,6 +118,7 @@ def fitted(rig):
     return result
 
 
+@pytest.mark.study
 def test_poles_are_found_without_a_guess(rig, fitted):
     for name, value in rig.truth.items():
         print(name, fitted[name], "truth", value)
@@ -127,6 +128,7 @@ def test_poles_are_found_without_a_guess(rig, fitted):
         assert fitted[name].lower < fitted[name].value < fitted[name].upper
 
 
+@pytest.mark.study
 def test_motion_that_was_not_fitted_is_predicted(rig, fitted):
     assert fitted.held_out is not None
     assert fitted.held_out.rms_um < 1.25 * 0.03
@@ -139,6 +141,7 @@ def test_motion_that_was_not_fitted_is_predicted(rig, fitted):
     assert inside > 0.7
 
 
+@pytest.mark.study
 def test_the_joint_fit_beats_the_hysteresis_alone(rig, fitted):
     alone = fits.fit([rig.records["slow"]], levels=16, holdout=0.0, initial="negative")
     assert type(alone) is type(fitted) is fits.FitResult
@@ -148,6 +151,7 @@ def test_the_joint_fit_beats_the_hysteresis_alone(rig, fitted):
     assert np.std(off) > 5 * np.std(fitted.predict(rig.records["check"]).displacement_um - rig.true_um["check"])
 
 
+@pytest.mark.study
 def test_gains_stay_in_the_operator(fitted):
     assert {"driver.gain", "mechanics.gain"} <= set(fitted.model.frozen)
     assert float(fitted.model["driver"].gain) == 1.0
@@ -187,6 +191,7 @@ def test_a_gain_beside_the_operator_is_refused(rig):
         fits.fit_stage(runs, stage=stage, initial="negative", levels=8)
 
 
+@pytest.mark.study
 def test_a_voltage_beyond_the_fitted_range_is_refused(fitted):
     time = np.arange(100) / 1000
     with pytest.raises(fits.DataError, match=r"prog.csv: sample 51 .* fitted between 0 and 120 V"):
@@ -271,6 +276,7 @@ def test_settings_that_cannot_be_honoured_are_refused(rig, settings, sentence):
         fits.fit_stage([])
 
 
+@pytest.mark.study
 def test_new_data_of_the_same_shape_compile_nothing(rig):
     # Here, as what was compiled may be forgotten between tests.
     slow, fast, check = (rig.records[name] for name in ("slow", "fast", "check"))

@@ -138,6 +138,7 @@ def test_the_bench_oscillates_as_adaptive_integration_does(rng):
     assert np.abs(found - done.y[0]).max() < 1e-4 * np.ptp(done.y[0])
 
 
+@pytest.mark.study
 @pytest.mark.skipif(
     not OFFICIAL.is_dir(), reason="no official record of the Bouc-Wen benchmark beside the repository"
 )

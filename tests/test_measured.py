@@ -17,6 +17,7 @@ def measured(name):
     return fits.read_csv(path)
 
 
+@pytest.mark.study
 def test_sine_of_a_picma_stack_held_out():
     record = measured("picma_p885_sine_1hz.csv")
     found = fits.fit([record], holdout=0.3, levels=12)

@@ -13,7 +13,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _DEGREE, _PIECES = 3, 5
-_KNOTS = np.concatenate([np.zeros(_DEGREE), np.linspace(0.0, 1.0, _PIECES + 1), np.ones(_DEGREE)])
 
 
 @jax.jit
@@ -28,15 +27,16 @@ def _spline(reached_V: Float[Array, " n"]) -> Float[Array, "n k"]:
     B-splines, by the recurrence of C. de Boor, A Practical Guide to Splines (1978): sums over a run of truncated
     powers are so nearly singular that rounding decides what is fitted.
     """
+    knots = np.concatenate([np.zeros(_DEGREE), np.linspace(0.0, 1.0, _PIECES + 1), np.ones(_DEGREE)])
     first, last = reached_V[0], reached_V[-1]
     left = (last - reached_V) / jnp.where(first == last, 1.0, last - first)
     # The last piece has its end, too.
     piece = jnp.minimum(jnp.floor(left * _PIECES), _PIECES - 1)[:, None]
-    splines = (piece == np.arange(-_DEGREE, len(_KNOTS) - 1.0 - _DEGREE)[None]).astype(left.dtype)
+    splines = (piece == np.arange(-_DEGREE, len(knots) - 1.0 - _DEGREE)[None]).astype(left.dtype)
     for degree in range(1, _DEGREE + 1):
-        begins, ends = _KNOTS[: -degree - 1], _KNOTS[degree + 1 :]
-        rise = (left[:, None] - begins[None]) * _inverse(_KNOTS[degree:-1] - begins)
-        fall = (ends[None] - left[:, None]) * _inverse(ends - _KNOTS[1:-degree])
+        begins, ends = knots[: -degree - 1], knots[degree + 1 :]
+        rise = (left[:, None] - begins[None]) * _inverse(knots[degree:-1] - begins)
+        fall = (ends[None] - left[:, None]) * _inverse(ends - knots[1:-degree])
         splines = rise * splines[:, :-1] + fall * splines[:, 1:]
     # All but the first vanish where nothing is left.
     return splines[:, 1:]
