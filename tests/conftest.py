@@ -78,7 +78,7 @@ def pytest_collection_finish() -> None:
 
 # Every compiled function maps some memory, of which a process on Linux may have 65530 pieces. Beyond that it crashes.
 # One diagnosis takes up to 35,000. Between the tests of a module less is forgotten, as they share what is compiled.
-_BETWEEN_MODULES, _BETWEEN_TESTS = 25_000, 30_000
+_BETWEEN_MODULES, _BETWEEN_TESTS = 10_000, 20_000
 
 
 def _forget_beyond(most: int) -> None:
