@@ -196,6 +196,7 @@ def test_the_measured_mirror_without_a_model(level_mV, most):
     assert together < min(most, 0.8 * alone)
 
 
+@pytest.mark.study
 def test_plays_are_recovered_and_win_on_held_out_realizations(rng):
     threshold_V = np.array([0.3, 1.0])
     weight = rng.uniform(0.1, 0.4, (2, 2))

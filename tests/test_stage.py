@@ -110,7 +110,8 @@ def driven(stage, time_s, voltage_V):
     return stage(time_s, voltage_V, m.Start(rest_V=jnp.zeros(())))
 
 
-@pytest.mark.parametrize("kind", [pytest.param("preisach", marks=pytest.mark.study), "plays"])
+@pytest.mark.study
+@pytest.mark.parametrize("kind", ["preisach", "plays"])
 def test_derivatives_through_the_memory_are_those_of_finite_differences(kind, rng):
     """A driver before a hysteresis moves every remembered extreme when its time constant changes."""
     law = random_model(rng) if kind == "preisach" else plays_of(rng)
