@@ -136,3 +136,12 @@ from microid.kinetostatics._motion import tilt_arm_mm as tilt_arm_mm
 from microid.kinetostatics._stage_constants import Actuation as Actuation
 from microid.kinetostatics._stage_constants import StageConstants as StageConstants
 from microid.kinetostatics._stage_constants import stage_constants as stage_constants
+
+
+def __getattr__(name: str) -> str:
+    # The version is looked up among what is installed, and only where it is asked for.
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("microid")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

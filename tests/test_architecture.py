@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import importlib.metadata
 import inspect
 import os
 import pkgutil
@@ -123,6 +124,12 @@ def test_public_names_are_the_listed_ones(package):
     submodules = {found.name for found in pkgutil.iter_modules(module.__path__)}
     public = {name for name in dir(module) if not name.startswith("_")} - submodules
     assert public - {"TYPE_CHECKING", "Any", "Path", "ast", "importlib", "pkgutil"} == set(names)
+
+
+def test_the_version_is_that_of_the_package():
+    assert microid.__version__ == importlib.metadata.version("microid")
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = microid.nothing
 
 
 def test_names_that_fits_looks_up_late_are_the_ones_it_declares():

@@ -1,6 +1,5 @@
 """The command `microid diagnose`: its options, and the work."""
 
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -81,7 +80,9 @@ def diagnose(given: common.Given) -> None:
     progress(late.Step.WRITING)
     content = late.diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)
-    common.print_result(given, {"out": given.out, "files": places, **content}, [*_lines(diagnosis), "", *places])
+    common.print_result(
+        given, {"out": given.out, "files": places, **content}, [late.describe_diagnosis(diagnosis), "", *places]
+    )
 
 
 def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> list[str]:
@@ -115,32 +116,3 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
             # One of an earlier diagnosis would pass for this one's.
             files.absent(Path(out) / _PROGRAM)
     return common.paths_in(out, [*texts, *([_PROGRAM] if ahead is not None else [])])
-
-
-def _lines(diagnosis: "late.Diagnosis") -> list[str]:
-    """What a terminal shows: the verdict, the causes with their parameters, and the gain."""
-    lines = [f"{late.KINDS[diagnosis.verdict]}; noise {diagnosis.noise_um:.3g} um, {diagnosis.noise_source}"]
-    for cause in diagnosis.causes:
-        also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
-        lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {cause.p_family:.1g}")
-        if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
-            lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
-        for each in cause.parameters:
-            unit = "" if each.unit == "1" else f" {each.unit}"
-            below, above = each.value - each.lower, each.upper - each.value
-            # An interval that ends at a bound, or reaches farther to one side, is no standard deviation.
-            spread = f"+- {each.sd:.2g}{unit}"
-            if not min(below, above) > 0.8 * max(below, above):
-                spread = f"(95 %: {each.lower:.3g} to {each.upper:.3g}){unit}"
-            lines.append(f"    {each.name:24} {each.value:.4g} {spread}")
-    if diagnosis.unexplained_rms_um > 0:
-        lines.append(f"  unexplained: {diagnosis.unexplained_rms_um:.3g} um")
-    gain = diagnosis.gain
-    if math.isfinite(gain.heldout_rms_before_um):
-        line = f"error on held-out data: {gain.heldout_rms_before_um:.3g} um"
-        if diagnosis.causes and math.isfinite(gain.heldout_rms_after_um):
-            line += f" without, {gain.heldout_rms_after_um:.3g} um with what was found"
-        lines.append(line)
-    if diagnosis.next_experiment is not None:
-        lines.append(f"next experiment: {diagnosis.next_experiment.purpose}")
-    return [*lines, *(f"Note: {remark}" for remark in diagnosis.remarks)]
