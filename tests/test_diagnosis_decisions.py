@@ -12,8 +12,9 @@ from fits import Record
 from fits.diagnosis import _diagnose
 from fits.diagnosis._conclude import Misfit
 from fits.diagnosis._effects import Law
-from fits.diagnosis._extension import Compared, gain_of, predicts_worse, shared_effects
+from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
 from fits.diagnosis._prepare import _covered
+from fits.stage._fit import default_stage
 from fits.stats._held import _regressed, _stretches_at_rest
 from microid.effects import EFFECTS
 
@@ -68,6 +69,19 @@ def test_an_extension_is_worse_only_beyond_chance(rng):
     pairs = [compared(*rng.standard_normal((2, 5000))) for _ in range(400)]
     assert 0.002 < np.mean([predicts_worse(one, 2.0) for one in pairs]) < 0.06
     assert not predicts_worse([Compared(None, before, 2 * before, np.zeros(5000, dtype=bool))], 2.0)
+
+
+def test_what_the_runs_held_out_do_not_share_is_left_out_of_the_stage(rng):
+    before, after = rng.standard_normal((2, 200))
+    own, aside = compared(before, after)[0], compared(before, 2 * before)[0]
+    stage = default_stage()
+    runs = (SimpleNamespace(samples=SimpleNamespace(stride=4)),)
+    ready = SimpleNamespace(baseline=SimpleNamespace(runs=runs, fine=runs, stage=stage))
+    found = without_effects(ready, Extension(stage, (own, aside), ("load",)))
+    assert found.effects == ()
+    assert found.stage.substeps == 4
+    assert found.compared[0] is own
+    np.testing.assert_array_equal(found.compared[1].after_um, before)
 
 
 def test_the_gain_and_its_uncertainty_are_those_of_many_records(rng):

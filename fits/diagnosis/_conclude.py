@@ -15,6 +15,7 @@ from fits.diagnosis._extension import (
     gain_of,
     plain_steps,
     predicts_worse,
+    without_effects,
 )
 from fits.diagnosis._findings import bounds, causes_of, with_held_gain
 from fits.diagnosis._noise import Faults, find_faults, name_faults
@@ -136,6 +137,10 @@ def conclude(
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
+    elif kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0):
+        own = ", ".join(sorted({one.name for one in extension.effects if one.per_run}))
+        remarks.append(f"{own}: the runs held out have another, and extended.json is the plain stage")
+        extension = without_effects(ready, extension)
     # Up to its own size rounding makes structure, too.
     left_over = left_over and not (rounded and rest_noise * noise_um < rounding_um)
     cyclic = (

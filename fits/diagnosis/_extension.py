@@ -66,6 +66,14 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Exte
     return Extension(stage, compared, tuple(effects))
 
 
+def without_effects(ready: Prepared, extension: Extension) -> Extension:
+    """The plain stage, which runs held out whole follow; the others stay compared with effects of their own."""
+    runs = len(ready.baseline.runs)
+    behind = (replace(one, after_um=one.before_um) for one in extension.compared[runs:])
+    stage = ready.baseline.stage.with_substeps(plain_steps(ready))
+    return Extension(stage, (*extension.compared[:runs], *behind), ())
+
+
 def shared_effects(model: Refit, runs: int, spread: float = THRESHOLDS.minor_share) -> list[AbstractEffect]:
     """The effects as a model holds them: strengths that every run has by their mean, and others not at all.
 

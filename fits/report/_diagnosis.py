@@ -117,7 +117,7 @@ def _gained(diagnosis: Diagnosis, length: Lengths) -> str:
     """What the extension is worth on data that were not used."""
     gain = diagnosis.gain
     before = gain.heldout_rms_before_um
-    if not diagnosis.causes:
+    if not diagnosis.causes or gain.heldout_rms_after_um == before:
         return f"On data that were not used, the plain stage errs by {length(before)}, root mean square."
     difference = before - gain.heldout_rms_after_um
     size = length.bare(abs(difference))

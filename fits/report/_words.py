@@ -189,6 +189,8 @@ def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
     if not math.isfinite(gain.heldout_rms_before_um) or not math.isfinite(gain.heldout_rms_after_um):
         return ["Nothing was held out, so what this is worth on new data is not known."]
     before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
+    if after == before:
+        return [f"What {listed(modelled)} did in these runs is not in the model of the next."]
     change = "falls" if after < before else "does not fall: it goes"
     return [
         f"With {listed(modelled)} in the model, the error on data that were not "
