@@ -139,7 +139,7 @@ def conclude(
         extension = extend_stage(ready, found, None)
     elif kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0):
         own = ", ".join(sorted({one.name for one in extension.effects if one.per_run}))
-        remarks.append(f"{own}: the runs held out have another, and extended.json is the plain stage")
+        remarks.append(f"{own}: not the same in the runs held out, so that extended.json is the plain stage")
         extension = without_effects(ready, extension)
     # Up to its own size rounding makes structure, too.
     left_over = left_over and not (rounded and rest_noise * noise_um < rounding_um)
