@@ -9,8 +9,9 @@ from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State, fit_jointly
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
-from fits.diagnosis._score import Scored, best_of, improvement_z, score
+from fits.diagnosis._score import Scored, best_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
+from fits.stats._compare import improvement_z
 from microid import EFFECTS, AbstractEffect
 
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
@@ -61,7 +62,7 @@ def compare_rivals(
     chance_z = thresholds.chance_z
     noise = [found for _, found in fits if found.is_noise(projector, chance_z)]
     # What ended at its bound is taken only where nothing else explains as much.
-    alone = not model.is_noise(projector, chance_z) and all(found.is_at_bound for found in noise)
+    alone = not model.is_noise(projector, chance_z) and all(found.laws[-1].at_bound(found.x[-1]) for found in noise)
     fitted: dict[type[AbstractEffect], Refit] = {}
     for one, found in fits if has_time() else ():
         scored = [other for other in scores if other.name == one.name]

@@ -13,7 +13,7 @@ from fits.diagnosis._extension import (
     extend_stage,
     feedforward,
     gain_of,
-    plain_steps,
+    plain_stage,
     predicts_worse,
     without_effects,
 )
@@ -212,7 +212,7 @@ def conclude(
         gain=gain,
         next_experiment=ahead,
         remarks=tuple(remarks),
-        baseline=baseline.stage.with_substeps(plain_steps(ready)),
+        baseline=plain_stage(ready),
         extended=extension.stage,
         runs=tuple(map(_run_view, compared)),
         false_alarm=false_alarm,

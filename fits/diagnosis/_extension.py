@@ -14,15 +14,14 @@ from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
-from fits.diagnosis._score import improvement_z
 from fits.diagnosis._select import Selection
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop._run import Run
 from fits.stage._motion import signals
 from fits.stage._run import project_out
+from fits.stats._compare import improvement_z, sd_of_difference
 from microid import AbstractEffect, Stage
 
-_BLOCKS = 24
 _ROUNDS = 6
 
 
@@ -45,17 +44,16 @@ class Extension:
     effects: tuple[AbstractEffect, ...]
 
 
-def plain_steps(ready: Prepared) -> int:
-    """Steps between samples that the plain stage needs."""
-    return max(run.samples.stride for run in ready.baseline.fine)
+def plain_stage(ready: Prepared) -> Stage:
+    """The plain stage, with as many steps between samples as it needs."""
+    return ready.baseline.stage.with_substeps(max(run.samples.stride for run in ready.baseline.fine))
 
 
 def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Extension:
     """Let the plain stage follow what the effects of a model leave, and compare the two; none for the plain stage."""
     baseline = ready.baseline
     if model is None or not model.laws:
-        stage = baseline.stage.with_substeps(plain_steps(ready))
-        return Extension(stage, _compare(ready, ready.bench, None, ready.regression, (), False), ())
+        return Extension(plain_stage(ready), _compare(ready, ready.bench, None, ready.regression, (), False), ())
     # What followed along the tangent is put into the stage itself.
     beside = found.projector
     regression = regress(beside.move(beside.residual - beside.join(model.change_um)), ())
@@ -70,8 +68,7 @@ def without_effects(ready: Prepared, extension: Extension) -> Extension:
     """The plain stage, which runs held out whole follow; the others stay compared with effects of their own."""
     runs = len(ready.baseline.runs)
     behind = (replace(one, after_um=one.before_um) for one in extension.compared[runs:])
-    stage = ready.baseline.stage.with_substeps(plain_steps(ready))
-    return Extension(stage, (*extension.compared[:runs], *behind), ())
+    return Extension(plain_stage(ready), (*extension.compared[:runs], *behind), ())
 
 
 def shared_effects(model: Refit, runs: int, spread: float = THRESHOLDS.minor_share) -> list[AbstractEffect]:
@@ -143,29 +140,24 @@ _without = eqx.filter_jit(project_out)
 
 def predicts_worse(compared: Sequence[Compared], worse_z: float) -> bool:
     """Whether the extended stage predicts what was held out worse, by so many standard deviations."""
-    held = [one for one in compared if one.held_out.any()]
-    if not held:
-        return False
-    before, after = (
-        np.concatenate([values[one.held_out] for one, values in zip(held, pick, strict=True)])
-        for pick in ([one.before_um for one in held], [one.after_um for one in held])
-    )
-    return improvement_z(before, after) < -worse_z
+    return improvement_z(*_held_out(compared)) < -worse_z
+
+
+def _held_out(compared: Sequence[Compared]) -> tuple[np.ndarray, np.ndarray]:
+    """Errors before and after in what was held out of all runs, shape `(n,)` each."""
+    held = [(one.before_um[one.held_out], one.after_um[one.held_out]) for one in compared]
+    before, after = zip((np.zeros(0), np.zeros(0)), *held, strict=True)
+    return np.concatenate(before), np.concatenate(after)
 
 
 def gain_of(compared: Sequence[Compared], noise_um: float, source: str) -> Gain:
     """Errors on held-out data before and after, and how sure their difference is."""
-    before = [one.before_um[one.held_out] for one in compared if one.held_out.any()]
-    after = [one.after_um[one.held_out] for one in compared if one.held_out.any()]
-    if not before:
+    before, after = errors = _held_out(compared)
+    if not len(before):
         return Gain(noise_um=noise_um, source="nothing was held out")
-    r0, r1 = np.concatenate(before), np.concatenate(after)
-    rms0, rms1 = float(np.sqrt(np.mean(r0**2))), float(np.sqrt(np.mean(r1**2)))
-    # The difference of the two, linearised, over blocks longer than errors stay alike.
-    influence = r0**2 / (2 * max(rms0, 1e-300)) - r1**2 / (2 * max(rms1, 1e-300))
-    blocks = np.array([block.mean() for block in np.array_split(influence, _BLOCKS)])
-    sd = float(np.std(blocks, ddof=1) / len(blocks) ** 0.5)
-    return Gain(rms0, rms1, sd, float(np.max(np.abs(r0))), float(np.max(np.abs(r1))), noise_um, source=source)
+    rms = [float(np.sqrt(np.mean(one**2))) for one in errors]
+    most = [float(np.max(np.abs(one))) for one in errors]
+    return Gain(rms[0], rms[1], sd_of_difference(before, after), most[0], most[1], noise_um, source=source)
 
 
 def feedforward(bench: Bench, effects: Sequence[AbstractEffect]) -> tuple[float, float]:

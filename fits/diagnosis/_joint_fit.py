@@ -12,8 +12,8 @@ from fits.diagnosis._noise import find_faults
 from fits.diagnosis._projector import Projector, learn_roughness, smoothed, with_discrepancy
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
-from fits.diagnosis._score import improvement_z
 from fits.diagnosis._thresholds import Thresholds
+from fits.stats._compare import improvement_z
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _LARGEST_DIFFERENCE = 1.0

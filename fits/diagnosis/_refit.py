@@ -63,11 +63,6 @@ class Refit:
         """Bayesian information criterion: the smaller, the better."""
         return self.cost + self.freedom * float(np.log(count))
 
-    @property
-    def is_at_bound(self) -> bool:
-        """Whether the last effect ended at a bound."""
-        return self.laws[-1].at_bound(self.x[-1])
-
     def effects(self, run: int) -> list[AbstractEffect]:
         """The effects in one run."""
         return [law.effect(x, run) for law, x in zip(self.laws, self.x, strict=True)]

@@ -19,8 +19,6 @@ _DRAWS = 2000
 _BLIND = 0.003
 # Signatures that are projected at once.
 _AT_ONCE = 64
-# Stretches of held-out data that are taken to err by themselves.
-_BLOCKS = 24
 # Samples that are taken to err alike.
 BLOCK = 25
 
@@ -250,15 +248,6 @@ def _robust_z(along: np.ndarray, residual: np.ndarray) -> float:
     products = along * (residual - along)
     blocks = np.add.reduceat(products, np.arange(0, len(products), BLOCK))
     return float(along @ along / max(float(np.linalg.norm(blocks)), 1e-300)) if np.any(along) else 0.0
-
-
-def improvement_z(before: np.ndarray, after: np.ndarray) -> float:
-    """Standard deviations by which errors of shape `(n,)` became smaller, over blocks longer than they stay alike.
-
-    0 where there are none.
-    """
-    blocks = np.array([np.sum(block) for block in np.array_split(before**2 - after**2, _BLOCKS)])
-    return float(np.sum(blocks) / max(float(np.linalg.norm(blocks - np.mean(blocks))), 1e-300))
 
 
 def evidence(

@@ -105,11 +105,6 @@ class Explanation:
         return cls(tuple(causes), bench, projector, model, scores.each, Family(scores, search.rng))
 
     @property
-    def state(self) -> State:
-        """Baseline and causes."""
-        return self.bench, self.projector, self.model
-
-    @property
     def names(self) -> tuple[str, ...]:
         """Of the causes, in the order in which they were found, each once."""
         return tuple(dict.fromkeys(cause.name for cause in self.causes))
@@ -169,7 +164,7 @@ def select(
 def _grown(one: Explanation, search: Search) -> list[Explanation]:
     """The same with one more cause: with each of those that explain about as much."""
     thresholds, false_alarm = search.thresholds, search.false_alarm
-    bench, projector, model = one.state
+    bench, projector, model = one.bench, one.projector, one.model
     taken, refused = set(one.names), set[str]()
     # Models of effects are not exact: what one leaves may look like another, above all like its confusions.
     whole = max(search.plain.cost - model.cost, 0.0)
