@@ -159,7 +159,10 @@ def _unconstrain(spec: ParameterSpec, value: Float[Array, "..."]) -> Float[Array
 # One program for all parameters of a kind: one by one, their operations would each be compiled.
 @partial(jax.jit, inline=True)
 def _constrained(
-    z: Float[Array, "..."], scale: float, lower: float | None, upper: float | None
+    z: Float[Array, "..."],
+    scale: Float[Array, ""],
+    lower: Float[Array, ""] | None,
+    upper: Float[Array, ""] | None,
 ) -> Float[Array, "..."]:
     if lower is not None and upper is not None:
         return lower + (upper - lower) * jax.nn.sigmoid(z)
@@ -176,7 +179,10 @@ def _softplus_inverse(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 @partial(jax.jit, inline=True)
 def _unconstrained(
-    value: Float[Array, "..."], scale: float, lower: float | None, upper: float | None
+    value: Float[Array, "..."],
+    scale: Float[Array, ""],
+    lower: Float[Array, ""] | None,
+    upper: Float[Array, ""] | None,
 ) -> Float[Array, "..."]:
     # A value on its bound lies at infinity; a millionth of the scale inside is where solvers can start.
     margin = 1e-6
