@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -146,31 +146,24 @@ def parameter_table(model: PyTree) -> tuple[ParameterInfo, ...]:
     return tuple(ParameterInfo(name, leaf.shape, spec) for name, leaf, spec in _walk(model) if spec is not None)
 
 
-def _constrain(spec: ParameterSpec, z: Float[Array, "..."]) -> Float[Array, "..."]:
+# Scale, lower and upper bound: what differs between parameters of a kind, which share one program. One by one, their
+# operations would each be compiled.
+_Bounds: TypeAlias = tuple[Float[Array, ""], Float[Array, ""] | None, Float[Array, ""] | None]
+
+
+def _bounds(spec: ParameterSpec) -> Any:
     low, high = math.isfinite(spec.lower), math.isfinite(spec.upper)
-    return _constrained(z, spec.scale, spec.lower if low else None, spec.upper if high else None)
+    return spec.scale, spec.lower if low else None, spec.upper if high else None
 
 
-def _unconstrain(spec: ParameterSpec, value: Float[Array, "..."]) -> Float[Array, "..."]:
-    low, high = math.isfinite(spec.lower), math.isfinite(spec.upper)
-    return _unconstrained(value, spec.scale, spec.lower if low else None, spec.upper if high else None)
-
-
-# One program for all parameters of a kind: one by one, their operations would each be compiled.
 @partial(jax.jit, inline=True)
-def _constrained(
-    z: Float[Array, "..."],
-    scale: Float[Array, ""],
-    lower: Float[Array, ""] | None,
-    upper: Float[Array, ""] | None,
-) -> Float[Array, "..."]:
+def _constrain(z: Float[Array, "..."], bounds: _Bounds) -> Float[Array, "..."]:
+    scale, lower, upper = bounds
     if lower is not None and upper is not None:
         return lower + (upper - lower) * jax.nn.sigmoid(z)
     if lower is not None:
         return lower + scale * jax.nn.softplus(z)
-    if upper is not None:
-        return upper - scale * jax.nn.softplus(-z)
-    return scale * z
+    return scale * z if upper is None else upper - scale * jax.nn.softplus(-z)
 
 
 def _softplus_inverse(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -178,12 +171,8 @@ def _softplus_inverse(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 @partial(jax.jit, inline=True)
-def _unconstrained(
-    value: Float[Array, "..."],
-    scale: Float[Array, ""],
-    lower: Float[Array, ""] | None,
-    upper: Float[Array, ""] | None,
-) -> Float[Array, "..."]:
+def _unconstrain(value: Float[Array, "..."], bounds: _Bounds) -> Float[Array, "..."]:
+    scale, lower, upper = bounds
     # A value on its bound lies at infinity; a millionth of the scale inside is where solvers can start.
     margin = 1e-6
     if lower is not None and upper is not None:
@@ -194,9 +183,7 @@ def _unconstrained(
         return jnp.log(fraction) - jnp.log1p(-fraction)
     if lower is not None:
         return _softplus_inverse(jnp.maximum((value - lower) / scale, margin))
-    if upper is not None:
-        return -_softplus_inverse(jnp.maximum((upper - value) / scale, margin))
-    return value / scale
+    return value / scale if upper is None else -_softplus_inverse(jnp.maximum((upper - value) / scale, margin))
 
 
 class Coordinates(eqx.Module, Generic[_Model]):
@@ -269,7 +256,7 @@ class Coordinates(eqx.Module, Generic[_Model]):
             value = leaves[index]
             if not isinstance(value, jax.core.Tracer):
                 _refuse_outside(info.spec, np.asarray(value))
-            parts.append(jnp.ravel(_unconstrain(info.spec, value)))
+            parts.append(jnp.ravel(_unconstrain(value, _bounds(info.spec))))
         return jnp.concatenate(parts)
 
     def values(self, vector: Float[Array, " size"]) -> Float[Array, " size"]:
@@ -280,7 +267,7 @@ class Coordinates(eqx.Module, Generic[_Model]):
         found, start = [], 0
         for index, info in self._slots:
             stop = start + math.prod(info.shape)
-            found.append((index, _constrain(info.spec, vector[start:stop].reshape(info.shape))))
+            found.append((index, _constrain(vector[start:stop].reshape(info.shape), _bounds(info.spec))))
             start = stop
         return found
 
