@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from fits import DataError
+from fits.cli._common import Terminated, in_sentences
 from fits.io._atomic import atomic_write_text
 from fits.io._file_set import file_set
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
@@ -270,6 +271,30 @@ def test_what_another_user_left_stays(tmp_path, ended):
     os.chown(tmp_path / name, 12345, -1)
     remove_stale(tmp_path)
     assert (tmp_path / name).exists()
+
+
+@pytest.mark.skipif(not shutil.rmtree.avoids_symlink_attacks, reason="folders are not opened here to be removed")
+def test_an_interruption_is_told_though_a_folder_was_being_closed(tmp_path, monkeypatch, capsys):
+    """`shutil.rmtree` closes a folder again where the signal comes just after it was closed."""
+    close = os.close
+
+    def interrupted(number):
+        close(number)
+        monkeypatch.undo()
+        raise Terminated(signal.SIGTERM)
+
+    @in_sentences
+    def work(_given):
+        with file_set() as files:
+            (files.folder(tmp_path / "plots") / "a.json").write_text("a")
+            monkeypatch.setattr(os, "close", interrupted)
+            shutil.rmtree(files.folder(tmp_path / "others"))
+
+    with pytest.raises(SystemExit) as end:
+        work()
+    assert end.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "Terminated: no unfinished file was left.\n"
+    assert not any(tmp_path.iterdir())
 
 
 LOST = """

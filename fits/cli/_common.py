@@ -127,6 +127,9 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
             sys.exit(2)
         except OSError as error:
+            # An interruption just after a file was closed makes `shutil.rmtree` close it again, whose error hides it.
+            if error.errno == errno.EBADF and isinstance(error.__context__, KeyboardInterrupt):
+                stopped(error.__context__, NOTHING_LEFT)
             system_refuses(error)
 
     return run
