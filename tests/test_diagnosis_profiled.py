@@ -104,7 +104,7 @@ def test_a_fit_finds_its_way_from_near_a_bound():
     bench = SimpleNamespace(
         prepared=[None],
         plain=[np.zeros(50)],
-        respond=lambda effects: [float(own[0].slope) * column for own in effects],
+        respond_in=lambda run, own: float(own[0].slope) * column,
     )
     projector = SimpleNamespace(residual=0.8 * column, off=lambda joined: joined, join=lambda signals: signals[0])
     found = refit(bench, projector, [law], [law.start])
@@ -119,7 +119,7 @@ def at_slope(value, truth):
     bench = SimpleNamespace(
         prepared=[None],
         plain=[np.zeros(50)],
-        respond=lambda effects: [float(own[0].slope) * column for own in effects],
+        respond_in=lambda run, own: float(own[0].slope) * column,
     )
     projector = SimpleNamespace(residual=truth * column, off=lambda joined: joined, join=lambda signals: signals[0])
     return bench, projector, refit(bench, projector, [law], [law.start], 0)

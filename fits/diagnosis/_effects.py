@@ -45,17 +45,19 @@ class Bench:
 
     def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
         """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
-        out = []
-        for acting, known, one in zip(effects, self.known, self.prepared, strict=True):
-            stage = with_effects(self.stage, self._seen(acting, one))
-            # Up to the first part that is another, the signal is known.
-            pairs = zip(stage.parts, self.stage.parts, strict=False)
-            same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], pairs))
-            signal = known[same]
-            for part in stage.parts[same:]:
-                signal = pass_signal(part, one.time_s, signal, one.scene)
-            out.append(at_samples(signal, one))
-        return out
+        return [self.respond_in(run, acting) for run, acting in enumerate(effects)]
+
+    def respond_in(self, run: int, effects: Sequence[AbstractEffect]) -> np.ndarray:
+        """Simulate one run with effects; um, shape `(n,)`."""
+        one = self.prepared[run]
+        stage = with_effects(self.stage, self._seen(effects, one))
+        # Up to the first part that is another, the signal is known.
+        pairs = zip(stage.parts, self.stage.parts, strict=False)
+        same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], pairs))
+        signal = self.known[run][same]
+        for part in stage.parts[same:]:
+            signal = pass_signal(part, one.time_s, signal, one.scene)
+        return at_samples(signal, one)
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
         """Those that a run may be asked about: none that is its own and too fast for its samples."""
@@ -67,8 +69,7 @@ class Bench:
 
     def change(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
         """What effects that all runs share change in them, in um."""
-        out = self.respond([effects] * len(self.prepared))
-        return [a - b for a, b in zip(out, self.plain, strict=True)]
+        return [self.respond_in(run, effects) - plain for run, plain in enumerate(self.plain)]
 
 
 def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:

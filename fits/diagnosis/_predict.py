@@ -196,13 +196,12 @@ def _same(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -
 
 def _changes(bench: Bench, h: Hypothesis) -> tuple[list[np.ndarray], list[list[list[np.ndarray]]]]:
     """What a hypothesis changes in all runs, in um, and of each effect the derivatives along its coordinates."""
-    runs = range(len(bench.prepared))
-    at = bench.respond([h.effects(run) for run in runs])
+    at = bench.respond([h.effects(run) for run in range(len(bench.prepared))])
     slopes: list[list[list[np.ndarray]]] = [[] for _ in h.laws]
     for k, law in enumerate(h.laws):
-        for step in _STEP * np.eye(law.size):
+        for j, step in enumerate(_STEP * np.eye(law.size)):
             moved = replace(h, x=(*h.x[:k], h.x[k] + step, *h.x[k + 1 :]))
-            ahead = bench.respond([moved.effects(run) for run in runs])
+            ahead = [bench.respond_in(i, moved.effects(i)) if j in law.places[i] else at[i] for i in range(len(at))]
             slopes[k].append([(a - b) / _STEP for a, b in zip(ahead, at, strict=True)])
     return [a - b for a, b in zip(at, bench.plain, strict=True)], slopes
 

@@ -231,45 +231,43 @@ def _fit(
 ) -> Refit:
     """Fit all laws but the first so many, which follow along `basis`."""
     runs = len(bench.prepared)
-    sizes = [law.size for law in laws[held:]]
+    moving = laws[held:]
     target = projector.off(projector.residual)
 
     def parts(flat: np.ndarray) -> list[np.ndarray]:
-        return np.split(flat, np.cumsum(sizes)[:-1])
+        return np.split(flat, np.cumsum([law.size for law in moving])[:-1])
 
     fixed = [[law.effect(own, run) for law, own in zip(laws[:held], x[:held], strict=True)] for run in range(runs)]
+    # Per run, whether it depends on each of the coordinates.
+    counts = [[k in law.places[run] for law in moving for k in range(law.size)] for run in range(runs)]
 
-    def change(flat: np.ndarray) -> list[np.ndarray]:
-        cut = parts(flat)
-        effects = [
-            [*fixed[run], *(law.effect(own, run) for law, own in zip(laws[held:], cut, strict=True))]
-            for run in range(runs)
-        ]
+    def change_in(run: int, flat: np.ndarray) -> np.ndarray:
+        effects = [*fixed[run], *(law.effect(own, run) for law, own in zip(moving, parts(flat), strict=True))]
         # What runs away is as wrong as can be, and its square is still a number.
-        return [np.clip(a - b, -_AWAY_um, _AWAY_um) for a, b in zip(bench.respond(effects), bench.plain, strict=True)]
+        return np.clip(bench.respond_in(run, effects) - bench.plain[run], -_AWAY_um, _AWAY_um)
 
     def off(joined: np.ndarray) -> np.ndarray:
         moved = projector.off(joined)
         return moved - basis @ (basis.T @ moved)
 
-    def joined(flat: np.ndarray) -> np.ndarray:
-        return projector.join(change(flat))
-
-    def left(joined: np.ndarray) -> np.ndarray:
-        moved = aim - off(joined)
+    def left(change_um: Sequence[np.ndarray]) -> np.ndarray:
+        moved = aim - off(projector.join(change_um))
         return np.where(np.isfinite(moved), moved, 1e6)
 
-    def slope(flat: np.ndarray, at: np.ndarray) -> np.ndarray:
-        raw = np.stack([(joined(flat + step) - at) / _STEP for step in _STEP * np.eye(len(flat))], axis=1)
+    def slope() -> np.ndarray:
+        at, raw = projector.join(at_um), np.empty((len(target), len(flat)))
+        for k, step in enumerate(_STEP * np.eye(len(flat))):
+            moved = [change_in(run, flat + step) if counts[run][k] else um for run, um in enumerate(at_um)]
+            raw[:, k] = (projector.join(moved) - at) / _STEP
         raw = np.where(np.isfinite(raw), raw, 0.0)
         seen = -off(raw)
         return np.where(np.linalg.norm(seen, axis=0) > _ROUNDING_SHARE * np.linalg.norm(raw, axis=0), seen, 0.0)
 
     aim = target - basis @ (basis.T @ target)
     flat = np.concatenate(list(x[held:]))
-    at = joined(flat)
-    residual = left(at)
-    jacobian = slope(flat, at) if rounds else np.zeros((len(residual), len(flat)))
+    at_um = [change_in(run, flat) for run in range(runs)]
+    residual = left(at_um)
+    jacobian = slope() if rounds else np.zeros((len(residual), len(flat)))
     damping, farthest = 1e-3, _FARTHEST
     for _ in range(rounds):
         cost = float(residual @ residual)
@@ -281,17 +279,16 @@ def _fit(
             # No coordinate moves by more than a few e-folds at a time, or than less where that was too far, as near a
             # bound; one at its bound holds no other back.
             step = np.clip(step, -farthest, farthest)
-            ahead = joined(flat + step)
-            trial = left(ahead)
+            ahead_um = [change_in(run, flat + step) for run in range(runs)]
+            trial = left(ahead_um)
             if float(trial @ trial) < cost:
-                flat, at, residual, damping, moved = flat + step, ahead, trial, damping / 10, True
+                flat, at_um, residual, damping, moved = flat + step, ahead_um, trial, damping / 10, True
                 farthest = min(_SHORTER * farthest, _FARTHEST)
                 break
             damping *= 10
             farthest = min(farthest, float(np.max(np.abs(step)))) / _SHORTER
         if not moved or cost - float(residual @ residual) < _LEAST_GAIN:
             break
-        jacobian = slope(flat, at)
-    cut = parts(flat)
-    found = tuple(laws), (*x[:held], *cut), tuple(change(flat))
+        jacobian = slope()
+    found = tuple(laws), (*x[:held], *parts(flat)), tuple(at_um)
     return Refit(*found, residual, -jacobian, float(residual @ residual))

@@ -76,7 +76,7 @@ def regress(
     # By run, and then by kind.
     structure: list[list[np.ndarray]] = []
     stage = baseline.stage
-    for run, fine_run, there, own in zip(runs, baseline.fine, levelling, effects, strict=True):
+    for run, many, few, there, own in zip(runs, baseline.fine, baseline.coarse, levelling, effects, strict=True):
         here = with_effects_in(chain, baseline.z, there)
         _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
@@ -84,13 +84,13 @@ def regress(
         # The change of others depends on driver and mechanics: a lag of the sensor and one of the driver do nearly
         # the same, so that telling them apart takes exact derivatives.
         dependent = tuple(one for one in own if one.place not in ("environment", "noise"))
-        both[:, chain.size :] = _slope(baseline, dependent, fine_run) if dependent else slope[:n]
+        both[:, chain.size :] = slope[:n] + (_slope_of_change(baseline, dependent, few) if dependent else 0.0)
         for first, columns in pieces(here, z, run, True):
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         around = both[:, : chain.size] @ baseline.columns_um
         both[:, : chain.size] = propagated(here, baseline.z, run, around, both[:, : chain.size])
         rows.append(both)
-        plain = simulate(stage, fine_run)
+        plain = simulate(stage, many)
         speed = np.gradient(plain, run.record.time_s)
         late = [speed] if baseline.skewed else []
         # With an instant off by d, a reading is y + d y' + d^2 y'' / 2: the first is noise, the second is not.
@@ -120,16 +120,18 @@ def _without_decayed(nuisance: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     return np.where(left, nuisance, 0.0)
 
 
-def _slope(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: Run) -> np.ndarray:
-    """Derivatives along the coordinates of the stage with effects, shape `(n, p)`, by central differences.
+def _slope_of_change(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: Run) -> np.ndarray:
+    """Derivatives along the coordinates of what effects change, shape `(n, p)`, by central differences.
 
     Their programs are at hand, those of exact ones would have to be compiled for every effect.
     """
-    out = np.empty((len(run.record), len(baseline.z)))
-    for k, step in enumerate(_STEP * np.eye(len(baseline.z))):
-        ends = [simulate(with_effects(baseline.moved(way, 0.0).stage, effects), run) for way in (step, -step)]
-        out[:, k] = (ends[0] - ends[1]) / (2 * _STEP)
-    return out
+
+    def change(step: np.ndarray) -> np.ndarray:
+        stage = baseline.moved(step, 0.0).stage
+        return simulate(with_effects(stage, effects), run) - simulate(stage, run)
+
+    steps = _STEP * np.eye(len(baseline.z))
+    return np.column_stack([(change(step) - change(-step)) / (2 * _STEP) for step in steps])
 
 
 def _roughness(baseline: Baseline) -> np.ndarray:
