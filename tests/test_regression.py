@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad
+from scipy.integrate import dblquad, quad
 from scipy.optimize import nnls
 from scipy.stats import multivariate_normal
 
@@ -79,7 +79,7 @@ def test_evidence_is_the_density_of_the_data_under_the_prior(rng):
         covariance = np.exp(variance) * np.eye(len(target)) + design @ np.linalg.solve(prior, design.T)
         ours = float(_negative_log(hyper, (data.total, rough)))
         smooth = np.array([density, along, reversible])
-        weak = np.sum(((smooth + 4.6) / 6.0) ** 2) / 2
+        weak = np.sum(((smooth - [np.log(1e-2), 2.0, np.log(1e-2)]) / 6.0) ** 2) / 2
         return ours - weak, -multivariate_normal(np.zeros(len(target)), covariance).logpdf(target)
 
     pairs = [cost(*point) for point in ((-3.0, -4.0, -2.0, -1.0), (1.0, 0.5, -1.0, -3.0), (-5.0, 0.0, 2.0, 0.0))]
@@ -106,7 +106,7 @@ def test_posterior_is_that_of_dense_bayesian_regression(problem):
     np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-5, atol=1e-9 * covariance.max())
 
 
-def test_roughness_is_the_weighted_integral_of_squared_curvature():
+def test_roughness_is_the_weighted_integral_of_squared_curvature_and_slope():
     # A quadratic has constant second derivatives: 2a, 2c and b along the two axes and mixed.
     n, (a, b, c) = 40, (1.3, -0.7, 0.4)
     v = np.linspace(0, 1, n)
@@ -117,11 +117,18 @@ def test_roughness_is_the_weighted_integral_of_squared_curvature():
     area = quad(lambda x: (1 - x) * ((x + 0.05) / 0.35) ** 2, 0, 1)[0]
     curvature = ((2 * a) ** 2 + 2 * b**2 + (2 * c) ** 2) * area
     np.testing.assert_allclose(columns @ rough.density @ columns, curvature, rtol=0.15)
-    np.testing.assert_allclose(columns @ rough.along @ columns, (2 * a + 2 * b + 2 * c) ** 2 * area, rtol=0.15)
+    # Along the diagonal both thresholds move.
+    slope, _ = dblquad(
+        lambda low, high: ((2 * a + b) * high + (b + 2 * c) * low) ** 2 * ((high - low + 0.05) / 0.35) ** 2,
+        *(0, 1, 0, lambda high: high),
+    )
+    np.testing.assert_allclose(columns @ rough.along @ columns, slope, rtol=0.15)
     np.testing.assert_allclose(columns @ rough.reversible @ columns, 16.0, rtol=0.1)
     straight = np.concatenate([3 + 2 * alpha - beta, 1 - v])
-    for form in (rough.density, rough.along, rough.reversible):
+    for form in (rough.density, rough.reversible):
         assert abs(straight @ form @ straight) < 1e-6
+    plays = np.concatenate([np.exp(-((alpha - beta) ** 2)), 1 - v])
+    assert abs(plays @ rough.along @ plays) < 1e-6
 
 
 def test_interpolated_columns_respond_as_the_coarse_ones_where_the_grids_share_nodes(rng):

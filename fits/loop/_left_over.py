@@ -42,17 +42,30 @@ def suggestions(runs: Sequence[Run], model: Preisach, stroke_um: float, hyper: H
         lags.append(np.gradient(predicted, time)[:, None])
         relaxations.append(_relaxed(time, predicted))
     left_um, lags, relaxations = map(beside, ([run.displacement_um for run in runs], lags, relaxations))
-    out = []
-    for what, option, columns in (
-        ("a lag", "--lag", lags),
-        ("relaxations (creep)", f"--relaxation {_CONSTANTS}", relaxations),
-    ):
-        share = _share_left(runs, columns, left_um)
-        if share < _CLEARLY:
-            out.append(
-                f"{what} would take {100 * (1 - share):.0f} % of the residual away, in blocks that are predicted "
-                f"from the others: fit again with {option}"
-            )
+    found = {
+        ("a lag", "--lag"): lags,
+        ("relaxations (creep)", f"--relaxation {_CONSTANTS}"): relaxations,
+    }
+    # Each beside what is suggested already: what one leaves may hide the other.
+    out, options = list[str](), ""
+    taken = [np.ones((len(left), 1)) for left in left_um]
+    before = _left(runs, taken, left_um)
+    while found:
+        joined = {key: [np.c_[own, more] for own, more in zip(taken, found[key], strict=True)] for key in found}
+        rms_um = {key: _left(runs, columns, left_um) for key, columns in joined.items()}
+        best = min(rms_um, key=lambda key: rms_um[key])
+        share = rms_um[best] / max(before, 1e-300)
+        if share >= _CLEARLY:
+            break
+        what, option = best
+        rest = "beside that, " if out else ""
+        options += f" {option}"
+        out.append(
+            f"{rest}{what} would take {100 * (1 - share):.0f} % of the residual away, in blocks that are predicted "
+            f"from the others: fit again with{options}"
+        )
+        taken, before = joined[best], rms_um[best]
+        del found[best]
     return out
 
 
@@ -67,17 +80,16 @@ def _relaxed(time_s: np.ndarray, predicted_um: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def _share_left(runs: Sequence[Run], columns: Sequence[np.ndarray], left_um: Sequence[np.ndarray]) -> float:
-    """What columns leave of the root mean square of blocks, with coefficients from the other blocks, as a share."""
-    before = after = 0.0
-    for run, own, left in zip(runs, columns, left_um, strict=True):
+def _left(runs: Sequence[Run], columns: Sequence[np.ndarray], left_um: Sequence[np.ndarray]) -> float:
+    """Root mean square, in um, of what columns leave of blocks, with coefficients from the other blocks."""
+    square = count = 0.0
+    for run, rows, left in zip(runs, columns, left_um, strict=True):
         label = blocks_of(run, PIECES)
-        rows = np.c_[own, np.ones(len(own))]
         for block in range(BLOCKS):
             rest, inside = (label >= 0) & (label != block), label == block
             if not inside.any():
                 continue
             answer = np.linalg.lstsq(rows[rest], left[rest], rcond=1e-10)[0]
-            before += float(np.sum((left[inside] - left[rest].mean()) ** 2))
-            after += float(np.sum((left[inside] - rows[inside] @ answer) ** 2))
-    return (after / max(before, 1e-300)) ** 0.5
+            square += float(np.sum((left[inside] - rows[inside] @ answer) ** 2))
+            count += float(inside.sum())
+    return float((square / max(count, 1.0)) ** 0.5)

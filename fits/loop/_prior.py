@@ -12,13 +12,17 @@ from jaxtyping import Array, Float
 
 from fits.loop._moments import Moments
 
+# Logarithms of the weights where the data say nothing: curvatures of about ten strokes per squared range, and a
+# density, of some strokes per squared range, that changes by a third of one from one end of the range to the other.
+_MIDDLING = (np.log(1e-2), 2.0, np.log(1e-2))
+
 
 class Hyper(eqx.Module):
     """How smooth and how noisy, as natural logarithms; found from the data by the evidence.
 
-    `log_density` weighs the integrated squared curvature of the density in all directions, `log_along` in addition
-    that along the diagonal, as loops of one size are alike at all biases, and `log_reversible` that of the reversible
-    slope. `log_variance` is of the noise, in squared strokes.
+    `log_density` weighs the integrated squared curvature of the density in all directions, `log_along` its squared
+    slope along the diagonal, as loops of one size are alike at all biases (exactly so in sums of plays), and
+    `log_reversible` the squared curvature of the reversible slope. `log_variance` is of noise, in squared strokes.
     """
 
     log_density: Float[Array, ""]
@@ -28,9 +32,9 @@ class Hyper(eqx.Module):
 
     @classmethod
     def start(cls) -> "Hyper":
-        """Curvatures of about ten strokes per squared range, noise of a thousandth of the stroke."""
-        weight = jnp.asarray(np.log(1e-2))
-        return cls(weight, weight, weight, jnp.asarray(np.log(1e-6)))
+        """Weights that are believed beforehand, and noise of a thousandth of the stroke."""
+        density, along, reversible = map(jnp.asarray, _MIDDLING)
+        return cls(density, along, reversible, jnp.asarray(np.log(1e-6)))
 
     def relaxed(self, efolds: float) -> "Hyper":
         """The same with all curvature counting less by so many e-folds."""
@@ -39,7 +43,7 @@ class Hyper(eqx.Module):
 
 
 class Roughness(eqx.Module):
-    """Quadratic forms that measure the squared curvature of what `Hyper` weighs, in the columns of a `Grid`."""
+    """Quadratic forms that measure the squared curvatures and slope that `Hyper` weighs, in columns of a `Grid`."""
 
     density: Float[Array, "D D"]
     along: Float[Array, "D D"]
@@ -77,13 +81,13 @@ def _matrices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         + _squared(n, ((0, -1), (0, 0), (0, 1)), second)
         + _squared(n, ((0, 0), (1, 0), (0, 1), (1, 1)), np.sqrt(2.0) * np.array([1.0, -1.0, -1.0, 1.0]))
     )
-    along = _squared(n, ((-1, -1), (0, 0), (1, 1)), second)
+    along = _squared(n, ((0, 0), (1, 1)), np.array([-1.0, 1.0]))
     slope = np.diff(np.eye(n), 2, axis=0)
     weights = len(density)
     forms = np.zeros((3, weights + n, weights + n))
-    # A second difference over a step of 1 / (n - 1) is a derivative times the step squared.
+    # Over a step of 1 / (n - 1) a second difference is a derivative times the step squared, a first one times it.
     forms[0, :weights, :weights] = density * (n - 1) ** 2
-    forms[1, :weights, :weights] = along * (n - 1) ** 2
+    forms[1, :weights, :weights] = along
     forms[2, weights:, weights:] = slope.T @ slope * (n - 1) ** 3
     return forms[0], forms[1], forms[2]
 
@@ -166,7 +170,7 @@ def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array,
     prior_volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(prior))))
     weights = jnp.stack([hyper.log_density, hyper.log_along, hyper.log_reversible])
     # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
-    unlikely = jnp.sum(((weights + 4.6) / 6.0) ** 2)
+    unlikely = jnp.sum(((weights - jnp.asarray(_MIDDLING)) / 6.0) ** 2)
     return jnp.asarray(moments.count * hyper.log_variance + misfit + volume - prior_volume + unlikely) / 2
 
 
