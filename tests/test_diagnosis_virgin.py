@@ -1,6 +1,7 @@
 """Runs that begin where no loop comes by, made by plain plays; and steps that a bound or a zero once broke."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from fits import FitError, Record, diagnose
 from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
-from fits.diagnosis._regression import regress
+from fits.diagnosis._regression import _slope_of_change, regress
 from fits.loop._choose_grid import _resolve
 from fits.loop._result import FitStatus
 from fits.loop._run import known_samples
@@ -94,6 +95,12 @@ def test_what_shows_nothing_does_not_move_the_baseline(rng):
     expected, moved = (projector.move(projector.residual) for projector in (plain, dead))
     np.testing.assert_allclose(moved.z, expected.z, atol=1e-6)
     np.testing.assert_allclose(moved.columns_um, expected.columns_um, atol=1e-6)
+
+
+def test_a_stage_without_driver_and_mechanics_has_no_coordinates(rng):
+    static = SimpleNamespace(z=np.zeros(0))
+    run = SimpleNamespace(record=record(rng, None))
+    assert _slope_of_change(static, (Backlash(jnp.asarray(0.03), jnp.asarray(0.5)),), run).shape == (3000, 0)
 
 
 def test_a_grid_that_fails_leaves_the_coarser():

@@ -121,10 +121,9 @@ def diagnose(
 
     reading = Reading(records, aside, fraction, initial, thresholds)
     ready, found = answer(reading)
-    error = ready.projector.held_out(found.model.change_um)
-    # Asked again, it takes as long again.
-    has_twice = 2 * time.monotonic() - begin_s < end_s
-    if not found.causes and not aside and len(error) and float(np.mean(error**2)) > _UNLIKE and has_twice:
+    left, plain = (ready.projector.held_out(one.change_um) for one in (found.model, found.plain))
+    unlike = float(left @ left) > max(_UNLIKE * len(left), (1 - thresholds.minor_share) * float(plain @ plain))
+    if unlike and not aside and 2 * time.monotonic() - begin_s < end_s:  # it takes as long again
         progress("asking again with what was held out, which noise does not explain")
         whole, shown = answer(replace(reading, fraction=0.0))
         if max((cause.z for cause in shown.causes), default=0.0) > thresholds.strong_z:

@@ -130,8 +130,11 @@ def _slope_of_change(baseline: Baseline, effects: tuple[AbstractEffect, ...], ru
         stage = baseline.moved(step, 0.0).stage
         return simulate(with_effects(stage, effects), run) - simulate(stage, run)
 
-    steps = _STEP * np.eye(len(baseline.z))
-    return np.column_stack([(change(step) - change(-step)) / (2 * _STEP) for step in steps])
+    # Without driver and mechanics there are no coordinates.
+    out = np.empty((len(run.record), len(baseline.z)))
+    for k, step in enumerate(_STEP * np.eye(len(baseline.z))):
+        out[:, k] = (change(step) - change(-step)) / (2 * _STEP)
+    return out
 
 
 def _roughness(baseline: Baseline) -> np.ndarray:
