@@ -167,7 +167,7 @@ def asked(monkeypatch):
     def prepare(reading, progress):
         log.readings.append(reading)
         answer = log.answers[len(log.readings) - 1]
-        projector = SimpleNamespace(held_out=lambda change: np.full(50, answer.get("error", 1.0) ** 0.5))
+        projector = SimpleNamespace(held_out=lambda which: np.full(50, answer.get(which, answer.get("error", 1.0)) ** 0.5))
         baseline = fits.diagnosis._baseline.Baseline(*(None,) * 14, True, ("said",))
         parts = {"bench": None, "regression": None, "probes": (), "faults": None, "skipped": ()}
         from fits.diagnosis._prepare import Prepared
@@ -177,7 +177,8 @@ def asked(monkeypatch):
     def select(*_):
         answer = log.answers[len(log.readings) - 1]
         causes = [SimpleNamespace(z=z) for z in answer.get("z", ())]
-        return SimpleNamespace(causes=causes, model=SimpleNamespace(change_um=()), of=answer)
+        model, plain = (SimpleNamespace(change_um=which) for which in ("error", "plain"))
+        return SimpleNamespace(causes=causes, model=model, plain=plain, of=answer)
 
     monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
     monkeypatch.setattr(_diagnose, "select", select)
@@ -208,8 +209,10 @@ def test_what_was_held_out_is_used_where_only_it_shows_a_cause(asked, z):
     assert reading.fraction == 0.0
     assert kept is (whole if z > 8 else first)
     assert any("not measured on new data" in words for words in ready.baseline.remarks) == (z > 8)
-    # It is not where noise explains it, a cause was found, or whole runs are held out.
+    # Also where a cause was found that explains hardly any of it.
+    assert asked({"error": 3.0, "plain": 3.5, "z": (9.0,)}, whole)[2][1].fraction == 0.0
+    # It is not where noise explains it, a cause does, or whole runs are held out.
     assert asked({"error": 1.2})[1] == {"error": 1.2}
-    asked({"error": 3.0, "z": (9.0,)})
+    asked({"error": 3.0, "plain": 6.0, "z": (9.0,)})
     aside = Record(np.arange(6.0), np.arange(6.0), np.zeros(6))
     assert asked({"error": 3.0}, holdout=[aside])[2][0].fraction == 0.12
