@@ -167,7 +167,9 @@ def asked(monkeypatch):
     def prepare(reading, progress):
         log.readings.append(reading)
         answer = log.answers[len(log.readings) - 1]
-        projector = SimpleNamespace(held_out=lambda which: np.full(50, answer.get(which, answer.get("error", 1.0)) ** 0.5))
+        projector = SimpleNamespace(
+            held_out=lambda which: np.full(50, answer.get(which, answer.get("error", 1.0)) ** 0.5)
+        )
         baseline = fits.diagnosis._baseline.Baseline(*(None,) * 14, True, ("said",))
         parts = {"bench": None, "regression": None, "probes": (), "faults": None, "skipped": ()}
         from fits.diagnosis._prepare import Prepared
