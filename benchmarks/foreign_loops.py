@@ -4,7 +4,7 @@ Usage: `python benchmarks/foreign_loops.py [--rigs 4] [--seed 0]`. Three laws, n
 grid: sums of 300 plays with gamma or lognormal thresholds, and a grid of relays with a bell in the half-plane; each
 beside a straight line, with white noise of 0.03 um on a stroke of some 20 um. Three programs, from negative
 saturation: `one way` is seen up only, `two turns` once up, down and up, and the last way back is predicted; of
-`loops`, which shrink, the last third is predicted. Errors are in % of the stroke; the first fit of each kind also compiles.
+`loops`, which shrink, the last third is predicted. Errors are in % of the stroke.
 """
 
 import argparse
