@@ -23,8 +23,8 @@ from fits.diagnosis._residual_tests import (
     irregular,
     run_regressors,
 )
+from fits.stats._band import Band
 from fits.stats._noise import Noise
-from fits.stats._noise_spectrum import Band
 
 
 def run_of(voltage_V, displacement_um, rate_Hz=1000.0):

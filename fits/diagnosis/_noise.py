@@ -9,15 +9,15 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
+from fits.stats._band import Band, band_of
 from fits.stats._noise import Noise, quantum_um, rough_noise_um
-from fits.stats._noise_spectrum import Band, band_of
 from fits.stats._sensor_noise import floor_of, jitter_s, pooled, spikes, white_noise
 from microid.effects import Statistic
 
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
-# A band is one of a resonance from this quality on; what is broader wanders, or jumps.
-_NARROW = 1.5
+# A band is one of a resonance from this quality on; what is broader may be the colour of the noise.
+_NARROW = 3.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,191 @@
+"""A narrow band in noise of any colour, as a shaking floor makes it, by the likelihood of the spectrum."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+from scipy.optimize import minimize
+
+from fits.io._quantity import FloatArray
+from fits.stats._noise_spectrum import DRIFT, MAINS_Hz
+
+# Where a band is looked for, in Hz, and from how many cycles in the record on.
+_LOWEST_Hz, _HIGHEST_Hz, _CYCLES = 2.0, 200.0, 5
+# Bins of the spectrum are averaged over this part of their frequency. A Hann window leaves half of them independent.
+_TOGETHER, _INDEPENDENT = 1 / 150, 0.5
+# The floor is known by its level at every so many octaves.
+_OCTAVES = 2
+# A Hann window makes a line so many bins wide.
+_LINE = 4
+# Qualities, and heights above the floor, from which the likelihood climbs.
+_QUALITIES, _HEIGHTS = 2.0 ** np.arange(0, 9), 4.0 ** np.arange(0, 8)
+
+
+@dataclass(frozen=True)
+class Band:
+    """The strongest narrow band of a residual: middle, size (rms) and its sd, quality, evidence, and bins."""
+
+    frequency_Hz: float
+    size_um: float
+    sd_um: float
+    quality: float
+    z: float
+    rate_Hz: float = 0.0
+    bins: int = 1
+
+    @property
+    def mains(self) -> bool:
+        """Whether it is near a line of mains, or near what sampling makes of one, or is nothing at all."""
+        rate, own = self.rate_Hz, DRIFT * 4
+        if self.bins >= 16:  # no line has so many
+            return False
+        return rate == 0 or any(
+            abs(self.frequency_Hz - abs((k * line + rate / 2) % rate - rate / 2))
+            < own * k * line + self.frequency_Hz / 60
+            for line in MAINS_Hz
+            for k in range(1, 5)
+        )
+
+
+def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -> Band:
+    """Find a narrow band between 2 and 200 Hz that goes on throughout and that the command does not play.
+
+    The spectrum is that of a floor, whose logarithm is straight over every two octaves, and of one Lorentzian
+    peak above it. The evidence is what the peak adds to the likelihood (P. Whittle, "Estimation and information in
+    stationary time series", Ark. Mat. 2 (1953), 423-434), less what chance adds at the best of all places.
+    """
+    none = Band(0.0, 0.0, 0.0, 0.0, 0.0)
+    n, bin_Hz = len(residual_um), 1 / (len(residual_um) * interval_s)
+    lowest_Hz, highest_Hz = max(_LOWEST_Hz, _CYCLES * bin_Hz), min(_HIGHEST_Hz, 0.45 / interval_s)
+    # An octave beyond both ends tells a peak there from a slope.
+    spectrum = _Spectrum.of(_power(residual_um), bin_Hz, lowest_Hz / 2, 2 * highest_Hz)
+    inside = (spectrum.frequency_Hz > lowest_Hz) & (spectrum.frequency_Hz < highest_Hz)
+    if inside.sum() < 20 or not spectrum.power.min() > 0:
+        return none
+    floor = spectrum.floor()
+    _, nothing = spectrum.fit(floor, None)
+    start = spectrum.start(floor, spectrum.frequency_Hz[inside], bin_Hz)
+    (*_, height, middle, quality), found = spectrum.fit(floor, np.log(start))
+    middle_Hz, quality = float(np.exp(middle)), float(np.exp(quality))
+    best, width_Hz = round(middle_Hz / bin_Hz), middle_Hz / quality
+    bins = max(round(width_Hz / bin_Hz), 1)
+    if not lowest_Hz < middle_Hz < highest_Hz or (bins <= _LINE and _played(_power(command_V), best)):
+        return none
+    # It goes on throughout: no block has nearly all of it.
+    swing = np.exp(-2j * np.pi * middle_Hz * interval_s * np.arange(n)) * (residual_um - residual_um.mean())
+    blocks = np.array([np.abs(block.sum()) ** 2 for block in np.array_split(swing, 8)])
+    if np.sort(blocks)[-2:].sum() > 0.85 * blocks.sum():
+        return none
+    if not _steady(residual_um, best / n, 2 * width_Hz * interval_s):
+        return none
+    # The area of the peak, whose bins stand for two each.
+    size_um = float(np.exp(height) * np.pi / 2 * width_Hz / bin_Hz * 2 / n) ** 0.5
+    # Noise of this width has so many independent values.
+    sd_um = size_um / (2 * max(width_Hz * n * interval_s, 1.0) ** 0.5)
+    z = max(2 * (found - nothing - np.log(inside.sum())), 0.0) ** 0.5
+    return Band(middle_Hz, size_um, sd_um, quality, float(z), 1 / interval_s, bins)
+
+
+def _power(values: FloatArray) -> FloatArray:
+    """Spectrum under a Hann window, whose mean over the bins is the variance of white noise."""
+    window = np.hanning(len(values))
+    return np.asarray(np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2 / np.sum(window**2))
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """Averages of a spectrum, their numbers of independent bins, shapes `(k,)`, and the floor's tents, `(k, m)`."""
+
+    frequency_Hz: FloatArray
+    power: FloatArray
+    count: FloatArray
+    tents: FloatArray
+
+    @classmethod
+    def of(cls, power: FloatArray, bin_Hz: float, lowest_Hz: float, highest_Hz: float) -> "_Spectrum":
+        """Average neighbours where many are within a small part of their frequency."""
+        first, stop = max(int(lowest_Hz / bin_Hz), 2), min(int(highest_Hz / bin_Hz) + 1, len(power) - 1)
+        edges = [first]
+        while edges[-1] < stop:
+            edges.append(edges[-1] + max(int(edges[-1] * _TOGETHER), 1))
+        edges[-1] = max(stop, first + 1)
+        bins = np.diff(edges)
+        frequency_Hz = (np.array(edges[:-1]) + (bins - 1) / 2) * bin_Hz
+        mean = np.add.reduceat(power[: edges[-1]], edges[:-1]) / bins
+        octaves = np.log2(frequency_Hz)
+        knots = np.linspace(octaves[0], octaves[-1], max(round((octaves[-1] - octaves[0]) / _OCTAVES), 1) + 1)
+        tents = np.stack([np.interp(octaves, knots, one) for one in np.eye(len(knots))], axis=1)
+        return cls(frequency_Hz, mean, np.asarray(_INDEPENDENT * bins), tents)
+
+    def floor(self) -> FloatArray:
+        """Logarithm of the floor at its knots: medians around them, which a narrow band does not move."""
+        logarithm = np.log(self.power)
+        return np.array([np.median(logarithm[tent > 0.3]) for tent in self.tents.T]) - np.log(np.log(2))
+
+    def fit(self, floor: FloatArray, peak: FloatArray | None) -> tuple[FloatArray, float]:
+        """Maximise the likelihood from a floor and the logarithms of a peak's height, middle and quality, if any."""
+        knots = len(floor)
+
+        def cost(unknowns: FloatArray) -> tuple[float, FloatArray]:
+            level = np.exp(self.tents @ unknowns[:knots])
+            slopes = [self.tents * level[:, None]]
+            if peak is not None:
+                height, middle, quality = np.exp(unknowns[knots:])
+                off = 2 * quality * (self.frequency_Hz / middle - 1)
+                lorentzian = height / (1 + off**2)
+                bent = 2 * lorentzian * off / (1 + off**2)
+                slopes += [lorentzian[:, None], (bent * (off + 2 * quality))[:, None], (-bent * off)[:, None]]
+                level = level + lorentzian
+            ratio = self.power / level
+            gradient = np.concatenate(slopes, axis=1).T @ (self.count * (1 - ratio) / level)
+            return float(self.count @ (np.log(level) + ratio)), gradient
+
+        start = floor if peak is None else np.concatenate([floor, peak])
+        least, most = np.log(self.frequency_Hz[[0, -1]])
+        shapes = [(None, None), (least, most), (0.0, np.log(_QUALITIES[-1]))]
+        bounds = [(None, None)] * knots + ([] if peak is None else shapes)
+        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 300})
+        return found.x, -float(found.fun)
+
+    def start(self, floor: FloatArray, middles_Hz: FloatArray, bin_Hz: float) -> FloatArray:
+        """Height, middle and quality of the peak that adds most to the likelihood of a floor."""
+        level = np.exp(self.tents @ floor)
+        ratio, best, found = self.power / level, -np.inf, np.ones(3)
+        for quality in _QUALITIES:
+            # So close together that none is missed, and no band narrower than two bins.
+            lowest, highest = float(middles_Hz[0]), float(middles_Hz[-1])
+            some = np.geomspace(lowest, highest, round(4 * quality * np.log(highest / lowest)))
+            some = middles_Hz[np.unique(np.searchsorted(middles_Hz, some[some > 2 * quality * bin_Hz]))]
+            off = 2 * quality * (self.frequency_Hz[None, :] / some[:, None] - 1)
+            for height in _HEIGHTS:
+                more = height / (1 + off**2)
+                gain = (ratio * more / (1 + more) - np.log1p(more)) @ self.count
+                if len(gain) and gain.max() > best:
+                    at = int(np.argmax(gain))
+                    best = float(gain[at])
+                    found = np.array([height * np.interp(some[at], self.frequency_Hz, level), some[at], quality])
+        return found
+
+
+def _played(played: FloatArray, at: int) -> bool:
+    """Whether a bin is at a multiple of a line of the command's spectrum: a loop played again and again has some."""
+    lines = median_filter(played, 2 * (len(played) // 16) + 1, mode="nearest")
+    for k in range(1, 13):
+        middle = round(at / k)
+        near = slice(max(middle - 2, 1), middle + 3)
+        if middle > _CYCLES and played[near].max() > max(1e3 * lines[middle], 1e-4 * played.sum()):
+            return True
+    return False
+
+
+def _steady(values: FloatArray, middle: float, width: float) -> bool:
+    """Whether what is in a band, in parts of the sampling rate, is as strong throughout as noise of that width."""
+    # Each block has some eight independent numbers; of fewer blocks none is told from chance.
+    blocks = min(round(width * len(values) / 4), 8)
+    if blocks < 4:
+        return True
+    spectrum = np.fft.rfft(values - values.mean())
+    frequency = np.fft.rfftfreq(len(values))
+    part = np.fft.irfft(np.where(np.abs(frequency - middle) < width / 2, spectrum, 0.0), len(values))
+    powers = np.sort([float(block @ block) for block in np.array_split(part, blocks)])
+    return bool(powers[1] > 0.25 * powers.mean())  # as nearly every eighth of a record has
