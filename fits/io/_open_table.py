@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from fits.io._errors import AnyPath, DataError
-from fits.io._frames import of_frame
 from fits.io._read_file import MOST_CSV_BYTES, read_bytes, unpack
-from fits.io._table import ArrayTable, Table, gathered
+from fits.io._table import ArrayTable, Table, gathered, of_frame
 from fits.io.formats import FORMATS, Format
 
 _CSV = "a CSV file"
