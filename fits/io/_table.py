@@ -81,11 +81,11 @@ class ArrayTable(Table):
                 columns[name] = array
                 continue
             row = int(np.argmin(good))
+            found = str(array[row])
             if name in strict:
-                raise self.error(
-                    f"expected a finite number, found {array[row]}; {missing_remedy(array[row])}", row, name
-                )
-            problems[name] = self.place(row), str(array[row])
+                remedy = "correct it" + (", or leave such rows out with --missing drop" if found == "nan" else "")
+                raise self.error(f"expected a finite number, found {found}; {remedy}", row, name)
+            problems[name] = self.place(row), found
         return columns, problems
 
     def without_missing(self, strict: Collection[str]) -> tuple[Table, NDArray[np.bool_]]:
@@ -97,11 +97,6 @@ class ArrayTable(Table):
     def place(self, row: int | None = None) -> str:
         """Rows are counted from 1."""
         return "" if row is None else f"row {(row if self.rows is None else int(self.rows[row])) + 1}"
-
-
-def missing_remedy(value: object) -> str:
-    """What to do about a value that is not a number."""
-    return "correct it" + (", or leave such rows out with --missing drop" if str(value) == "nan" else "")
 
 
 def seconds(times: NDArray[Any]) -> FloatArray:

@@ -110,7 +110,8 @@ class Store:
             self._group = need("zarr").open_group(str(self.folder / RESULTS), mode="r+", zarr_format=2)
         return self._group
 
-    def _entry(self, chunk: int) -> Path:
+    def entry(self, chunk: int) -> Path:
+        """The file by which a chunk is in the ledger."""
         return self.folder / LEDGER / f"{chunk:08d}.json"
 
     def sound(self) -> bool:
@@ -149,7 +150,7 @@ class Store:
                 if path.exists():
                     flush(path)
             entry = {"sha256": self._sum(arrays), "failed": sum(map(bool, rows.reasons)), "rows": len(rows.reasons)}
-            atomic_write_text(self._entry(chunk), json.dumps(entry) + "\n")
+            atomic_write_text(self.entry(chunk), json.dumps(entry) + "\n")
 
     def read(self, chunk: int) -> dict[str, np.ndarray]:
         rows, group = rows_of(self.sweep, chunk), self._open()
@@ -159,14 +160,11 @@ class Store:
     def whole(self, chunk: int) -> bool:
         """Whether a chunk is in the ledger and what is kept of it has the sum that is written there."""
         try:
-            entry = json.loads(self._entry(chunk).read_text(encoding="utf-8"))
+            entry = json.loads(self.entry(chunk).read_text(encoding="utf-8"))
             return bool(entry["sha256"] == self._sum(self.read(chunk)))
         except Exception:
             # Whatever a broken file makes a decoder say, the chunk is not whole.
             return False
-
-    def noted(self, chunk: int) -> bool:
-        return self._entry(chunk).exists()
 
     def _sum(self, arrays: dict[str, np.ndarray]) -> str:
         total = hashlib.sha256()
