@@ -107,9 +107,6 @@ class Stopped(SystemExit):
 class Given(SimpleNamespace):
     """What a command was given, by the names of its options."""
 
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"the command declares no option {name!r}")
-
 
 def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
     """Hand a command its options in one piece; bad input and interruption end in one line on stderr and a status."""
