@@ -113,7 +113,7 @@ class FitJob(AbstractJob):
             n, v = len(record), record.voltage_V
             limits[k] = v.min(), v.max()
             voltage[k], displacement[k, :n] = np.pad(v, (0, samples - n), mode="edge"), record.displacement_um
-            known[k, :n] = True if initial[k] != "unknown" else known_samples(v, *limits[k])
+            known[k, :n] = known_samples(v, *limits[k], initial[k])
             fitted[k] = known[k] & (np.arange(samples) < n - round(holdout[k] * n))
             if fitted[k].sum() < _FEWEST:
                 reasons[k] = f"only {int(fitted[k].sum())} samples are left to fit, {_FEWEST} are needed"
