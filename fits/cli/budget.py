@@ -47,7 +47,6 @@ def budget(given: common.Given) -> None:
             "none; add --arm, such as --arm 50mm."
         )
     with file_set() as files:
-        # Entered before the work, so that a place that cannot be written to is refused before the wait.
         unfinished, drawings = None if out is None else files.file(out), files.folder(given.plots)
         design = late.paper_design() if given.stage == "paper" else late.read_design(given.stage)
         noise = late.idle_noise(late.read_idle(given.idle, **common.reading(given)))

@@ -58,7 +58,6 @@ def diagnose(given: common.Given) -> None:
     fraction, files = common.fraction_or_files(given.holdout)
     for name in (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM):
         common.refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
-    # Before the work, so that a place that cannot be written to is refused before the wait.
     usable_folder(given.out, "--out")
     records = late.read_runs(given.runs, **how)
     aside = [late.read_table(file, **how) for file in files]

@@ -37,7 +37,6 @@ def sensitivity(given: common.Given) -> None:
     design = _design(given.stage, given.tolerance, given.level)
     axes = tuple(name for name in late.AXES if given.axis in (name, "all"))
     with file_set() as files:
-        # Entered before the work, so that a place that cannot be written to is refused before the wait.
         unfinished, drawings = None if out is None else files.file(out), files.folder(given.plots)
         unfinished_stage = None if given.write_stage is None else files.file(given.write_stage)
         report = late.sensitivities(design, axes)

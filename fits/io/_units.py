@@ -85,11 +85,10 @@ def parse_columns(text: str) -> dict[str, str]:
 
 def known_quantity(column: str) -> Quantity:
     """Quantity of a canonical column; a `DataError` where there is none of that name."""
-    for quantity in QUANTITIES:
-        if quantity.column == column:
-            return quantity
-    known = ", ".join(quantity.column for quantity in QUANTITIES)
-    raise DataError(f"--columns: '{column}' is not a column of a record; name one of {known}.")
+    known = {quantity.column: quantity for quantity in QUANTITIES}
+    if column not in known:
+        raise DataError(f"--columns: '{column}' is not a column of a record; name one of {', '.join(known)}.")
+    return known[column]
 
 
 def find_sources(
