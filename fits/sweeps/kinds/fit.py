@@ -111,13 +111,13 @@ class FitJob(AbstractJob):
                 continue
             assert record.displacement_um is not None
             n, v = len(record), record.voltage_V
-            limits[k] = v.min(), v.max()
+            lower, upper = limits[k] = v.min(), v.max()
             voltage[k], displacement[k, :n] = np.pad(v, (0, samples - n), mode="edge"), record.displacement_um
-            known[k, :n] = known_samples(v, *limits[k], initial[k])
+            known[k, :n] = known_samples(v, lower, upper, initial[k])
             fitted[k] = known[k] & (np.arange(samples) < n - round(holdout[k] * n))
             if fitted[k].sum() < _FEWEST:
                 reasons[k] = f"only {int(fitted[k].sum())} samples are left to fit, {_FEWEST} are needed"
-            start = initial_state(initial[k], *limits[k])
+            start = initial_state(initial[k], lower, upper)
             extremes[k], used[k] = np.asarray(start.extremes_V), int(start.count)
         rows = voltage, displacement, fitted, limits, smoothness, extremes, used
         # The whole block on each number of levels there is in it, of which every row takes its own: what is found
