@@ -78,8 +78,8 @@ def test_rows_of_a_batch_have_their_own_levels_and_initial_state(seed):
     assert found.outputs["levels"].tolist() == found.outputs["fit.levels"].tolist() == [5, 8] * 4
     for row, record in enumerate(records_of(sweep, np.arange(8))):
         alone = batch_of(record, (5, 8)[row % 2], WORDS[row // 2])
-        assert found.outputs["noise_um"][row] == pytest.approx(float(alone.noise_um[0]), rel=1e-10)
-        assert found.outputs["offset_um"][row] == pytest.approx(float(alone.offset_um[0]), rel=1e-10)
+        assert found.outputs["noise_um"][row] == pytest.approx(float(alone["noise_um"][0]), rel=1e-10)
+        assert found.outputs["offset_um"][row] == pytest.approx(float(alone["offset_um"][0]), rel=1e-10)
         assert found.outputs["loops_um"][row] > 0
     # The stage began at negative saturation, and what begins with another memory leaves more.
     noise = dict(zip(WORDS, found.outputs["noise_um"][1::2], strict=True))

@@ -107,9 +107,6 @@ class Stopped(SystemExit):
 class Given(SimpleNamespace):
     """What a command was given, by the names of its options."""
 
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"the command declares no option {name!r}")
-
 
 def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
     """Hand a command its options in one piece; bad input and interruption end in one line on stderr and a status."""
@@ -135,21 +132,11 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
     return run
 
 
-def progress_to_stderr(quiet: bool) -> Callable[[str], None]:
-    """Make what tells on stderr what is being done, and since when."""
-    began = time.monotonic()
+def progress_to_stderr(quiet: bool, stages: Sequence[StrEnum] = ()) -> Callable[[str], None]:
+    """Make what tells on stderr what is being done, and since when.
 
-    def tell(sentence: str) -> None:
-        if not quiet:
-            click.echo(f"{time.monotonic() - began:6.1f} s  {sentence}", err=True)
-
-    return tell
-
-
-def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], None]:
-    """Make what draws on stderr how far the work has come: a step for each stage, which is announced by itself.
-
-    Other sentences tell of details. On a terminal the bar stays in its line; elsewhere each sentence has its own.
+    Where there are stages, which are announced by themselves, a bar has a step for each; other sentences tell of
+    details. On a terminal the bar stays in its line; elsewhere each sentence has its own.
     """
     began, at = time.monotonic(), 0
 
@@ -157,14 +144,11 @@ def bar_to_stderr(quiet: bool, stages: Sequence[StrEnum]) -> Callable[[str], Non
         nonlocal at
         if quiet:
             return
-        if isinstance(sentence, StrEnum):
-            at = max(at, stages.index(sentence) + 1)
-        bar = "#" * at + "." * (len(stages) - at)
-        line = f"[{bar}] {time.monotonic() - began:6.1f} s  {sentence}"
-        if sys.stderr is not None and sys.stderr.isatty():
-            click.echo(f"\r\033[K{line}", nl=at == len(stages), err=True)
-        else:
-            click.echo(line, err=True)
+        at = max(at, stages.index(sentence) + 1) if isinstance(sentence, StrEnum) else at
+        bar = f"[{'#' * at}{'.' * (len(stages) - at)}] " if stages else ""
+        line = f"{bar}{time.monotonic() - began:6.1f} s  {sentence}"
+        stays = bool(stages) and sys.stderr is not None and sys.stderr.isatty()
+        click.echo(f"\r\033[K{line}" if stays else line, nl=not stays or at == len(stages), err=True)
 
     return tell
 
@@ -185,10 +169,15 @@ def paths_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
     return [str(Path(folder or "") / Path(file).name) for file in made]
 
 
-def with_paths(words: str, places: Iterable[tuple[str, str | None]]) -> str:
-    """Words, then what was written where; what was not has no place."""
+def json_place(given: Given) -> str | None:
+    """The JSON file to write, None where there is none or it is printed."""
+    return None if given.json_file == "-" else given.json_file
+
+
+def print_words(given: Given, text: str, words: str, places: Iterable[tuple[str, str | None]]) -> None:
+    """Print words, then what was written where, or instead the JSON text; what was not written has no place."""
     written = [f"{what:5}  {place}" for what, place in places if place is not None]
-    return "\n".join([words, *([""] if written else []), *written])
+    click.echo(text if given.json_file == "-" else "\n".join([words, *([""] if written else []), *written]))
 
 
 def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:

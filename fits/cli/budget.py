@@ -37,8 +37,7 @@ def budget(given: common.Given) -> None:
     rest in IDLE.csv, with the columns time_s and displacement_um.
     """
     late.start_jax()
-    printed = given.json_file == "-"
-    out = None if printed else given.json_file
+    out = common.json_place(given)
     for what, path in {"STAGE.toml": given.stage, "MODEL.json": given.model, "IDLE.csv": given.idle}.items():
         common.refuse_clashes({what: None if path == "paper" else path, "--json": out})
     arm_mm = None if given.arm is None else common.length_mm("--arm", given.arm, ("mm", "m"), "50mm")
@@ -48,7 +47,6 @@ def budget(given: common.Given) -> None:
             "none; add --arm, such as --arm 50mm."
         )
     with file_set() as files:
-        # Entered before the work, so that a place that cannot be written to is refused before the wait.
         unfinished, drawings = None if out is None else files.file(out), files.folder(given.plots)
         design = late.paper_design() if given.stage == "paper" else late.read_design(given.stage)
         noise = late.idle_noise(late.read_idle(given.idle, **common.reading(given)))
@@ -59,11 +57,8 @@ def budget(given: common.Given) -> None:
         drawn = [] if drawings is None else late.plot_budget(found, drawings)
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
-    if printed:
-        click.echo(text)
-        return
     places = [("json", out), *(("plot", place) for place in common.paths_in(given.plots, drawn))]
-    click.echo(common.with_paths(late.describe_budget(found), places))
+    common.print_words(given, text, late.describe_budget(found), places)
 
 
 def _law(path: str) -> "late.Preisach":

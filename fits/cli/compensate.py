@@ -45,7 +45,6 @@ def compensate(given: common.Given) -> None:
             "leave out --dynamic, or fit a whole stage."
         )
     wanted = late.read_reference(given.reference, **common.reading(given))
-    # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         found = late.compensate(stage, wanted, given.initial, given.clip, volts, given.way)

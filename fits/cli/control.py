@@ -119,7 +119,6 @@ def control(given: common.Given) -> None:
     loaded = late.load_model(given.model)
     plant = common.stage_or_preisach(given.model, loaded)
     wanted = late.read_reference(given.reference, **common.reading(given))
-    # Entered before the work, so that a place that cannot be written to is refused before the wait.
     with file_set() as files:
         unfinished, drawings = files.file(given.out), files.folder(given.plots)
         try:

@@ -49,23 +49,21 @@ def diagnose(given: common.Given) -> None:
     """
     if not 0 < given.false_alarm <= 0.5:
         raise DataError(f"--false-alarm: expected a probability above 0 and up to 0.5, found {given.false_alarm:g}.")
-    if not 0 < given.budget <= _LONGEST_s:
-        raise DataError(f"--budget: expected a time above 0 and up to {_LONGEST_s:g} s, found {given.budget:g}.")
-    if given.duration is not None and not 0 < given.duration <= _LONGEST_s:
-        raise DataError(f"--duration: expected a time above 0 and up to {_LONGEST_s:g} s, found {given.duration:g}.")
+    for option, time_s in (("--budget", given.budget), ("--duration", given.duration)):
+        if time_s is not None and not 0 < time_s <= _LONGEST_s:
+            raise DataError(f"{option}: expected a time above 0 and up to {_LONGEST_s:g} s, found {time_s:g}.")
     if not 0 <= given.margin <= 10:
         raise DataError(f"--margin: expected a share of the ranges reached, 0 to 10, found {given.margin:g}.")
     limits, how = late.parse_limits(given.limit), common.reading(given)
     fraction, files = common.fraction_or_files(given.holdout)
     for name in (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM):
         common.refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
-    # Before the work, so that a place that cannot be written to is refused before the wait.
     usable_folder(given.out, "--out")
     records = late.read_runs(given.runs, **how)
     aside = [late.read_table(file, **how) for file in files]
     # Only now, so that what cannot be read is refused at once.
     late.start_jax()
-    progress = common.bar_to_stderr(given.quiet, tuple(late.Step))
+    progress = common.progress_to_stderr(given.quiet, tuple(late.Step))
     diagnosis = late.diagnose(
         records,
         holdout=aside or fraction,

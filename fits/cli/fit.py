@@ -73,7 +73,6 @@ def fit(given: common.Given) -> None:
     how = common.reading(given)
     fraction, files = common.fraction_or_files(given.holdout)
     common.refuse_overwriting(given.out, [*given.runs, *files])
-    # Entered before the fit, so that a place that cannot be written to is refused before the wait.
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         records = late.read_runs(given.runs, **how)

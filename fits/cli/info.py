@@ -25,7 +25,8 @@ def info(given: common.Given) -> None:
     lines = [f"{kind}, written by {held['written_by']}"]
     for row in numbers:
         unit = "" if row["unit"] == "1" else row["unit"]
-        shown = f"{row['value']:.6g} {unit}" if "value" in row else f"{_shape(row)} numbers {unit and f'in {unit}'}"
+        size = "x".join(map(str, row["shape"])) if prod(row["shape"]) else "no"
+        shown = f"{row['value']:.6g} {unit}" if "value" in row else f"{size} numbers {unit and f'in {unit}'}"
         lines.append(f"  {row['path']:34} {shown}".rstrip())
     if not given.as_json:
         lines += ["", _known_of_fit(given.model, held)]
@@ -50,10 +51,6 @@ def _numbers(part: Any, path: str = "") -> Iterator[dict[str, Any]]:
         for name, inner in part.items() if isinstance(part, dict) else enumerate(part):
             step = f"{path}.{name}".lstrip(".") if isinstance(part, dict) else f"{path}[{name}]"
             yield from _numbers(inner, step)
-
-
-def _shape(row: dict[str, Any]) -> str:
-    return "x".join(map(str, row["shape"])) if prod(row["shape"]) else "no"
 
 
 def _known_of_fit(path: str, held: dict[str, Any]) -> str:

@@ -32,33 +32,27 @@ def sensitivity(given: common.Given) -> None:
     followed by what the paper reads in its Fig. 7. --write-stage writes one to begin with.
     """
     late.start_jax()
-    printed = given.json_file == "-"
-    out = None if printed else given.json_file
+    out = common.json_place(given)
     common.refuse_clashes({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
     design = _design(given.stage, given.tolerance, given.level)
     axes = tuple(name for name in late.AXES if given.axis in (name, "all"))
     with file_set() as files:
-        # Entered before the work, so that a place that cannot be written to is refused before the wait.
         unfinished, drawings = None if out is None else files.file(out), files.folder(given.plots)
         unfinished_stage = None if given.write_stage is None else files.file(given.write_stage)
         report = late.sensitivities(design, axes)
         text = late.finite_json(late.sensitivity_json(report))
-        claimed = [] if given.stage or printed else late.paper_claims(design)
+        claimed = [] if given.stage or given.json_file == "-" else late.paper_claims(design)
         claims = [claim for claim in claimed if {*claim.axes} & {*axes}]
         drawn = [] if drawings is None else late.plot_sensitivity(design, report, drawings)
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
         if unfinished_stage is not None:
             unfinished_stage.write_text(late.design_text(design), encoding="utf-8")
-    if printed:
-        click.echo(text)
-        return
     words = late.describe_sensitivity(report, given.voltage)
     if claims:
         words += f"\n\n{late.describe_claims(claims)}"
     plots = [("plot", place) for place in common.paths_in(given.plots, drawn)]
-    places = [("json", out), ("stage", given.write_stage), *plots]
-    click.echo(common.with_paths(words, places))
+    common.print_words(given, text, words, [("json", out), ("stage", given.write_stage), *plots])
 
 
 def _design(stage: str | None, tolerance: str | None, level: int | None) -> "late.Design":

@@ -34,7 +34,6 @@ def synth(given: common.Given) -> None:
     import data_synth
 
     with file_set() as made:
-        # Before the work, so that a place that cannot be written to is refused before the wait.
         folder = made.folder(given.out, "--out")
         try:
             bench = data_synth.simulate(data_synth.load_scenario(given.scenario), given.seed)

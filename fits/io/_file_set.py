@@ -249,7 +249,8 @@ def file_set() -> Iterator[FileSet]:
     All are written to the disk before the first is renamed. If a rename fails, those before it are undone. A process
     that is killed meanwhile leaves each file as it was or whole, and temporary ones that the next `file_set` in the
     same folder removes; a folder that was not there appears in one step with all that is in it. A `DataError` says
-    that a file cannot be written, or that the disk is full.
+    that a file cannot be written, or that the disk is full. Commands enter it before their work, so that a place that
+    cannot be written to is refused before the wait.
     """
     files = FileSet()
     _OPEN.append(files)

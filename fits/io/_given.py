@@ -17,7 +17,10 @@ def records_given(given: AnyRuns) -> tuple[Record, ...]:
 
     A `DataError` says which cannot be read, has no samples, or was only commanded.
     """
-    each: Iterable[Any] = (given,) if _is_one(given) else given
+    # Tables of pandas and of xarray are iterables of their columns.
+    is_table = hasattr(given, "columns") or hasattr(given, "to_dataframe")
+    is_one = is_table or isinstance(given, Record | str | os.PathLike | Mapping) or not isinstance(given, Iterable)
+    each: Iterable[Any] = (given,) if is_one else given
     found = tuple(one if isinstance(one, Record) else read_table(one) for one in each)
     for number, record in enumerate(found, 1):
         name = record.source or f"run {number}"
@@ -31,9 +34,3 @@ def records_given(given: AnyRuns) -> tuple[Record, ...]:
 def holdout_given(holdout: float | AnyRuns) -> float | tuple[Record, ...]:
     """Fraction held out of every run, or runs that are held out as a whole; see `records_given`."""
     return holdout if isinstance(holdout, int | float) else records_given(holdout)
-
-
-def _is_one(given: Any) -> bool:
-    # Tables of pandas and of xarray are iterables of their columns.
-    is_table = hasattr(given, "columns") or hasattr(given, "to_dataframe")
-    return is_table or isinstance(given, Record | str | os.PathLike | Mapping) or not isinstance(given, Iterable)

@@ -107,25 +107,19 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
     for column in ("time_s", "voltage_V", "displacement_um"):
         if column in known or (column == "time_s" and table.interval_s is not None):
             continue
-        fit = [
-            name
-            for name in free
-            if np.ptp(found[name]) > 0 and known_unit(name) in (None, *known_quantity(column).powers)
-        ]
+        quantity = known_quantity(column)
+        fit = [name for name in free if np.ptp(found[name]) > 0 and known_unit(name) in (None, *quantity.powers)]
         if column == "time_s":
             fit = [name for name in fit if np.all(np.diff(found[name]) > 0)]
         if fit:
             best = max(fit, key=lambda name: _score(name, column))
             free.remove(best)
-            guessed[column] = Source(best, known_unit(best) or known_quantity(column).unit)
-    both = known | guessed
-    moved = guessed.get("displacement_um")
-    if moved and "voltage_V" in both and known_unit(moved.column) is None:
-        volts = known_quantity("voltage_V").convert(np.ptp(found[both["voltage_V"].column]), both["voltage_V"].unit)
-        stroke = np.ptp(found[moved.column])
-        lengths = ("um", "nm", "mm", "m")
-        convert = known_quantity("displacement_um").convert
-        unit = next((unit for unit in lengths if likely_stroke(float(convert(stroke, unit) / volts))), "um")
+            guessed[column] = Source(best, known_unit(best) or quantity.unit)
+    moved, driven = guessed.get("displacement_um"), (known | guessed).get("voltage_V")
+    if moved and driven and known_unit(moved.column) is None:
+        volts = known_quantity("voltage_V").convert(np.ptp(found[driven.column]), driven.unit)
+        strokes = {unit: quantity.convert(np.ptp(found[moved.column]), unit) for unit in ("um", "nm", "mm", "m")}
+        unit = next((unit for unit, stroke in strokes.items() if likely_stroke(float(stroke / volts))), "um")
         guessed["displacement_um"] = Source(moved.column, unit)
     return guessed
 
@@ -145,15 +139,17 @@ def _spec(table: Table, source: Source) -> str:
 
 def _command(path: str, there: set[str], options: list[str], still: bool) -> str:
     """What to paste; a record under a voltage that is `still` is of the noise."""
-    moved, driven = "displacement_um" in there, "voltage_V" in there
-    words = {
-        (True, True): ["fit", path, *options, "--out", "model.json"],
-        (True, False): ["compensate", "model.json", path, *options, "--out", "voltage.csv"],
-        (False, True): ["simulate", "model.json", path, *options, "--out", "prediction.csv"],
-    }.get((moved, driven), [])
-    if still and moved:
-        words = ["budget", "paper", "model.json", path, *options]
-    return shlex.join(["microid", *words]) if words else ""
+    if "displacement_um" in there:
+        words = ["compensate", "model.json", path, *options, "--out", "voltage.csv"]
+        if "voltage_V" in there:
+            words = ["fit", path, *options, "--out", "model.json"]
+        if still:
+            words = ["budget", "paper", "model.json", path, *options]
+    elif "voltage_V" in there:
+        words = ["simulate", "model.json", path, *options, "--out", "prediction.csv"]
+    else:
+        return ""
+    return shlex.join(["microid", *words])
 
 
 def _remarks(path: AnyPath, columns: str, options: list[str], there: set[str]) -> list[str]:

@@ -203,7 +203,8 @@ def check_command(
 def stated_as(one: Extreme) -> str:
     """The option that would allow what is predicted, such as `--limit displacement=-1.2:43um`."""
     if one.name in _TWO_SIDED:
-        return f"--limit {one.name}={_below(min(one.low, one.lowest))}:{_above(max(one.high, one.highest))}{one.unit}"
+        low, high = -float(_above(-min(one.low, one.lowest))), _above(max(one.high, one.highest))
+        return f"--limit {one.name}={low:.4g}:{high}{one.unit}"
     return f"--limit {one.name}={_above(max(-one.low, one.high))}{one.unit}"
 
 
@@ -213,10 +214,6 @@ def _above(value: float) -> str:
         return "0"
     unit = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
     return f"{math.ceil(value / unit - 1e-9) * unit:.4g}"
-
-
-def _below(value: float) -> str:
-    return f"{-float(_above(-value)):.4g}"
 
 
 def ranges_json(ranges: RangeMap) -> dict[str, list[float]]:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from fits.io._errors import AnyPath, DataError
-from fits.io._frames import of_frame
 from fits.io._read_file import MOST_CSV_BYTES, read_bytes, unpack
-from fits.io._table import ArrayTable, Table, gathered
+from fits.io._table import Table, gathered, of_frame
 from fits.io.formats import FORMATS, Format
 
 _CSV = "a CSV file"
@@ -23,8 +22,19 @@ def open_table(source: AnyPath | Any) -> Table:
     Formats are known by their first bytes and by the ending of the name, text by neither. A `DataError` says that it
     cannot be read, or has no columns.
     """
+    if hasattr(source, "to_dataframe"):  # xarray
+        source = source.to_dataframe()
+    if isinstance(source, Mapping):
+        return gathered("mapping", "a mapping", [((str(name),), values, None) for name, values in source.items()])
     if not isinstance(source, str | os.PathLike):
-        return _of_object(source)
+        import pandas as pd
+
+        if isinstance(source, pd.DataFrame):
+            return of_frame("DataFrame", source)
+        raise DataError(
+            f"expected the name of a file, a DataFrame or a mapping of arrays, found {type(source).__name__}; "
+            "give one of these."
+        )
     shown = os.fspath(source)
     data = read_bytes(shown, _format_of(shown, b"").name, MOST_CSV_BYTES)
     if data.startswith(b"\x1f\x8b") or shown.lower().endswith(".gz"):
@@ -51,19 +61,3 @@ def _format_of(path: str, data: bytes) -> Format:
     by_start = (form for form in FORMATS.values() if form.starts and data.startswith(form.starts))
     by_ending = (form for form in FORMATS.values() if ending in form.endings)
     return next(by_start, None) or next(by_ending, FORMATS[_CSV])
-
-
-def _of_object(source: Any) -> ArrayTable:
-    """Columns of a `DataFrame`, of what makes one, or of a mapping of arrays."""
-    import pandas as pd
-
-    if hasattr(source, "to_dataframe"):  # xarray
-        source = source.to_dataframe()
-    if isinstance(source, Mapping):
-        return gathered("mapping", "a mapping", [((str(name),), values, None) for name, values in source.items()])
-    if not isinstance(source, pd.DataFrame):
-        raise DataError(
-            f"expected the name of a file, a DataFrame or a mapping of arrays, found {type(source).__name__}; "
-            "give one of these."
-        )
-    return of_frame("DataFrame", source)

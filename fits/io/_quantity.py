@@ -13,24 +13,10 @@ FloatArray = NDArray[np.float64]
 LENGTH = {"um": 0, "nm": -3, "mm": 3, "m": 6, "pm": -6}
 VOLTAGE = {"V": 0, "mV": -3, "uV": -6, "kV": 3}
 # Words for units, as programs of measurement have them.
-_WORDS = {
-    "second": "s",
-    "sec": "s",
-    "millisecond": "ms",
-    "msec": "ms",
-    "microsecond": "us",
-    "volt": "V",
-    "millivolt": "mV",
-}
-_WORDS |= {"kilovolt": "kV", "meter": "m", "metre": "m", "millimeter": "mm", "millimetre": "mm", "micron": "um"}
-_WORDS |= {
-    "micrometer": "um",
-    "micrometre": "um",
-    "nanometer": "nm",
-    "nanometre": "nm",
-    "kelvin": "K",
-    "celsius": "degC",
-}
+_WORDS = {"second": "s", "sec": "s", "millisecond": "ms", "msec": "ms", "microsecond": "us"}
+_WORDS |= {"volt": "V", "millivolt": "mV", "kilovolt": "kV", "kelvin": "K", "celsius": "degC"}
+_WORDS |= {"meter": "m", "millimeter": "mm", "micrometer": "um", "micron": "um", "nanometer": "nm"}
+_WORDS |= {"metre": "m", "millimetre": "mm", "micrometre": "um", "nanometre": "nm"}
 _PLAIN_SIGNS = {"µ": "u", "μ": "u", "°C": "degC"}  # both Unicode micro signs, and the degree sign
 BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]")
 

@@ -170,10 +170,8 @@ class KnownColumns:
         if missing == "drop":
             table, kept = table.without_missing(strict)
             if not kept.all():
-                words = (
-                    f"{np.sum(~kept)} of {kept.size} rows were left out, as a number that is needed is missing there"
-                )
-                left_out = (f"{table.path}: {words}.",)
+                rows = f"{np.sum(~kept)} of {kept.size} rows"
+                left_out = (f"{table.path}: {rows} were left out, as a number that is needed is missing there.",)
         found, problems = table.read(strict)
         arrays = {}
         for name, source in sources.items():
@@ -192,9 +190,9 @@ class KnownColumns:
 
     def place(self, column: str, row: int | None = None) -> str:
         """File, line and header of a canonical column, to begin a warning with."""
-        words = [self.table.path, "" if row is None else self.table.place(row)]
-        words.append(f"column '{self.sources[column].column}'" if column in self.sources else "")
-        return ", ".join(filter(None, words))
+        line = "" if row is None else self.table.place(row)
+        header = f"column '{self.sources[column].column}'" if column in self.sources else ""
+        return ", ".join(filter(None, (self.table.path, line, header)))
 
     def odd_gaps(self) -> Iterator[str]:
         """Few long steps in an otherwise even time base; uneven sampling is legal."""

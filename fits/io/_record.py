@@ -42,18 +42,8 @@ class Record:
 
     def __post_init__(self) -> None:
         extra = {name: _read_only(values) for name, values in self.extra.items()}
-        arrays = {"time_s": _read_only(self.time_s), "voltage_V": _read_only(self.voltage_V)}
-        if self.displacement_um is not None:
-            arrays["displacement_um"] = _read_only(self.displacement_um)
-        for name, array in (arrays | extra).items():
-            if array.shape != (arrays["time_s"].size,):
-                raise DataError(f"{name} has shape {array.shape}, expected ({arrays['time_s'].size},) as time_s.")
-        for name, array in arrays.items():
-            if name not in extra:
-                _refuse_odd(self.source, name, array)
-            object.__setattr__(self, name, array)
+        _settle(self, ("time_s", "voltage_V", "displacement_um"), extra, " as time_s")
         object.__setattr__(self, "extra", MappingProxyType(extra))
-        _make_printable(self)
 
     def __len__(self) -> int:
         return self.time_s.size
@@ -91,18 +81,28 @@ class Reference:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("time_s", "displacement_um"):
-            object.__setattr__(self, name, _read_only(getattr(self, name)))
-        if self.displacement_um.shape != (self.time_s.size,):
-            raise DataError(
-                f"displacement_um has shape {self.displacement_um.shape}, expected ({self.time_s.size},)."
-            )
-        for name in ("time_s", "displacement_um"):
-            _refuse_odd(self.source, name, getattr(self, name))
-        _make_printable(self)
+        _settle(self, ("time_s", "displacement_um"))
 
     def __len__(self) -> int:
         return self.time_s.size
+
+
+def _settle(
+    record: Record | Reference, names: Sequence[str], extra: Mapping[str, FloatArray] | None = None, like: str = ""
+) -> None:
+    """Make arrays read-only and texts printable; what no model could be fitted to, or follow, is refused."""
+    given = {name: getattr(record, name) for name in names}
+    arrays = {name: _read_only(values) for name, values in given.items() if values is not None}
+    size = arrays["time_s"].size
+    for name, array in (arrays | dict(extra or {})).items():
+        if array.shape != (size,):
+            raise DataError(f"{name} has shape {array.shape}, expected ({size},){like}.")
+    for name, array in arrays.items():
+        _refuse_odd(record.source, name, array)
+        object.__setattr__(record, name, array)
+    # Names of files may hold what no report, page or picture can.
+    object.__setattr__(record, "source", printable(record.source))
+    object.__setattr__(record, "warnings", tuple(map(printable, record.warnings)))
 
 
 def _refuse_odd(source: str, name: str, array: FloatArray) -> None:
@@ -120,12 +120,6 @@ def _refuse_odd(source: str, name: str, array: FloatArray) -> None:
             f"{place}time_s[{at}]: expected a time after {array[at - 1]:.9g} s, found {array[at]:.9g} s; sort the "
             "samples, and keep one of each time"
         )
-
-
-def _make_printable(record: Record | Reference) -> None:
-    """Names of files may hold what no report, page or picture can."""
-    object.__setattr__(record, "source", printable(record.source))
-    object.__setattr__(record, "warnings", tuple(map(printable, record.warnings)))
 
 
 def refuse_repeats(records: Sequence[Record]) -> None:

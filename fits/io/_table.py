@@ -81,11 +81,11 @@ class ArrayTable(Table):
                 columns[name] = array
                 continue
             row = int(np.argmin(good))
+            found = str(array[row])
             if name in strict:
-                raise self.error(
-                    f"expected a finite number, found {array[row]}; {missing_remedy(array[row])}", row, name
-                )
-            problems[name] = self.place(row), str(array[row])
+                remedy = "correct it" + (", or leave such rows out with --missing drop" if found == "nan" else "")
+                raise self.error(f"expected a finite number, found {found}; {remedy}", row, name)
+            problems[name] = self.place(row), found
         return columns, problems
 
     def without_missing(self, strict: Collection[str]) -> tuple[Table, NDArray[np.bool_]]:
@@ -97,11 +97,6 @@ class ArrayTable(Table):
     def place(self, row: int | None = None) -> str:
         """Rows are counted from 1."""
         return "" if row is None else f"row {(row if self.rows is None else int(self.rows[row])) + 1}"
-
-
-def missing_remedy(value: object) -> str:
-    """What to do about a value that is not a number."""
-    return "correct it" + (", or leave such rows out with --missing drop" if str(value) == "nan" else "")
 
 
 def seconds(times: NDArray[Any]) -> FloatArray:
@@ -144,6 +139,21 @@ def gathered(path: str, what: str, found: Iterable[Found], interval_s: float | N
     if len(kept) > MOST_COLUMNS:
         raise DataError(f"{path}: expected up to {MOST_COLUMNS:,} columns, found {len(kept):,}; leave some out.")
     return ArrayTable(path, arrays, interval_s)
+
+
+def of_frame(path: str, frame: Any, units: Mapping[str, str] | None = None) -> ArrayTable:
+    """Columns of a `DataFrame`, its index among them if it has a name or holds times."""
+    index = frame.index
+    if index.name is not None or index.nlevels > 1 or index.dtype.kind in "mM":
+        frame = frame.reset_index(names=None if index.nlevels > 1 else [index.name or "time"])
+    found = []
+    for k, name in enumerate(frame.columns):
+        column, words = frame.iloc[:, k], "_".join(map(str, name)) if isinstance(name, tuple) else str(name)
+        if getattr(column.dtype, "tz", None) is not None:
+            column = column.dt.tz_convert(None)
+        values = column.to_numpy(np.float64, na_value=np.nan) if column.dtype.kind in "iuf" else column.to_numpy()
+        found.append(((words,), values, (units or {}).get(words)))
+    return gathered(path, "a table", found)
 
 
 def _columns(name: tuple[str, ...], values: Any) -> Iterable[tuple[tuple[str, ...], FloatArray]]:

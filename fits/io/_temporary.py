@@ -70,19 +70,14 @@ def _stale(entry: os.DirEntry[str], host: str, boot: str, pid: str, start: str) 
             # A clock that was set right meanwhile must not make a live file look old.
             return status.st_mtime < time.time() - uptime_s - 60
         return False
-    return not _lives(int(pid), int(start))
-
-
-def _lives(pid: int, start: int) -> bool:
-    """Whether a process of this machine is alive; where that is not certain, it is."""
     try:
-        os.kill(pid, 0)
+        os.kill(int(pid), 0)
     except ProcessLookupError:
-        return False
+        return True
     except (OSError, OverflowError):
         pass  # another user's
-    found = _started(pid)
-    return found is None or found == start or start == 0
+    # Where it is not certain that the process has ended, it lives.
+    return _started(int(pid)) not in (None, int(start)) and int(start) != 0
 
 
 def _started(pid: int) -> int | None:

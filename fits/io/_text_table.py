@@ -41,8 +41,7 @@ class TextTable(Table):
 
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
         if next(self._lines(), None) is None:
-            what = "expected rows of numbers below the header, found none; export again"
-            raise self.error(what)
+            raise self.error("expected rows of numbers below the header, found none; export again")
         columns = self._read_fast()
         if columns is None or not all(name in columns for name in strict):
             return self._read_slowly(strict)
@@ -98,15 +97,10 @@ class TextTable(Table):
         """Columns that pandas finds finite and numeric, or None where the rows need a closer look."""
         import pandas as pd
 
-        n = len(self.names)
-        text = self.body
-        if '"' in text:
+        n, width = len(self.names), next(self._lines())[1].count(self.separator) + 1
+        if '"' in self.body or width > MOST_COLUMNS:
             return None
-        if "#" in text or "%" in text:
-            text = _COMMENT.sub("", text)
-        width = next(self._lines())[1].count(self.separator) + 1
-        if width > MOST_COLUMNS:
-            return None
+        text = _COMMENT.sub("", self.body) if "#" in self.body or "%" in self.body else self.body
         options: dict[str, Any] = {}
         if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
             options["float_precision"] = "round_trip"  # the only mode from 3.1 on, where naming it warns
@@ -126,9 +120,8 @@ class TextTable(Table):
         except (pd.errors.ParserError, ValueError):
             return None
         # pandas pads short rows without a word; counting the separators finds them.
-        if width < n or text.count(self.separator) != (width - 1) * len(frame):
-            return None
-        if any((frame[i] != "").any() for i in range(n, width)):
+        whole = width >= n and text.count(self.separator) == (width - 1) * len(frame)
+        if not whole or any((frame[i] != "").any() for i in range(n, width)):
             return None
         columns = {}
         for i, name in enumerate(self.names):

@@ -85,11 +85,10 @@ def parse_columns(text: str) -> dict[str, str]:
 
 def known_quantity(column: str) -> Quantity:
     """Quantity of a canonical column; a `DataError` where there is none of that name."""
-    for quantity in QUANTITIES:
-        if quantity.column == column:
-            return quantity
-    known = ", ".join(quantity.column for quantity in QUANTITIES)
-    raise DataError(f"--columns: '{column}' is not a column of a record; name one of {known}.")
+    known = {quantity.column: quantity for quantity in QUANTITIES}
+    if column not in known:
+        raise DataError(f"--columns: '{column}' is not a column of a record; name one of {', '.join(known)}.")
+    return known[column]
 
 
 def find_sources(
@@ -183,7 +182,9 @@ def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str,
     free = [name for name in names if name not in taken]
     guesses = []
     for quantity in map(known_quantity, missing):
-        near = _nearest(quantity, free) if free else "NAME"
+        # Of a name like the column's, in a unit of it if there is such a one.
+        likely = [name for name in free if split_unit(name)[1] in quantity.powers] or free or ["NAME"]
+        near = max(likely, key=lambda name: SequenceMatcher(None, quantity.column, name.lower()).ratio())
         free = [name for name in free if name != near]  # a column serves once
         stem, unit = split_unit(near)
         known = unit in quantity.powers
@@ -196,11 +197,6 @@ def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str,
     return f"{message}."
 
 
-def _nearest(quantity: Quantity, names: Sequence[str]) -> str:
-    with_unit = [name for name in names if split_unit(name)[1] in quantity.powers]
-    return max(with_unit or names, key=lambda name: SequenceMatcher(None, quantity.column, name.lower()).ratio())
-
-
-def _listed(names: Sequence[str], most: int = 12) -> str:
-    shown = ", ".join(f"'{name[:40]}'" for name in names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(f"'{name[:40]}'" for name in names[:12])
+    return shown if len(names) <= 12 else f"{shown} and {len(names) - 12} more"

@@ -52,7 +52,7 @@ def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], 
             progress(f"identifying the response of axis {name}")
             modes = identify_modes(axis, piezo, seeds, others[2 * k], Path(records))
             stands[name], noises[name] = PaperStand(axis, piezo, identified, modes), others[2 * k + 1]
-    steps: dict[str, PaperRun] = {}
+    steps = dict[str, PaperRun]()
     for scheme in PAPER["table2"]:
         progress(f"step, {scheme}")
         steps[scheme] = stands["x"].step(scheme, None)
@@ -61,15 +61,12 @@ def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], 
     tracks: dict[str, dict[str, PaperRun]] = {}
     for name, stand in stands.items():
         said = PAPER["table3"] if name == "x" else PAPER["table4"][name]
-        tracks[name] = {}
+        found = result.table3 if name == "x" else result.table4.setdefault(name, {})
+        runs = tracks[name] = {}
         for scheme in said:
             progress(f"tracking along {name}, {scheme}")
-            tracks[name][scheme] = stand.track(scheme, noises[name].spawn(1)[0])
-        found = {scheme: _tracking(run, said[scheme]) for scheme, run in tracks[name].items()}
-        if name == "x":
-            result.table3 = found
-        else:
-            result.table4[name] = found
+            runs[scheme] = stand.track(scheme, noises[name].spawn(1)[0])
+            found[scheme] = _tracking(runs[scheme], said[scheme])
     progress("drawing")
     fits = [one.fit.runs[0] for one in identified]
     loops_um = [compensated(one, piezo) for one in identified]
@@ -185,7 +182,6 @@ def _draw_tracks(tracks: dict[str, dict[str, PaperRun]], path: Path) -> Path:
 
 def _assumed() -> list[str]:
     axes = data_synth.PAPER_AXES
-    values = {"levels": LEVELS, "lead_s": LEAD_s, "training_runs": TRAINING_RUNS}
     bench = {"sensor": data_synth.PaperSensor(), "axes": axes, "rotation": list(axes.values())[-1]}
-    work = {"bias_V": data_synth.PAPER_BIAS_V, "swing_um": data_synth.PAPER_SWING_um}
-    return render("assumed.txt.j2", **values, **bench, **work).splitlines()
+    work = {"bias_V": data_synth.PAPER_BIAS_V, "swing_um": data_synth.PAPER_SWING_um, "lead_s": LEAD_s}
+    return render("assumed.txt.j2", levels=LEVELS, training_runs=TRAINING_RUNS, **bench, **work).splitlines()

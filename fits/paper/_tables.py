@@ -57,47 +57,27 @@ CALIBRATED = {("table2", "HC"), ("table3", "OPEN"), ("z", "OPEN"), ("alpha", "OP
 AXIS_TITLES = {"z": "Z", "alpha": "rotation about X, Y", "gamma": "rotation about Z"}
 
 
-@dataclass(eq=False)
 class Measured:
-    """One figure of the true displacement by seed, shape `(seeds,)`; not finite where a run did not settle."""
+    """One figure of the true displacement by seed, `ours` of shape `(seeds,)`, which may not be finite.
 
-    # What the paper prints.
-    paper: float
-    ours: np.ndarray
-    # The same of the readings; for steps, of the true displacement where the sensor is noisy.
-    beside: np.ndarray | None = None
-    # Whether the median stands for a distance that no single reading of the sensor shows (erratum 40).
-    below_sensor: bool = False
+    `paper` is what the paper prints, and `beside` the same of the readings, or for steps, of the true displacement
+    where the sensor is noisy. It is `below_sensor` if the median stands for a distance that no single reading of the
+    sensor shows (erratum 40). The spread is the largest less the smallest, the ratio that of the median to the
+    paper's, and it is `worse` if the median, to the two digits that the paper prints, is above the paper's. What is
+    not finite is None.
+    """
 
-    @property
-    def median(self) -> float | None:
-        """Median over the seeds; None where it is not finite."""
-        return _finite(np.median(self.ours))
-
-    @property
-    def median_beside(self) -> float | None:
-        """The same of `beside`."""
-        return None if self.beside is None else _finite(np.median(self.beside))
-
-    @property
-    def spread(self) -> float | None:
-        """Largest less smallest."""
+    def __init__(self, paper: float, ours: np.ndarray, beside: np.ndarray | None = None, below_sensor: bool = False):
+        self.paper, self.beside, self.below_sensor = paper, beside, below_sensor
+        self.median = _finite(np.median(ours))
+        self.median_beside = None if beside is None else _finite(np.median(beside))
         with np.errstate(invalid="ignore"):
-            return _finite(np.ptp(self.ours))
+            self.spread = _finite(np.ptp(ours))
+        self.ratio = None if self.median is None or paper == 0 else self.median / paper
+        self.worse = self.median is None or round(self.median, 2) > paper
 
-    @property
-    def ratio(self) -> float | None:
-        """Median over the paper's; None where that is zero."""
-        return None if self.median is None or self.paper == 0 else self.median / self.paper
-
-    @property
-    def worse(self) -> bool:
-        """Whether the median, to the two digits after the point that the paper prints, is above the paper's."""
-        return self.median is None or round(self.median, 2) > self.paper
-
-    def json(self) -> dict[str, float | bool | None]:
-        figures = {"paper": self.paper, "ours": self.median, "spread": self.spread}
-        return figures | {"below_sensor": self.below_sensor}
+    def json(self) -> dict[str, float | None]:
+        return {"paper": self.paper, "ours": self.median, "spread": self.spread}
 
 
 def _finite(value: Any) -> float | None:
@@ -118,11 +98,12 @@ class PaperResult:
 
     def rows(self) -> list[tuple[str, str, str, Measured]]:
         """Place, scheme, name and figure of all rows of the tables."""
-        rows = []
-        for place, schemes in {"table2": self.table2, "table3": self.table3, **self.table4}.items():
-            for scheme, figures in schemes.items():
-                rows += [(place, scheme, name, figure) for name, figure in figures.items()]
-        return rows
+        return [
+            (place, scheme, name, figure)
+            for place, schemes in {"table2": self.table2, "table3": self.table3, **self.table4}.items()
+            for scheme, figures in schemes.items()
+            for name, figure in figures.items()
+        ]
 
     def worse(self) -> list[str]:
         """Rows in which ours is worse than the paper's, calibrated ones and settling values apart."""
@@ -140,7 +121,10 @@ def paper_json(result: PaperResult) -> dict[str, Any]:
     """Put a result into JSON values, `microid.paper/1`."""
 
     def table(schemes: Mapping[str, Mapping[str, Measured]]) -> dict[str, Any]:
-        return {scheme: {name: f.json() for name, f in figures.items()} for scheme, figures in schemes.items()}
+        return {
+            scheme: {name: f.json() | {"below_sensor": f.below_sensor} for name, f in figures.items()}
+            for scheme, figures in schemes.items()
+        }
 
     return {
         "schema": SCHEMA,
@@ -151,8 +135,7 @@ def paper_json(result: PaperResult) -> dict[str, Any]:
         "table4": {axis: table(schemes) for axis, schemes in result.table4.items()},
         # Of the fits of whole records, which the sensor's noise does not bound.
         "figures": {
-            place: {name: {"paper": f.paper, "ours": f.median, "spread": f.spread} for name, f in figures.items()}
-            for place, figures in result.figures.items()
+            place: {name: f.json() for name, f in figures.items()} for place, figures in result.figures.items()
         },
         "beside": [
             {"where": _PLACES[place], "scheme": scheme, "figure": name, "ours": f.median_beside}

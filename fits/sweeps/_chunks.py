@@ -35,9 +35,8 @@ def bytes_per_row(sweep: Sweep) -> int:
 
 def swept_of(sweep: Sweep) -> tuple[Output, ...]:
     """The variables that hold the values of the axes."""
-    known, found = {parameter.name: parameter for parameter in sweep.facts.parameters}, []
-    for axis in sweep.plan.axes:
-        parameter = known[axis.parameter]
+    found = []
+    for axis, parameter in sweep.swept:
         dtype = f"U{max(map(len, parameter.words))}" if parameter.words else "f8"
         found.append(Output(parameter.name, "1" if axis.relative else parameter.unit, "swept", dtype=dtype))
     return tuple(found)
@@ -83,10 +82,9 @@ def _blocks(sweep: Sweep, rows: NDArray[np.int64], together: int) -> Rows:
         outputs[output.name] = np.asarray(found.outputs[output.name])[: len(rows)].astype(output.dtype)
         if outputs[output.name].dtype.kind == "f":
             outputs[output.name][failed] = np.nan
-    known = {parameter.name: parameter for parameter in sweep.facts.parameters}
-    for name, value in values.items():
-        words = np.array(known[name].words)
-        outputs[name] = words[value[: len(rows)].astype(int)] if len(words) else value[: len(rows)]
+    for _, parameter in sweep.swept:
+        words, value = np.array(parameter.words), values[parameter.name][: len(rows)]
+        outputs[parameter.name] = words[value.astype(int)] if len(words) else value
     if sweep.facts.sources:
         names = [sweep.facts.sources[k] for k in sweep.plan.repeat_of(rows)]
         outputs["source"] = np.array(names, dtype=source_of(sweep).dtype)

@@ -1,6 +1,5 @@
 """Many small loop fits at once, as `fits.fit` does them on one grid: the smoothness is stated, the noise is found."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -14,16 +13,6 @@ from fits.sweeps._devices import by_rows
 from microid import Staircase
 
 
-class BatchFit(eqx.Module):
-    """What a batch of fits gives, one row each, as in `Grid`: the noise is a standard deviation."""
-
-    columns_um: Float[Array, "n D"]
-    offset_um: Float[Array, " n"]
-    noise_um: Float[Array, " n"]
-    predicted_um: Float[Array, "n t"]
-    success: Array
-
-
 @by_rows("voltage_V", "displacement_um", "weight", "limits_V", "smoothness", "starts")
 def fit_batch(
     levels: int,
@@ -35,18 +24,19 @@ def fit_batch(
     limits_V: Float[Array, "n 2"],
     smoothness: Float[Array, " n"],
     starts: Staircase,
-) -> BatchFit:
+) -> dict[str, Array]:
     """Fit all rows on a grid, of which `table` is the `branch_table` and `rough` the `roughness`.
 
     The weight is 1 for samples that are fitted and 0 for others; the smoothness that of the curvature, see `Hyper`;
-    the range of the levels and the memory before it belong to each row.
+    the range of the levels and the memory before it belong to each row. What comes back has a row each: `columns_um`
+    as in `Grid`, `offset_um`, `noise_um`, a standard deviation, `predicted_um`, shape `(n, t)`, and `success`.
     """
 
     def responses(row: tuple[Array, Array, Staircase]) -> Float[Array, "t D"]:
         voltage, limits, start = row
         return design(Grid(limits[0], limits[1], levels), table, voltage, start)[0]
 
-    def one(columns: Array, displacement: Array, weight: Array, smoothness: Array) -> BatchFit:
+    def one(columns: Array, displacement: Array, weight: Array, smoothness: Array) -> dict[str, Array]:
         count, used = jnp.maximum(jnp.sum(weight), 1.0), weight > 0
         highest = jnp.max(displacement, where=used, initial=-jnp.inf)
         stroke = highest - jnp.min(displacement, where=used, initial=jnp.inf)
@@ -69,7 +59,8 @@ def fit_batch(
         found = solution / scale * stroke
         offset = mean - mean_column @ found
         noise = jnp.exp(hyper.log_variance / 2) * stroke
-        return BatchFit(found, offset, noise, columns @ found + offset, success)
+        fitted = {"columns_um": found, "offset_um": offset, "noise_um": noise}
+        return fitted | {"predicted_um": columns @ found + offset, "success": success}
 
     # Row by row: what a hysteresis remembers is found fastest by a loop of scalars.
     columns = lax.map(responses, (voltage_V, limits_V, starts))

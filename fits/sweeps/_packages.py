@@ -7,12 +7,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from fits.io import _packages
+from fits.io import _late
 
 
 def need(name: str) -> Any:
     """Import a package of the extras `sweep` and `cluster`; a `DataError` says what to run if it is not installed."""
-    return _packages.need(name, "sweep,cluster" if name.partition(".")[0] == "distributed" else "sweep")
+    return _late.need(name, "sweep,cluster" if name.partition(".")[0] == "distributed" else "sweep")
 
 
 @lru_cache(maxsize=1)

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Annotated, Any, Literal
@@ -16,8 +17,8 @@ from fits.io._typed import typed
 from fits.sweeps._axes import SAMPLERS, Axis, Drawn, Listed, Plan
 from fits.sweeps._types import Parameter, check_plain, number, one_of
 
-_PREFIXES = {"k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
-_BASES = ("s", "V", "m", "Hz", "Pa", "rad")
+_PREFIXES = {"": 0, "k": 3, "M": 6, "m": -3, "u": -6, "n": -9}
+_UNIT = re.compile(r"([kMmun]?)(s|V|m|Hz|Pa|rad)")
 _MOST_ROWS = 2**62
 # Values of a grid are held at once.
 _LONGEST = 1_000_000
@@ -187,16 +188,10 @@ def _factor(unit: str | None, wanted: str, place: str, name: str) -> float:
     """What takes a unit to the parameter's own."""
     if unit is None or unit == wanted:
         return 1.0
-    (power, base), (own, other) = _split(unit.replace("µ", "u").replace("μ", "u")), _split(wanted)
-    if base != other or base not in _BASES:
+    found, own = _UNIT.fullmatch(unit.replace("µ", "u").replace("μ", "u")), _UNIT.fullmatch(wanted)
+    if found is None or own is None or found[2] != own[2]:
         raise DataError(f"{place}: {name} is in {wanted}, found {shown(unit)}; convert the values.")
-    return float(10.0 ** (power - own))
-
-
-def _split(unit: str) -> tuple[int, str]:
-    """Power of ten of a unit's prefix, and the unit without it."""
-    prefixed = unit[:1] in _PREFIXES and unit[1:] in _BASES
-    return (_PREFIXES[unit[0]], unit[1:]) if prefixed else (0, unit)
+    return float(10.0 ** (_PREFIXES[found[1]] - _PREFIXES[own[1]]))
 
 
 def _list(entry: Any, known: Mapping[str, Parameter], load: Callable[[str], bytes]) -> Listed:

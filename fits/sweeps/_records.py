@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
-import jax.numpy as jnp
 import msgspec
 import numpy as np
 from msgspec import Meta
@@ -19,9 +18,8 @@ from fits.io._typed import typed
 from fits.io._units import parse_columns
 from fits.loop._result import FitError
 from fits.loop._run import INITIAL_STATES
-from fits.sweeps._devices import place
-from fits.sweeps._programs import Program, drive, read_program
-from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
+from fits.sweeps._programs import Program, read_program
+from fits.sweeps._stages import requested_stage, simulated, stage_parameters
 from fits.sweeps._types import Block, Output, Parameter, Request, Rows
 from microid import Stage
 
@@ -83,15 +81,11 @@ class Simulated:
 
     def records(self, block: Block) -> list[Record | str]:
         """Simulate the record of each row; its noise depends on the seed and the row's number alone."""
-        own = {parameter.name for parameter in self.parameters}
-        values = place({name: value for name, value in block.values.items() if name in own})
-        voltage = drive(self.program, block, values)
-        memory, interval_s = memory_before(self.stage, self.initial), jnp.asarray(self.program.interval_s)
-        displacement = respond(self.stage, values, block.relative, interval_s, voltage, memory)
         time_s = np.asarray(np.arange(self.program.samples) * self.program.interval_s, dtype=np.float64)
         sd_um = block.numbers(_NOISE, self.noise_um)
+        signals = jax.device_get(simulated(self.stage, self.program, self.initial, block))
         found: list[Record | str] = []
-        for row, sd, v, w in zip(block.rows, sd_um, *jax.device_get((voltage, displacement)), strict=True):
+        for row, sd, v, w in zip(block.rows, sd_um, *signals, strict=True):
             if np.all(np.isfinite(w)):
                 noise = np.random.default_rng([block.seed, int(row)]).normal(0.0, 1.0, len(w))
                 found.append(Record(time_s, v, w + sd * noise, source=f"row {row}"))

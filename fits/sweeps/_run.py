@@ -81,7 +81,7 @@ def run_sweep(
         store = stack.enter_context(opened(sweep, os.fspath(out), resume))
         chunks = range(chunk_count(sweep))
         done = {chunk for chunk in chunks if store.whole(chunk)} if resume else set()
-        again = sum(store.noted(chunk) for chunk in chunks if chunk not in done) if resume else 0
+        again = sum(store.entry(chunk).exists() for chunk in chunks if chunk not in done) if resume else 0
         if resume:
             progress(f"{len(done)} of {len(chunks)} chunks are there" + (f", {again} broken" if again else ""))
         left = [chunk for chunk in chunks if chunk not in done]

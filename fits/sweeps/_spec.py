@@ -1,7 +1,6 @@
 """A sweep as a TOML file describes it, checked before anything runs."""
 
 import hashlib
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,9 +15,9 @@ from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_CSV_BYTES, MOST_TOML_BYTES, parse_toml, read_bytes, read_text
 from fits.io._typed import check_keys, typed
 from fits.sweeps import kinds
-from fits.sweeps._axes import Plan
+from fits.sweeps._axes import Axis, Plan
 from fits.sweeps._read_axes import read_plan
-from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Request, one_of
+from fits.sweeps._types import SCHEMA, AbstractJob, Facts, Parameter, Request, one_of
 
 _MOST_MB = 1_000_000_000
 
@@ -45,6 +44,12 @@ class Sweep:
     memory_MB: float
     chunk_rows: int | None
     folder: Path | None = None
+
+    @property
+    def swept(self) -> list[tuple[Axis, Parameter]]:
+        """The axes, each with the parameter that it varies."""
+        known = {parameter.name: parameter for parameter in self.facts.parameters}
+        return [(axis, known[axis.parameter]) for axis in self.plan.axes]
 
     @property
     def digest(self) -> str:
@@ -124,14 +129,12 @@ def outside(sweep: Sweep, values: Mapping[str, np.ndarray]) -> tuple[dict[str, n
     """Replace values out of bounds by nominal ones, and give the reason for each row that fails."""
     reasons = [""] * len(next(iter(values.values()), np.zeros(0)))
     kept = dict(values)
-    parameters = {parameter.name: parameter for parameter in sweep.facts.parameters}
-    for axis in sweep.plan.axes:
-        parameter, value = parameters[axis.parameter], values[axis.parameter]
-        lower, upper, nominal, words = parameter.lower, parameter.upper, parameter.nominal, parameter.range_words
+    for axis, parameter in sweep.swept:
+        name, value, bounds, words = parameter.name, values[parameter.name], parameter, parameter.range_words
         if axis.relative:
-            lower, upper, nominal, words = 0.0, math.inf, 1.0, "0 to inf times its own"
-        wrong = ~((value >= lower) & (value <= upper))
-        kept[axis.parameter] = np.where(wrong, nominal, value)
+            bounds, words = Parameter(name, "1", 1.0, lower=0.0), "0 to inf times its own"
+        wrong = ~((value >= bounds.lower) & (value <= bounds.upper))
+        kept[name] = np.where(wrong, bounds.nominal, value)
         for k in np.flatnonzero(wrong):
-            reasons[k] = reasons[k] or f"{parameter.name} = {value[k]:.6g} lies outside its bounds, {words}"
+            reasons[k] = reasons[k] or f"{name} = {value[k]:.6g} lies outside its bounds, {words}"
     return kept, reasons

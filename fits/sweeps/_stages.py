@@ -14,8 +14,9 @@ from fits.control._tune import parameter_values
 from fits.io._errors import DataError, shown
 from fits.stage._model_file import load_model
 from fits.stage._run import as_stage
-from fits.sweeps._devices import by_rows
-from fits.sweeps._types import Parameter, Request, in_a_file, one_of
+from fits.sweeps._devices import by_rows, place
+from fits.sweeps._programs import Program, drive
+from fits.sweeps._types import Block, Parameter, Request, in_a_file, one_of
 
 NOMINAL = "nominal"
 INITIAL = ("negative", "positive", "demagnetised")
@@ -87,6 +88,16 @@ def respond(
     """Respond to commands, each row at rest under its first sample."""
     rows = jax.tree.map(lambda leaf: leaf[None], stage)
     return m.respond_all(varied(rows, values, relative), interval_s, voltage_V, memory)
+
+
+def simulated(
+    stage: m.Stage, program: Program, initial: str, block: Block
+) -> tuple[Float[Array, "n t"], Float[Array, "n t"]]:
+    """Commands in V of the rows of a block, and displacements in um that they make a stage respond with."""
+    # In programs of their own: compiled as one, XLA computes much of it several times.
+    values, interval_s = place(block.values), jnp.asarray(program.interval_s)
+    voltage = drive(program, block, values)
+    return voltage, respond(stage, values, block.relative, interval_s, voltage, memory_before(stage, initial))
 
 
 def range_of(stage: m.Stage) -> tuple[float, float] | None:

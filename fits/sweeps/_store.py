@@ -12,6 +12,8 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -48,12 +50,12 @@ class _About(TypedDict):
     versions: dict[str, str]
 
 
+@dataclass(eq=False)
 class Store:
     """The folder of one sweep, held by one process at a time."""
 
-    def __init__(self, sweep: Sweep, folder: Path):
-        self.sweep, self.folder = sweep, folder
-        self._group: Any = None
+    sweep: Sweep
+    folder: Path
 
     @property
     def variables(self) -> tuple[Output, ...]:
@@ -105,12 +107,12 @@ class Store:
             # Last: a folder without it holds no sweep yet.
             atomic_write_text(self.folder / ABOUT, json.dumps(about, indent=1) + "\n")
 
-    def _open(self) -> Any:
-        if self._group is None:
-            self._group = need("zarr").open_group(str(self.folder / RESULTS), mode="r+", zarr_format=2)
-        return self._group
+    @cached_property
+    def _group(self) -> Any:
+        return need("zarr").open_group(str(self.folder / RESULTS), mode="r+", zarr_format=2)
 
-    def _entry(self, chunk: int) -> Path:
+    def entry(self, chunk: int) -> Path:
+        """The file by which a chunk is in the ledger."""
         return self.folder / LEDGER / f"{chunk:08d}.json"
 
     def sound(self) -> bool:
@@ -119,7 +121,7 @@ class Store:
         try:
             json.loads((self.folder / RESULTS / ".zmetadata").read_text(encoding="utf-8"))
             for variable in self.variables:
-                array, shape = self._open()[variable.name], variable.shape
+                array, shape = self._group[variable.name], variable.shape
                 expected = (rows, *shape), (size, *shape), np.dtype(variable.dtype)
                 if (array.shape, array.chunks, array.dtype) != expected:
                     return False
@@ -143,30 +145,27 @@ class Store:
             start = chunk * chunk_rows(self.sweep)
             for variable in self.variables:
                 array = np.ascontiguousarray(arrays[variable.name], dtype=variable.dtype)
-                self._open()[variable.name][start : start + len(array)] = array
+                self._group[variable.name][start : start + len(array)] = array
                 path = self.folder / RESULTS / variable.name / f"{chunk}{'.0' * len(variable.shape)}"
                 # A chunk of nothing but fill values has no file; others are on the disk before the ledger says so.
                 if path.exists():
                     flush(path)
             entry = {"sha256": self._sum(arrays), "failed": sum(map(bool, rows.reasons)), "rows": len(rows.reasons)}
-            atomic_write_text(self._entry(chunk), json.dumps(entry) + "\n")
+            atomic_write_text(self.entry(chunk), json.dumps(entry) + "\n")
 
     def read(self, chunk: int) -> dict[str, np.ndarray]:
-        rows, group = rows_of(self.sweep, chunk), self._open()
+        rows, group = rows_of(self.sweep, chunk), self._group
         place = slice(int(rows[0]), int(rows[-1]) + 1)
         return {variable.name: np.asarray(group[variable.name][place]) for variable in self.variables}
 
     def whole(self, chunk: int) -> bool:
         """Whether a chunk is in the ledger and what is kept of it has the sum that is written there."""
         try:
-            entry = json.loads(self._entry(chunk).read_text(encoding="utf-8"))
+            entry = json.loads(self.entry(chunk).read_text(encoding="utf-8"))
             return bool(entry["sha256"] == self._sum(self.read(chunk)))
         except Exception:
             # Whatever a broken file makes a decoder say, the chunk is not whole.
             return False
-
-    def noted(self, chunk: int) -> bool:
-        return self._entry(chunk).exists()
 
     def _sum(self, arrays: dict[str, np.ndarray]) -> str:
         total = hashlib.sha256()

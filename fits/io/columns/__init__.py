@@ -1,6 +1,6 @@
 """Further columns of a record, one file each, which registers it when the package is imported."""
 
-from fits.io._plugins import import_all as _import_all
+from fits.io._late import import_all as _import_all
 from fits.io.columns._base import COLUMNS as COLUMNS
 from fits.io.columns._base import Column as Column
 from fits.io.columns._base import columns_beside as columns_beside

@@ -76,15 +76,10 @@ def _check_matrix(data: bytes, order: str, depth: int) -> str:
     complex_, kind = bool(kind & 0x800), kind & 0xFF
     if kind not in (_CELL, _STRUCT, _TEXT, *_NUMBERS):
         raise _OfMatlabAlone("tables and objects are not read")
-    if (
-        len(parts) < 2
-        or parts[0][0] != 5
-        or len(parts[0][1]) % 4
-        or len(parts[0][1]) < 8
-        or parts[1][0] not in (1, 16)
-    ):
+    kinds, sizes = [each for each, _ in parts[:2]], parts[0][1] if parts else b""
+    if kinds not in ([5, 1], [5, 16]) or len(sizes) % 4 or len(sizes) < 8:
         raise ValueError("a matrix has no size or name")
-    shape = struct.unpack(f"{order}{len(parts[0][1]) // 4}i", parts[0][1])
+    shape = struct.unpack(f"{order}{len(sizes) // 4}i", sizes)
     count, rest, name = math.prod(shape), parts[2:], parts[1][1].decode("latin-1")
     if min(shape) < 0:
         raise ValueError("a matrix has a negative size")

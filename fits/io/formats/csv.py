@@ -118,7 +118,8 @@ def _header(lines: list[_Line]) -> tuple[int, str, bool]:
     for i in range(len(lines)):
         separator = _separator(lines[i][2])
         rows = [_names(line, separator) for _, _, line in lines[i : i + _ENOUGH]]
-        if not all(len(row) == len(rows[0]) and _numeric(row) for row in rows):
+        known = (looks_numeric(cell) or is_clock(cell) for row in rows for cell in row)
+        if not (all(len(row) == len(rows[0]) and any(row) for row in rows) and all(known)):
             continue
         width, first = len(rows[0]), i
         while first and len(_names(lines[first - 1][2], separator)) == width:
@@ -127,8 +128,8 @@ def _header(lines: list[_Line]) -> tuple[int, str, bool]:
         if not above:
             break
         units = [all(map(_is_unit, names)) for names in above]
-        known = [k for k, names in enumerate(above) if any(map(recognise, names))]
-        k = known[0] if known else max((k for k in range(len(above)) if not units[k]), default=0)
+        named = [k for k, names in enumerate(above) if any(map(recognise, names))]
+        k = named[0] if named else max((k for k in range(len(above)) if not units[k]), default=0)
         return first + k, separator, k + 1 < len(above) and units[k + 1]
     return 0, _separator(lines[0][2]), False
 
@@ -141,11 +142,6 @@ def _separator(line: str) -> str:
     unquoted = re.sub(r'"[^"]*"', "", line.strip())
     # Names in a semicolon file may hold commas; the reverse is rare.
     return next((mark for mark in "\t;" if mark in unquoted), ",")
-
-
-def _numeric(cells: list[str]) -> bool:
-    fine = all(looks_numeric(cell) or is_clock(cell) for cell in cells)
-    return fine and any(cells)
 
 
 def _is_unit(cell: str) -> bool:

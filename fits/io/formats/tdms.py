@@ -3,7 +3,7 @@
 import io
 import logging
 
-from fits.io._packages import need
+from fits.io._late import need
 from fits.io._table import Found, Table, gathered
 from fits.io.formats._base import Format, register
 

@@ -1,13 +1,12 @@
 """The job `control`: a stage in closed loop with a controller, and its figures of merit."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from fits.control._tune_start import major_loop_slope
 from fits.sweeps._controllers import Controllers, read_controllers
@@ -38,13 +37,12 @@ _STEP = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class ControlJob(AbstractJob):
+class ControlJob(eqx.Module, AbstractJob):
     """Closed loops of a stage, with what they follow and how the stage stands before each row."""
 
     stage: Stage
     controllers: Controllers
-    reference: Program
+    reference: Program = eqx.field(static=True)
     start: Start
 
     @property
@@ -56,13 +54,12 @@ class ControlJob(AbstractJob):
 
     def compute(self, block: Block) -> Rows:
         """Run a block of loops on each device; see `AbstractJob.compute`."""
-        values, step = place(block.values), self.reference.shape == "step"
+        values = place(block.values)
         wanted = drive(self.reference, block, values)
-        found = _control(self.stage, self.controllers, values, block.relative, wanted, self.start, step)
-        outputs = {name: np.asarray(value) for name, value in found.items()}
+        outputs = {name: np.asarray(x) for name, x in _control(self, values, block.relative, wanted).items()}
 
         def radius(rows: Array, values: Mapping[str, Array]) -> Array:
-            return _radius(self.stage, self.controllers, rows, values, block.relative)
+            return _radius(self, rows, values, block.relative)
 
         outputs["pole_radius"] = in_turn(radius, block.rows, block.values)
         way = np.maximum(np.ptp(np.asarray(wanted), axis=1), np.abs(outputs.pop("from_um")))
@@ -90,17 +87,11 @@ def make(request: Request) -> ControlJob:
 
 @by_rows("wanted", "values")
 def _control(
-    stage: Stage,
-    controllers: Controllers,
-    values: Mapping[str, Float[Array, " n"]],
-    relative: tuple[str, ...],
-    wanted: Float[Array, "n t"],
-    start: Start,
-    step: bool,
+    job: ControlJob, values: Mapping[str, Array], relative: tuple[str, ...], wanted: Float[Array, "n t"]
 ) -> dict[str, Float[Array, " n"]]:
     def one(values: Mapping[str, Float[Array, ""]], reference: Float[Array, " t"]) -> dict[str, Float[Array, ""]]:
-        changed = varied(stage, values, relative)
-        run = simulate_loop(controllers.at(values), changed, reference, delay=controllers.delay, start=start)
+        controller, changed = job.controllers.at(values), varied(job.stage, values, relative)
+        run = simulate_loop(controller, changed, reference, delay=job.controllers.delay, start=job.start)
         # A step at the first sample is none within the record, but from where the stage stood.
         way = jnp.append(reference, run.displacement_um[0])
         share = 100 / jnp.ptp(way)
@@ -113,7 +104,7 @@ def _control(
             "command_max_V": jnp.max(run.command_V),
             "from_um": reference[0] - run.displacement_um[0],
         }
-        if step:
+        if job.reference.shape == "step":
             answer = step_metrics(run.time_s, run.displacement_um, reference[-1], run.displacement_um[0])
             waited = run.time_s[jnp.argmax(reference == reference[-1])]
             found |= {"settling_time_s": answer.settling_time_s - waited, "overshoot_pct": answer.overshoot_pct}
@@ -124,20 +115,16 @@ def _control(
 
 @eqx.filter_jit
 def _radius(
-    stage: Stage,
-    controllers: Controllers,
-    rows: Int[Array, " n"],
-    values: Mapping[str, Float[Array, " n"]],
-    relative: tuple[str, ...],
+    job: ControlJob, rows: Array, values: Mapping[str, Array], relative: tuple[str, ...]
 ) -> Float[Array, " n"]:
     """Largest modulus of the poles of each loop, NaN where a part of the stage has no linear form."""
-    if not all(isinstance(part, AbstractLinear | Preisach) for part in stage.parts):
+    if not all(isinstance(part, AbstractLinear | Preisach) for part in job.stage.parts):
         return jnp.full(rows.shape, jnp.nan)
 
     def one(values: Mapping[str, Float[Array, ""]]) -> Float[Array, ""]:
-        changed = varied(stage, values, relative)
+        changed = varied(job.stage, values, relative)
         slopes = [major_loop_slope(part, fine=8) for part in changed.parts if isinstance(part, Preisach)]
-        linear, slope = controllers.at(values).linear(), slopes[0] if slopes else None
-        return margins(linear, changed, delay=controllers.delay, slope_um_per_V=slope).radius
+        linear, slope = job.controllers.at(values).linear(), slopes[0] if slopes else None
+        return margins(linear, changed, delay=job.controllers.delay, slope_um_per_V=slope).radius
 
     return jax.vmap(one)(values)

@@ -20,7 +20,7 @@ from fits.loop._prior import roughness
 from fits.loop._run import INITIAL_STATES, initial_state, known_samples
 from fits.stats._metrics import errors
 from fits.sweeps._devices import in_turn, place
-from fits.sweeps._fit_batch import BatchFit, fit_batch
+from fits.sweeps._fit_batch import fit_batch
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, each_alone, requested_records
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
 from microid import Staircase, node_areas
@@ -111,13 +111,13 @@ class FitJob(AbstractJob):
                 continue
             assert record.displacement_um is not None
             n, v = len(record), record.voltage_V
-            limits[k] = v.min(), v.max()
+            lower, upper = limits[k] = v.min(), v.max()
             voltage[k], displacement[k, :n] = np.pad(v, (0, samples - n), mode="edge"), record.displacement_um
-            known[k, :n] = True if initial[k] != "unknown" else known_samples(v, *limits[k])
+            known[k, :n] = known_samples(v, lower, upper, initial[k])
             fitted[k] = known[k] & (np.arange(samples) < n - round(holdout[k] * n))
             if fitted[k].sum() < _FEWEST:
                 reasons[k] = f"only {int(fitted[k].sum())} samples are left to fit, {_FEWEST} are needed"
-            start = initial_state(initial[k], *limits[k])
+            start = initial_state(initial[k], lower, upper)
             extremes[k], used[k] = np.asarray(start.extremes_V), int(start.count)
         rows = voltage, displacement, fitted, limits, smoothness, extremes, used
         # The whole block on each number of levels there is in it, of which every row takes its own: what is found
@@ -161,15 +161,14 @@ def _fitted(levels: int, rows: tuple[NDArray[Any], ...]) -> dict[str, NDArray[An
     """Fit whole blocks on one number of levels; figures by output, weights, predictions and success."""
     table, rough = jnp.asarray(branch_table(levels)), roughness(levels)
 
-    def regress(*rows: Array) -> BatchFit:
+    def regress(*rows: Array) -> dict[str, Array]:
         return fit_batch(levels, table, rough, *rows[:5], Staircase(*rows[5:]))
 
-    found = in_turn(regress, *rows) if jax.default_backend() == "cpu" else regress(*map(place, rows))
-    packed = np.tril_indices(levels)
-    weights = np.asarray(found.columns_um)[:, : len(packed[0])] * node_areas(levels)[packed]
-    same = {name: np.asarray(getattr(found, name)) for name in ("offset_um", "noise_um", "predicted_um", "success")}
+    batch = in_turn(regress, *rows) if jax.default_backend() == "cpu" else regress(*map(place, rows))
+    found, packed = {name: np.asarray(values) for name, values in batch.items()}, np.tril_indices(levels)
+    weights = found["columns_um"][:, : len(packed[0])] * node_areas(levels)[packed]
     numbers = np.full(len(weights), float(levels))
-    return same | {"loops_um": weights.sum(axis=1), "levels": numbers, "weights_um": weights}
+    return found | {"loops_um": weights.sum(axis=1), "levels": numbers, "weights_um": weights}
 
 
 def _errors(measured: FloatArray, predicted: FloatArray, samples: Any, known: Any) -> tuple[float, float]:

@@ -12,9 +12,9 @@ from msgspec import Meta
 
 from fits.io._errors import DataError
 from fits.io._typed import typed
-from fits.sweeps._devices import block_rows, by_rows, place
-from fits.sweeps._programs import Program, drive, read_program
-from fits.sweeps._stages import memory_before, requested_stage, respond, stage_parameters
+from fits.sweeps._devices import block_rows, by_rows
+from fits.sweeps._programs import Program, read_program
+from fits.sweeps._stages import requested_stage, simulated, stage_parameters
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Request, Rows
 from microid import Stage
 
@@ -67,12 +67,8 @@ class SimulateJob(AbstractJob):
 
     def compute(self, block: Block) -> Rows:
         """Simulate a block on each device; see `AbstractJob.compute`."""
-        # In programs of their own: compiled as one, XLA computes much of it several times.
-        values, interval_s = place(block.values), jnp.asarray(self.program.interval_s)
-        memory, first = memory_before(self.stage, self.initial), round(self.from_s / self.program.interval_s)
-        voltage = drive(self.program, block, values)
-        displacement = respond(self.stage, values, block.relative, interval_s, voltage, memory)
-        found = _sum_up(voltage, displacement, first)
+        voltage, displacement = simulated(self.stage, self.program, self.initial, block)
+        found = _sum_up(voltage, displacement, round(self.from_s / self.program.interval_s))
         if self.every:
             found |= {"displacement_um": displacement[:, :: self.every], "voltage_V": voltage[:, :: self.every]}
         outputs = {name: np.asarray(value) for name, value in found.items()}
