@@ -1,6 +1,6 @@
 """A whole stage as a regression: linear in the columns of its hysteresis, linearised in its other parameters."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -165,7 +165,7 @@ def along(
     z: Float[Array, " p"],
     columns_um: Float[Array, " D"] | None,
     run: Run,
-    directions: tuple[np.ndarray, np.ndarray],
+    directions: Sequence[np.ndarray],
     reduce: Callable[[np.ndarray], np.ndarray] = lambda moved: moved,
 ) -> np.ndarray:
     """Move coordinates and columns along `k` directions, to first order: changes of the displacement, shape `(n, k)`.

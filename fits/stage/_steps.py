@@ -163,7 +163,7 @@ def _lagging(plan: Plan, problem: Problem, runs: list[Run], drives: Sequence[np.
     simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, dropped),))
     plan.progress("a lag without a resonance")
     solved = try_chain(simpler, runs, plan.loss, plan.progress)
-    if solved is None or not shows_poles(solved, drives) or float(np.max(Precision(solved).sd())) > UNSEEN:
+    if solved is None or not shows_poles(solved, drives) or float(np.max(Precision(solved).sd)) > UNSEEN:
         return None
     return solved.onward
 
@@ -186,13 +186,13 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         precision = Precision(solved)
         if plan.gain is None or stride > 1:
             return solved, precision
-        influence, stage = precision.influence(), solved.stage
-        sd = np.sqrt(np.diagonal(precision.covariance(influence)))
-        off = [simulate_stage(stage, a) - simulate_stage(stage, b) for a, b in zip(runs, plan.runs(2), strict=True)]
-        moved = [own @ (o - o[run.fitted].mean()) for own, o, run in zip(influence, off, runs, strict=True)]
+        moved = np.zeros(len(solved.z))
+        for own, run, halved in zip(precision.influence, runs, plan.runs(2), strict=True):
+            off = simulate_stage(solved.stage, run) - simulate_stage(solved.stage, halved)
+            moved += own @ (off - off[run.fitted].mean())
         # Halving the step takes three quarters of its error off, which falls with its square; it may move a parameter
         # by 0.15 standard deviations.
-        excess = float(np.max(np.abs(np.sum(moved, axis=0)) / sd)) / (0.75 * 0.15)
+        excess = float(np.max(np.abs(moved) / precision.sd)) / (0.75 * 0.15)
         if excess <= 1:
             return solved, precision
         stride = min(16, 2 ** math.ceil(math.log2(excess) / 2))
