@@ -79,7 +79,6 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
     if not runs:
         return None
     points = max(_POINTS // (2 * len(runs)), 200)
-    extended = bool(diagnosis.causes)
 
     def draw(width_in: float) -> Figure:
         height_in = 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0)
@@ -87,7 +86,7 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
         for axes, run in zip(grid[:, 0], runs, strict=True):
             _set_aside(axes, run)
             band = 2.0 * diagnosis.noise_um * per_um
-            curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if extended else [])
+            curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if diagnosis.causes else [])
             for values, colour, line in curves:
                 keep = thinned(values, points)
                 axes.plot(run.time_s[keep], per_um * values[keep], color=colour, linewidth=line)
@@ -115,24 +114,23 @@ def _set_aside(axes: Axes, run: RunView) -> None:
 
 def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, unit: str) -> tuple[Picture, str] | None:
     """The residual against the variable that shows an effect, and what is drawn in words; None where runs do not."""
-    for found in (VIEWS[card_of(name).view if name else "voltage"], VIEWS["voltage"]):
+    sides: list[tuple[str, Callable[[RunView], np.ndarray]]] = [(BEFORE, lambda run: per_um * run.before_um)]
+    if diagnosis.causes:
+        sides.append((AFTER, lambda run: per_um * run.after_um))
+    for view in (VIEWS[card_of(name).view if name else "voltage"], VIEWS["voltage"]):
         try:
-            seen = found.look(diagnosis.runs, per_um)
+            seen = [(colour, curve) for colour, of in sides for curve in view.look(diagnosis.runs, of)]
             break
         except ValueError:
             continue
     else:
         return None
-    view, extended = found, bool(diagnosis.causes)
 
     def draw(width_in: float) -> Figure:
         picture, axes = panels(width_in, 2.7 if width_in == _WIDE_in else 2.5)
         if not view.spectrum:
             axes.axhline(0.0, color=INK, linewidth=0.5)
-        for curve in seen:
-            if curve.after and not extended:
-                continue
-            colour = AFTER if curve.after else BEFORE
+        for colour, curve in seen:
             if curve.low is not None and curve.high is not None:
                 axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.14, linewidth=0)
             axes.plot(curve.x, curve.y, "--" if curve.downwards else "-", color=colour, linewidth=1.3)
