@@ -134,8 +134,7 @@ def load_model(path: AnyPath) -> ModelFile:
         raise DataError(f"{name}: expected a model and its uncertainty; {again}.")
     if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
         raise DataError(f"{name}: the uncertainty does not fit the stage; {again}.")
-    columns = 0 if uncertainty is None or uncertainty.grid is None else uncertainty.grid.columns
-    if uncertainty is not None and uncertainty.columns_um.shape[1] != columns:
+    if uncertainty and uncertainty.columns_um.shape[1] != (uncertainty.grid.columns if uncertainty.grid else 0):
         raise DataError(f"{name}: the uncertainty does not fit its grid; {again}.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
 

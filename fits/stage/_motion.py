@@ -1,8 +1,9 @@
 """What a command makes a stage do, between its samples as well: voltage at the piezo, displacement, derivatives."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -31,29 +32,10 @@ def prepare(stage: Stage, run: Run) -> Prepared:
     return Prepared(run, samples.time_s, Scene(command, samples.beside, samples.start.memory))
 
 
-class _Programs:
-    """Compiled functions that send a signal through one part; one for each kind of part, and length of signal."""
-
-    def __init__(self) -> None:
-        self.drop()
-
-    def drop(self) -> None:
-        """Give back the memory of all of them: they go with the function that they were compiled for."""
-
-        @eqx.filter_jit
-        def run(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
-            return part.run(time_s, signal, scene)
-
-        self.run = run
-
-
-programs = _Programs()
-
-
-def pass_signal(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
-    """Send a signal through one part."""
-    passed: Signal = programs.run(part, time_s, signal, scene)
-    return passed
+@cache
+def program() -> Callable[[AbstractPart, Any, Signal, Scene], Signal]:
+    """Send a signal through one part: compiled for each kind of part and length of signal, until it is made anew."""
+    return eqx.filter_jit(lambda part, time_s, signal, scene: part.run(time_s, signal, scene))
 
 
 def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
@@ -61,7 +43,7 @@ def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
     signal = prepared.scene.command
     found = [signal]
     for part in stage.parts:
-        signal = pass_signal(part, prepared.time_s, signal, prepared.scene)
+        signal = program()(part, prepared.time_s, signal, prepared.scene)
         found.append(signal)
     return found
 

@@ -124,17 +124,15 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
             failure = error
     if not found:
         raise failure
-    solved = min(found, key=lambda one: one.cost)
-    solved = replace(solved, hyper=hyper)
+    solved = replace(min(found, key=lambda one: one.cost), hyper=hyper)
     problem = solved.onward
     try:
         dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
     except DataError:
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
-        lagging = None if plan.accept_best or fast != slow else _lagging(plan, problem, runs, drives)
-        if lagging is None:
-            raise
-        return lagging
+        if not plan.accept_best and fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
+            return lagging
+        raise
     if dropped is not None:
         # Begin without a mechanics that the runs do not show.
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
@@ -203,15 +201,12 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
 def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
 
-    Whole steps do not see one that answers between two samples, and from no time constant at all there is no way
-    back.
+    Whole steps do not see one that answers between two samples, and from no time constant there is no way back.
     """
     stage = solved.stage
-    changed = False
-    for name, part in named_parts(stage, Driver):
-        if float(part.time_constant_s) < 1e-2 * plan.interval_s:
-            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(0.3 * plan.interval_s)))
-            changed = True
-    if plan.hold != "zero" or not changed:
+    quick = [each for each in named_parts(stage, Driver) if float(each[1].time_constant_s) < 1e-2 * plan.interval_s]
+    if plan.hold != "zero" or not quick:
         return solved.z
+    for name, part in quick:
+        stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(0.3 * plan.interval_s)))
     return np.asarray(solved.problem.chain.coordinates.of(stage))
