@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from fits.report._control import control_json, describe_control
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
-    from fits.report._fit import describe, fit_report
+    from fits.report._fit import fit_report
+    from fits.report._fit_words import describe
     from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
     from fits.report._words import describe_diagnosis
     from fits.stage._fit import default_stage, fit_stage

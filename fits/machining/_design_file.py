@@ -44,9 +44,7 @@ class _Quantity(msgspec.Struct):
     unit: str
 
 
-class _Dimension(msgspec.Struct):
-    value: float
-    unit: str
+class _Dimension(_Quantity):
     tolerance: float | None = None
 
 

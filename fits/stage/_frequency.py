@@ -172,8 +172,8 @@ def _local_polynomial(
     """Fit a response that is a polynomial about each line, by least squares (Pintelon and Schoukens, section 7.2).
 
     Of spectra of the inputs, `(f, r, m)`, and outputs, `(f, r, p)`, of `r` realizations: the response, `(f, p, m)`,
-    the variance of the outputs about it, `(f, p)`, that of the response over the latter, `(f, m)`, and what is left of
-    each realization where the fit is to the others, `(f, r, p)`.
+    the variance of the outputs about it, `(f, p)`, that of the response over the latter, `(f, m)`, and what is left
+    of each realization where the fit is to the others, `(f, r, p)`.
     """
     lines, realizations, inputs = drive.shape
     width = 2 * neighbours + 1

@@ -1,0 +1,136 @@
+"""The report of a fit in words."""
+
+from collections.abc import Mapping
+from itertools import combinations
+from math import floor, log10
+from typing import Any
+
+from fits.report._json import columns
+from fits.stats._metrics import WHITE
+
+# Held-out errors up to this many times the fitted ones count as equal.
+_EQUAL = 1.1
+
+
+def describe(report: Mapping[str, Any]) -> str:
+    """Put a report from `fit_report` into words: some twenty lines, without a newline at the end."""
+    stage = "parts" in report
+    lines = _said_of_misfit(report.get("misfit"))
+    if stage:
+        chain = ", ".join(f"{part['name']} ({part['type']})" for part in report["parts"])
+        lines.append(f"stage          {chain}")
+    if report["family"] is not None:
+        lines.append(
+            f"density        {report['family']}, {report['levels']} levels from {report['lower_V']:g} to "
+            f"{report['upper_V']:g} V"
+        )
+    lines += _parameters(report) if stage else _resolution(report)
+    lines += ["", f"{'':14} {'samples':>8} {'e_rms':>10} {'':>12} {'e_max':>10}"]
+    lines += [_row("in-sample", report["in_sample"]), _row("held-out", report["held_out"])]
+    for run in report["runs"] if stage or len(report["runs"]) > 1 else ():
+        lines.append(f"  {run['source']}")
+        lines += [_row(f"    {key.replace('_', '-')}", run[key]) for key in ("in_sample", "held_out") if run[key]]
+        if run.get("noise_um") is not None:
+            steps = "" if run["substeps"] == 1 else f", {run['substeps']} steps per sample"
+            lines.append(f"    residual     {_residual(run)}{steps}")
+    lines += ["e_rms: root mean square error, e_max: largest error, both in % of the measured range (Eq. 35, 36)", ""]
+    lines += [_loop(run) for run in report["runs"]]
+    lines += ["e_loop: widest gap of the largest loop in % of its height (Eq. 34)", "", _verdict(report)]
+    lines += [f"Unseen: {sentence}" for sentence in (report["unseen"] if stage else ())]
+    return "\n".join(lines + [f"Note: {remark}" for remark in report["remarks"]])
+
+
+def _said_of_misfit(misfit: Mapping[str, Any] | None) -> list[str]:
+    """Say first how far a residual is from noise; nothing of models that were written before it was looked at."""
+    if misfit is None:
+        return []
+    figures = (
+        "{residual_um:.4g} um rms in {source}, {share_pct:.3g} % of its stroke and {times_noise:.3g} times the "
+        "sensor's noise ({noise_um:.3g} um, by {noise_shown_by})"
+    ).format(**misfit)
+    if not misfit["far"]:
+        return [f"left over      {figures}", ""]
+    return [f"FAR FROM NOISE {figures}: the model misses something, and all below is no better than that", ""]
+
+
+def _resolution(report: Mapping[str, Any]) -> list[str]:
+    levels = ", ".join(f"{trial['levels']:d}" for trial in report["trials"])
+    errors = ", ".join(f"{trial['error_um']:.4g}" for trial in report["trials"])
+    return [
+        f"levels tried   {levels}",
+        f"  their error  {errors} um, on blocks predicted from the others",
+        f"residual       {_residual(report)}",
+    ]
+
+
+def _residual(report: Mapping[str, Any]) -> str:
+    correlation = report["correlation_samples"]
+    colour = "white" if correlation <= WHITE else f"neighbours alike over {correlation:.0f} samples"
+    return f"{report['noise_um']:.4g} um standard deviation, {colour}"
+
+
+def _row(name: str, errors: Mapping[str, Any] | None) -> str:
+    if errors is None:
+        return f"{name:14} {'none':>8}"
+    return (
+        f"{name:14} {errors['samples']:8d} {errors['e_rms_pct']:8.4g} % {errors['rms_um']:9.4g} um "
+        f"{errors['e_max_pct']:8.4g} % {errors['max_um']:9.4g} um"
+    )
+
+
+def _loop(run: Mapping[str, Any]) -> str:
+    measured, model = run["e_loop_measured_pct"], run["e_loop_model_pct"]
+    if measured is None or model is None:
+        return f"e_loop         {run['source']}: no full loop in it"
+    return f"e_loop         {run['source']}: measured {measured:.4g} %, model {model:.4g} %"
+
+
+def _verdict(report: Mapping[str, Any]) -> str:
+    held_out, in_sample = report["held_out"], report["in_sample"]
+    if held_out is None:
+        return "Nothing was held out, so how well new voltages are predicted was not seen."
+    ratio = held_out["rms_um"] / max(in_sample["rms_um"], 1e-300)
+    misfit = report.get("misfit")
+    if ratio <= _EQUAL and misfit is not None and misfit["far"]:
+        return (
+            f"Samples that the fit never saw are off by {held_out['e_rms_pct']:.3g} % of the range, those it did by "
+            f"{in_sample['e_rms_pct']:.3g} %, where noise alone would leave "
+            f"{100 * misfit['noise_um'] / in_sample['range_um']:.2g} %: the model misses the same in both."
+        )
+    if ratio <= _EQUAL:
+        return "Samples that the fit never saw are predicted as well as those it did."
+    return (
+        f"Samples that the fit never saw are predicted {ratio:.3g} times worse than those it did: expect the "
+        "held-out figures, not the in-sample ones."
+    )
+
+
+def _parameters(report: Mapping[str, Any]) -> list[str]:
+    """A table of the parameters, and the pairs whose errors go together."""
+    rows = [
+        (
+            one["name"],
+            f"{_value(one)} ± {'unknown' if one['sd'] is None else format(one['sd'], '.2g')}",
+            f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})",
+            "" if one["unit"] == "1" else one["unit"],
+        )
+        for one in report["parameters"]
+    ]
+    lines = ["", *columns(rows)]
+    names = [each["name"] for each in report["parameters"]]
+    for i, j in combinations(range(len(names)), 2):
+        value = report["correlation"][i][j]
+        if value is not None and abs(value) > 0.5:
+            lines.append(f"correlated     {names[i]} and {names[j]}: {value:+.2f}")
+    return lines
+
+
+def _value(parameter: Mapping[str, Any], key: str = "value") -> str:
+    """Write a value down to the second digit of its standard deviation."""
+    value, sd = parameter[key], parameter["sd"]
+    if value is None:
+        return "unknown"
+    if not sd or value == 0:
+        return f"{value:.6g}"
+    digits = floor(log10(abs(value))) - floor(log10(sd)) + 2
+    return f"{value:#.{min(max(digits, 2), 10)}g}".rstrip(".")
