@@ -11,7 +11,6 @@ from io import StringIO
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -84,7 +83,10 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
         height_in = 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0)
         picture, grid = panels(width_in, height_in, len(runs), sharey=True, squeeze=False)
         for axes, run in zip(grid[:, 0], runs, strict=True):
-            _set_aside(axes, run)
+            # Shaded is what was not used for the fit; single samples without a value are not what was held out.
+            for begin, end in stretches(~np.asarray(run.fitted, bool)):
+                if end - begin > 0.01 * run.time_s.size:
+                    axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
             band = 2.0 * diagnosis.noise_um * per_um
             curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if diagnosis.causes else [])
             for values, colour, line in curves:
@@ -102,14 +104,6 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
         return picture
 
     return _drawn("residuals", "Residual over time before and after the extension, with the band of the noise", draw)
-
-
-def _set_aside(axes: Axes, run: RunView) -> None:
-    """Shade what was not used for the fit."""
-    # Single samples without a value are not what was held out.
-    for begin, end in stretches(~np.asarray(run.fitted, bool)):
-        if end - begin > 0.01 * run.time_s.size:
-            axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
 
 
 def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, unit: str) -> tuple[Picture, str] | None:

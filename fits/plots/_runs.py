@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fits.io._record import Record
@@ -71,9 +70,11 @@ def over_time(runs: Sequence[Drawn], held_out_alone: bool = False) -> Figure:
         for size, line, name in ((half, "-", "95 % band"), (noisy, ":", "95 % band with noise")):
             style.curve(below, time_s, size, name, color=style.DARK, linestyle=line, linewidth=0.8)
             style.curve(below, time_s, -size, color=style.DARK, linestyle=line, linewidth=0.8)
-        if not held_out_alone:
+        aside = each.run.record.time_s[each.run.held_out]
+        if not held_out_alone and len(aside) and each.run.fitted.any():
+            # What the fit did not see, where it saw the rest.
             for panel in (above, below):
-                _mark_held_out(panel, each)
+                panel.axvspan(aside[0], aside[-1], color="0.93", linewidth=0, zorder=0)
         style.label(below, "time (s)")
         style.label(above, title=_caption(each.report, held_out_alone))
     style.legend(picture, axes[:, 0])
@@ -93,11 +94,3 @@ def _caption(report: RunReport, held_out_alone: bool = False) -> str:
     errors = report.held_out if held_out_alone else report.in_sample or report.held_out
     figures = "" if errors is None else f"\ne_rms {errors.e_rms_pct:.3g} %, e_max {errors.e_max_pct:.3g} %"
     return style.verbatim(report.source) + figures
-
-
-def _mark_held_out(axes: Axes, each: Drawn) -> None:
-    """Shade what the fit did not see, where it saw the rest."""
-    aside = np.flatnonzero(each.run.held_out)
-    if len(aside) and each.run.fitted.any():
-        time_s = each.run.record.time_s
-        axes.axvspan(time_s[aside[0]], time_s[aside[-1]], color="0.93", linewidth=0, zorder=0)

@@ -32,7 +32,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "verdict": diagnosis.verdict,
         "sentence": verdict_sentence(diagnosis),
         **{name: getattr(diagnosis, name) for name in noise},
-        "causes": [_cause(cause) for cause in diagnosis.causes],
+        "causes": [vars(cause) | {"parameters": _by_name(cause)} for cause in diagnosis.causes],
         **{name: getattr(diagnosis, name) for name in kept},
         "next_experiment": None if ahead is None else _experiment(ahead),
         "remarks": diagnosis.remarks,
@@ -41,9 +41,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     return dict(strict(found))
 
 
-def _cause(cause: FoundCause) -> dict[str, Any]:
+def _by_name(cause: FoundCause) -> dict[str, Any]:
     parameters = [dict(vars(each)) for each in cause.parameters]
-    return {**vars(cause), "parameters": {each.pop("name"): each for each in parameters}}
+    return {each.pop("name"): each for each in parameters}
 
 
 def _experiment(ahead: Experiment) -> dict[str, Any]:

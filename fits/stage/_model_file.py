@@ -53,9 +53,6 @@ from fits.stage._moments import offsets_out
 from fits.stage._uncertainty import StageUncertainty
 from microid import Preisach, Stage
 
-# One number per weight is worth reading; one per weight and perturbation is not.
-_PACKED = ("columns_um", "coordinates", "mean_um")
-
 
 @dataclass(frozen=True)
 class ModelFile:
@@ -94,7 +91,7 @@ def model_text(
         "sha256": "",
         "written_by": written_by(),
         "model": encode(model),
-        "uncertainty": encode(uncertainty, packed=_PACKED),
+        "uncertainty": encode(uncertainty),
         "fit": dict(report),
     }
     try:

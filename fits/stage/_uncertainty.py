@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy import fft
+from scipy.signal import fftconvolve
 
 from fits.io._errors import DataError
 from fits.io._record import Record
@@ -143,18 +144,13 @@ class Precision:
 def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """Covariance of `influence @ noise`, the noise having the autocovariance of a residual, shape `(p, p)`."""
     left = np.where(fitted, residual_um, 0.0)
-    n = len(left)
-    size = fft.next_fast_len(2 * n)
-    auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[:n] / fitted.sum()
     correlation = correlation_samples([residual_um[fitted]])
-    lags = 0 if correlation <= WHITE else min(n - 1, int(np.ceil(6.0 * correlation)))
-    window = np.zeros(n)
-    window[: lags + 1] = 1 - np.arange(lags + 1) / (lags + 1)
-    kernel = np.zeros(size)
-    kernel[:n] = auto * window
-    kernel[size - n + 1 :] = kernel[1:n][::-1]
-    spectrum = np.maximum(fft.rfft(kernel).real, 0.0)
-    moved = fft.irfft(fft.rfft(influence, size, axis=1) * spectrum, size, axis=1)[:, :n]
+    lags = 0 if correlation <= WHITE else min(len(left) - 1, int(np.ceil(6.0 * correlation)))
+    size = fft.next_fast_len(2 * len(left))
+    auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[: lags + 1] / fitted.sum()
+    # Bartlett's window keeps the covariance positive.
+    kernel = auto * (1 - np.arange(lags + 1) / (lags + 1))
+    moved = fftconvolve(influence, np.concatenate([kernel[:0:-1], kernel])[None], mode="same", axes=1)
     return np.asarray(influence @ moved.T)
 
 
