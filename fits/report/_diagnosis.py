@@ -44,37 +44,34 @@ def report_html(diagnosis: Diagnosis) -> str:
     ]
     extremes = [
         (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
-        for one in (ahead.extremes if ahead is not None else ())
+        for one in (ahead.extremes if ahead else ())
     ]
     further = _arrow("Largest error", gain.heldout_max_before_um, gain.heldout_max_after_um, length)
     driven = gain.feedforward_before_um, gain.feedforward_after_um
     further += _arrow("Error under feedforward, rms", *driven, length)
-    return (
-        _environment()
-        .get_template("diagnosis.html")
-        .render(
-            diagnosis=diagnosis,
-            length=length,
-            ahead=ahead,
-            style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
-            kind=KINDS[diagnosis.verdict],
-            sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
-            tiles=_tiles(diagnosis, length),
-            residuals=residuals(diagnosis, length.per_um, length.unit),
-            some_aside=any((~run.fitted).any() for run in diagnosis.runs),
-            left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
-            views=[fingerprint(diagnosis, name, k, length.per_um, length.unit) for k, name in enumerate(named)],
-            gained=_gained(diagnosis, length),
-            bars=_bars(diagnosis),
-            further=further,
-            bounds=bounds,
-            tests=tests,
-            program=None if ahead is None else program(ahead),
-            ahead_facts=() if ahead is None else _facts(ahead),
-            extremes=extremes,
-            weakest=max((cause.p_family for cause in causes), default=math.nan),
-            written_by=written_by(),
-        )
+    template = _environment().get_template("diagnosis.html")
+    return template.render(
+        diagnosis=diagnosis,
+        length=length,
+        ahead=ahead,
+        style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
+        kind=KINDS[diagnosis.verdict],
+        sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
+        tiles=_tiles(diagnosis, length),
+        residuals=residuals(diagnosis, length.per_um, length.unit),
+        some_aside=any((~run.fitted).any() for run in diagnosis.runs),
+        left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
+        views=[fingerprint(diagnosis, name, k, length.per_um, length.unit) for k, name in enumerate(named)],
+        gained=_gained(diagnosis, length),
+        bars=_bars(diagnosis),
+        further=further,
+        bounds=bounds,
+        tests=tests,
+        program=program(ahead) if ahead else None,
+        ahead_facts=_facts(ahead) if ahead else (),
+        extremes=extremes,
+        weakest=max((cause.p_family for cause in causes), default=math.nan),
+        written_by=written_by(),
     )
 
 
@@ -133,10 +130,9 @@ def _bars(diagnosis: Diagnosis) -> list[tuple[str, str, float, float]]:
     gain = diagnosis.gain
     if not math.isfinite(gain.heldout_rms_before_um):
         return []
-    entries = [("before", "plain stage", gain.heldout_rms_before_um)]
-    if diagnosis.causes:
-        entries.append(("after", "with what was found", gain.heldout_rms_after_um))
-    known = [one for one in (*entries, ("noise", "noise floor", gain.noise_um)) if math.isfinite(one[2])]
+    found = [("after", "with what was found", gain.heldout_rms_after_um)] if diagnosis.causes else []
+    entries = ("before", "plain stage", gain.heldout_rms_before_um), *found, ("noise", "noise floor", gain.noise_um)
+    known = [one for one in entries if math.isfinite(one[2])]
     longest = max(size for _, _, size in known) or 1.0
     return [(*one, 100 * one[2] / longest) for one in known]
 
