@@ -85,7 +85,6 @@ class Delay:
 
     @property
     def samples(self) -> float:
-        """The same in samples."""
         return self.delay_s * self.run.rate_Hz
 
     @property
@@ -94,7 +93,6 @@ class Delay:
         return abs(self.delay_s) > 5.0 * self.sd_s and abs(self.samples) > 0.02
 
     def words(self) -> str:
-        """Say what the columns look like."""
         sd = self.sd_s * self.run.rate_Hz
         digits = max(1, min(4, 1 - int(np.floor(np.log10(max(sd, 1e-9))))))
         size = f"{abs(self.samples):.{digits}f} +- {sd:.{digits}f} samples ({abs(self.delay_s):.3g} s)"

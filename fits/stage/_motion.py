@@ -26,7 +26,6 @@ class Prepared:
 
 
 def prepare(stage: Stage, run: Run) -> Prepared:
-    """Build the scene of a run."""
     samples = run.samples
     command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
     return Prepared(run, samples.time_s, Scene(command, samples.beside, samples.start.memory))
@@ -61,11 +60,10 @@ def fine_steps(stage: Stage, interval_s: float, count: int) -> int:
 def motion(
     stage: Stage, record: Record, range_V: tuple[float, float], initial: str = "unknown"
 ) -> tuple[Ranges, np.ndarray]:
-    """Extremes of what a command makes a stage do, between its samples as well, and the displacement at the samples.
+    """Ranges of all that a command makes a stage do, between its samples as well, and the displacement at these.
 
-    The former are ranges of voltage, slew, displacement (without the sensor's offset, which is the stage's own),
-    velocity, acceleration and driver current, the latter in um, shape `(n,)`. The displacement of the record is not
-    looked at. `range_V` is that of the switching voltages, as commands.
+    The displacement, `(n,)`, has the stage's own offset; that of the record is not looked at. `range_V` is that of
+    the switching voltages, as commands.
     """
     n = len(record)
     stride = fine_steps(stage, float(np.median(np.diff(record.time_s))), n)
@@ -95,8 +93,7 @@ def predicted_ranges(
 ) -> Ranges:
     """What a command is, and makes a model do, between its samples too where the model rings.
 
-    The displacement is what the model does at the samples, shape `(n,)`. Velocity, acceleration and current are given
-    if `every` range is asked for.
+    Its displacement at them, `(n,)`, is known; velocity, acceleration and current are given if `every` is asked for.
     """
     ranges = measured_ranges(replace(program, displacement_um=displacement_um))
     stage = as_stage(model)
@@ -134,10 +131,9 @@ def reached_by(
 ) -> tuple[Ranges, list[float]]:
     """What records have shown of a rig: the displacement as measured, its derivatives as a fitted stage has them.
 
-    Noise would make derivatives of the measurement larger than anything the rig did. Each record has a state before
-    it and samples that do not depend on an unknown past, shape `(n,)`; see `motion`. Returns the ranges, where
-    displacements are as the sensor reads them in the first record; and for each record what the sensor reads, in um,
-    where the stage's own displacement is zero.
+    Noise would make derivatives of the measurement larger than anything the rig did. Of each record the state before
+    it is given, and what does not depend on an unknown past. Displacements are as the sensor reads them in the first
+    record; what it reads in each where the stage's own displacement is zero, in um, comes second.
     """
     found, offsets_um = [], []
     for record, state, sure in zip(records, states, known, strict=True):

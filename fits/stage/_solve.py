@@ -70,7 +70,6 @@ class Weighing:
         return [(self.least_um / max(um, self.least_um)) ** 2 / each for um, each in noises]
 
     def total(self, sums: Sequence[RunSums]) -> Moments:
-        """Moments of all runs."""
         return reduce(operator.add, (one.moments.scaled(k, 1.0) for one, k in zip(sums, self.shares, strict=True)))
 
     def cost_um2(self, runs: Sequence[Run], residuals: Sequence[np.ndarray]) -> float:
