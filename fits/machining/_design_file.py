@@ -44,7 +44,9 @@ class _Quantity(msgspec.Struct):
     unit: str
 
 
-class _Dimension(_Quantity):
+class _Dimension(msgspec.Struct):
+    value: float
+    unit: str
     tolerance: float | None = None
 
 
