@@ -56,7 +56,7 @@ class Bench:
         same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], pairs))
         signal = self.known[run][same]
         for part in stage.parts[same:]:
-            signal = program()(part, one.time_s, signal, one.scene)
+            signal = program()(part, one.run.samples.time_s, signal, one.scene)
         return at_samples(signal, one)
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:

@@ -21,14 +21,13 @@ class Prepared:
     """A run, and what a stage makes of it."""
 
     run: Run
-    time_s: Any
     scene: Scene
 
 
 def prepare(stage: Stage, run: Run) -> Prepared:
     samples = run.samples
     command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
-    return Prepared(run, samples.time_s, Scene(command, samples.beside, samples.start.memory))
+    return Prepared(run, Scene(command, samples.beside, samples.start.memory))
 
 
 @cache
@@ -42,7 +41,7 @@ def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
     signal = prepared.scene.command
     found = [signal]
     for part in stage.parts:
-        signal = program()(part, prepared.time_s, signal, prepared.scene)
+        signal = program()(part, prepared.run.samples.time_s, signal, prepared.scene)
         found.append(signal)
     return found
 
