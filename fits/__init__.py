@@ -36,16 +36,15 @@ if TYPE_CHECKING:
     from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, sensitivities
     from fits.machining._sobol import SobolIndices, sobol
     from fits.plots._control import plot_compensation, plot_control
-    from fits.plots._loop import plot_fit
+    from fits.plots._fit import plot_fit, plot_stage
     from fits.plots._machining import plot_budget, plot_idle, plot_sensitivity
-    from fits.plots._stage import plot_stage
     from fits.plots._sweep import plot_sweep
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
-    from fits.report._diagnosis_words import describe_diagnosis
     from fits.report._fit import fit_report
     from fits.report._fit_words import describe
     from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
+    from fits.report._words import describe_diagnosis
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._frequency import Multisine, ResponseData, estimate_response, read_multisine, read_response

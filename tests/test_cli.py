@@ -154,7 +154,7 @@ def test_what_cannot_be_read_is_refused_without_jax(command, tmp_path):
     assert "bad.csv, line 3, column 'voltage_V'" in done.stderr
 
 
-@pytest.mark.parametrize("step", ["loop._fit.fit", "plots._loop.plot_fit", "stage._model_file.model_text"])
+@pytest.mark.parametrize("step", ["loop._fit.fit", "plots._fit.plot_fit", "stage._model_file.model_text"])
 def test_an_interruption_leaves_nothing(bench, tmp_path, monkeypatch, step):
     folder, _, _ = bench
     old = tmp_path / "m.json"

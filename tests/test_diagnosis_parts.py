@@ -16,7 +16,7 @@ from fits.diagnosis import _effects
 from fits.diagnosis._effects import drop_programs
 from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
 from fits.diagnosis._score import Family, Probe, evidence, score
-from fits.stage._motion import pass_signal
+from fits.stage._motion import program
 from fits.stats._band import band_of
 from fits.stats._noise import Noise, learn_noise
 from microid import EFFECTS, AbstractPart, Scene, Signal
@@ -269,7 +269,7 @@ def test_programs_make_room_where_records_are_long_and_those_of_the_host_stay(mo
 
     def traces_after(n):
         drop_programs([Record(np.arange(float(n)), np.zeros(n), np.zeros(n), source="run")] * 2)
-        pass_signal(Part(), jnp.ones(()), signal, Scene(signal, {}, None))
+        program()(Part(), jnp.ones(()), signal, Scene(signal, {}, None))
         host(jnp.ones(3))
         return len(traced), len(hosts)
 

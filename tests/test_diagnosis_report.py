@@ -179,7 +179,8 @@ def test_the_view_of_creep_shows_its_logarithm():
     signs = np.sign(np.diff(heights, prepend=10.0))
     residual = np.concatenate([0.3 + sign * np.log10(1 + hold / 0.1) for sign in signs])
     one = RunView("", 0.01 * np.arange(voltage.size), voltage, voltage, residual, 0 * residual, residual < 9)
-    before, after = VIEWS[card_of("creep").view].look([one], 1.0)
+    look = VIEWS[card_of("creep").view].look
+    (before,), (after,) = look([one], lambda run: run.before_um), look([one], lambda run: run.after_um)
     expected = np.log10(1 + before.x / 0.1)
     np.testing.assert_allclose(before.y - before.y.mean(), expected - expected.mean(), atol=0.03)
     assert np.ptp(before.y) > 1.5
@@ -190,7 +191,7 @@ def test_the_view_of_hum_shows_its_line(rng):
     time_s = 0.001 * np.arange(8192)
     hum = np.sin(2 * np.pi * 50 * time_s) + 0.1 * rng.standard_normal(time_s.size)
     one = RunView("", time_s, time_s, time_s, hum, 0 * hum, hum < 9)
-    before, _ = VIEWS[card_of("mains_hum").view].look([one], 1.0)
+    (before,) = VIEWS[card_of("mains_hum").view].look([one], lambda run: run.before_um)
     assert before.x[np.argmax(before.y)] == pytest.approx(50, rel=0.02)
 
 

@@ -77,7 +77,7 @@ def test_several_runs_and_an_unknown_start(tmp_path, rng, model, monkeypatch):
         drawn[path.stem] = [[line.get_xydata() for line in axes.lines] for axes in picture.axes]
         return path
 
-    monkeypatch.setattr("fits.plots._loop.save", remember_curves)
+    monkeypatch.setattr("fits.plots._style.save", remember_curves)
     start = microid.demagnetised(LOWER_V, UPPER_V)
     first = record(rng, model, np.concatenate([np.linspace(50, 100, 400), waves(1600, 2)]), 5.0, "a.csv", start)
     others = [record(rng, model, waves(9000, 2), 0.0, f"{name}.csv") for name in "bcd"]

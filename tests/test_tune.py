@@ -171,7 +171,7 @@ def test_slopes_of_the_cost_are_those_of_finite_differences(tuned):
     stages = [stage_of(*one) for one in plants]
     signals = {"feedforward_V": None, "noise_um": noise}
     fixed = {"start": m.Start(), "delay": 0, "resolution_um": None}
-    problem = _problem(pid, stages, goal, reference, signals, 0, None, fixed)
+    problem = _problem(pid, stages, goal, reference, signals, 0, None, **fixed)
     y = 0.1 * np.arange(1.0, 4.0)
     found = eqx.filter_jit(jax.jacfwd(lambda y: judge(problem, y)[2]))(jnp.asarray(y))
     expected = central_differences(lambda y: judge(problem, jnp.asarray(y))[2], y, np.full(3, 1e-5))

@@ -35,17 +35,16 @@ if TYPE_CHECKING:
     from fits.machining._sensitivity import sensitivities
     from fits.paper._regenerate import paper_result
     from fits.plots._control import plot_compensation, plot_control
-    from fits.plots._loop import plot_fit
+    from fits.plots._fit import plot_fit, plot_stage
     from fits.plots._machining import plot_budget, plot_sensitivity
-    from fits.plots._stage import plot_stage
     from fits.plots._sweep import plot_sweep
     from fits.report._control import control_json, describe_control
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
-    from fits.report._diagnosis_words import describe_diagnosis
     from fits.report._fit import fit_report
     from fits.report._fit_words import describe
     from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
+    from fits.report._words import describe_diagnosis
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._model_file import ModelFile, load_model, model_text

@@ -9,14 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from fits.control._compensate_stage import (
-    command,
-    demand,
-    demand_remarks,
-    plain_of,
-    simulate_model,
-    static_equivalent,
-)
+from fits.control import _compensate_stage as whole
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
 from fits.loop._run import initial_state
@@ -76,18 +69,18 @@ def compensate(
     if reference.displacement_um is None:
         raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
     wanted, time_s = reference.displacement_um, reference.time_s
-    if isinstance(model, Stage) and (plain := plain_of(model)) is not model:
+    if isinstance(model, Stage) and (plain := whole.plain_of(model)) is not model:
         without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
         return _beside_effects(model, plain, reference, initial, without)
-    law = static_equivalent(model)
+    law = whole.static_equivalent(model)
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":
         if not isinstance(model, Stage):
             raise DataError("expected a stage for --dynamic, found a Preisach model, which has no mechanics.")
-        needed, doubt_um = demand(model, time_s, wanted, reference.source)
+        needed, doubt_um = whole.demand(model, time_s, wanted, reference.source)
     elif way != "static":
         raise ValueError(f"way must be 'static' or 'dynamic', got {way!r}")
-    turning, moving = demand_remarks(wanted, needed, doubt_um)
+    turning, moving = whole.demand_remarks(wanted, needed, doubt_um)
     remarks = turning + moving
     lower, upper = float(law.density.lower_V), float(law.density.upper_V)
     limits = within_range(law, limits_V)
@@ -115,7 +108,7 @@ def compensate(
     if isinstance(model, Stage) and way == "dynamic":
         voltage, cut, more = _led(model, reference, voltage, limits, clip, bind)
         clipped, remarks = clipped | cut, remarks + more
-    played = simulate_model(model, Record(time_s, voltage, None, source=reference.source), initial)
+    played = whole.simulate_model(model, Record(time_s, voltage, None, source=reference.source), initial)
     return Compensation(voltage, played, wanted, clipped, tuple(remarks))
 
 
@@ -135,8 +128,8 @@ def _beside_effects(
     for _ in range(12):
         found = invert(Reference(time_s, asked, reference.source))
         program = Record(time_s, found.voltage_V, None, source=reference.source)
-        played = simulate_model(stage, program, initial)
-        change = played - simulate_model(plain, program, initial)
+        played = whole.simulate_model(stage, program, initial)
+        change = played - whole.simulate_model(plain, program, initial)
         moved = float(np.max(np.abs(wanted - change - asked)))
         if moved <= 1e-9 * float(np.ptp(wanted)) or moved > 0.9 * before:
             break
@@ -153,7 +146,7 @@ def _led(
     bind: str,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Compensate the driver's lag within the limits: the command, which samples were cut, and remarks on that."""
-    asked_V = command(stage, reference.time_s, static_V)
+    asked_V = whole.command(stage, reference.time_s, static_V)
     if stage.hold == "zero":
         # A step stands for the line across its interval.
         asked_V = np.append((asked_V[:-1] + asked_V[1:]) / 2, asked_V[-1])

@@ -78,10 +78,10 @@ def tune_controller(
     the start, although that is not an optimum.
     """
     stages = [plants] if isinstance(plants, Stage) else list(plants)
-    goal, signals = goal or Goal(), {"feedforward_V": feedforward_V, "noise_um": noise_um}
-    fixed = {"start": start or Start(), "delay": delay}
-    fixed["resolution_um"] = None if resolution_um is None else jnp.asarray(float(resolution_um))
-    problem = _problem(controller, stages, goal, reference_um, signals, skip, free, fixed)
+    resolution = None if resolution_um is None else jnp.asarray(float(resolution_um))
+    fixed = {"start": start or Start(), "delay": delay, "resolution_um": resolution}
+    signals = {"feedforward_V": feedforward_V, "noise_um": noise_um}
+    problem = _problem(controller, stages, goal or Goal(), reference_um, signals, skip, free, **fixed)
     origin = jnp.zeros_like(problem.origin)
     figures, over, cost = judge(problem, origin)
     if not np.all(np.asarray(figures.stable)):
@@ -127,19 +127,16 @@ def _problem(
     signals: dict[str, ArrayLike | None],
     skip: int,
     free: Sequence[str] | None,
-    fixed: dict[str, Any],
+    **fixed: Any,
 ) -> Problem:
-    kinds: set[Any] = {jax.tree.structure(one) for one in stages}
-    if len(kinds) != 1:
+    if len({jax.tree.structure(one) for one in stages}) != 1:
         raise DataError("expected one plant or more, all of the same parts in the same order")
     reference = np.atleast_2d(np.asarray(reference_um, dtype=float))
-    given: dict[str, Any] = dict.fromkeys(signals)
     for name, signal in signals.items():
-        if signal is not None:
-            row = np.asarray(signal, dtype=float)
-            if row.shape not in (reference.shape, reference.shape[1:]):
-                raise DataError(f"{name} has shape {row.shape}, expected {reference.shape} or one row of it")
-            given[name] = jnp.asarray(np.broadcast_to(row, reference.shape))
+        row = None if signal is None else np.asarray(signal, dtype=float)
+        if row is not None and row.shape not in (reference.shape, reference.shape[1:]):
+            raise DataError(f"{name} has shape {row.shape}, expected {reference.shape} or one row of it")
+        fixed[name] = None if row is None else jnp.asarray(np.broadcast_to(row, reference.shape))
     if not 0 <= skip < reference.shape[1]:
         raise DataError(f"skip: expected a number of samples below {reference.shape[1]}, found {skip}")
     values = parameter_values(controller)
@@ -163,7 +160,6 @@ def _problem(
         weights_um_per_V=(jnp.asarray(float(goal.effort_um_per_V)), jnp.asarray(float(goal.rate_um_per_V))),
         limits={name: jnp.asarray(limit) for name, limit in goal.limits().items()},
         command_width_V=jnp.asarray(goal.command_width_V()),
-        **given,
         **fixed,
     )
 

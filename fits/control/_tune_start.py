@@ -100,12 +100,11 @@ def relay_start(plants: Stage | Sequence[Stage], interval_s: float, *, delay: in
     """
     stages = [plants] if isinstance(plants, Stage) else list(plants)
     point = ultimate_point(stages[0], interval_s, delay=delay)
-    slopes = [slope_array(stage) for stage in stages]
+    given = [(stage, slope_array(stage)) for stage in stages]
     gain, integral_s, derivative_s = 0.6 * point.gain_V_per_um, point.period_s / 2, point.period_s / 8
     # Ever smaller gains reach the margin on any stage that is stable by itself.
     for _ in range(60):
         pid = PID.from_times(gain, integral_s, derivative_s, interval_s, filter_s=derivative_s / 10)
-        given = zip(stages, slopes, strict=True)
         found = [margins(pid, stage, delay=delay, slope_um_per_V=slope) for stage, slope in given]
         if all(bool(one.stable) and float(one.gain_margin) >= 2 for one in found):
             return pid

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from fits.diagnosis._baseline import Baseline, with_effects
 from fits.io._record import Record
-from fits.stage._motion import Prepared, pass_signal, prepare, programs, signals
+from fits.stage._motion import Prepared, prepare, program, signals
 from microid import AbstractEffect, Coordinates, Sensor, Signal
 
 # Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
@@ -56,7 +56,7 @@ class Bench:
         same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], pairs))
         signal = self.known[run][same]
         for part in stage.parts[same:]:
-            signal = pass_signal(part, one.time_s, signal, one.scene)
+            signal = program()(part, one.run.samples.time_s, signal, one.scene)
         return at_samples(signal, one)
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
@@ -84,7 +84,7 @@ def drop_programs(records: Sequence[Record]) -> None:
     What else the process has compiled stays.
     """
     if sum(len(record) for record in records) >= _LONG or len(get_backend().live_executables()) > _MANY:
-        programs.drop()
+        program.cache_clear()
 
 
 def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float) -> AbstractEffect:

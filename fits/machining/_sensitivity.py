@@ -15,14 +15,7 @@ import microid as m
 from fits.io._errors import DataError
 from fits.io._jax_setup import require_float64
 from fits.machining._design import Design, uniform_tolerance
-from fits.machining._gains import (
-    check_axes,
-    gain_model,
-    gains_of_few,
-    once_per_function,
-    quick_jit,
-    twin,
-)
+from fits.machining._gains import check_axes, gain_model, gains_of_few, once_per_function, quick_jit, twin
 from fits.machining._tolerances import tolerances
 
 # So short a stroke that all motions are in proportion to it, to the last digit.

@@ -83,9 +83,8 @@ def outputs_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Evaluate a function of points in the unit cube, shape `(samples, count)`, where the indices need it.
 
-    Outputs at two independent sets of points of a scrambled Sobol sequence come back, each of shape `(samples,)`, and
-    at the first with one coordinate after the other taken from the second, shape `(count, samples)`; less the mean of
-    the first two.
+    At two independent sets of points of a scrambled Sobol sequence, and at the first with one coordinate after the
+    other taken from the second, shape `(count, samples)`; less the mean of the first two.
     """
     first, second = np.hsplit(stats.qmc.Sobol(2 * count, seed=seed, bits=64).random(samples), 2)
     both = [function(first), function(second)]
@@ -104,11 +103,9 @@ def indices(first: np.ndarray, second: np.ndarray, swapped: np.ndarray) -> tuple
 def intervals(
     first: np.ndarray, second: np.ndarray, swapped: np.ndarray, confidence: float, resamples: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bootstrap percentiles of the same indices, each of shape `(k, 2)`.
-
-    SciPy's own bootstrap holds all resamples and a jackknife in memory, GBs of it. The sums in the indices are linear
-    in the samples, so that here a resample is a row of weights.
-    """
+    """Bootstrap percentiles of the same indices, each of shape `(k, 2)`."""
+    # SciPy's own bootstrap holds all resamples and a jackknife in memory, GBs of it. The sums in the indices are
+    # linear in the samples, so that here a resample is a row of weights.
     rng = np.random.default_rng(seed)
     samples, count = len(first), len(swapped)
     parts = [first + second, first**2 + second**2, *(second * (swapped - first)), *((first - swapped) ** 2)]

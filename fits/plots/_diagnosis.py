@@ -11,7 +11,6 @@ from io import StringIO
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -79,15 +78,17 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
     if not runs:
         return None
     points = max(_POINTS // (2 * len(runs)), 200)
-    extended = bool(diagnosis.causes)
 
     def draw(width_in: float) -> Figure:
         height_in = 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0)
         picture, grid = panels(width_in, height_in, len(runs), sharey=True, squeeze=False)
         for axes, run in zip(grid[:, 0], runs, strict=True):
-            _set_aside(axes, run)
+            # Shaded is what was not used for the fit; single samples without a value are not what was held out.
+            for begin, end in stretches(~np.asarray(run.fitted, bool)):
+                if end - begin > 0.01 * run.time_s.size:
+                    axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
             band = 2.0 * diagnosis.noise_um * per_um
-            curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if extended else [])
+            curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if diagnosis.causes else [])
             for values, colour, line in curves:
                 keep = thinned(values, points)
                 axes.plot(run.time_s[keep], per_um * values[keep], color=colour, linewidth=line)
@@ -105,34 +106,25 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
     return _drawn("residuals", "Residual over time before and after the extension, with the band of the noise", draw)
 
 
-def _set_aside(axes: Axes, run: RunView) -> None:
-    """Shade what was not used for the fit."""
-    # Single samples without a value are not what was held out.
-    for begin, end in stretches(~np.asarray(run.fitted, bool)):
-        if end - begin > 0.01 * run.time_s.size:
-            axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
-
-
 def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, unit: str) -> tuple[Picture, str] | None:
     """The residual against the variable that shows an effect, and what is drawn in words; None where runs do not."""
-    for found in (VIEWS[card_of(name).view if name else "voltage"], VIEWS["voltage"]):
+    sides: list[tuple[str, Callable[[RunView], np.ndarray]]] = [(BEFORE, lambda run: per_um * run.before_um)]
+    if diagnosis.causes:
+        sides.append((AFTER, lambda run: per_um * run.after_um))
+    for view in (VIEWS[card_of(name).view if name else "voltage"], VIEWS["voltage"]):
         try:
-            seen = found.look(diagnosis.runs, per_um)
+            seen = [(colour, curve) for colour, of in sides for curve in view.look(diagnosis.runs, of)]
             break
         except ValueError:
             continue
     else:
         return None
-    view, extended = found, bool(diagnosis.causes)
 
     def draw(width_in: float) -> Figure:
         picture, axes = panels(width_in, 2.7 if width_in == _WIDE_in else 2.5)
         if not view.spectrum:
             axes.axhline(0.0, color=INK, linewidth=0.5)
-        for curve in seen:
-            if curve.after and not extended:
-                continue
-            colour = AFTER if curve.after else BEFORE
+        for colour, curve in seen:
             if curve.low is not None and curve.high is not None:
                 axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.14, linewidth=0)
             axes.plot(curve.x, curve.y, "--" if curve.downwards else "-", color=colour, linewidth=1.3)

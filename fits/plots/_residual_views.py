@@ -1,7 +1,7 @@
 """A residual against the variable that shows an effect best."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import numpy as np
@@ -13,11 +13,8 @@ from microid.effects import View
 _BINS = 36
 # Fewer samples than this make no mean.
 _FEWEST_IN_MEAN = 4
-# Whether a residual is that after the extension, and what takes it from a run.
-_RESIDUALS: tuple[tuple[bool, Callable[[RunView], np.ndarray]], ...] = (
-    (False, attrgetter("before_um")),
-    (True, attrgetter("after_um")),
-)
+# Takes a variable or a residual from a run.
+_Of = Callable[[RunView], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -26,7 +23,6 @@ class Curve:
 
     x: np.ndarray
     y: np.ndarray
-    after: bool
     low: np.ndarray | None = None
     high: np.ndarray | None = None
     downwards: bool = False
@@ -36,11 +32,11 @@ class Curve:
 class ResidualView:
     """A residual against one variable.
 
-    `look` makes curves from runs, with lengths times a factor; a `ValueError` where the runs, or none at all, do not
-    allow it. `per` follows the unit of the length. The first axis is `logarithmic`, or both are of a `spectrum`.
+    `look` makes curves of a residual of runs; a `ValueError` where the runs, or none at all, do not allow it. `per`
+    follows the unit of the length. The first axis is `logarithmic`, or both are of a `spectrum`.
     """
 
-    look: Callable[[Sequence[RunView], float], list[Curve]]
+    look: Callable[[Sequence[RunView], _Of], list[Curve]]
     x_label: str
     caption: str
     y_label: str = "residual"
@@ -49,7 +45,7 @@ class ResidualView:
     spectrum: bool = False
 
 
-def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, even: bool = True) -> Curve:
+def _binned(x: np.ndarray, y: np.ndarray, downwards: bool = False, even: bool = True) -> Curve:
     """Means over even stretches of `x`, or over equally many samples."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
@@ -67,33 +63,23 @@ def _binned(x: np.ndarray, y: np.ndarray, after: bool, downwards: bool = False, 
     if len(rows) < 3:
         raise ValueError("too few samples")
     middle, mean, low, high = np.array(rows).T
-    return Curve(middle, mean, after, None if downwards else low, None if downwards else high, downwards)
+    return Curve(middle, mean, None, None, True) if downwards else Curve(middle, mean, low, high)
 
 
-def _together(runs: Sequence[RunView], of: Callable[[RunView], np.ndarray]) -> np.ndarray:
+def _together(runs: Sequence[RunView], of: _Of) -> np.ndarray:
     return np.concatenate([np.ravel(of(run)) for run in runs])
 
 
-def _over(x: Callable[[RunView], np.ndarray], even: bool = True) -> Callable[[Sequence[RunView], float], list[Curve]]:
+def _over(x: _Of, even: bool = True) -> Callable[[Sequence[RunView], _Of], list[Curve]]:
     """Look at a residual against a variable of each sample."""
-
-    def look(runs: Sequence[RunView], factor: float) -> list[Curve]:
-        along = _together(runs, x)
-        return [_binned(along, factor * _together(runs, of), after, even=even) for after, of in _RESIDUALS]
-
-    return look
+    return lambda runs, of: [_binned(_together(runs, x), _together(runs, of), even=even)]
 
 
-def _over_voltage(runs: Sequence[RunView], factor: float) -> list[Curve]:
-    x = _together(runs, lambda run: run.voltage_V)
+def _over_voltage(runs: Sequence[RunView], of: _Of) -> list[Curve]:
+    x, y = _together(runs, attrgetter("voltage_V")), _together(runs, of)
     up = _together(runs, lambda run: _last_move(run)[0]) >= 0
-    curves = []
-    for after, of in _RESIDUALS:
-        y = factor * _together(runs, of)
-        curves.append(_binned(x[up], y[up], after))
-        if np.count_nonzero(~up) > _BINS:
-            curves.append(_binned(x[~up], y[~up], after, downwards=True))
-    return curves
+    down = [_binned(x[~up], y[~up], downwards=True)] if np.count_nonzero(~up) > _BINS else []
+    return [_binned(x[up], y[up]), *down]
 
 
 def _last_move(run: RunView) -> tuple[np.ndarray, np.ndarray]:
@@ -107,53 +93,47 @@ def _last_move(run: RunView) -> tuple[np.ndarray, np.ndarray]:
     return sign[moved], began
 
 
-def _since_move(runs: Sequence[RunView], factor: float) -> list[Curve]:
+def _since_move(runs: Sequence[RunView], of: _Of) -> list[Curve]:
     direction = _together(runs, lambda run: _last_move(run)[0])
     since_s = _together(runs, lambda run: run.time_s - run.time_s[_last_move(run)[1]])
     kept = (since_s > 0) & (direction != 0)
     if np.count_nonzero(kept) < _BINS or since_s[kept].max() < 10 * since_s[kept].min():
         raise ValueError("the voltage never goes on for long")
-    curves = []
-    for after, of in _RESIDUALS:
-        change_um = np.concatenate([_since_event(run, of(run)) for run in runs])
-        found = _binned(np.log10(since_s[kept]), factor * (direction * change_um)[kept], after)
-        curves.append(Curve(10**found.x, found.y, after, found.low, found.high))
-    return curves
+    change = _together(runs, lambda run: _since_event(run, of(run)))
+    found = _binned(np.log10(since_s[kept]), (direction * change)[kept])
+    return [replace(found, x=10**found.x)]
 
 
-def _since_event(run: RunView, residual_um: np.ndarray) -> np.ndarray:
+def _since_event(run: RunView, residual: np.ndarray) -> np.ndarray:
     """Change of a residual since the voltage last started, stopped or turned: from the mean of three samples on."""
     begins = np.unique(_last_move(run)[1])
-    out = np.array(residual_um, dtype=float)
+    out = np.array(residual, dtype=float)
     for begin, end in zip(begins, [*begins[1:], out.size], strict=True):
         out[begin:end] -= np.mean(out[begin : min(begin + 3, end)])
     return out
 
 
-def _over_time(runs: Sequence[RunView], factor: float) -> list[Curve]:
+def _over_time(runs: Sequence[RunView], of: _Of) -> list[Curve]:
     longest = max(runs, key=lambda run: run.time_s[-1] - run.time_s[0] if run.time_s.size else 0.0)
-    return [_binned(longest.time_s, factor * of(longest), after) for after, of in _RESIDUALS]
+    return [_binned(longest.time_s, of(longest))]
 
 
-def _spectrum(runs: Sequence[RunView], factor: float) -> list[Curve]:
+def _spectrum(runs: Sequence[RunView], of: _Of) -> list[Curve]:
     finest = max(
         runs, key=lambda run: run.time_s.size / (np.median(np.diff(run.time_s)) if run.time_s.size > 2 else 1)
     )
     if finest.time_s.size < 64:
         raise ValueError("too few samples")
     rate_Hz = 1 / float(np.median(np.diff(finest.time_s)))
-    curves = []
-    for after, of in _RESIDUALS:
-        values = factor * np.nan_to_num(of(finest))
-        frequency_Hz, density = signal.welch(values, rate_Hz, nperseg=min(4096, values.size // 2))
-        frequency_Hz, density = frequency_Hz[1:], density[1:]
-        # Peaks are what is looked for, so that each even stretch of the logarithm shows its largest.
-        edges = np.geomspace(frequency_Hz[0], frequency_Hz[-1] * 1.0001, 400)
-        place = np.searchsorted(edges, frequency_Hz, side="right")
-        kept = [np.flatnonzero(place == k) for k in np.unique(place)]
-        top = np.array([inside[np.argmax(density[inside])] for inside in kept])
-        curves.append(Curve(frequency_Hz[top], np.sqrt(np.maximum(density[top], 1e-30)), after))
-    return curves
+    values = np.nan_to_num(of(finest))
+    frequency_Hz, density = signal.welch(values, rate_Hz, nperseg=min(4096, values.size // 2))
+    frequency_Hz, density = frequency_Hz[1:], density[1:]
+    # Peaks are what is looked for, so that each even stretch of the logarithm shows its largest.
+    edges = np.geomspace(frequency_Hz[0], frequency_Hz[-1] * 1.0001, 400)
+    place = np.searchsorted(edges, frequency_Hz, side="right")
+    kept = [np.flatnonzero(place == k) for k in np.unique(place)]
+    top = np.array([inside[np.argmax(density[inside])] for inside in kept])
+    return [Curve(frequency_Hz[top], np.sqrt(np.maximum(density[top], 1e-30)))]
 
 
 _BAND = "Lines are means, and the shaded bands hold the middle 80 % of the samples."

@@ -34,13 +34,12 @@ def control_json(
             f"{' and its '.join(below)}: a bench cannot show it in single readings"
         )
     every = loop.margins(made.controller)
-    gains = printed_gains(made.controller, made.pid)
-    found: dict[str, Any] = {
+    found = {
         "schema": "microid.control/1",
         **about,
         "samples": len(wanted),
         "interval_s": loop.ready.interval_s,
-        "gains": {path: value.astype(float) for path, value in gains.items()},
+        "gains": {path: x.astype(float) for path, x in printed_gains(made.controller, made.pid).items()},
         "tuning": None if made.tuning is None else _tuning(made.tuning),
         "margins": every[0],
         "margins_worst": {
@@ -69,14 +68,9 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _tuning(found: Tuning[Any]) -> dict[str, Any]:
-    return {
-        "converged": found.converged,
-        "cost_before_um": found.cost_before_um,
-        "cost_after_um": found.cost_after_um,
-        "plants": len(found.plants),
-        "error_rms_um": [one.error_rms_um for one in found.plants],
-        "overshoot_pct": [one.overshoot_pct for one in found.plants],
-    }
+    figures = {name: getattr(found, name) for name in ("converged", "cost_before_um", "cost_after_um")}
+    by_plant = {name: [getattr(one, name) for one in found.plants] for name in ("error_rms_um", "overshoot_pct")}
+    return {**figures, "plants": len(found.plants), **by_plant}
 
 
 def _tracking(wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any]:
@@ -108,13 +102,12 @@ def _step(time_s: np.ndarray, wanted_um: np.ndarray, moved_um: np.ndarray) -> St
 
 def describe_control(summary: Mapping[str, Any]) -> str:
     """Put what `control_json` gives into lines of text."""
-    tracking, worst = summary["tracking"], summary["margins_worst"]
+    worst, without = summary["margins_worst"], summary["without_feedback"]
     lines = [f"{summary['controller']}, {summary['samples']} samples of {summary['interval_s']:.6g} s"]
     for path, value in summary["gains"].items():
         if "network" not in path:
             lines.append(f"{path.removeprefix('pid.'):24} {' '.join(f'{x:.5g}' for x in np.ravel(value))}")
-    if summary["tuning"] is not None:
-        tuning = summary["tuning"]
+    if (tuning := summary["tuning"]) is not None:
         how = "converged" if tuning["converged"] else "not converged"
         lines.append(
             f"tuning      cost {_said(tuning['cost_before_um'])} to {_said(tuning['cost_after_um'])} um over "
@@ -124,11 +117,9 @@ def describe_control(summary: Mapping[str, Any]) -> str:
         f"margins     {worst['plants']} plants, at worst: gain {_said(worst['gain_margin'])}, phase "
         f"{_said(worst['phase_margin_deg'])} degrees, peak of the sensitivity {_said(worst['sensitivity_peak'])}"
     )
-    lines.append(f"tracking    {_tracked(tracking)}")
-    if summary["without_feedback"] is not None:
-        lines.append(f"  without   {_tracked(summary['without_feedback'])}")
-    if summary["step"] is not None:
-        step = summary["step"]
+    lines.append(f"tracking    {_tracked(summary['tracking'])}")
+    lines += [] if without is None else [f"  without   {_tracked(without)}"]
+    if (step := summary["step"]) is not None:
         time_s = step["settling_time_s"]
         settled = "not settled within the record" if time_s is None else f"settled in {time_s:.4g} s"
         lines.append(

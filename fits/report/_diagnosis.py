@@ -11,6 +11,7 @@ from fits.io._version import written_by
 from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
 from fits.report import _words
 from fits.report._words import (
+    KINDS,
     SIGMA,
     Lengths,
     chance,
@@ -24,8 +25,6 @@ from fits.report._words import (
     sigmas,
 )
 
-KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
-
 
 def report_html(diagnosis: Diagnosis) -> str:
     """Write a diagnosis as an HTML page for screen, phone and paper, all in one; the same one gives the same text."""
@@ -35,7 +34,6 @@ def report_html(diagnosis: Diagnosis) -> str:
     asked = [one for one in diagnosis.upper_bounds if not one.reason]
     asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
     gain = diagnosis.gain
-    driven = gain.feedforward_before_um, gain.feedforward_after_um
     bounds = [
         (plain(one.name).capitalize(), sigmas(one.z), percent(one.absorbed_fraction), length.bare(one.bound_um))
         for one in asked
@@ -46,11 +44,11 @@ def report_html(diagnosis: Diagnosis) -> str:
     ]
     extremes = [
         (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
-        for one in (ahead.extremes if ahead is not None else ())
+        for one in (ahead.extremes if ahead else ())
     ]
-    largest = gain.heldout_max_before_um, gain.heldout_max_after_um
-    further = _arrow("Largest error, before → after", *largest, length)
-    further += _arrow("Error under feedforward, rms, before → after", *driven, length)
+    further = _arrow("Largest error", gain.heldout_max_before_um, gain.heldout_max_after_um, length)
+    driven = gain.feedforward_before_um, gain.feedforward_after_um
+    further += _arrow("Error under feedforward, rms", *driven, length)
     template = _environment().get_template("diagnosis.html")
     return template.render(
         diagnosis=diagnosis,
@@ -69,8 +67,8 @@ def report_html(diagnosis: Diagnosis) -> str:
         further=further,
         bounds=bounds,
         tests=tests,
-        program=None if ahead is None else program(ahead),
-        ahead_facts=() if ahead is None else _facts(ahead),
+        program=program(ahead) if ahead else None,
+        ahead_facts=_facts(ahead) if ahead else (),
         extremes=extremes,
         weakest=max((cause.p_family for cause in causes), default=math.nan),
         written_by=written_by(),
@@ -93,13 +91,13 @@ def _environment() -> Environment:
 def _tiles(diagnosis: Diagnosis, length: Lengths) -> list[tuple[str, str]]:
     """Key figures at the top of the page, by name."""
     gain, tiles = diagnosis.gain, []
-    if diagnosis.causes:
-        first = diagnosis.causes[0]
-        tiles.append((f"Evidence for {plain(first.name)}", f"{sigmas(first.z)} {SIGMA}"))
-        tiles.append(("Share of the misfit it explains", percent(first.share_of_misfit)))
-        before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
-        tiles += _arrow("Error on unused data, before → after", before, after, length)
-    else:
+    for first in diagnosis.causes[:1]:
+        tiles += [
+            (f"Evidence for {plain(first.name)}", f"{sigmas(first.z)} {SIGMA}"),
+            ("Share of the misfit it explains", percent(first.share_of_misfit)),
+            *_arrow("Error on unused data", gain.heldout_rms_before_um, gain.heldout_rms_after_um, length),
+        ]
+    if not diagnosis.causes:
         tiles.append(("Residual of the plain stage, rms", length(_words.rms_um(diagnosis.runs, "before_um"))))
     if diagnosis.verdict == "unexplained":
         tiles.append(("Unexplained, rms", length(diagnosis.unexplained_rms_um)))
@@ -110,7 +108,7 @@ def _arrow(name: str, before_um: float, after_um: float, length: Lengths) -> lis
     """How a size changes; nothing where one of the two is not known."""
     if not (math.isfinite(before_um) and math.isfinite(after_um)):
         return []
-    return [(name, f"{length.bare(before_um)} → {length.bare(after_um)} {length.unit}")]
+    return [(f"{name}, before → after", f"{length.bare(before_um)} → {length.bare(after_um)} {length.unit}")]
 
 
 def _gained(diagnosis: Diagnosis, length: Lengths) -> str:
@@ -132,10 +130,9 @@ def _bars(diagnosis: Diagnosis) -> list[tuple[str, str, float, float]]:
     gain = diagnosis.gain
     if not math.isfinite(gain.heldout_rms_before_um):
         return []
-    entries = [("before", "plain stage", gain.heldout_rms_before_um)]
-    if diagnosis.causes:
-        entries.append(("after", "with what was found", gain.heldout_rms_after_um))
-    known = [one for one in (*entries, ("noise", "noise floor", gain.noise_um)) if math.isfinite(one[2])]
+    found = [("after", "with what was found", gain.heldout_rms_after_um)] if diagnosis.causes else []
+    entries = ("before", "plain stage", gain.heldout_rms_before_um), *found, ("noise", "noise floor", gain.noise_um)
+    known = [one for one in entries if math.isfinite(one[2])]
     longest = max(size for _, _, size in known) or 1.0
     return [(*one, 100 * one[2] / longest) for one in known]
 
@@ -152,8 +149,5 @@ def _facts(ahead: Experiment) -> list[tuple[str, Any]]:
         pairs.append(("Voltage", _span(float(ahead.voltage_V.min()), float(ahead.voltage_V.max()), "V")))
     if ahead.separates:
         pairs.append(("Tells apart", listed(ahead.separates)))
-    if math.isfinite(ahead.predicted_z):
-        pairs.append(("Predicted separation", f"{sigmas(ahead.predicted_z)} {SIGMA}"))
-    if math.isfinite(ahead.present_z):
-        pairs.append(("In the records at hand", f"{sigmas(ahead.present_z)} {SIGMA}"))
-    return pairs
+    evidence = {"Predicted separation": ahead.predicted_z, "In the records at hand": ahead.present_z}
+    return pairs + [(name, f"{sigmas(z)} {SIGMA}") for name, z in evidence.items() if math.isfinite(z)]

@@ -15,8 +15,7 @@ from fits.report._words import rms_um, verdict_sentence
 def diagnosis_schema() -> dict[str, Any]:
     """Read the JSON Schema (draft 2020-12) of what `diagnosis_json` gives."""
     text = files("fits.report").joinpath("diagnosis.schema.json").read_text(encoding="utf-8")
-    schema: dict[str, Any] = json.loads(text)
-    return schema
+    return dict(json.loads(text))
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -26,55 +25,46 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """
     ahead = diagnosis.next_experiment
     noise = ("false_alarm", "noise_um", "noise_source", "noise_samples")
-    found: dict[str, Any] = strict(
-        {
-            "schema": SCHEMA,
-            "written_by": written_by(),
-            "verdict": diagnosis.verdict,
-            "sentence": verdict_sentence(diagnosis),
-            **{name: getattr(diagnosis, name) for name in noise},
-            "causes": [_cause(cause) for cause in diagnosis.causes],
-            "unexplained_rms_um": diagnosis.unexplained_rms_um,
-            "upper_bounds": diagnosis.upper_bounds,
-            "tests": diagnosis.tests,
-            "gain": diagnosis.gain,
-            "next_experiment": None if ahead is None else _experiment(ahead),
-            "remarks": diagnosis.remarks,
-            "runs": [_run(run) for run in diagnosis.runs],
-        }
-    )
-    return found
+    kept = ("unexplained_rms_um", "upper_bounds", "tests", "gain")
+    found = {
+        "schema": SCHEMA,
+        "written_by": written_by(),
+        "verdict": diagnosis.verdict,
+        "sentence": verdict_sentence(diagnosis),
+        **{name: getattr(diagnosis, name) for name in noise},
+        "causes": [vars(cause) | {"parameters": _by_name(cause)} for cause in diagnosis.causes],
+        **{name: getattr(diagnosis, name) for name in kept},
+        "next_experiment": None if ahead is None else _experiment(ahead),
+        "remarks": diagnosis.remarks,
+        "runs": [_run(run) for run in diagnosis.runs],
+    }
+    return dict(strict(found))
 
 
-def _cause(cause: FoundCause) -> dict[str, Any]:
+def _by_name(cause: FoundCause) -> dict[str, Any]:
     parameters = [dict(vars(each)) for each in cause.parameters]
-    return {**vars(cause), "parameters": {each.pop("name"): each for each in parameters}}
+    return {each.pop("name"): each for each in parameters}
 
 
 def _experiment(ahead: Experiment) -> dict[str, Any]:
-    known = ahead.time_s.size > 0
     kept = ("kind", "purpose", "separates", "predicted_z", "present_z", "extra_column")
-    ends = ("low", "high", "lowest", "highest")
+    known, ends = ahead.time_s.size > 0, ("unit", "low", "high", "lowest", "highest")
     return {
         **{name: getattr(ahead, name) for name in kept},
         "samples": int(ahead.time_s.size),
-        "duration_s": ahead.time_s[-1] - ahead.time_s[0] if known else None,
+        "duration_s": np.ptp(ahead.time_s) if known else None,
         "lowest_V": ahead.voltage_V.min() if known else None,
         "highest_V": ahead.voltage_V.max() if known else None,
-        "extremes": [
-            {"quantity": one.name, "unit": one.unit, **{key: getattr(one, key) for key in ends}}
-            for one in ahead.extremes
-        ],
+        "extremes": [{"quantity": one.name} | {key: getattr(one, key) for key in ends} for one in ahead.extremes],
     }
 
 
 def _run(run: RunView) -> dict[str, Any]:
-    known = run.time_s.size > 0
     return {
         "source": run.source,
         "samples": int(run.time_s.size),
         "fitted_samples": int(np.count_nonzero(run.fitted)),
-        "duration_s": run.time_s[-1] - run.time_s[0] if known else None,
+        "duration_s": np.ptp(run.time_s) if run.time_s.size else None,
         "rms_before_um": rms_um([run], "before_um", fitted=True),
         "rms_after_um": rms_um([run], "after_um", fitted=True),
     }

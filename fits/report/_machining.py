@@ -19,10 +19,11 @@ def sensitivity_json(report: SensitivityReport) -> dict[str, Any]:
 
 
 def _sensitivity_json(axis: AxisSensitivity) -> dict[str, Any]:
-    parameters = {effect.name: dataclasses.asdict(effect) for effect in axis.dimensions}
-    for values in parameters.values():
-        del values["name"]
+    parameters = {}
+    for effect in axis.dimensions:
+        values = dict(vars(effect))
         values[f"output_change_{axis.output_unit}_per_10um"] = values.pop("output_change_per_10um")
+        parameters[values.pop("name")] = values
     return {
         "gain": axis.gain,
         "gain_unit": axis.gain_unit,

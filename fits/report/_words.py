@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fits.diagnosis._result import Diagnosis, EffectParameter, FoundCause, RunView
+from fits.diagnosis._result import Diagnosis, EffectParameter, RunView
 from microid.effects import card_of
 
 # Below this, probabilities are those of tails that nobody has checked.
@@ -16,6 +16,7 @@ NONE = "\N{EN DASH}"
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _MINUS = "\N{MINUS SIGN}"
 _TIMES = "\N{MULTIPLICATION SIGN}"
+KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -52,9 +53,8 @@ def estimate(parameter: EffectParameter) -> tuple[str, str, str]:
     """Write estimate, standard deviation and 95 % interval, rounded to two digits of the standard deviation."""
     sd = parameter.sd
     size = abs(parameter.value) if math.isfinite(parameter.value) else 0.0
-    if not (math.isfinite(sd) and sd > 0) or max(size, sd) >= 1e6 or sd < 1e-6:
-        ends = number(parameter.lower), number(parameter.upper)
-        return number(parameter.value, 4), number(sd, 2), f"{ends[0]} to {ends[1]}"
+    if not (math.isfinite(sd) and sd >= 1e-6) or max(size, sd) >= 1e6:
+        return number(parameter.value, 4), number(sd, 2), f"{number(parameter.lower)} to {number(parameter.upper)}"
     places = max(1 - math.floor(math.log10(sd)), 0)
     lower, upper = (_decimals(end, places) for end in (parameter.lower, parameter.upper))
     return _decimals(parameter.value, places), _decimals(sd, places), f"{lower} to {upper}"
@@ -81,13 +81,11 @@ def parameter_name(parameter: EffectParameter) -> str:
 
 def percent(share: float) -> str:
     """Write a fraction as a percentage that is never rounded to all or nothing."""
-    if not math.isfinite(share):
-        return NONE
     if 0 < share < 0.01:
         return "< 1 %"
     if 0.99 < share < 1:
         return "> 99 %"
-    return f"{100 * share:.0f} %".replace("-", _MINUS)
+    return f"{100 * share:.0f} %".replace("-", _MINUS) if math.isfinite(share) else NONE
 
 
 def chance(p: float) -> str:
@@ -102,11 +100,8 @@ class Lengths:
     """Writes sizes of a residual, all in one unit: nm where they are small, um elsewhere."""
 
     def __init__(self, diagnosis: Diagnosis):
-        sizes = [rms_um(diagnosis.runs, "before_um"), diagnosis.noise_um]
-        known = [size for size in sizes if math.isfinite(size)]
-        small = bool(known) and max(known) < 0.5
-        self.unit = "nm" if small else "µm"
-        self.per_um = 1e3 if small else 1.0
+        known = list(filter(math.isfinite, (rms_um(diagnosis.runs, "before_um"), diagnosis.noise_um)))
+        self.per_um, self.unit = (1e3, "nm") if known and max(known) < 0.5 else (1.0, "µm")
 
     def bare(self, size_um: float) -> str:
         """Without its unit, for tables whose heading has it."""
@@ -127,43 +122,37 @@ def rms_um(runs: Sequence[RunView], name: str, fitted: bool = False) -> float:
 
 def headline(diagnosis: Diagnosis) -> str:
     """Say in a few words what is wrong."""
-    names = [cause.name for cause in diagnosis.causes]
-    found = listed(names)
+    found = listed([cause.name for cause in diagnosis.causes])
     if diagnosis.verdict == "no_effect":
         return "No hidden effect was found."
     if diagnosis.verdict == "unexplained":
-        begin = "Something is wrong that no known effect explains" if not names else f"There is {found}, and more"
-        return f"{begin}{'' if not names else ' that no known effect explains'}."
-    if any(cause.also_consistent for cause in diagnosis.causes) and len(names) == 1:
-        return f"The stage shows {either(diagnosis.causes[0])}."
+        begin = f"There is {found}, and more" if found else "Something is wrong"
+        return f"{begin} that no known effect explains."
+    if len(diagnosis.causes) == 1:
+        (cause,) = diagnosis.causes
+        return f"The stage shows {listed([cause.name, *cause.also_consistent], 'or')}."
     return f"The stage shows {found}."
-
-
-def either(cause: FoundCause) -> str:
-    """Name an effect with all that cannot be told from it."""
-    return listed([cause.name, *cause.also_consistent], "or")
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """Say in plain sentences what is wrong, why, how sure that is, and how much better the extension predicts."""
     length = Lengths(diagnosis)
-    unclear = [cause for cause in diagnosis.causes if cause.also_consistent]
     apart = [
         f"These records cannot tell {plain(cause.name)} from {listed(cause.also_consistent, 'or')}."
-        for cause in unclear
+        for cause in diagnosis.causes
+        if cause.also_consistent
     ]
-    parts = [_found(diagnosis, length), *apart, *_gained(diagnosis, length)]
-    return " ".join(part for part in parts if part)
+    return " ".join([_found(diagnosis, length), *apart, *_gained(diagnosis, length)])
 
 
 def _found(diagnosis: Diagnosis, length: Lengths) -> str:
-    noise = length(diagnosis.noise_um)
+    noise, left = length(diagnosis.noise_um), length(diagnosis.unexplained_rms_um)
+    if not diagnosis.causes and diagnosis.verdict == "unexplained":
+        return (
+            f"The plain stage leaves a reproducible error of {left}, root mean square, over a noise floor of "
+            f"{noise}, and no effect of the library explains it."
+        )
     if not diagnosis.causes:
-        if diagnosis.verdict == "unexplained":
-            return (
-                f"The plain stage leaves a reproducible error of {length(diagnosis.unexplained_rms_um)}, root mean "
-                f"square, over a noise floor of {noise}, and no effect of the library explains it."
-            )
         return (
             f"The plain stage describes these records down to a noise floor of {noise}. Of records that hold "
             f"no effect, {percent(diagnosis.false_alarm)} are given a cause by chance."
@@ -176,19 +165,17 @@ def _found(diagnosis: Diagnosis, length: Lengths) -> str:
             f"({sigmas(cause.z)} standard deviations; probability by chance {chance(cause.p_family)})."
         )
     if diagnosis.unexplained_rms_um > 0:
-        left = length(diagnosis.unexplained_rms_um)
         sentences.append(f"A reproducible error of {left}, root mean square, is left without an explanation.")
     return " ".join(sentences)
 
 
 def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
-    gain = diagnosis.gain
+    before, after = diagnosis.gain.heldout_rms_before_um, diagnosis.gain.heldout_rms_after_um
     modelled = [cause.name for cause in diagnosis.causes if not card_of(cause.name).statistic]
     if not modelled:
         return []
-    if not math.isfinite(gain.heldout_rms_before_um) or not math.isfinite(gain.heldout_rms_after_um):
+    if not math.isfinite(before) or not math.isfinite(after):
         return ["Nothing was held out, so what this is worth on new data is not known."]
-    before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
     if after == before:
         return [f"What {listed(modelled)} did in these runs is not in the model of the next."]
     change = "falls" if after < before else "does not fall: it goes"
@@ -197,3 +184,32 @@ def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
         f"used {change} from {length(before)} to {length(after)}, root mean square; the noise "
         f"floor is {length(diagnosis.noise_um)}."
     ]
+
+
+def describe_diagnosis(diagnosis: Diagnosis) -> str:
+    """Put a diagnosis into a few lines, without a newline at the end: verdict, causes with parameters, and gain."""
+    lines = [f"{KINDS[diagnosis.verdict]}; noise {diagnosis.noise_um:.3g} um, {diagnosis.noise_source}"]
+    for cause in diagnosis.causes:
+        also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
+        lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {cause.p_family:.1g}")
+        if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
+            lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
+        for each in cause.parameters:
+            unit = "" if each.unit == "1" else f" {each.unit}"
+            below, above = each.value - each.lower, each.upper - each.value
+            # An interval that ends at a bound, or reaches farther to one side, is no standard deviation.
+            spread = f"+- {each.sd:.2g}{unit}"
+            if not min(below, above) > 0.8 * max(below, above):
+                spread = f"(95 %: {each.lower:.3g} to {each.upper:.3g}){unit}"
+            lines.append(f"    {each.name:24} {each.value:.4g} {spread}")
+    if diagnosis.unexplained_rms_um > 0:
+        lines.append(f"  unexplained: {diagnosis.unexplained_rms_um:.3g} um")
+    gain = diagnosis.gain
+    if math.isfinite(gain.heldout_rms_before_um):
+        line = f"error on held-out data: {gain.heldout_rms_before_um:.3g} um"
+        if diagnosis.causes and math.isfinite(gain.heldout_rms_after_um):
+            line += f" without, {gain.heldout_rms_after_um:.3g} um with what was found"
+        lines.append(line)
+    if diagnosis.next_experiment is not None:
+        lines.append(f"next experiment: {diagnosis.next_experiment.purpose}")
+    return "\n".join([*lines, *(f"Note: {remark}" for remark in diagnosis.remarks)])

@@ -1,12 +1,14 @@
 """Runs that cannot be fitted as one stage: what is wrong with them, in words."""
 
 from collections.abc import Sequence
+from itertools import permutations
 
 import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._misfit import Misfit, compare_gains
+from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.stage._run import named_parts, residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
@@ -28,18 +30,14 @@ _FASTER, _OR_ALONE = "sample at 5 times the resonance or more", "or fit the hyst
 
 def refuse_slopes(records: Sequence[Record]) -> None:
     """Refuse, in a `DataError`, slow runs over one range of voltage that move differently far."""
-    spans = [
-        (float(np.ptp(record.voltage_V)), float(np.ptp(record.displacement_um)), speed_Hz(record), record.source)
-        for record in records
-        if record.displacement_um is not None
-    ]
-    widest = max(span for span, _, _, _ in spans)
-    full = [(moved / span, speed, source) for span, moved, speed, source in spans if span > 0.95 * widest]
-    for high, fast, one in full:
-        for low, slow, other in full:
-            # What is faster may move less far because of the dynamics, which are not known yet.
-            if high > (1 + _REFUSED) * low and max(fast, slow) < 1.5 * min(fast, slow):
-                raise DataError(_not_one_rig(one, other, high / low))
+    spans = [float(np.ptp(record.voltage_V)) for record in records]
+    moved = [float(np.ptp(record.displacement_um)) for record in records if record.displacement_um is not None]
+    found = zip(records, spans, moved, map(speed_Hz, records), strict=True)
+    full = [(um / span, speed, one.source) for one, span, um, speed in found if span > 0.95 * max(spans)]
+    for (high, fast, one), (low, slow, other) in permutations(full, 2):
+        # What is faster may move less far because of the dynamics, which are not known yet.
+        if high > (1 + _REFUSED) * low and max(fast, slow) < 1.5 * min(fast, slow):
+            raise DataError(_not_one_rig(one, other, high / low))
 
 
 def speed_Hz(record: Record) -> float:
@@ -62,24 +60,23 @@ def _not_one_rig(one: str, other: str, ratio: float) -> str:
 def refuse_unidentifiable(
     solved: Solved, drives: Sequence[np.ndarray], fast: bool, may_drop: bool = False
 ) -> str | None:
-    """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with.
+    """Refuse, in a `DataError`, runs that do not show the dynamics they are fitted with; `fast` if one is faster.
 
-    The solution is that of the poles that explain the runs best, the hysteresis being given; `drives` are what it
-    alone would give for each run, shape `(n,)`; `fast` says whether a run is faster than the others. Where a
-    mechanics may be left out (`may_drop`) that the runs do not show, though they are sampled finely enough, its name
-    is returned instead.
+    `drives` are what the hysteresis alone would give for each run, shape `(n,)`. Where a mechanics may be left out
+    (`may_drop`) that the runs do not show, though they are sampled finely enough, its name is returned instead.
     """
     stage = solved.stage
     information = marginal_information(solved.weighing.total(solved.sums), 0, None, solved.weighing.least_um**2)
     named, value, derivative = solved.parameters()
     slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
-    names = [name for name, _ in named]
-    poles = [k for k, name in enumerate(names) if name.endswith((".time_constant_s", ".natural_frequency_Hz"))]
-    if not poles:
-        return None
     spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     # At a bound the slope vanishes, however far the coordinate may run.
-    unidentified = [names[k] for k in poles if spread[k] * slope[k] > UNSEEN or spread[k] > 5]
+    unseen = (spread * slope > UNSEEN) | (spread > 5)
+    endings = ".time_constant_s", ".natural_frequency_Hz"
+    poles = [(name, lost) for (name, _), lost in zip(named, unseen, strict=True) if name.endswith(endings)]
+    if not poles:
+        return None
+    unidentified = [name for name, lost in poles if lost]
     sources = ", ".join(run.record.source for run in solved.runs)
     fastest = max(solved.runs, key=lambda run: run.rate_Hz)
     mechanics = [(name, float(part.natural_frequency_Hz)) for name, part in named_parts(stage, Mechanics)]
@@ -99,18 +96,13 @@ def refuse_unidentifiable(
         if noise[loudest] > 3.0 * min(noise):  # it moves in ways that its samples do not show
             check_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
-            what = (
-                f"{noise[loudest]:.3g} um of it stay unexplained, {noise[loudest] / min(noise):.3g} times as much as "
-                "of the quietest run"
-            )
+            why, remedy = f"sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it", _FASTER
             if _resolved(loud):
-                raise DataError(
-                    f"{loud.record.source}: no lag and no resonance was found that explains what moves in it: "
-                    f"{what}; record it for longer, with a slower chirp or a longer period, {_OR_ALONE}"
-                )
+                why = "no lag and no resonance was found that explains what moves in it"
+                remedy = "record it for longer, with a slower chirp or a longer period"
             raise DataError(
-                f"{loud.record.source}: sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it: "
-                f"{what}; {_FASTER}, {_OR_ALONE}"
+                f"{loud.record.source}: {why}: {noise[loudest]:.3g} um of it stay unexplained, "
+                f"{noise[loudest] / min(noise):.3g} times as much as of the quietest run; {remedy}, {_OR_ALONE}"
             )
         raise DataError(
             f"{sources}: the displacement follows the voltage without delay or ringing, so these runs hold nothing "
@@ -150,22 +142,19 @@ def _resolved(run: Run) -> bool:
     return float(power[len(power) // 2 :].sum()) < 0.1 * float(power.sum())
 
 
-def implausible(names: Sequence[str], values: Sequence[float], sources: Sequence[str]) -> tuple[str, float] | None:
+def implausible(parameters: Sequence[ParameterEstimate], sources: Sequence[str]) -> tuple[str, float] | None:
     """Find poles that no piezo stage has: a sentence, and the factor that takes times in the suspected unit to s."""
-    for name, value in zip(names, values, strict=True):
-        field = name.rpartition(".")[2]
-        low, high = _USUAL_RANGES.get(field, (-np.inf, np.inf))
-        if low <= value <= high:
-            continue
-        hertz = field.endswith("_Hz")
-        # Slow poles and long times come of numbers that are too large.
-        units, factor = ("ms instead of s", 1e-3) if (value < low) == hertz else ("s instead of ms", 1e3)
-        return (
-            f"{', '.join(sources)}: {name} comes out as {value:.3g} {'Hz' if hertz else 's'}, where piezo stages "
-            f"have {low:g} to {high:g}: the time is probably in another unit than its column says, for example in "
-            f"{units}",
-            factor,
-        )
+    for one in parameters:
+        low, high = _USUAL_RANGES.get(one.name.rpartition(".")[2], (-np.inf, np.inf))
+        if not low <= one.value <= high:
+            # Slow poles and long times come of numbers that are too large.
+            large = (one.value < low) == (one.unit == "Hz")
+            units, factor = ("ms instead of s", 1e-3) if large else ("s instead of ms", 1e3)
+            return (
+                f"{', '.join(sources)}: {one.name} comes out as {one.value:.3g} {one.unit}, where piezo stages have "
+                f"{low:g} to {high:g}: the time is probably in another unit than its column says, for example in "
+                f"{units}"
+            ), factor
     return None
 
 

@@ -26,9 +26,7 @@ _MOVED_SD = 0.5
 _FARTHEST_SAMPLES = 64
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
-_REMEDY = (
-    "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
-)
+REMEDY = "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
 
 
 @dataclass(frozen=True)
@@ -42,9 +40,8 @@ class Alternative:
     @classmethod
     def of(cls, solved: Solved) -> "Alternative":
         """Read it off a solution."""
-        sd, values = Precision(solved).sd(), solved.problem.chain.coordinates.values
-        ends = (np.asarray(values(jnp.asarray(solved.z + k * TWO_SIDED_95 * sd))) for k in (0, -1, 1))
-        return cls(*ends)
+        sd, values = Precision(solved).sd, solved.problem.chain.coordinates.values
+        return cls(*(np.asarray(values(jnp.asarray(solved.z + k * TWO_SIDED_95 * sd))) for k in (0, -1, 1)))
 
     @classmethod
     def in_unit(cls, fit: FitResult[Stage], factor: float) -> "Alternative":
@@ -53,26 +50,17 @@ class Alternative:
         figures = [[getattr(p, name) for p in fit.parameters] for name in ("value", "lower", "upper")]
         return cls(*(factor**powers * np.asarray(each) for each in figures))
 
-    def contradicted(self, fit: FitResult[Stage]) -> list[str]:
-        """Say which parameters of a fit are far from these, one sentence each."""
-        return [
-            f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
-            for p, v in zip(fit.parameters, self.values, strict=True)
-            if abs(v - p.value) > 0.5 * min(abs(v), abs(p.value))
-        ]
-
     def widen(self, fit: FitResult[Stage], said: str, remedy: str = "") -> FitResult[Stage]:
         """Let a fit's intervals reach these, and say first what pulls it and what to do about that."""
-        parameters = tuple(
-            replace(
-                p, sd=float(np.hypot(p.sd, v - p.value)), lower=min(p.lower, float(a)), upper=max(p.upper, float(b))
-            )
-            for p, v, a, b in zip(fit.parameters, self.values, self.low, self.high, strict=True)
-        )
-        listed = ", ".join(f"{p.name} {v:.5g} {p.unit}" for p, v in zip(fit.parameters, self.values, strict=True))
+        parameters, named = [], []
+        for p, v, a, b in zip(fit.parameters, self.values, self.low, self.high, strict=True):
+            sd, lower, upper = float(np.hypot(p.sd, v - p.value)), min(p.lower, float(a)), max(p.upper, float(b))
+            parameters.append(replace(p, sd=sd, lower=lower, upper=upper))
+            named.append(f"{p.name} {v:.5g} {p.unit}")
+        listed = ", ".join(named)
         remark = f"{said}; without that the parameters would be {listed}, and the intervals reach there"
         remark += f": {remedy}" if remedy else ""
-        return replace(fit, parameters=parameters, remarks=(remark, *fit.remarks))
+        return replace(fit, parameters=tuple(parameters), remarks=(remark, *fit.remarks))
 
 
 def fit_without_outliers(plan: Plan, solved: Solved) -> tuple[list[str], Alternative] | None:
@@ -97,7 +85,6 @@ class Delay:
 
     @property
     def samples(self) -> float:
-        """The same in samples."""
         return self.delay_s * self.run.rate_Hz
 
     @property
@@ -106,13 +93,11 @@ class Delay:
         return abs(self.delay_s) > 5.0 * self.sd_s and abs(self.samples) > 0.02
 
     def words(self) -> str:
-        """Say what the columns look like."""
         sd = self.sd_s * self.run.rate_Hz
         digits = max(1, min(4, 1 - int(np.floor(np.log10(max(sd, 1e-9))))))
         size = f"{abs(self.samples):.{digits}f} +- {sd:.{digits}f} samples ({abs(self.delay_s):.3g} s)"
-        if self.delay_s > 0:
-            return f"the displacement comes {size} AFTER what the voltage asks for"
-        return f"the displacement comes {size} BEFORE the voltage that causes it"
+        way = "AFTER what the voltage asks for" if self.delay_s > 0 else "BEFORE the voltage that causes it"
+        return f"the displacement comes {size} {way}"
 
 
 @dataclass(frozen=True)
@@ -126,15 +111,13 @@ class WithoutDelays:
         """Say what the columns of the runs look like."""
         return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
 
-    def refused(self) -> DataError:
-        """Say that the delays kept a fit from an answer."""
-        return DataError(f"{self.words()}, and no fit was found with that: {_REMEDY}")
-
     def widen(self, fit: FitResult[Stage]) -> FitResult[Stage]:
         """Name the delays, and widen intervals by what they did; a `DataError` if that leaves nothing to say."""
         other, said = Alternative.of(self.solved), self.words()
-        if moved := other.contradicted(fit):
-            raise DataError(f"{said}, and {moved[0]}: {_REMEDY}")
+        for p, v in zip(fit.parameters, other.values, strict=True):
+            if abs(v - p.value) > 0.5 * min(abs(v), abs(p.value)):
+                moved = f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
+                raise DataError(f"{said}, and {moved}: {REMEDY}")
         return other.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
 
 
@@ -189,17 +172,16 @@ def fit_without_delays(
             break
         assert again is not None
         shifts, found = shifts + step, again
+    noises = zip(solved.weighing.noise_um, found.weighing.noise_um, strict=True)
     seen = tuple(
         one
-        for one, shift, miss, before, after in zip(
-            known, shifts, left, solved.weighing.noise_um, found.weighing.noise_um, strict=True
-        )
+        for one, shift, miss, (before, after) in zip(known, shifts, left, noises, strict=True)
         # Where much is left with it as without it, it is something else.
         if one.seen and shift and after < (0.4 if after > miss.noise_um * 2.0 else 1.0) * before
     )
     if not seen:
         return None
-    if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd()) < _MOVED_SD:
+    if searched is None and precision is not None and np.max(np.abs(found.z - solved.z) / precision.sd) < _MOVED_SD:
         return None
     return WithoutDelays(seen, found)
 

@@ -6,7 +6,6 @@ import dataclasses
 import inspect
 import math
 import re
-from collections.abc import Collection
 from typing import Any
 
 import equinox as eqx
@@ -23,21 +22,23 @@ from fits.stage._uncertainty import StageUncertainty
 from microid import ParameterSpec
 
 _ACTIVATIONS = {"tanh": jnp.tanh}
+# In base64: one number per weight is worth reading; one per weight and perturbation of an uncertainty is not.
+_PACKED = ("columns_um", "coordinates", "mean_um")
 # Squares and products of what is larger overflow.
 _LARGEST, _LARGEST_PLAIN = 1e30, 1000
 _DTYPES = ("float32", "float64", "int32", "int64", "bool")
 
 
-def encode(value: Any, unit: str = "1", packed: Collection[str] = ()) -> Any:
-    """JSON values of a module or a field's value, `packed` fields in base64; a `DataError` if it has none."""
+def encode(value: Any, unit: str = "1") -> Any:
+    """JSON values of a module or a field's value; a `DataError` if it has none."""
     if isinstance(value, eqx.nn.MLP):
         return _encode_network(value, unit)
     if isinstance(value, eqx.Module):
-        return _encode_module(value, packed)
+        return _encode_module(value)
     if isinstance(value, jax.Array | np.ndarray):
         return _encode_array(np.asarray(value), unit)
     if isinstance(value, tuple):
-        return [encode(item, unit, packed) for item in value]
+        return [encode(item, unit) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         raise DataError("it holds a number that is not finite")
     if value is None or isinstance(value, bool | int | float | str):
@@ -86,17 +87,15 @@ def _unit(field: dataclasses.Field[Any]) -> str:
     return re.sub(r"(\d+)", r"^\1", "/".join(part for part in parts if part != "per")) if len(name) > 1 else "1"
 
 
-def _encode_module(module: eqx.Module, packed: Collection[str]) -> dict[str, Any]:
+def _encode_module(module: eqx.Module) -> dict[str, Any]:
     name = type(module).__name__
     if _classes().get(name) is not type(module):
         raise DataError(f"microid has no public class {name}")
     out: dict[str, Any] = {"type": name}
     for key, field in _fields(type(module)).items():
         value, unit = getattr(module, key), _unit(field)
-        if key in packed and isinstance(value, jax.Array) and value.dtype == np.float64:
-            out[key] = _encode_array(np.asarray(value), unit, packed=True)
-        else:
-            out[key] = encode(value, unit, packed)
+        packed = key in _PACKED and isinstance(value, jax.Array) and value.dtype == np.float64
+        out[key] = _encode_array(np.asarray(value), unit, packed) if packed else encode(value, unit)
     return out
 
 
@@ -199,7 +198,7 @@ def _decode_network(item: dict[str, Any], where: str, spec: ParameterSpec | None
         raise DataError(f"{where}: expected arrays in the layers of the network")
 
     def slots(network: eqx.nn.MLP) -> list[Any]:
-        return [getattr(layer, key) for layer in network.layers for key in ("weight", "bias")]
+        return [getattr(network.layers[n], key) for n, key in slots_of]
 
     try:
         sizes = item["in_size"], item["out_size"], arrays[0].shape[0], len(layers) - 1

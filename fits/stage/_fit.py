@@ -17,7 +17,7 @@ from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate, RunReport
 from fits.loop._run import Progress, Run, prepare_run, refuse_many_steps
 from fits.stage._checks import check_gains, implausible, refuse_undersampled
-from fits.stage._delay import GROSS_PCT, Alternative, fit_without_delays, fit_without_outliers
+from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simulate_stage
 from fits.stage._solve import Problem, Solved
 from fits.stage._steps import Plan, refine_problem, start_problem
@@ -87,7 +87,7 @@ def fit_stage(
     if undelayed is None or any(one.far for one in misfits(undelayed.solved.runs, undelayed.solved.residuals_um)):
         refuse_undersampled(solved.stage, runs, left)
     if undelayed is not None and (found.failure is not None or simplified):
-        raise undelayed.refused()
+        raise DataError(f"{undelayed.words()}, and no fit was found with that: {REMEDY}")
     if found.failure is not None:
         raise found.failure
     gross = worst(left)
@@ -108,16 +108,20 @@ def fit_stage(
     outliers = fit_without_outliers(found.plan, solved)
     if outliers is not None:
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
-    odd = remarks_on(runs, solved.residuals_um, robust=loss == "huber")
-    sources = [record.source for record in records]
-    unit = implausible([p.name for p in summary.parameters], [p.value for p in summary.parameters], sources)
+    unit = implausible(summary.parameters, [record.source for record in records])
     if unit is not None:
-        summary = Alternative.in_unit(summary, unit[1]).widen(
-            summary, unit[0], "name the right one as in --columns time_s=time_ms"
-        )
-    notes = [warning for record in (*records, *aside) for warning in record.warnings]
-    told = tuple(dict.fromkeys((*odd, *notes, *solved.problem.remarks, *summary.remarks)))
-    return replace(summary, misfit=worst(left), remarks=told)
+        remedy = "name the right one as in --columns time_s=time_ms"
+        summary = Alternative.in_unit(summary, unit[1]).widen(summary, unit[0], remedy)
+    summary = replace(summary, remarks=(*solved.problem.remarks, *summary.remarks))
+    return completed(summary, solved, (*records, *aside), loss)
+
+
+def completed(found: FitResult[Stage], solved: Solved, records: Sequence[Record], loss: str) -> FitResult[Stage]:
+    """Add how far a fit is from noise, and say first what is wrong with its runs and records."""
+    odd = remarks_on(solved.runs, solved.residuals_um, robust=loss == "huber")
+    notes = [warning for record in records for warning in record.warnings]
+    told = tuple(dict.fromkeys((*odd, *notes, *found.remarks)))
+    return replace(found, misfit=worst(misfits(solved.runs, solved.residuals_um)), remarks=told)
 
 
 @dataclass(frozen=True)
@@ -188,7 +192,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     """Put the fit of a stage, and held-out runs, into figures; a `DataError` if the runs are not of one rig."""
     coordinates, solved, stage = precision.chain.coordinates, precision.solved, precision.solved.stage
     remarks = check_gains(stage, solved.runs, refuse=True)
-    covariance = precision.covariance(precision.influence())
+    covariance = precision.covariance
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     names, value, slope = solved.parameters()
     ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * TWO_SIDED_95 * sd))) for sign in (-1, 1)]
@@ -241,16 +245,11 @@ def _report(stage: Stage, run: Run, **figures: Any) -> RunReport:
 def unseen_directions(information: np.ndarray, names: Sequence[str], relative: np.ndarray) -> tuple[str, ...]:
     """Name the combinations of parameters that the data leave open, one sentence each, in the order of ignorance.
 
-    `information` is the precision of the coordinates, whatever else is unknown, shape `(p, p)`; `relative` the change
-    of each parameter's logarithm per coordinate, shape `(p,)`.
+    `information` is the precision of the coordinates, `relative` the change of each parameter's logarithm per one.
     """
     values, vectors = np.linalg.eigh(information)
-    sentences = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value > 1:  # coordinates are scaled to be of the order of 1
-            break
-        sentences.append(_sentence(vector * relative, names))
-    return tuple(sentences)
+    # Coordinates are scaled to be of the order of 1.
+    return tuple(_sentence(vector * relative, names) for vector in vectors.T[values <= 1])
 
 
 def _sentence(direction: np.ndarray, names: Sequence[str]) -> str:

@@ -12,11 +12,10 @@ from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid, weigh_robustly
 from fits.loop._fit import check_fit
-from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
 from fits.loop._run import Progress, Run, prepare_run
-from fits.stage._fit import default_stage, summarise
+from fits.stage._fit import completed, default_stage, summarise
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem, solve_chain
 from fits.stage._uncertainty import Precision
@@ -28,7 +27,7 @@ _SHORTEST, _LONGEST = 20.0, 1 / 4
 _GAIN, _LAG = 0.1, 2.0
 MOST_RELAXATIONS = 6
 # A relaxation is not seen whose gain ends near its bound.
-_ANY = 0.49
+_MOST = 0.49
 
 
 def fit_slow(
@@ -76,7 +75,8 @@ def fit_slow(
     while True:
         problem = Problem.of(stage, tried.data.grid, columns, hyper, stroke)
         solved = solve_chain(problem, runs, loss, progress, accept_best=True)
-        unseen = _unseen(solved.stage)
+        effects = [(name, part) for name, part in named_parts(solved.stage, AbstractEffect) if part.relaxation]
+        unseen = [(name, part) for name, part in effects if float(getattr(part, part.strength[0])) > _MOST]
         if not unseen:
             break
         columns, hyper, stage = solved.columns_um, solved.hyper, solved.stage
@@ -87,11 +87,11 @@ def fit_slow(
             remarks.append(f"a relaxation of {constant_s:.3g} s is not seen in these runs, and was left out")
     progress("comparing with the measurement")
     found = summarise(Precision(solved), [prepare(record, 1.0) for record in aside])
-    left = misfits(solved.runs, solved.residuals_um)
-    odd = remarks_on(solved.runs, solved.residuals_um, robust=loss == "huber")
-    notes = [warning for record in (*records, *aside) for warning in record.warnings]
-    told = tuple(dict.fromkeys((*odd, *notes, *remarks, *found.remarks)))
-    return replace(found, model=_seen(found.model), misfit=worst(left), remarks=told)
+    model = found.model
+    for name in set(stage.frozen) & set(stage.names):
+        model = model.without(name)
+    found = replace(found, model=model, remarks=(*remarks, *found.remarks))
+    return completed(found, solved, (*records, *aside), loss)
 
 
 def _stage(records: Sequence[Record], lag: bool, relaxations: int) -> Stage:
@@ -110,16 +110,3 @@ def _stage(records: Sequence[Record], lag: bool, relaxations: int) -> Stage:
     if lag:
         parts["lag"] = lagging(**{lagging.lag: jnp.asarray(_LAG * interval)})
     return Stage(tuple(parts.values()), tuple(parts), frozen=tuple(held))
-
-
-def _unseen(stage: Stage) -> list[tuple[str, Any]]:
-    """Relaxations that may take any part."""
-    effects = named_parts(stage, AbstractEffect)
-    return [(name, p) for name, p in effects if p.relaxation and float(getattr(p, p.strength[0])) > _ANY]
-
-
-def _seen(stage: Stage) -> Stage:
-    """The same without relaxations that were left out."""
-    kept = {n: part for n, part in zip(stage.names, stage.parts, strict=True) if n not in stage.frozen}
-    frozen = tuple(path for path in stage.frozen if path.split(".")[0] in kept)
-    return Stage(tuple(kept.values()), tuple(kept), stage.hold, stage.substeps, frozen)

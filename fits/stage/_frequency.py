@@ -12,13 +12,14 @@ from fits.io._errors import AnyPath, DataError
 from fits.io._open_table import open_table
 from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._table import Table
-from fits.stage._local_polynomial import TRIED, local_polynomial
 
 _REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
 _MAGNITUDE, _DECIBEL, _DEGREES, _RADIANS = "magnitude_um_per_V", "magnitude_dB", "phase_deg", "phase_rad"
 # What a unit is checked by, of each column.
 _UNITS = {"frequency_Hz": "Hz"} | dict.fromkeys((_REAL, _IMAGINARY, _MAGNITUDE), "um/V")
 _UNITS |= {_VARIANCE: "um^2/V^2", _DECIBEL: "dB", _DEGREES: "deg", _RADIANS: "rad"}
+# Degree of a local polynomial, and the neighbours on each side that are tried where the record is to choose.
+_DEGREE, _TRIED = 2, (2, 3, 4, 6, 8, 12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +146,7 @@ def estimate_response(record: Multisine, neighbours: int | None = 0) -> Response
     frequency_Hz, u, y = record.spectra()
     gain, total = approximate(record, u, y)
     drive, moved = np.mean(u, axis=2), np.mean(y, axis=2)
-    tried = [n for n in TRIED if 2 * n + 1 <= len(frequency_Hz)] if neighbours is None else [neighbours]
+    tried = [n for n in _TRIED if 2 * n + 1 <= len(frequency_Hz)] if neighbours is None else [neighbours]
     if not all(0 <= 2 * n < len(frequency_Hz) for n in tried):
         most = (len(frequency_Hz) - 1) // 2
         raise DataError(
@@ -153,7 +154,7 @@ def estimate_response(record: Multisine, neighbours: int | None = 0) -> Response
             "choose another number."
         )
     if any(tried):
-        found = [local_polynomial(drive, moved, n) for n in tried]
+        found = [_local_polynomial(drive, moved, n) for n in tried]
         gain, total, spread, _ = min(found, key=lambda one: float(np.linalg.norm(one[3])))
     else:
         spread = np.real(np.diagonal(np.linalg.inv(np.swapaxes(drive, 1, 2).conj() @ drive), axis1=1, axis2=2))
@@ -163,6 +164,37 @@ def estimate_response(record: Multisine, neighbours: int | None = 0) -> Response
         between = np.mean(np.var(y, axis=2, ddof=1), axis=1) / y.shape[2]
         noise = smooth(between)[:, :, None] * spread[:, None, :]
     return ResponseData(frequency_Hz, gain, total[:, :, None] * spread[:, None, :], noise)
+
+
+def _local_polynomial(
+    drive: NDArray[Any], moved: NDArray[Any], neighbours: int
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64], NDArray[Any]]:
+    """Fit a response that is a polynomial about each line, by least squares (Pintelon and Schoukens, section 7.2).
+
+    Of spectra of the inputs, `(f, r, m)`, and outputs, `(f, r, p)`, of `r` realizations: the response, `(f, p, m)`,
+    the variance of the outputs about it, `(f, p)`, that of the response over the latter, `(f, m)`, and what is left
+    of each realization where the fit is to the others, `(f, r, p)`.
+    """
+    lines, realizations, inputs = drive.shape
+    width = 2 * neighbours + 1
+    first = np.clip(np.arange(lines) - neighbours, 0, lines - width)
+    near = first[:, None] + np.arange(width)
+    away = (near - np.arange(lines)[:, None]) / neighbours
+    powers = away[..., None] ** np.arange(_DEGREE + 1)
+    # Of each line: neighbours, realizations, and the columns of all inputs to each power.
+    columns = np.einsum("fwd,fwrm->frwdm", powers, drive[near]).reshape(lines, realizations, width, -1)
+    target = np.moveaxis(moved[near], 2, 1)
+    gram = np.swapaxes(columns, 2, 3).conj() @ columns
+    cross = np.swapaxes(columns, 2, 3).conj() @ target
+    whole = np.linalg.inv(gram.sum(axis=1))
+    found = whole @ cross.sum(axis=1)
+    left = target - columns @ found[:, None]
+    freedom = realizations * width - columns.shape[3]
+    total = np.sum(np.abs(left) ** 2, axis=(1, 2)) / freedom
+    others = np.linalg.solve(gram.sum(axis=1)[:, None] - gram, cross.sum(axis=1)[:, None] - cross)
+    predicted = np.einsum("frm,frmp->frp", drive, others[:, :, :inputs])
+    spread = np.real(np.diagonal(whole, axis1=1, axis2=2))[:, :inputs]
+    return np.swapaxes(found[:, :inputs], 1, 2), total, spread, moved - predicted
 
 
 def approximate(record: Multisine, u: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -199,8 +231,7 @@ def read_response(path: AnyPath) -> ResponseData:
     says in one sentence with file and column what was expected and what to do.
     """
     table = open_table(path)
-    magnitude = _one_of(table, _MAGNITUDE, _DECIBEL)
-    phase = _one_of(table, _DEGREES, _RADIANS)
+    magnitude, phase = _one_of(table, _MAGNITUDE, _DECIBEL), _one_of(table, _DEGREES, _RADIANS)
     cartesian = _REAL in table.names and _IMAGINARY in table.names
     if "frequency_Hz" not in table.names or cartesian == bool(magnitude and phase):
         raise table.error(

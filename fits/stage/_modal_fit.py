@@ -70,9 +70,11 @@ def fit_response(data: ResponseData, modes: int = 2, band_Hz: _Band = None, coup
 
 
 def _reshaped(modes: Modes, shape: tuple[int, ...]) -> Modes:
-    gains = tuple(getattr(modes, name) for name in _GAINS)
-    new = tuple(gain.reshape(*gain.shape[:-2], *shape) for gain in gains)
-    return eqx.tree_at(lambda modes: tuple(getattr(modes, name) for name in _GAINS), modes, new)
+    return eqx.tree_at(_gains, modes, tuple(gain.reshape(*gain.shape[:-2], *shape) for gain in _gains(modes)))
+
+
+def _gains(model: Modes | HystereticModes) -> tuple[Array, ...]:
+    return tuple(getattr(_modes(model), name) for name in _GAINS)
 
 
 def fit_hysteresis(
@@ -92,10 +94,9 @@ def fit_hysteresis(
     threshold = np.atleast_1d(np.asarray(threshold_V, dtype=float))
     band = _in_band(frequency, band_Hz, len(modes.damping_ratio))
     variance = np.repeat(smooth(approximate(record, u, y)[1])[band, None], u.shape[1], axis=1)
-    voltage, samples = np.mean(record.voltage_V, axis=1), record.voltage_V.shape[2]
+    voltage = np.mean(record.voltage_V, axis=1)
     drive = np.stack([with_plays(jnp.asarray(v), jnp.asarray(threshold)) for v in voltage])
-    lines = np.rint(frequency[band] * samples * record.interval_s).astype(int)
-    drive = np.moveaxis(np.fft.rfft(drive, axis=1)[:, lines] / samples, 1, 0)
+    drive = _spectra(drive, frequency[band], record)
     wanted = jnp.asarray(np.mean(y, axis=2)[band])
     spectra = _Spectra(jnp.asarray(frequency[band]), jnp.asarray(drive), wanted, jnp.asarray(variance), coupled)
     # Solved for first of all, so what they start from does not matter.
@@ -110,18 +111,23 @@ def relative_error(model: Modes | HystereticModes | ResponseData, record: Multis
     A measured response is one, too; a `DataError` if it is not of the lines of the record.
     """
     frequency, u, y = record.spectra()
-    band, samples = _in_band(frequency, band_Hz, 0), record.voltage_V.shape[2]
+    band = _in_band(frequency, band_Hz, 0)
     wanted = np.mean(y, axis=2)[band]
     if isinstance(model, ResponseData):
         if len(model.frequency_Hz) != len(frequency) or not np.allclose(model.frequency_Hz, frequency):
             raise DataError(f"{record.source}: expected the lines of the measured response; record the same program.")
         found = np.einsum("fpm,frm->frp", model.response_um_per_V[band], np.mean(u, axis=2)[band])
-        return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
-    voltage = np.mean(record.voltage_V, axis=1)
-    moved = np.stack([model.respond_periodically(jnp.asarray(v), record.interval_s) for v in voltage])
-    lines = np.rint(frequency[band] * samples * record.interval_s).astype(int)
-    found = np.moveaxis(np.fft.rfft(moved, axis=1)[:, lines] / samples, 1, 0)
+    else:
+        voltage = np.mean(record.voltage_V, axis=1)
+        moved = np.stack([model.respond_periodically(jnp.asarray(v), record.interval_s) for v in voltage])
+        found = _spectra(moved, frequency[band], record)
     return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
+
+
+def _spectra(signals: NDArray[Any], frequency_Hz: NDArray[np.float64], record: Multisine) -> NDArray[Any]:
+    """Spectra of a period of signals, shape `(r, n, k)`, at some lines of a record, shape `(f, r, k)`."""
+    lines = np.rint(frequency_Hz * signals.shape[1] * record.interval_s).astype(int)
+    return np.moveaxis(np.fft.rfft(signals, axis=1)[:, lines] / signals.shape[1], 1, 0)
 
 
 def _in_band(frequency_Hz: NDArray[np.float64], band_Hz: _Band, modes: int) -> NDArray[np.bool_]:
@@ -185,7 +191,7 @@ def _with_gains(model: _M, gains: Float[Array, "p b m"], coupled: bool) -> _M:
     k = _modes(model).damping_ratio.shape[0]
     each = jnp.moveaxis(gains, 0, 1)
     new = (each[:k], each[k : 2 * k] if coupled else jnp.zeros_like(each[:k]), each[-1])
-    return eqx.tree_at(lambda model: tuple(getattr(_modes(model), name) for name in _GAINS), model, new)
+    return eqx.tree_at(_gains, model, new)
 
 
 @eqx.filter_jit

@@ -53,9 +53,6 @@ from fits.stage._moments import offsets_out
 from fits.stage._uncertainty import StageUncertainty
 from microid import Preisach, Stage
 
-# One number per weight is worth reading; one per weight and perturbation is not.
-_PACKED = ("columns_um", "coordinates", "mean_um")
-
 
 @dataclass(frozen=True)
 class ModelFile:
@@ -94,7 +91,7 @@ def model_text(
         "sha256": "",
         "written_by": written_by(),
         "model": encode(model),
-        "uncertainty": encode(uncertainty, packed=_PACKED),
+        "uncertainty": encode(uncertainty),
         "fit": dict(report),
     }
     try:
@@ -134,8 +131,7 @@ def load_model(path: AnyPath) -> ModelFile:
         raise DataError(f"{name}: expected a model and its uncertainty; {again}.")
     if isinstance(uncertainty, StageUncertainty) and not _moves(model, uncertainty):
         raise DataError(f"{name}: the uncertainty does not fit the stage; {again}.")
-    columns = 0 if uncertainty is None or uncertainty.grid is None else uncertainty.grid.columns
-    if uncertainty is not None and uncertainty.columns_um.shape[1] != columns:
+    if uncertainty and uncertainty.columns_um.shape[1] != (uncertainty.grid.columns if uncertainty.grid else 0):
         raise DataError(f"{name}: the uncertainty does not fit its grid; {again}.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
 

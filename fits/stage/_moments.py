@@ -1,6 +1,6 @@
 """A whole stage as a regression: linear in the columns of its hysteresis, linearised in its other parameters."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -52,7 +52,6 @@ class Chain(eqx.Module):
 
     @property
     def levels(self) -> int:
-        """Levels of the grid."""
         return 0 if self.grid is None else self.grid.levels
 
     def stage(self, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None) -> Stage:
@@ -118,8 +117,7 @@ def _rows(
 class RunSums:
     """What one run adds to the regression on columns and coordinates, its nuisance parameters eliminated.
 
-    `mean` is that of the rows over the fitted samples, shape `(D + p,)`; `residual_um` is measurement less prediction
-    at all samples, the nuisance parameters taken off, shape `(n,)`.
+    `mean` is that of the rows over the fitted samples, shape `(D + p,)`; the residual at all samples is `(n,)`.
     """
 
     moments: Moments
@@ -165,14 +163,13 @@ def along(
     z: Float[Array, " p"],
     columns_um: Float[Array, " D"] | None,
     run: Run,
-    directions: tuple[np.ndarray, np.ndarray],
+    directions: Sequence[np.ndarray],
     reduce: Callable[[np.ndarray], np.ndarray] = lambda moved: moved,
 ) -> np.ndarray:
-    """Move coordinates and columns along `k` directions, to first order: changes of the displacement, shape `(n, k)`.
+    """Move columns, `(D, k)`, and coordinates, `(p, k)`, to first order: changes of the displacement, shape `(n, k)`.
 
-    The directions are those of the columns, shape `(D, k)`, and of the coordinates, shape `(p, k)`. Without columns
-    the run is linearised at those that the stage has, whose grid may then differ from the chain's. Of the changes of
-    each piece, shape `(samples, k)`, only what `reduce` makes of them is kept.
+    Without columns the run is linearised at those that the stage has, whose grid may then differ from the chain's. Of
+    the changes of each piece, shape `(samples, k)`, only what `reduce` makes of them is kept.
     """
     _, slope, _ = linearise(chain, z, columns_um, run)
     moved = [

@@ -1,8 +1,9 @@
 """What a command makes a stage do, between its samples as well: voltage at the piezo, displacement, derivatives."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -20,40 +21,19 @@ class Prepared:
     """A run, and what a stage makes of it."""
 
     run: Run
-    time_s: Any
     scene: Scene
 
 
 def prepare(stage: Stage, run: Run) -> Prepared:
-    """Build the scene of a run."""
     samples = run.samples
     command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
-    return Prepared(run, samples.time_s, Scene(command, samples.beside, samples.start.memory))
+    return Prepared(run, Scene(command, samples.beside, samples.start.memory))
 
 
-class _Programs:
-    """Compiled functions that send a signal through one part; one for each kind of part, and length of signal."""
-
-    def __init__(self) -> None:
-        self.drop()
-
-    def drop(self) -> None:
-        """Give back the memory of all of them: they go with the function that they were compiled for."""
-
-        @eqx.filter_jit
-        def run(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
-            return part.run(time_s, signal, scene)
-
-        self.run = run
-
-
-programs = _Programs()
-
-
-def pass_signal(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
-    """Send a signal through one part."""
-    passed: Signal = programs.run(part, time_s, signal, scene)
-    return passed
+@cache
+def program() -> Callable[[AbstractPart, Any, Signal, Scene], Signal]:
+    """Send a signal through one part: compiled for each kind of part and length of signal, until it is made anew."""
+    return eqx.filter_jit(lambda part, time_s, signal, scene: part.run(time_s, signal, scene))
 
 
 def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
@@ -61,7 +41,7 @@ def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
     signal = prepared.scene.command
     found = [signal]
     for part in stage.parts:
-        signal = pass_signal(part, prepared.time_s, signal, prepared.scene)
+        signal = program()(part, prepared.run.samples.time_s, signal, prepared.scene)
         found.append(signal)
     return found
 
@@ -79,11 +59,10 @@ def fine_steps(stage: Stage, interval_s: float, count: int) -> int:
 def motion(
     stage: Stage, record: Record, range_V: tuple[float, float], initial: str = "unknown"
 ) -> tuple[Ranges, np.ndarray]:
-    """Extremes of what a command makes a stage do, between its samples as well, and the displacement at the samples.
+    """Ranges of all that a command makes a stage do, between its samples as well, and the displacement at these.
 
-    The former are ranges of voltage, slew, displacement (without the sensor's offset, which is the stage's own),
-    velocity, acceleration and driver current, the latter in um, shape `(n,)`. The displacement of the record is not
-    looked at. `range_V` is that of the switching voltages, as commands.
+    The displacement, `(n,)`, has the stage's own offset; that of the record is not looked at. `range_V` is that of
+    the switching voltages, as commands.
     """
     n = len(record)
     stride = fine_steps(stage, float(np.median(np.diff(record.time_s))), n)
@@ -113,8 +92,7 @@ def predicted_ranges(
 ) -> Ranges:
     """What a command is, and makes a model do, between its samples too where the model rings.
 
-    The displacement is what the model does at the samples, shape `(n,)`. Velocity, acceleration and current are given
-    if `every` range is asked for.
+    Its displacement at them, `(n,)`, is known; velocity, acceleration and current are given if `every` is asked for.
     """
     ranges = measured_ranges(replace(program, displacement_um=displacement_um))
     stage = as_stage(model)
@@ -152,10 +130,9 @@ def reached_by(
 ) -> tuple[Ranges, list[float]]:
     """What records have shown of a rig: the displacement as measured, its derivatives as a fitted stage has them.
 
-    Noise would make derivatives of the measurement larger than anything the rig did. Each record has a state before
-    it and samples that do not depend on an unknown past, shape `(n,)`; see `motion`. Returns the ranges, where
-    displacements are as the sensor reads them in the first record; and for each record what the sensor reads, in um,
-    where the stage's own displacement is zero.
+    Noise would make derivatives of the measurement larger than anything the rig did. Of each record the state before
+    it is given, and what does not depend on an unknown past. Displacements are as the sensor reads them in the first
+    record; what it reads in each where the stage's own displacement is zero, in um, comes second.
     """
     found, offsets_um = [], []
     for record, state, sure in zip(records, states, known, strict=True):

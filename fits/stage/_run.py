@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -91,8 +92,8 @@ def residual_of(stage: m.Stage, run: Run) -> np.ndarray:
 
 def place_of_hysteresis(stage: m.Stage) -> int | None:
     """Where in the chain the hysteresis stands; None where there is none."""
-    places = [n for n, part in enumerate(stage.parts) if isinstance(m.innermost(part), m.AbstractHysteresis)]
-    return places[0] if places else None
+    hysteretic = (n for n, part in enumerate(stage.parts) if isinstance(m.innermost(part), m.AbstractHysteresis))
+    return next(hysteretic, None)
 
 
 def named_parts(stage: m.Stage, *kinds: type) -> list[tuple[str, Any]]:
@@ -124,7 +125,7 @@ def gain_ahead(stage: m.Stage) -> float | None:
     if place is None:
         return None
     gain = float(_static_gain(stage.parts[:place]))
-    if not (math.isfinite(gain) and gain > 0):
+    if not 0 < gain < math.inf:
         raise DataError(
             f"the static gain ahead of {stage.names[place]!r} is {gain:g}, expected a positive one: turn the sign of "
             "the voltage column instead"
@@ -140,12 +141,9 @@ def _static_gain(parts: Sequence[Any]) -> Float[Array, ""]:
 
 def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
     """Linear parts as one system; None where there are none, or one of them is not linear."""
-    total: m.LinearSystem | None = None
-    for part in parts:
-        if not isinstance(part, m.AbstractLinear):
-            return None
-        total = part.system() if total is None else total.then(part.system())
-    return total
+    if not parts or not all(isinstance(part, m.AbstractLinear) for part in parts):
+        return None
+    return reduce(m.LinearSystem.then, (part.system() for part in parts))
 
 
 @eqx.filter_jit
@@ -177,8 +175,7 @@ def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
 
 def range_of(stage: m.Stage) -> tuple[float, float]:
     """Commands that a stage was fitted on, in V; unlimited without a Preisach operator."""
-    law, gain = hysteresis_of(stage), gain_ahead(stage)
-    law = None if law is None else m.innermost(law)
+    law, gain = m.innermost(hysteresis_of(stage)), gain_ahead(stage)
     if gain is None or not isinstance(law, m.Preisach):
         return -np.inf, np.inf
     return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain

@@ -33,7 +33,8 @@ class Weighing:
     """How much a sample of each run counts, by the standard deviation of the run's residual.
 
     So many samples as `correlation` are worth one independent one; `counted` is the same as the samples are counted.
-    No run counts as quieter than the part `least_noise_share` of the loudest.
+    Where more than noise is left, one run would be fitted ever better, and count ever more, at the cost of others:
+    none counts as quieter than the part `least_noise_share` of the loudest.
     """
 
     noise_um: tuple[float, ...]
@@ -69,7 +70,6 @@ class Weighing:
         return [(self.least_um / max(um, self.least_um)) ** 2 / each for um, each in noises]
 
     def total(self, sums: Sequence[RunSums]) -> Moments:
-        """Moments of all runs."""
         return reduce(operator.add, (one.moments.scaled(k, 1.0) for one, k in zip(sums, self.shares, strict=True)))
 
     def cost_um2(self, runs: Sequence[Run], residuals: Sequence[np.ndarray]) -> float:
@@ -83,9 +83,7 @@ class Problem:
     """A stage to be fitted, where its fit begins, and what the user should know.
 
     The columns' unit is `stroke_um`; `hyper` is the smoothness and noise to start from, None to leave columns as they
-    are. Where more than noise is left, one run would be fitted ever better, and count ever more, at the cost of
-    others: none counts as quieter than the part `least_noise_share` of the loudest. `full` is the stage before a part
-    was left out.
+    are; for `least_noise_share` see `Weighing`. `full` is the stage before a part was left out.
     """
 
     stage: Stage
@@ -190,16 +188,15 @@ def solve_chain(
         here = weights.cost_um2(runs, [one.residual_um for one in sums])
         while True:
             try:
-                found = _step(problem, total, columns_um, hyper, weights, damping)
+                step, columns, hyper, variance, distance = _step(problem, total, columns_um, hyper, weights, damping)
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
-                if damping > _HIGHEST and not (accept_best and number):
-                    raise
-                if damping > _HIGHEST:
+                if damping <= _HIGHEST:
+                    continue
+                if accept_best and number:
                     return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
-                continue
-            step, columns, hyper, variance, distance = found
+                raise
             prior = prior_precision(chain, hyper, stroke_um)
             there = weights.cost_um2(runs, _residuals(chain, z + step, columns, runs))
             old = here / variance + columns_um @ prior @ columns_um

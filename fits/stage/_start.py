@@ -91,11 +91,8 @@ def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) 
     if not parts or len(response.frequency_Hz) < _LINES:
         return []
     problem = _LogResponse.of([response], [isinstance(part, Driver) for part in parts], [])
-    costs = []
-    for shift in shifts_s:
-        turned = problem.measured * np.exp(2j * np.pi * problem.frequency_Hz * shift)
-        costs.append(replace(problem, measured=turned).ranked()[0][0])
-    cost = np.asarray(costs)
+    turns = np.exp(2j * np.pi * np.outer(shifts_s, problem.frequency_Hz))
+    cost = np.array([replace(problem, measured=problem.measured * turn).ranked()[0][0] for turn in turns])
     low = np.flatnonzero((cost <= np.r_[np.inf, cost[:-1]]) & (cost <= np.r_[cost[1:], np.inf]))
     return [float(shifts_s[k]) for k in low[np.argsort(cost[low])]]
 

@@ -124,17 +124,15 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
             failure = error
     if not found:
         raise failure
-    solved = min(found, key=lambda one: one.cost)
-    solved = replace(solved, hyper=hyper)
+    solved = replace(min(found, key=lambda one: one.cost), hyper=hyper)
     problem = solved.onward
     try:
         dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
     except DataError:
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
-        lagging = None if plan.accept_best or fast != slow else _lagging(plan, problem, runs, drives)
-        if lagging is None:
-            raise
-        return lagging
+        if not plan.accept_best and fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
+            return lagging
+        raise
     if dropped is not None:
         # Begin without a mechanics that the runs do not show.
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
@@ -163,7 +161,7 @@ def _lagging(plan: Plan, problem: Problem, runs: list[Run], drives: Sequence[np.
     simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, dropped),))
     plan.progress("a lag without a resonance")
     solved = try_chain(simpler, runs, plan.loss, plan.progress)
-    if solved is None or not shows_poles(solved, drives) or float(np.max(Precision(solved).sd())) > UNSEEN:
+    if solved is None or not shows_poles(solved, drives) or float(np.max(Precision(solved).sd)) > UNSEEN:
         return None
     return solved.onward
 
@@ -186,13 +184,13 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         precision = Precision(solved)
         if plan.gain is None or stride > 1:
             return solved, precision
-        influence, stage = precision.influence(), solved.stage
-        sd = np.sqrt(np.diagonal(precision.covariance(influence)))
-        off = [simulate_stage(stage, a) - simulate_stage(stage, b) for a, b in zip(runs, plan.runs(2), strict=True)]
-        moved = [own @ (o - o[run.fitted].mean()) for own, o, run in zip(influence, off, runs, strict=True)]
+        moved = np.zeros(len(solved.z))
+        for own, run, halved in zip(precision.influence, runs, plan.runs(2), strict=True):
+            off = simulate_stage(solved.stage, run) - simulate_stage(solved.stage, halved)
+            moved += own @ (off - off[run.fitted].mean())
         # Halving the step takes three quarters of its error off, which falls with its square; it may move a parameter
         # by 0.15 standard deviations.
-        excess = float(np.max(np.abs(np.sum(moved, axis=0)) / sd)) / (0.75 * 0.15)
+        excess = float(np.max(np.abs(moved) / precision.sd)) / (0.75 * 0.15)
         if excess <= 1:
             return solved, precision
         stride = min(16, 2 ** math.ceil(math.log2(excess) / 2))
@@ -203,15 +201,12 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
 def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
 
-    Whole steps do not see one that answers between two samples, and from no time constant at all there is no way
-    back.
+    Whole steps do not see one that answers between two samples, and from no time constant there is no way back.
     """
     stage = solved.stage
-    changed = False
-    for name, part in named_parts(stage, Driver):
-        if float(part.time_constant_s) < 1e-2 * plan.interval_s:
-            stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(0.3 * plan.interval_s)))
-            changed = True
-    if plan.hold != "zero" or not changed:
+    quick = [each for each in named_parts(stage, Driver) if float(each[1].time_constant_s) < 1e-2 * plan.interval_s]
+    if plan.hold != "zero" or not quick:
         return solved.z
+    for name, part in quick:
+        stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(0.3 * plan.interval_s)))
     return np.asarray(solved.problem.chain.coordinates.of(stage))

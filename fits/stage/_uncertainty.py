@@ -1,11 +1,12 @@
 """How sure the fit of a stage is: of its parameters, however coloured the noise, of predictions and of plants."""
 
-from collections.abc import Sequence
+from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy import fft
+from scipy.signal import fftconvolve
 
 from fits.io._errors import DataError
 from fits.io._record import Record
@@ -13,7 +14,7 @@ from fits.loop._design import Grid, columns_of
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Prediction, Uncertainty
-from fits.stage._moments import Chain, RunSums, along, offsets_out
+from fits.stage._moments import Chain, along, offsets_out
 from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._metrics import WHITE
@@ -43,14 +44,10 @@ class StageUncertainty(AbstractUncertainty):
 
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
         stage = _stage(model)
-        chain = Chain.of(stage, self.grid)
-        mean = np.asarray(self.mean_um)
-
-        def variance(moved: np.ndarray) -> np.ndarray:
-            return np.asarray(np.sum((moved - mean) ** 2, axis=1))
-
+        chain, mean = Chain.of(stage, self.grid), np.asarray(self.mean_um)
         directions = np.asarray(self.columns_um).T, np.asarray(self.coordinates).T
-        square = along(chain, chain.coordinates.of(stage), None, run, directions, variance)
+        z = chain.coordinates.of(stage)
+        square = along(chain, z, None, run, directions, lambda moved: np.sum((moved - mean) ** 2, axis=1))
         return np.sqrt(square + float(self.discrepancy_um) ** 2)
 
     def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
@@ -79,6 +76,7 @@ class Precision:
             self.prior[:size, :size] = scale_free(prior, solved.columns_um)
         self.information = marginal_information(total, size, self.prior[:size, :size], self.variance)
 
+    @cached_property
     def answer(self) -> np.ndarray:
         """Columns of the covariance that belong to the coordinates, shape `(D + p, p)`."""
         size, count = self.chain.size, len(self.solved.z)
@@ -87,37 +85,37 @@ class Precision:
         whole[np.arange(size, size + count), np.arange(size, size + count)] += NO_PRECISION
         return np.linalg.solve(whole, np.eye(size + count)[:, size:])
 
+    @cached_property
     def influence(self) -> list[np.ndarray]:
         """How much a unit of each sample's noise moves each coordinate, per run, shape `(p, n)`."""
-        size, answer = self.chain.size, self.answer()
-        here = jnp.asarray(self.solved.z), jnp.asarray(self.solved.columns_um)
-        out = []
-        weighing = self.solved.weighing
-        for run, share in zip(self.solved.runs, weighing.shares, strict=True):
-            slope = along(self.chain, *here, run, (answer[:size], answer[size:])).T
-            weight = run.fit_weight
-            slope = slope - np.average(slope, axis=1, weights=weight)[:, None]
+        directions = np.split(self.answer, [self.chain.size])
+        here, out = (jnp.asarray(self.solved.z), jnp.asarray(self.solved.columns_um)), []
+        for run, share in zip(self.solved.runs, self.solved.weighing.shares, strict=True):
+            slope = along(self.chain, *here, run, directions).T
+            slope = slope - np.average(slope, axis=1, weights=run.fit_weight)[:, None]
             # The other half of the weight goes to the residual that this is multiplied by.
-            out.append(slope * np.sqrt(weight) * share / weighing.least_um**2)
+            out.append(slope * np.sqrt(run.fit_weight) * share / self.variance)
         return out
 
-    def covariance(self, influence: Sequence[np.ndarray]) -> np.ndarray:
+    @cached_property
+    def covariance(self) -> np.ndarray:
         """Covariance of the coordinates, the noise of each run as coloured as its residual is, shape `(p, p)`.
 
         The estimate moves by the influence of each sample times its noise, so its covariance is a double sum over
         autocovariances (the sandwich of Newey & West 1987), to which comes what is not known of the columns.
         """
-        size, answer = self.chain.size, self.answer()
-        columns, rest = answer[:size], answer[size:]
+        size = self.chain.size
+        columns, rest = np.split(self.answer, [size])
         # What nothing is known of stays unknown, whatever the residual.
         held = columns.T @ self.prior[:size, :size] @ columns + NO_PRECISION * rest.T @ rest
-        for own, (one, run) in zip(influence, self._pairs(), strict=True):
+        for own, one, run in zip(self.influence, self.solved.sums, self.solved.runs, strict=True):
             held = held + sandwich(own, np.sqrt(run.fit_weight) * one.residual_um, run.fitted)
         return held
 
+    @property
     def sd(self) -> np.ndarray:
         """Standard deviations of the coordinates, shape `(p,)`."""
-        return np.sqrt(np.diagonal(self.covariance(self.influence())))
+        return np.sqrt(np.diagonal(self.covariance))
 
     def uncertainty(self) -> StageUncertainty:
         """Perturbations for predictions."""
@@ -131,7 +129,8 @@ class Precision:
         precision = whole.T @ (self.gram + self.prior) @ whole + NO_PRECISION * np.eye(whole.shape[1])
         root = np.linalg.cholesky(precision)
         factor = np.linalg.solve(root, np.eye(len(root)))
-        shared = float(np.mean([shared_square(one.residual_um[run.fitted]) for one, run in self._pairs()]))
+        left = zip(self.solved.residuals_um, self.solved.runs, strict=True)
+        shared = float(np.mean([shared_square(one[run.fitted]) for one, run in left]))
         mean = self.solved.sums[0].mean @ whole
         return StageUncertainty(
             jnp.asarray(factor[:, basis.shape[1] :]),
@@ -141,25 +140,17 @@ class Precision:
             grid,
         )
 
-    def _pairs(self) -> list[tuple[RunSums, Run]]:
-        return list(zip(self.solved.sums, self.solved.runs, strict=True))
-
 
 def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """Covariance of `influence @ noise`, the noise having the autocovariance of a residual, shape `(p, p)`."""
     left = np.where(fitted, residual_um, 0.0)
-    n = len(left)
-    size = fft.next_fast_len(2 * n)
-    auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[:n] / fitted.sum()
     correlation = correlation_samples([residual_um[fitted]])
-    lags = 0 if correlation <= WHITE else min(n - 1, int(np.ceil(6.0 * correlation)))
-    window = np.zeros(n)
-    window[: lags + 1] = 1 - np.arange(lags + 1) / (lags + 1)
-    kernel = np.zeros(size)
-    kernel[:n] = auto * window
-    kernel[size - n + 1 :] = kernel[1:n][::-1]
-    spectrum = np.maximum(fft.rfft(kernel).real, 0.0)
-    moved = fft.irfft(fft.rfft(influence, size, axis=1) * spectrum, size, axis=1)[:, :n]
+    lags = 0 if correlation <= WHITE else min(len(left) - 1, int(np.ceil(6.0 * correlation)))
+    size = fft.next_fast_len(2 * len(left))
+    auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[: lags + 1] / fitted.sum()
+    # Bartlett's window keeps the covariance positive.
+    kernel = auto * (1 - np.arange(lags + 1) / (lags + 1))
+    moved = fftconvolve(influence, np.concatenate([kernel[:0:-1], kernel])[None], mode="same", axes=1)
     return np.asarray(influence @ moved.T)
 
 

@@ -1,0 +1,291 @@
+"""Pictures of a fit, for print, readable in grey: of a hysteresis alone, of a stage, and of runs beside either."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+
+from fits.io._errors import AnyPath
+from fits.io._record import Record
+from fits.loop._result import FitResult, RunReport
+from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
+from fits.plots import _style as style
+from fits.stage._checks import speed_Hz
+from fits.stage._run import gain_ahead, residual_of
+from fits.stage._start import MeasuredResponse, measure_response
+from fits.stage._steps import hysteresis_alone
+from fits.stats._metrics import TWO_SIDED_95
+from microid import AbstractLinear, Preisach, Reversible, Stage
+
+_surfaces = eqx.filter_jit(lambda model, alpha, beta: (model.density(alpha, beta), model.everett(alpha, beta)))
+_ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
+# How far beyond the measured frequencies the model's response is drawn.
+_BEYOND = 1.3
+# Coherence from which a line counts as measured.
+_COHERENT = 0.8
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A run with its prediction and its standard deviation, as the report compares them, in um."""
+
+    run: Run
+    report: RunReport
+    predicted_um: np.ndarray
+    sd_um: np.ndarray
+    noise_um: float
+
+    @property
+    def off_um(self) -> np.ndarray:
+        """Measured less predicted, NaN where the unknown history still counts, shape `(n,)`."""
+        return np.where(self.run.known, self.run.displacement_um - self.predicted_um, np.nan)
+
+
+def _held_out(holdout: float | Sequence[Record], records: int, runs: int) -> tuple[float, Sequence[Record]]:
+    """Tell the fraction that was held out from records; a ValueError where both are not the runs of a result."""
+    fraction, aside = (float(holdout), ()) if isinstance(holdout, int | float) else (0.0, holdout)
+    if records + len(aside) != runs:
+        raise ValueError(f"the result has {runs} runs, and {records + len(aside)} records were given")
+    return fraction, aside
+
+
+def _loops(runs: Sequence[_Drawn]) -> Figure:
+    """Draw displacement and error against the voltage, with a column for each of the first runs."""
+    picture, axes = _columns(runs, style.NARROW_in if len(runs) == 1 else style.WIDE_in)
+    for each, (loop, error) in zip(runs, axes.T, strict=False):
+        voltage, known = each.run.record.voltage_V, each.run.known
+        # Loops run over each other many times: lines of one kind would hide those of the other.
+        style.curve(loop, voltage, each.predicted_um, "model", color=style.LIGHT, linewidth=1.4)
+        style.dots(loop, voltage, each.run.displacement_um, "measured")
+        error.axhline(0.0, color=style.LIGHT, linewidth=0.6)
+        style.dots(error, voltage[known], each.off_um[known])
+        style.label(error, "voltage (V)")
+        style.label(loop, title=_caption(each.report))
+    style.legend(picture, axes[:1, 0])
+    return picture
+
+
+def _over_time(runs: Sequence[_Drawn], held_out_alone: bool = False) -> Figure:
+    """Draw displacement and error against time, with their 95 % bands and a column for each of the first runs."""
+    picture, axes = _columns(runs, style.WIDE_in)
+    for each, (above, below) in zip(runs, axes.T, strict=False):
+        samples = each.run.held_out if held_out_alone else np.ones(len(each.run.record), dtype=bool)
+        time_s, predicted = each.run.record.time_s[samples], each.predicted_um[samples]
+        half = TWO_SIDED_95 * each.sd_um[samples]
+        style.curve(above, time_s, each.run.displacement_um[samples], "measured", **style.MEASURED)
+        style.curve(above, time_s, predicted, "model", **style.MODEL)
+        keep = style.thinned(predicted)
+        low, high = (predicted - half)[keep], (predicted + half)[keep]
+        above.fill_between(time_s[keep], low, high, color="0.3", linewidth=0, zorder=1)
+        style.curve(below, time_s, each.off_um[samples], "error", color="0.6", linewidth=0.35)
+        noisy = np.hypot(half, TWO_SIDED_95 * each.noise_um)
+        for size, line, name in ((half, "-", "95 % band"), (noisy, ":", "95 % band with noise")):
+            style.curve(below, time_s, size, name, color=style.DARK, linestyle=line, linewidth=0.8)
+            style.curve(below, time_s, -size, color=style.DARK, linestyle=line, linewidth=0.8)
+        aside = each.run.record.time_s[each.run.held_out]
+        if not held_out_alone and len(aside) and each.run.fitted.any():
+            # What the fit did not see, where it saw the rest.
+            for panel in (above, below):
+                panel.axvspan(aside[0], aside[-1], color="0.93", linewidth=0, zorder=0)
+        style.label(below, "time (s)")
+        style.label(above, title=_caption(each.report, held_out_alone))
+    style.legend(picture, axes[:, 0])
+    return picture
+
+
+def _columns(runs: Sequence[_Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
+    """Two rows of axes, values above errors, with a column for each of the first runs."""
+    many = min(len(runs), 3)
+    picture, axes = style.panels(width_in, 3.6, 2, many, 0.04, squeeze=False, sharex="col", height_ratios=(2, 1))
+    style.label(axes[0, 0], "", "displacement (µm)")
+    style.label(axes[1, 0], "", "error (µm)")
+    return picture, axes
+
+
+def _caption(report: RunReport, held_out_alone: bool = False) -> str:
+    errors = report.held_out if held_out_alone else report.in_sample or report.held_out
+    figures = "" if errors is None else f"\ne_rms {errors.e_rms_pct:.3g} %, e_max {errors.e_max_pct:.3g} %"
+    return style.verbatim(report.source) + figures
+
+
+def plot_fit(
+    result: FitResult[Preisach],
+    records: Sequence[Record],
+    folder: AnyPath,
+    *,
+    holdout: float | Sequence[Record] = 0.2,
+    initial: str = "unknown",
+) -> list[Path]:
+    """Draw a fit: loops, density, Everett surface and, where something was held out, its prediction.
+
+    Records, holdout and initial memory are those that `fit` was given; a ValueError says that they are not those of
+    the result. `loops.png`, `density.png`, `everett.png` and `heldout.png` are written into an existing folder, at
+    200 dots per inch; a `DataError` says if they cannot be.
+    """
+    fraction, aside = _held_out(holdout, len(records), len(result.runs))
+    range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
+    runs = [prepare_run(record, range_V, initial, fraction) for record in records]
+    runs += [prepare_run(record, range_V, initial, holdout=1.0) for record in aside]
+    drawn = [_simulated(result, run, report) for run, report in zip(runs, result.runs, strict=True)]
+
+    voltage, (density, everett) = _over_half_plane(result.model)
+    pictures = {
+        "loops": _loops(drawn[: len(records)]),
+        "density": _density(voltage, density, result.model.reversible),
+        "everett": _everett(voltage, everett),
+    }
+    if predicted := [each for each in drawn if each.run.held_out.any()]:
+        pictures["heldout"] = _over_time(predicted, held_out_alone=True)
+    return [style.save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
+
+
+def _simulated(result: FitResult[Preisach], run: Run, report: RunReport) -> _Drawn:
+    model = eqx.tree_at(lambda m: m.offset_um, result.model, jnp.asarray(report.offset_um))
+    predicted = simulate_run(model, run)
+    if not run.known.all():
+        # The reported errors are those of the known samples; the start was estimated from the others.
+        predicted = np.where(run.known, predicted, simulate_run(model, replace(run, start=report.start)))
+    sd_um = result.uncertainty.sd_um(result.model, run) if run.held_out.any() else np.zeros(len(predicted))
+    return _Drawn(run, report, predicted, sd_um, result.noise_um)
+
+
+def _over_half_plane(model: Preisach) -> tuple[np.ndarray, list[np.ma.MaskedArray]]:
+    """Evaluate the density and the Everett surface on a mesh of voltages; beta runs along the last axis."""
+    voltage = np.linspace(float(model.density.lower_V), float(model.density.upper_V), 361)
+    alpha, beta = np.meshgrid(voltage, voltage, indexing="ij")
+    surfaces = _surfaces(model, jnp.asarray(alpha), jnp.asarray(beta))
+    return voltage, [np.ma.masked_where(alpha < beta, np.asarray(surface)) for surface in surfaces]
+
+
+def _half_plane(axes: Axes, voltage: np.ndarray) -> None:
+    axes.plot(voltage[[0, -1]], voltage[[0, -1]], color=style.DARK, linewidth=0.8)
+    axes.set_aspect("equal")
+
+
+def _density(voltage: np.ndarray, values: np.ma.MaskedArray, reversible: Reversible) -> Figure:
+    picture, (plane, slope) = style.panels(style.WIDE_in, 2.9, 1, 2, width_ratios=(1.25, 1), gap=0.08)
+    # One sharp peak at the diagonal would otherwise leave the rest white.
+    top = float(np.quantile(values.compressed(), 0.995)) or None
+    mesh = plane.pcolormesh(voltage, voltage, values, cmap="Greys", vmin=0, vmax=top, rasterized=True)
+    _half_plane(plane, voltage)
+    style.label(plane, "switching down at β (V)", f"switching up at {_ALPHA} (V)")
+    picture.colorbar(mesh, ax=plane, extend="max").set_label("density (µm/V²)")
+    slope.plot(np.linspace(voltage[0], voltage[-1], reversible.levels), reversible.slope_um_per_V, color=style.DARK)
+    slope.set_ylim(bottom=0)
+    style.label(slope, "voltage (V)", "reversible slope (µm/V)")
+    return picture
+
+
+def _everett(voltage: np.ndarray, values: np.ma.MaskedArray) -> Figure:
+    picture, axes = style.panels(style.NARROW_in, 2.9)
+    filled = axes.contourf(voltage, voltage, values, levels=12, cmap="Greys")
+    axes.contour(voltage, voltage, values, levels=filled.levels, colors=style.DARK, linewidths=0.4)
+    _half_plane(axes, voltage)
+    style.label(axes, "fall to β (V)", f"fall from {_ALPHA} (V)")
+    picture.colorbar(filled, ax=axes).set_label("Everett surface (µm)")
+    return picture
+
+
+def plot_stage(
+    result: FitResult[Stage],
+    records: Sequence[Record],
+    folder: AnyPath,
+    *,
+    holdout: float | Sequence[Record] = 0.2,
+    initial: str | Sequence[str] = "unknown",
+) -> list[Path]:
+    """Draw the fit of a stage: frequency response, runs with their residuals, and the loop of the slowest run.
+
+    Records, holdout and initial memory are those that `fit_stage` was given; a ValueError says that they are not
+    those of the result. `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
+    out) and `loop.png` are written into an existing folder, at 200 dots per inch; a `DataError` if they cannot be.
+    """
+    fraction, aside = _held_out(holdout, len(records), len(result.runs))
+    states = [initial] * len(records) if isinstance(initial, str) else list(initial)
+    known = result.fitted_runs
+    if len(records) != len(known):
+        raise ValueError(f"the result is of {len(known)} fitted runs, and {len(records)} were given")
+    # The runs are refined already.
+    stage, gain = result.model.with_substeps(1), gain_ahead(result.model)
+    range_V = command_range_V([*records, *aside])
+    runs = [
+        prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold)
+        for record, state, report in zip(records, states, known, strict=True)
+    ]
+    before_aside = initial if isinstance(initial, str) else "unknown"
+    for record in aside:
+        run = prepare_run(record, range_V, before_aside, 1.0, known[-1].substeps or 1, gain, stage.hold)
+        runs.append(replace(run, fitted=run.known))
+    noises = [report.noise_um or 0.0 for report in known]
+    noises += [max(noises)] * len(aside)
+    drawn = [
+        _Drawn(
+            run, report, run.displacement_um - residual_of(stage, run), result.uncertainty.sd_um(stage, run), noise
+        )
+        for run, report, noise in zip(runs, result.runs, noises, strict=True)
+    ]
+    fitted, predicted = drawn[: len(records)], drawn[len(records) :]
+    pictures: dict[str, Figure] = {}
+    behind = float(stage.static_gain) / (gain or 1.0)
+    static_um = [behind * one for one in hysteresis_alone(stage, runs[: len(records)])]
+    found = [(run.record.source, measure_response(run, drive)) for run, drive in zip(runs, static_um, strict=False)]
+    if seen := [each for each in found if len(each[1].frequency_Hz)]:
+        # Of the run that shows the highest frequencies.
+        pictures["response"] = _response(stage, *max(seen, key=lambda each: _highest_Hz(each[1])))
+    pictures["runs"] = _over_time(fitted)
+    if predicted:
+        pictures["heldout"] = _over_time(predicted)
+    pictures["loop"] = _loops([min(fitted, key=lambda each: speed_Hz(each.run.record))])
+    return [style.save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
+
+
+def _highest_Hz(measured: MeasuredResponse) -> float:
+    """The highest frequency that a run surely shows; that of its last line if it shows none surely."""
+    sure = measured.frequency_Hz[measured.coherence > _COHERENT]
+    return float((sure if len(sure) else measured.frequency_Hz).max())
+
+
+def _linear(stage: Stage, frequency_Hz: np.ndarray) -> np.ndarray:
+    """Frequency response of all linear parts over their static gain, complex, shape `(f,)`."""
+    out = np.ones(len(frequency_Hz), dtype=complex)
+    for part in stage.parts:
+        if isinstance(part, AbstractLinear):
+            out = out * np.asarray(part.frequency_response(jnp.asarray(frequency_Hz))) / float(part.static_gain)
+    return out
+
+
+def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
+    # Beyond what was excited there are only lines that noise put there.
+    low, high = float(measured.frequency_Hz.min()), _BEYOND * _highest_Hz(measured)
+    shown = measured.frequency_Hz <= high
+    measured = MeasuredResponse(measured.frequency_Hz[shown], measured.response[shown], measured.coherence[shown])
+    frequency = np.geomspace(low / _BEYOND, high, 600)
+    model = _linear(stage, frequency)
+    phase = np.unwrap(np.angle(model))
+    at_lines = _linear(stage, measured.frequency_Hz)
+    # The measured phase is drawn on the branch of the model's.
+    near = np.interp(measured.frequency_Hz, frequency, phase) + np.angle(measured.response / at_lines)
+
+    picture, (size, turn) = style.panels(style.WIDE_in, 3.9, 2, 1, sharex=True, height_ratios=(1.4, 1))
+    # The less coherent a line, the lighter.
+    shade = 0.85 * np.minimum(1.0, (1 - measured.coherence) / (1 - _COHERENT) / 2)
+    grey: dict[str, Any] = {"c": shade, "cmap": "gray", "vmin": 0.0, "vmax": 1.0, "s": 5.0, "linewidths": 0.0}
+    grey["zorder"], name = 3, "measured (Welch: peaks are rounded)"
+    size.scatter(measured.frequency_Hz, np.abs(measured.response), label=name, **grey)
+    size.loglog(frequency, np.abs(model), label="driver and mechanics", color="0.5", linewidth=1.2)
+    turn.scatter(measured.frequency_Hz, np.degrees(near), **grey)
+    turn.semilogx(frequency, np.degrees(phase), color="0.5", linewidth=1.2)
+    turn.xaxis.set_major_formatter(LogFormatter())
+    turn.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
+    title = f"{style.verbatim(source)}\nover the displacement that the hysteresis alone would give"
+    style.label(size, "", "magnitude", title)
+    style.label(turn, "frequency (Hz)", "phase (°)")
+    style.legend(picture, (size,))
+    return picture
