@@ -18,7 +18,7 @@ _OCTAVES = 2
 # A Hann window makes a line so many bins wide.
 _LINE = 4
 # Qualities, and heights above the floor, from which the likelihood climbs.
-_QUALITIES, _HEIGHTS = 2.0 ** np.arange(0, 9), 4.0 ** np.arange(0, 8)
+_QUALITIES, _HEIGHTS = tuple(2.0**k for k in range(9)), tuple(4.0**k for k in range(8))
 
 
 @dataclass(frozen=True)
