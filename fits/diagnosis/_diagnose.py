@@ -10,9 +10,9 @@ import numpy as np
 
 from fits.diagnosis._conclude import conclude
 from fits.diagnosis._experiment import Request
-from fits.diagnosis._prepare import Prepared, Reading, prepare_diagnosis
+from fits.diagnosis._prepare import Reading, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis, Step
-from fits.diagnosis._select import Selection, select
+from fits.diagnosis._select import select
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._errors import DataError
 from fits.io._given import AnyRuns, holdout_given, records_given
@@ -113,21 +113,22 @@ def diagnose(
     def has_time() -> bool:
         return time.monotonic() < end_s
 
-    def answer(reading: Reading) -> tuple[Prepared, Selection]:
+    def answer(reading: Reading, *remarks: str) -> Diagnosis:
         ready = prepare_diagnosis(reading, progress)
+        ready = replace(ready, baseline=replace(ready.baseline, remarks=(*ready.baseline.remarks, *remarks)))
         progress(Step.SELECTION)
         stage = ready.bench, ready.projector, ready.probes
-        return ready, select(*stage, false_alarm, rng, progress, thresholds, has_time)
+        found = select(*stage, false_alarm, rng, progress, thresholds, has_time)
+        request = Request(duration_s, limits, margin, has_time) if has_time() else None
+        return conclude(ready, found, [*records, *aside], false_alarm, progress, request)
 
     reading = Reading(records, aside, fraction, initial, thresholds)
-    ready, found = answer(reading)
-    left, plain = (ready.projector.held_out(one.change_um) for one in (found.model, found.plain))
-    unlike = float(left @ left) > max(_UNLIKE * len(left), (1 - thresholds.minor_share) * float(plain @ plain))
-    if unlike and not aside and 2 * time.monotonic() - begin_s < end_s:  # it takes as long again
-        progress("asking again with what was held out, which noise does not explain")
-        whole, shown = answer(replace(reading, fraction=0.0))
-        if max((cause.z for cause in shown.causes), default=0.0) > thresholds.strong_z:
-            baseline = replace(whole.baseline, remarks=(*whole.baseline.remarks, _ALL))
-            ready, found = replace(whole, baseline=baseline), shown
-    request = Request(duration_s, limits, margin, has_time) if has_time() else None
-    return conclude(ready, found, [*records, *aside], false_alarm, progress, request)
+    diagnosis = answer(reading)
+    gain = diagnosis.gain
+    least_um2 = max(_UNLIKE * gain.noise_um**2, (1 - thresholds.minor_share) * gain.heldout_rms_before_um**2)
+    if gain.heldout_rms_after_um**2 > least_um2 and not aside and 2 * time.monotonic() - begin_s < end_s:
+        progress("asking again with what was held out, which noise and causes do not explain")
+        whole = answer(replace(reading, fraction=0.0), _ALL)
+        if max((cause.z for cause in whole.causes), default=0.0) > thresholds.strong_z:
+            return whole
+    return diagnosis
