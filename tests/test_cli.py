@@ -145,13 +145,14 @@ def test_info_does_not_wait_for_jax(bench):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("command", ["fit", "diagnose"])
+@pytest.mark.parametrize("command", [["fit"], ["diagnose"], ["simulate", "model.json"], ["compensate", "model.json"]])
 def test_what_cannot_be_read_is_refused_without_jax(command, tmp_path):
     bad = tmp_path / "bad.csv"
-    bad.write_text("time_s,voltage_V,displacement_um\n0,1,2\n1,x,3\n")
-    done = without_jax(command, bad, "--out", tmp_path / "out.json")
+    bad.write_text("time_s,voltage_V,displacement_um\n0,1,2\n1,x,y\n")
+    done = without_jax(*command, bad, "--out", tmp_path / "out.json")
     assert done.returncode == 2
-    assert "bad.csv, line 3, column 'voltage_V'" in done.stderr
+    column = "displacement_um" if command[0] == "compensate" else "voltage_V"
+    assert f"bad.csv, line 3, column '{column}'" in done.stderr
 
 
 @pytest.mark.parametrize("step", ["loop._fit.fit", "plots._fit.plot_fit", "stage._model_file.model_text"])

@@ -36,6 +36,8 @@ def compensate(given: common.Given) -> None:
 
     common.refuse_overwriting(given.out, [given.model, given.reference])
     volts, stated = common.parse_rig_limits(given.limits, given.limit, given.margin)
+    wanted = late.read_reference(given.reference, **common.reading(given))
+    # Only now, so that what cannot be read is refused at once.
     late.start_jax()
     loaded = late.load_model(given.model)
     stage = common.stage_or_preisach(given.model, loaded)
@@ -44,7 +46,6 @@ def compensate(given: common.Given) -> None:
             f"{given.model}: expected a model with mechanics for --dynamic, found a Preisach model, which has none; "
             "leave out --dynamic, or fit a whole stage."
         )
-    wanted = late.read_reference(given.reference, **common.reading(given))
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         found = late.compensate(stage, wanted, given.initial, given.clip, volts, given.way)

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy import fft
-from scipy.signal import fftconvolve
 
 from fits.io._errors import DataError
 from fits.io._record import Record
@@ -143,6 +142,8 @@ class Precision:
 
 def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """Covariance of `influence @ noise`, the noise having the autocovariance of a residual, shape `(p, p)`."""
+    from scipy.signal import fftconvolve  # slow to import, and only a fit needs it
+
     left = np.where(fitted, residual_um, 0.0)
     correlation = correlation_samples([residual_um[fitted]])
     lags = 0 if correlation <= WHITE else min(len(left) - 1, int(np.ceil(6.0 * correlation)))

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
-from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 # Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
 _HUBER = 1.345
@@ -65,6 +63,8 @@ class Noise:
         """Standard deviation of the noise itself."""
         if len(self.past) == 0:
             return self.innovation_um
+        from scipy.signal import lfilter  # slow to import, and white noise needs none of it
+
         impulse = np.zeros(4096)
         impulse[0] = 1.0
         return self.innovation_um * float(np.linalg.norm(lfilter([1.0], np.r_[1.0, -self.past], impulse)))
@@ -83,6 +83,8 @@ class Noise:
         """Turn noise into independent numbers of variance one, along the first axis."""
         # SciPy filters no array without columns.
         if len(self.past) and values.size:
+            from scipy.signal import lfilter
+
             values = lfilter(np.r_[1.0, -self.past], [1.0], values, axis=0)
         if self.spread is not None:
             values = values / self.spread.reshape(-1, *(1,) * (values.ndim - 1))
@@ -97,6 +99,8 @@ def rough_noise_um(residual_um: np.ndarray) -> float:
 
 def learn_noise(residual_um: np.ndarray, freedom: float, order: int = 8) -> Noise:
     """Learn the noise of a residual by Yule-Walker, its order by BIC; `freedom` unknowns were fitted to it."""
+    from scipy.linalg import solve_toeplitz
+
     n = len(residual_um)
     inflate = (n / max(n - freedom, n / 2)) ** 0.5
     lags = np.array([residual_um[: n - k] @ residual_um[k:] / n for k in range(order + 1)])
