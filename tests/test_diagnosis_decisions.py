@@ -13,7 +13,8 @@ from fits.diagnosis import _diagnose
 from fits.diagnosis._conclude import Misfit
 from fits.diagnosis._effects import Law
 from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
-from fits.diagnosis._prepare import _covered
+from fits.diagnosis._prepare import Prepared, _covered
+from fits.diagnosis._result import Gain
 from fits.stage._fit import default_stage
 from fits.stats._held import _regressed, _stretches_at_rest
 from microid.effects import EFFECTS
@@ -166,51 +167,47 @@ def asked(monkeypatch):
 
     def prepare(reading, progress):
         log.readings.append(reading)
-        answer = log.answers[len(log.readings) - 1]
-        projector = SimpleNamespace(
-            held_out=lambda which: np.full(50, answer.get(which, answer.get("error", 1.0)) ** 0.5)
-        )
         baseline = fits.diagnosis._baseline.Baseline(*(None,) * 14, True, ("said",))
         parts = {"bench": None, "regression": None, "probes": (), "faults": None, "skipped": ()}
-        from fits.diagnosis._prepare import Prepared
+        return Prepared(reading, baseline, projector=None, **parts)
 
-        return Prepared(reading, baseline, projector=projector, **parts)
-
-    def select(*_):
+    def conclude(ready, *_):
         answer = log.answers[len(log.readings) - 1]
+        # Root mean squares of the errors in what was held out, in um, beside noise of 1 um.
+        after_um = answer.get("error", 1.0)
+        gain = Gain(answer.get("plain", after_um), after_um, noise_um=1.0)
         causes = [SimpleNamespace(z=z) for z in answer.get("z", ())]
-        model, plain = (SimpleNamespace(change_um=which) for which in ("error", "plain"))
-        return SimpleNamespace(causes=causes, model=model, plain=plain, of=answer)
+        return SimpleNamespace(causes=causes, gain=gain, of=answer, remarks=ready.baseline.remarks)
 
     monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
-    monkeypatch.setattr(_diagnose, "select", select)
-    monkeypatch.setattr(_diagnose, "conclude", lambda ready, found, *_: (ready, found))
+    monkeypatch.setattr(_diagnose, "select", lambda *_: None)
+    monkeypatch.setattr(_diagnose, "conclude", conclude)
     record = Record(np.arange(5.0), np.arange(5.0), np.zeros(5))
 
     def ask(*answers, **options):
         log.answers, log.readings = list(answers), []
-        ready, found = fits.diagnose([record], **options)
+        found = fits.diagnose([record], **options)
         assert len(log.readings) == len(answers)
-        return ready, found.of, log.readings
+        return found, found.of, log.readings
 
     return ask
 
 
 def test_a_plain_answer_is_taken(asked):
     answer = {"z": (9.0,)}
-    ready, kept, (reading,) = asked(answer)
+    found, kept, (reading,) = asked(answer)
     assert kept is answer
     assert (reading.fraction, reading.initial) == (0.2, "unknown")
-    assert ready.baseline.remarks == ("said",)
+    assert found.remarks == ("said",)
 
 
 @pytest.mark.parametrize("z", [20.0, 5.0])
 def test_what_was_held_out_is_used_where_only_it_shows_a_cause(asked, z):
     first, whole = {"error": 3.0}, {"z": (z,)}
-    ready, kept, (_, reading) = asked(first, whole)
+    found, kept, (_, reading) = asked(first, whole)
     assert reading.fraction == 0.0
     assert kept is (whole if z > 8 else first)
-    assert any("not measured on new data" in words for words in ready.baseline.remarks) == (z > 8)
+    assert any("not measured on new data" in words for words in found.remarks) == (z > 8)
     # Also where a cause was found that explains hardly any of it.
     assert asked({"error": 3.0, "plain": 3.5, "z": (9.0,)}, whole)[2][1].fraction == 0.0
     # It is not where noise explains it, a cause does, or whole runs are held out.
