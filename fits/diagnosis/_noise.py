@@ -16,8 +16,6 @@ from microid.effects import Statistic
 
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
-# A band is one of a resonance from this quality on; what is broader may be the colour of the noise.
-_NARROW = 3.0
 
 
 @dataclass(frozen=True)
@@ -146,8 +144,8 @@ def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLD
         jitter = "jitter_s", faults.jitter_s, faults.jitter_s / (2 * max(faults.jitter_z, 1e-9)), "s"
         found.append(Fault("jitter", faults.jitter_z, (jitter,), faults.jitter_um**2))
     band = faults.band
-    narrow = band.z > thresholds.strong_z and band.quality > _NARROW
-    if narrow and band.size_um**2 > thresholds.minor_share / 3 * total and not band.mains:
+    narrow = band.z > thresholds.strong_z and band.narrow and not band.mains
+    if narrow and band.size_um**2 > thresholds.minor_share / 3 * total:
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"
         size_of_band = "amplitude_um", band.size_um, band.sd_um, "um"
         found.append(Fault("band", band.z, (size_of_band, middle), band.size_um**2))

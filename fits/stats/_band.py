@@ -15,6 +15,8 @@ _LOWEST_Hz, _HIGHEST_Hz, _CYCLES = 2.0, 200.0, 5
 _TOGETHER, _INDEPENDENT = 1 / 150, 0.5
 # The floor is known by its level at every so many octaves.
 _OCTAVES = 2
+# A band is one of a resonance from this quality on; what is broader may be the colour of the noise.
+_NARROW = 3.0
 # A Hann window makes a line so many bins wide.
 _LINE = 4
 # Qualities, and heights above the floor, from which the likelihood climbs.
@@ -32,6 +34,11 @@ class Band:
     z: float
     rate_Hz: float = 0.0
     bins: int = 1
+
+    @property
+    def narrow(self) -> bool:
+        """Whether it is too narrow to be the colour of the noise."""
+        return self.quality > _NARROW
 
     @property
     def mains(self) -> bool:
