@@ -79,18 +79,16 @@ def fit(given: common.Given) -> None:
         same = {"holdout": [late.read_table(file, **how) for file in files] or fraction, "initial": initial}
         # Only now, so that what cannot be read is refused at once.
         late.start_jax()
-        estimate: Any
-        draw: Any
+        estimate: Any = late.fit_slow if slow else late.fit
         if given.model == "stage":
-            estimate, draw = late.fit_stage, late.plot_stage
+            estimate = late.fit_stage
             asked["stage"] = late.default_stage(_HOLDS[given.hold or "lines"])
-        else:
-            estimate, draw = (late.fit_slow, late.plot_stage) if slow else (late.fit, late.plot_fit)
         asked |= {"levels": given.levels, "loss": given.loss or "squares", "progress": progress}
         result = estimate(records, **same, **asked)
         report, drawn = late.fit_report(result), []
         if drawings is not None:
             progress("drawing")
+            draw: Any = late.plot_stage if slow or given.model == "stage" else late.plot_fit
             drawn = draw(result, records, drawings, **same)
         unfinished.write_text(late.model_text(result.model, result.uncertainty, report), encoding="utf-8")
     places = common.paths_in(given.plots, drawn)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import signal
 
 from fits.io._errors import DataError
 from fits.loop._grid import BELIEF_LEVELS, GridSolution, cross_validate, relaxation_of, solve_coloured, solve_grid
@@ -130,6 +129,8 @@ def _stroke(run: Run) -> float:
 
 def _refuse_ringing(run: Run) -> None:
     """Refuse a run whose displacement follows its voltage, but not at once."""
+    from scipy import signal  # slow to import, and hardly ever needed
+
     which = np.flatnonzero(run.fitted)
     piece = slice(which[0], which[-1] + 1)
     voltage, displacement = run.record.voltage_V[piece], run.displacement_um[piece]

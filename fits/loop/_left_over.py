@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from fits.loop._grid import EVIDENCE_LEVELS
 from fits.loop._moments import BLOCKS, PIECES, blocks_of, gather, grid_of
@@ -71,6 +70,8 @@ def suggestions(runs: Sequence[Run], model: Preisach, stroke_um: float, hyper: H
 
 def _relaxed(time_s: np.ndarray, predicted_um: np.ndarray) -> np.ndarray:
     """What relaxations add to a displacement, and what moves before it leave to them, shape `(n, 2 k)`."""
+    from scipy.signal import lfilter  # slow to import, and a fit that leaves noise needs none of it
+
     even = np.linspace(0, time_s[-1], len(time_s))
     moved = np.interp(even, time_s, predicted_um - predicted_um[0])
     columns = []
