@@ -113,6 +113,7 @@ def test_new_files_of_lax_users_are_no_trouble(folder):
 
 def test_the_command_says_it_in_one_sentence(folder, tmp_path):
     group_writable(folder)
+    (tmp_path / "x.csv").write_text("time_s,voltage_V\n0,1\n1,2\n")
     done = subprocess.run(
         [sys.executable, "-m", "fits", "simulate", "model.json", "x.csv", "--out", "y.csv"],
         cwd=tmp_path,
