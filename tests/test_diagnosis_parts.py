@@ -200,6 +200,14 @@ def test_the_colour_of_a_sensor_is_no_narrow_band_and_hides_none(rng, past):
     assert 3 < found.quality < 50
 
 
+@pytest.mark.parametrize(
+    ("samples", "interval_s"), [(3000, 1.0), (3000, 0.2), (10, 1e-3), (40, 1e-3), (300, 1e-5), (3, 0.1)]
+)
+def test_records_too_slow_or_too_short_show_no_band(rng, samples, interval_s):
+    assert band_of(rng.standard_normal(samples), interval_s, np.arange(1.0 * samples)).z == 0
+    assert band_of(np.zeros(samples), interval_s, np.arange(1.0 * samples)).z == 0
+
+
 def test_a_band_of_many_weak_bins_is_found_and_is_no_hum(rng):
     n, rate = 3600, 64.0
     voltage = 50 + 50 * np.sin(2 * np.pi * 0.05 * np.arange(n) / rate)

@@ -11,6 +11,8 @@ from fits.stats._noise_spectrum import DRIFT, MAINS_Hz
 
 # Where a band is looked for, in Hz, and from how many cycles in the record on.
 _LOWEST_Hz, _HIGHEST_Hz, _CYCLES = 2.0, 200.0, 5
+# A band is told from what is around it in so many bins at least.
+_FEWEST = 20
 # Bins of the spectrum are averaged over this part of their frequency. A Hann window leaves half of them independent.
 _TOGETHER, _INDEPENDENT = 1 / 150, 0.5
 # The floor is known by its level at every so many octaves.
@@ -57,6 +59,9 @@ class Band:
 def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -> Band:
     """Find a narrow band between 2 and 200 Hz that goes on throughout and that the command does not play.
 
+    Residual and command are evenly sampled, shape `(n,)`. Where the samples show too few frequencies of that range,
+    nothing is found, with an evidence of 0.
+
     The spectrum is that of a floor, whose logarithm is straight over every two octaves, and of one Lorentzian
     peak above it. The evidence is what the peak adds to the likelihood (P. Whittle, "Estimation and information in
     stationary time series", Ark. Mat. 2 (1953), 423-434), less what chance adds at the best of all places.
@@ -64,10 +69,12 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
     none = Band(0.0, 0.0, 0.0, 0.0, 0.0)
     n, bin_Hz = len(residual_um), 1 / (len(residual_um) * interval_s)
     lowest_Hz, highest_Hz = max(_LOWEST_Hz, _CYCLES * bin_Hz), min(_HIGHEST_Hz, 0.45 / interval_s)
+    if highest_Hz - lowest_Hz < _FEWEST * bin_Hz:  # sampled too slowly, or too short
+        return none
     # An octave beyond both ends tells a peak there from a slope.
     spectrum = _Spectrum.of(_power(residual_um), bin_Hz, lowest_Hz / 2, 2 * highest_Hz)
     inside = (spectrum.frequency_Hz > lowest_Hz) & (spectrum.frequency_Hz < highest_Hz)
-    if inside.sum() < 20 or not spectrum.power.min() > 0:
+    if inside.sum() < _FEWEST or not spectrum.power.min() > 0:
         return none
     floor = spectrum.floor()
     _, nothing = spectrum.fit(floor, None)
@@ -101,12 +108,12 @@ def _power(values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Averages of a spectrum, their numbers of independent bins, shapes `(k,)`, and the floor's tents, `(k, m)`."""
+    """Averages of a spectrum and their numbers of independent bins, shapes `(k,)`, and hat functions, `(k, m)`."""
 
     frequency_Hz: FloatArray
     power: FloatArray
     count: FloatArray
-    tents: FloatArray
+    hats: FloatArray
 
     @classmethod
     def of(cls, power: FloatArray, bin_Hz: float, lowest_Hz: float, highest_Hz: float) -> "_Spectrum":
@@ -121,21 +128,21 @@ class _Spectrum:
         mean = np.add.reduceat(power[: edges[-1]], edges[:-1]) / bins
         octaves = np.log2(frequency_Hz)
         knots = np.linspace(octaves[0], octaves[-1], max(round((octaves[-1] - octaves[0]) / _OCTAVES), 1) + 1)
-        tents = np.stack([np.interp(octaves, knots, one) for one in np.eye(len(knots))], axis=1)
-        return cls(frequency_Hz, mean, np.asarray(_INDEPENDENT * bins), tents)
+        hats = np.stack([np.interp(octaves, knots, one) for one in np.eye(len(knots))], axis=1)
+        return cls(frequency_Hz, mean, np.asarray(_INDEPENDENT * bins), hats)
 
     def floor(self) -> FloatArray:
         """Logarithm of the floor at its knots: medians around them, which a narrow band does not move."""
         logarithm = np.log(self.power)
-        return np.array([np.median(logarithm[tent > 0.3]) for tent in self.tents.T]) - np.log(np.log(2))
+        return np.array([np.median(logarithm[hat > 0.3]) for hat in self.hats.T]) - np.log(np.log(2))
 
     def fit(self, floor: FloatArray, peak: FloatArray | None) -> tuple[FloatArray, float]:
         """Maximise the likelihood from a floor and the logarithms of a peak's height, middle and quality, if any."""
         knots = len(floor)
 
         def cost(unknowns: FloatArray) -> tuple[float, FloatArray]:
-            level = np.exp(self.tents @ unknowns[:knots])
-            slopes = [self.tents * level[:, None]]
+            level = np.exp(self.hats @ unknowns[:knots])
+            slopes = [self.hats * level[:, None]]
             if peak is not None:
                 height, middle, quality = np.exp(unknowns[knots:])
                 off = 2 * quality * (self.frequency_Hz / middle - 1)
@@ -156,7 +163,7 @@ class _Spectrum:
 
     def start(self, floor: FloatArray, middles_Hz: FloatArray, bin_Hz: float) -> FloatArray:
         """Height, middle and quality of the peak that adds most to the likelihood of a floor."""
-        level = np.exp(self.tents @ floor)
+        level = np.exp(self.hats @ floor)
         ratio, best, found = self.power / level, -np.inf, np.ones(3)
         for quality in _QUALITIES:
             # So close together that none is missed, and no band narrower than two bins.
