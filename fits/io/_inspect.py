@@ -118,8 +118,9 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
     moved, driven = guessed.get("displacement_um"), (known | guessed).get("voltage_V")
     if moved and driven and known_unit(moved.column) is None:
         volts = known_quantity("voltage_V").convert(np.ptp(found[driven.column]), driven.unit)
-        strokes = {unit: quantity.convert(np.ptp(found[moved.column]), unit) for unit in ("um", "nm", "mm", "m")}
-        unit = next((unit for unit, stroke in strokes.items() if likely_stroke(float(stroke / volts))), "um")
+        convert, stroke = known_quantity("displacement_um").convert, np.ptp(found[moved.column])
+        strokes = {unit: convert(stroke, unit) for unit in ("um", "nm", "mm", "m")}
+        unit = next((unit for unit, um in strokes.items() if likely_stroke(float(um / volts))), "um")
         guessed["displacement_um"] = Source(moved.column, unit)
     return guessed
 
