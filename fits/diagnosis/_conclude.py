@@ -21,7 +21,7 @@ from fits.diagnosis._findings import bounds, causes_of, with_held_gain
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import nothing, refit
+from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._residual_tests import (
     Cycles,
     cycles,
@@ -114,16 +114,15 @@ def conclude(
         find_faults(found.projector.regression, found.model.change_um, thresholds) if found.causes else ready.faults
     )
     # What there is to be explained is all that the sensor does not make, the model's discrepancy, too.
-    told = _in_noise(found, beside.noise)
     noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in beside.noise])))
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
     rounding_um = ready.faults.quantum_um / 12**0.5
     rounded = rounding_um**2 > thresholds.minor_share * noise_um**2
-    misfit, repeated = _misfit(ready, told, rounded)
+    found, told, misfit, repeated, minor = _worth_naming(ready, found, beside.noise, rounded)
     rest_noise, left_over = misfit.rest_noise, misfit.is_left_over
     progress(Step.EXTENSION)
     extension = extend_stage(ready, found, found.model if found.causes else None)
-    model, kept, remarks = found.model, found.causes, list(_remarks(ready, records))
+    model, kept, remarks = found.model, found.causes, [*_remarks(ready, records), *minor]
     weak = max((cause.z for cause in kept), default=0.0) < thresholds.strong_z
     # Of what one run had of its own other runs show nothing.
     repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
@@ -234,6 +233,42 @@ def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
     model = refit(found.bench, now, found.model.laws, found.model.x, 2) if found.causes else plain
     explained = max(plain.cost - model.cost, 0.0)
     return replace(found, first=first, projector=now, plain=plain, model=model, explained=explained)
+
+
+def _worth_naming(
+    ready: Prepared, found: Selection, noise: tuple[Noise, ...], rounded: bool
+) -> tuple[Selection, Selection, Misfit, Cycles, list[str]]:
+    """Leave out causes beside others that explain a minor share of what these leave: what explains the rest may
+    explain that, too.
+
+    Returns what was found, the same in the given noise, and what is said of causes that were left out.
+    """
+    said: list[str] = []
+    while True:
+        told = _in_noise(found, noise)
+        misfit, repeated = _misfit(ready, told, rounded)
+        names = [cause.name for cause in found.causes]
+        parts = {}
+        for name in {*names} if len({*names}) > 1 else ():
+            kept = [k for k, other in enumerate(names) if other != name]
+            fewer = _refit_of(told, kept, 2)
+            part = replace(misfit, explained=fewer.cost - told.model.cost).share
+            if not card_of(name).independent and part < misfit.thresholds.minor_share:
+                parts[name] = part, kept
+        if not parts:
+            return found, told, misfit, repeated, said
+        name, (part, kept) = min(parts.items(), key=lambda item: item[1][0])
+        said.append(
+            f"{name} would explain {part:.0%} of what the other causes leave: what makes the rest may make that, too, "
+            "so that it is not named"
+        )
+        found = replace(found, causes=tuple(found.causes[k] for k in kept), model=_refit_of(found, kept, 3))
+
+
+def _refit_of(found: Selection, kept: Sequence[int], rounds: int) -> Refit:
+    """Some of the laws fitted anew."""
+    laws, x = zip(*((found.model.laws[k], found.model.x[k]) for k in kept), strict=True)
+    return refit(found.bench, found.projector, laws, x, rounds)
 
 
 def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, Cycles]:
