@@ -15,10 +15,11 @@ from fits import Record
 from fits.diagnosis import _effects
 from fits.diagnosis._effects import drop_programs
 from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
-from fits.diagnosis._score import Family, Probe, evidence, score
+from fits.diagnosis._score import Family, Probe, score
 from fits.stage._motion import program
 from fits.stats._band import band_of
 from fits.stats._noise import Noise, learn_noise
+from fits.stats._score_test import evidence
 from microid import EFFECTS, AbstractPart, Scene, Signal
 
 WHITE = np.zeros(0)

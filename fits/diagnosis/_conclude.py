@@ -238,8 +238,7 @@ def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
 def _worth_naming(
     ready: Prepared, found: Selection, noise: tuple[Noise, ...], rounded: bool
 ) -> tuple[Selection, Selection, Misfit, Cycles, list[str]]:
-    """Leave out causes beside others that explain a minor share of what these leave: what explains the rest may
-    explain that, too.
+    """Leave out causes that explain a minor share of what the others leave: what explains the rest may explain that.
 
     Returns what was found, the same in the given noise, and what is said of causes that were left out.
     """
@@ -259,8 +258,8 @@ def _worth_naming(
             return found, told, misfit, repeated, said
         name, (part, kept) = min(parts.items(), key=lambda item: item[1][0])
         said.append(
-            f"{name} would explain {part:.0%} of what the other causes leave: what makes the rest may make that, too, "
-            "so that it is not named"
+            f"{name} would explain {part:.0%} of what the other causes leave: what makes the rest may make that, "
+            "too, so that it is not named"
         )
         found = replace(found, causes=tuple(found.causes[k] for k in kept), model=_refit_of(found, kept, 3))
 

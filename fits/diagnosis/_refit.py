@@ -9,9 +9,10 @@ import numpy as np
 
 from fits.diagnosis._effects import Bench, Law, remembering, strength_of
 from fits.diagnosis._projector import Projector, orthonormal
-from fits.diagnosis._score import BLOCK, Scored, law_of
+from fits.diagnosis._score import Scored, law_of
 from fits.io.columns import columns_beside
 from fits.io.columns.temperature import TEMPERATURE
+from fits.stats._score_test import BLOCK
 from microid import AbstractEffect
 
 _STEP = 1e-3

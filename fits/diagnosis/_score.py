@@ -12,6 +12,7 @@ from fits.diagnosis._effects import Bench, Law, times, without_host
 from fits.diagnosis._projector import Projector
 from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
+from fits.stats._score_test import best_multiples, evidence, evidence_of, robust_z, squares
 from microid import AbstractEffect, Coordinates, Scales, host
 
 _DRAWS = 2000
@@ -19,8 +20,6 @@ _DRAWS = 2000
 _BLIND = 0.003
 # Signatures that are projected at once.
 _AT_ONCE = 64
-# Samples that are taken to err alike.
-BLOCK = 25
 
 
 @dataclass(frozen=True)
@@ -204,13 +203,13 @@ def score(
     joined = np.empty((len(residual), len(signals)), order="F")
     for k, column in enumerate(signals):
         joined[:, k] = projector.join(column)
-    raw = _squares(joined)
+    raw = squares(joined)
     for at in range(0, len(signals), _AT_ONCE):
         columns = joined[:, at : at + _AT_ONCE]
         columns -= projector.orthonormal @ (projector.orthonormal.T @ columns)
         # A line that sampling turns into a constant, for example: what is left of it is rounding. Or what has died
         # away so far that its square is nothing.
-        columns[:, _squares(columns) <= _BLIND**2 * raw[at : at + _AT_ONCE]] = 0.0
+        columns[:, squares(columns) <= _BLIND**2 * raw[at : at + _AT_ONCE]] = 0.0
         if basis is not None:
             columns -= basis @ (basis.T @ columns)
     found, stop = [], 0
@@ -229,60 +228,14 @@ def best_of(scores: Sequence[Scored]) -> dict[str, Scored]:
 
 
 def _scored(probe: Probe, columns: np.ndarray, residual: np.ndarray, raw: float) -> Scored:
-    size = float(np.sum(_squares(columns))) ** 0.5
+    size = float(np.sum(squares(columns))) ** 0.5
     left = size / raw if raw > 0 else 0.0
     if left < _BLIND:
         # What the baseline follows but for rounding cannot be asked about.
         columns[:] = 0.0
         return Scored(probe, 0.0, 0.0, 0.0, np.zeros(columns.shape[1]), 0.0, left)
     z, coefficients, drop = evidence(columns, residual, probe.positive, probe.most)
-    return Scored(probe, size, z, _robust_z(columns @ coefficients, residual), coefficients, drop, left)
-
-
-def _squares(columns: np.ndarray) -> np.ndarray:
-    return np.einsum("ij,ij->j", columns, columns)
-
-
-def _robust_z(along: np.ndarray, residual: np.ndarray) -> float:
-    """Size of a fitted signal over the standard deviation that blocks of what is left of the residual give it."""
-    products = along * (residual - along)
-    blocks = np.add.reduceat(products, np.arange(0, len(products), BLOCK))
-    return float(along @ along / max(float(np.linalg.norm(blocks)), 1e-300)) if np.any(along) else 0.0
-
-
-def evidence(
-    columns: np.ndarray, residual: np.ndarray, positive: bool, most: float = np.inf
-) -> tuple[float, np.ndarray, float]:
-    """Standard deviations, coefficients up to `most` where they are positive, and decrease of the sum of squares."""
-    gram = columns.T @ columns
-    # What shows nowhere has no multiple: rounding over nothing would be one.
-    scale = np.where(np.diagonal(gram) > 0, np.sqrt(np.diagonal(gram)), 1.0)
-    normal, cross = gram / scale[:, None] / scale[None, :], (columns.T @ residual / scale)[:, None]
-    multiples = _multiples(normal, cross, positive, most * scale)
-    z, drop = _size(normal, cross, multiples)
-    return float(z[0]), multiples[:, 0] / scale, float(drop[0])
-
-
-def _multiples(gram: np.ndarray, cross: np.ndarray, positive: bool, most: np.ndarray) -> np.ndarray:
-    """Best multiples of signatures, whose `gram` has a diagonal of ones and zeros, shape `(k, draws)`.
-
-    Where none may be negative, one at a time is put where the others leave it (coordinate descent): signatures of
-    different runs have little in common.
-    """
-    if not positive:
-        return np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ cross
-    found = np.zeros_like(cross)
-    for _ in range(30 if len(gram) > 1 else 1):
-        for k, row in enumerate(gram):
-            found[k] = np.clip(found[k] + cross[k] - row @ found, 0.0, most[k]) if row[k] > 0 else 0.0
-    return found
-
-
-def _size(gram: np.ndarray, cross: np.ndarray, multiples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations and decreases: chance gives one of it to each signature in use but one."""
-    drop = np.einsum("ij,ij->j", multiples, 2 * cross - gram @ multiples)
-    chance = np.maximum(np.count_nonzero(multiples, axis=0) - 1, 0)
-    return np.sqrt(np.maximum(drop - chance, 0.0)), drop
+    return Scored(probe, size, z, robust_z(columns @ coefficients, residual), coefficients, drop, left)
 
 
 class Family:
@@ -298,8 +251,8 @@ class Family:
         for one in scores.each:
             stop = at + len(one.coefficients)
             own, cross = gram[at:stop, at:stop], draws[at:stop]
-            multiples = _multiples(own, cross, one.probe.positive, one.probe.most * scale[at:stop])
-            largest = np.maximum(largest, _size(own, cross, multiples)[0])
+            multiples = best_multiples(own, cross, one.probe.positive, one.probe.most * scale[at:stop])
+            largest = np.maximum(largest, evidence_of(own, cross, multiples)[0])
             at = stop
         self.largest = np.sort(largest)
 
