@@ -9,12 +9,13 @@ from scipy import stats
 
 import fits
 from fits import Record
-from fits.diagnosis import _diagnose
+from fits.diagnosis import _conclude, _diagnose
 from fits.diagnosis._conclude import Misfit
 from fits.diagnosis._effects import Law
 from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
 from fits.diagnosis._prepare import Prepared, _covered
 from fits.diagnosis._result import Gain
+from fits.diagnosis._select import Cause, Selection
 from fits.stage._fit import default_stage
 from fits.stats._held import _regressed, _stretches_at_rest
 from microid.effects import EFFECTS
@@ -55,6 +56,45 @@ def test_causes_share_what_is_beyond_chance():
     assert misfit(9.0, 39.0).unnamed(weak=False) == (pytest.approx(0.03), True)
     assert not misfit(1.0, 300.0).unnamed(weak=False)[1]
     assert not misfit(9.0, 39.0).unnamed(weak=True)[1]
+
+
+def named_beside(monkeypatch, parts, rest):
+    """Names that are kept where each cause explains a part of its own, in noise variances, and so much is left."""
+
+    def cost(names):
+        return rest + sum(part for name, part in parts.items() if name not in names)
+
+    def model(names):
+        return SimpleNamespace(cost=cost(names))
+
+    def fewer(found, kept, _):
+        return model([found.causes[k].name for k in kept])
+
+    def misfit_of(_, found, __):
+        return misfit(cost(()) - found.model.cost, rest), None
+
+    monkeypatch.setattr(_conclude, "_refit_of", fewer)
+    monkeypatch.setattr(_conclude, "_in_noise", lambda found, _: found)
+    monkeypatch.setattr(_conclude, "_misfit", misfit_of)
+    causes = tuple(Cause(name, 9.0, 0.0, (), part) for name, part in parts.items())
+    found = Selection(causes, model([*parts]), *(None,) * 7)
+    kept, _, last, _, said = _conclude._worth_naming(None, found, (), False)
+    names = [cause.name for cause in kept.causes]
+    assert last.explained == pytest.approx(sum(parts[name] for name in names))
+    assert [words.split(" would")[0] for words in said] == sorted({*parts} - {*names}, key=parts.__getitem__)
+    return names
+
+
+def test_what_the_rest_may_make_is_not_named(monkeypatch):
+    chance = 40 + 3 * 80**0.5
+    parts = {"transport_delay": 8000.0, "thermal_gain": 170.0, "creep": 90.0}
+    assert named_beside(monkeypatch, parts, chance + 2500.0) == ["transport_delay"]
+    assert named_beside(monkeypatch, parts, chance) == [*parts]
+    # A third of what there is beside the others is more than a minor share.
+    assert named_beside(monkeypatch, parts, chance + 300.0) == ["transport_delay", "thermal_gain"]
+    # One cause alone is decided on by its share of the whole misfit; a hum is no other effect's misfit.
+    assert named_beside(monkeypatch, {"creep": 90.0}, chance + 2500.0) == ["creep"]
+    assert named_beside(monkeypatch, {"creep": 8000.0, "mains_hum": 90.0}, chance + 2500.0) == ["creep", "mains_hum"]
 
 
 def compared(before, after):
