@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.control._compensate import within_range
+from fits.control._follow import within_range
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 from fits.io._version import written_by
@@ -45,7 +45,9 @@ def export_c(
         )
     if not 8 <= size <= 65_536:
         raise DataError(f"--memory: expected 8 to 65536 extremes, found {size}; 128 suit most references.")
-    fields = _fields(model, name, size, within_range(model, limits_V))
+    fields = _fields(
+        model, name, size, within_range((float(model.density.lower_V), float(model.density.upper_V)), limits_V)
+    )
     with file_set() as files:
         place = files.folder(folder, "--out")
         for ending in ("h", "c"):

@@ -15,12 +15,11 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import columns_beside
 from fits.loop._past import past_columns
+from fits.loop._prediction import MOST_EXTREMES, PIECE, too_deep
 
 # A hundred arrays of so many values are 8 GB.
 _MOST_STEPS = 10_000_000
-# All records pass through the same compiled functions in pieces of this many samples.
-_PIECE = 8192
-_STAIRCASES = (64, 512, 4096)
+_STAIRCASES = (64, 512, MOST_EXTREMES)
 # Samples that a run must leave to fit.
 _FEWEST = 50
 # Samples that a shorter run is padded to, so that runs of many lengths share what is compiled.
@@ -140,10 +139,10 @@ class Run:
         """The voltage followed by the memory, as the fit of a hysteresis alone needs it."""
         voltage = self.voltage_V
         # The last piece is filled up with its final value, which changes no memory.
-        padded = np.pad(voltage, (0, -len(voltage) % _PIECE), mode="edge")
+        padded = np.pad(voltage, (0, -len(voltage) % PIECE), mode="edge")
         for size in _STAIRCASES:
             memory, anchors, risings, pieces = resized(self.start, size), [], [], []
-            for piece in map(jnp.asarray, padded.reshape(-1, _PIECE)):
+            for piece in map(jnp.asarray, padded.reshape(-1, PIECE)):
                 pieces.append((piece, memory))
                 anchor, rising, memory = _remember(piece, memory)
                 anchors.append(anchor)
@@ -153,10 +152,7 @@ class Run:
                     break
             else:
                 return Path(tuple(pieces), *(np.concatenate(each)[: len(voltage)] for each in (anchors, risings)))
-        raise DataError(
-            f"the voltage nests more than {_STAIRCASES[-1]} loops into each other: that is noise, not a drive; "
-            "use the commanded voltage"
-        )
+        raise too_deep()
 
     @cached_property
     def samples(self) -> Samples:
