@@ -8,8 +8,9 @@ import numpy as np
 
 from fits.loop._plain import Perturbations, PlainLoop, Surface
 
-# Samples times perturbations beyond which JAX, which takes seconds to start, is there first.
-_MOST = 50_000_000
+# Samples times perturbations, and times a hundred for the memory and the inverse, beyond which JAX is done first
+# although it takes seconds to start.
+_MOST, _BESIDE = 60_000_000, 100
 # What is larger in size is refused where JAX reads it.
 _LARGEST, _FINEST = 1e30, 1000
 
@@ -39,7 +40,7 @@ def plain_loop(content: Mapping[str, Any], samples: int) -> PlainLoop | None:
             and len(offsets_um) == count > 0
             and 2 <= levels <= _FINEST
             and columns_um.shape[1] == size + levels
-            and count * samples <= _MOST
+            and (count + _BESIDE) * samples <= _MOST
         ):
             return None
     except (LookupError, TypeError, ValueError, AttributeError):
