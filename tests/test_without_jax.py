@@ -11,7 +11,7 @@ from _reference import branches, play_relays, relay_weights_um
 
 import microid as m
 from fits import DataError, Record, Reference, Uncertainty, compensate, predict, save_model
-from fits.control._follow import compensate_plainly
+from fits.control._follow import compensate_loop
 from fits.io._model_text import read_model_text
 from fits.loop import _plain_file
 from fits.loop._design import Grid
@@ -78,14 +78,14 @@ def test_voltages_are_those_of_jax(state, rng, file):
     for limits in (None, tuple(within_V)):
         found, expected = (
             invert(one, reference, state, True, limits)
-            for invert, one in ((compensate_plainly, loop), (compensate, model))
+            for invert, one in ((compensate_loop, loop), (compensate, model))
         )
         np.testing.assert_array_equal(found.clipped, expected.clipped)
         np.testing.assert_allclose(found.voltage_V, expected.voltage_V, rtol=0, atol=1e-11 * (upper_V - lower_V))
         exact = {"rtol": 0, "atol": EXACT * stroke_um(model)}
         np.testing.assert_allclose(found.displacement_um, expected.displacement_um, **exact)
         with pytest.raises(DataError) as plain:
-            compensate_plainly(loop, reference, state, False, limits)
+            compensate_loop(loop, reference, state, False, limits)
         with pytest.raises(DataError) as refusal:
             compensate(model, reference, state, False, limits)
         assert str(plain.value) == str(refusal.value)

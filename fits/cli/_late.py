@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from fits.control._compensate import compensate
     from fits.control._compensate_stage import static_equivalent
     from fits.control._export_c import export_c
-    from fits.control._follow import compensate_plainly
+    from fits.control._follow import compensate_loop
     from fits.control._gains import read_gains
     from fits.control._make import Loop, Maker
     from fits.control._setup import setup

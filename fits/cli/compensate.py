@@ -52,7 +52,7 @@ def compensate(given: common.Given) -> None:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         asked = stage, wanted, given.initial, given.clip, volts
         plain = isinstance(stage, late.PlainLoop)
-        found = late.compensate_plainly(*asked) if plain else late.compensate(*asked, given.way)
+        found = late.compensate_loop(*asked) if plain else late.compensate(*asked, given.way)
         program = late.Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
         if plain:
             predicted = late.measured_ranges(replace(program, displacement_um=found.displacement_um))

@@ -1,21 +1,19 @@
 """Feedforward: the voltage that makes a stage follow a reference (Eq. 19-21)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from fits.control import _compensate_stage as whole
-from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, follow, within_range
+from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, compensate_loop, follow, within_range
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
-from fits.loop._prediction import PIECE
-from fits.loop._run import initial_state
-from microid import AbstractEffect, Preisach, Stage, invert
+from fits.loop._plain import PlainLoop, Surface
+from microid import AbstractEffect, Preisach, Stage
 
 Way = Literal["static", "dynamic"]
 
@@ -47,23 +45,25 @@ def compensate(
     if reference.displacement_um is None:
         raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
     wanted, time_s = reference.displacement_um, reference.time_s
-    if isinstance(model, Stage) and (plain := whole.plain_of(model)) is not model:
+    if way not in ("static", "dynamic"):
+        raise ValueError(f"way must be 'static' or 'dynamic', got {way!r}")
+    if isinstance(model, Preisach):
+        if way == "dynamic":
+            raise DataError("expected a stage for --dynamic, found a Preisach model, which has no mechanics.")
+        return compensate_loop(plain_loop_of(model), reference, initial, clip, limits_V)
+    if (plain := whole.plain_of(model)) is not model:
         without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
         return _beside_effects(model, plain, reference, initial, without)
-    law = _Compiled(whole.static_equivalent(model))
+    law = plain_loop_of(whole.static_equivalent(model))
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":
-        if not isinstance(model, Stage):
-            raise DataError("expected a stage for --dynamic, found a Preisach model, which has no mechanics.")
         needed, doubt_um = whole.demand(model, time_s, wanted, reference.source)
-    elif way != "static":
-        raise ValueError(f"way must be 'static' or 'dynamic', got {way!r}")
     turning, moving = whole.demand_remarks(wanted, needed, doubt_um)
     remarks = turning + moving
     limits = within_range(law.range_V, limits_V)
     doubt = Doubt(doubt_um, *turning) if way == "dynamic" else None
     voltage, clipped = follow(law, reference, needed, initial, clip, limits, doubt)
-    if isinstance(model, Stage) and way == "dynamic":
+    if way == "dynamic":
         voltage, cut, more = _led(model, reference, voltage, limits, clip, binding(law, limits))
         clipped, remarks = clipped | cut, remarks + more
     played = whole.simulate_model(model, Record(time_s, voltage, None, source=reference.source), initial)
@@ -122,26 +122,13 @@ def _led(
     return voltage_V, cut, [said] if cut.any() else []
 
 
-@dataclass(frozen=True)
-class _Compiled:
-    """A hysteresis as `follow` takes it; lengths are filled up to pieces, so that few functions are compiled."""
-
-    model: Preisach
-
-    @property
-    def range_V(self) -> tuple[float, float]:
-        return float(self.model.density.lower_V), float(self.model.density.upper_V)
-
-    def invert(self, wanted_um: np.ndarray, initial: str) -> tuple[np.ndarray, float, float]:
-        n, start = len(wanted_um), initial_state(initial, *self.range_V)
-        found = _invert(self.model, jnp.asarray(np.pad(wanted_um, (0, -n % PIECE), mode="edge")), start)
-        return np.asarray(found.voltage_V)[:n], float(found.lowest_um), float(found.highest_um)
-
-    def respond(self, voltage_V: np.ndarray, initial: str) -> np.ndarray:
-        n, start = len(voltage_V), initial_state(initial, *self.range_V)
-        padded = np.pad(voltage_V, (0, -n % (2 * PIECE)), mode="edge")
-        return np.asarray(_respond(self.model, jnp.asarray(padded), start))[:n]
+@eqx.filter_jit
+def _nodes(model: Preisach) -> tuple[Float[Array, "N N"], Float[Array, " N"]]:
+    return model.density.nodes_um_per_V2(), model.reversible.slope_um_per_V
 
 
-_invert = eqx.filter_jit(invert)
-_respond = eqx.filter_jit(lambda model, voltage_V, start: model(voltage_V, start))
+def plain_loop_of(model: Preisach) -> PlainLoop:
+    """The same hysteresis in NumPy."""
+    density, slope = (np.asarray(values)[..., None] for values in _nodes(model))
+    surface = Surface.of(density, slope, float(model.density.lower_V), float(model.density.upper_V))
+    return PlainLoop(surface, float(model.offset_um))

@@ -7,15 +7,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from string import Template
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
 
+from fits.control._compensate import plain_loop_of
 from fits.control._follow import within_range
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 from fits.io._version import written_by
-from microid import Everett, Preisach
+from microid import Preisach
 
 
 def export_c(
@@ -57,17 +56,11 @@ def export_c(
     return [Path(folder) / f"{name}.{ending}" for ending in ("h", "c")]
 
 
-@eqx.filter_jit
-def _tables(model: Preisach) -> tuple[Everett, Float[Array, ""]]:
-    surface = model.everett
-    return surface, surface(surface.upper_V, surface.lower_V)
-
-
 def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]) -> dict[str, str]:
-    surface, stroke = _tables(model)
-    window, branch = np.asarray(surface.window_um), np.asarray(surface.branch_um)
-    lower, upper, offset, stroke_um = map(float, (surface.lower_V, surface.upper_V, model.offset_um, stroke))
-    if not np.isfinite([*window, *branch.ravel(), lower, upper, offset]).all():
+    law = plain_loop_of(model)
+    surface, (lower, upper), (lowest, highest) = law.surface, law.range_V, law.reach_um
+    window, branch = surface.window_um.ravel(), surface.branch_um[..., 0]
+    if not np.isfinite([*window, *branch.ravel(), lower, upper, lowest]).all():
         raise DataError("the model holds numbers that are not finite, which no controller can use; fit it again.")
     n = surface.intervals
     return {
@@ -78,9 +71,9 @@ def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]
         "upper_V": repr(upper),
         "lowest_V": repr(limits_V[0]),
         "highest_V": repr(limits_V[1]),
-        "lowest_um": repr(offset),
-        "highest_um": repr(offset + stroke_um),
-        "rounding_um": repr(2 * float(np.finfo(float).eps) * max(abs(offset), abs(offset + stroke_um))),
+        "lowest_um": repr(lowest),
+        "highest_um": repr(highest),
+        "rounding_um": repr(2 * float(np.finfo(float).eps) * max(abs(lowest), abs(highest))),
         "size": str(size),
         "swings": str(min(31, (size - 4) // 2)),  # at most those of a demagnetised staircase in `microid`
         "intervals": str(n),

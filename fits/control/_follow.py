@@ -1,7 +1,6 @@
-"""What a hysteresis can follow of a reference, and the voltage for it: whatever inverts it and lets it respond."""
+"""What a hysteresis can follow of a reference, and the voltage for it, without JAX."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -41,22 +40,8 @@ class Doubt:
     turning: str = ""
 
 
-class Law(Protocol):
-    """A hysteresis with a range, to be begun with a memory of some name."""
-
-    @property
-    def range_V(self) -> tuple[float, float]:
-        """Range of the switching voltages."""
-
-    def invert(self, wanted_um: np.ndarray, initial: str) -> tuple[np.ndarray, float, float]:
-        """Voltage whose displacement is the one wanted, `(n,)`, and the ends of what can be reached, in um."""
-
-    def respond(self, voltage_V: np.ndarray, initial: str) -> np.ndarray:
-        """Displacement along a voltage, `(n,)`, in um."""
-
-
 def follow(
-    law: Law,
+    law: PlainLoop,
     reference: Reference | Record,
     needed_um: np.ndarray,
     initial: str,
@@ -91,7 +76,7 @@ def follow(
     return voltage, clipped
 
 
-def binding(law: Law, limits: tuple[float, float]) -> str:
+def binding(law: PlainLoop, limits: tuple[float, float]) -> str:
     """Say which limits they are."""
     low, high = limits
     if limits == law.range_V:
@@ -99,13 +84,13 @@ def binding(law: Law, limits: tuple[float, float]) -> str:
     return f"the voltage is limited to {low:g} to {high:g} V"
 
 
-def compensate_plainly(
-    loop: PlainLoop, reference: Reference, initial: str, clip: bool, limits_V: tuple[float, float] | None
+def compensate_loop(
+    law: PlainLoop, reference: Reference | Record, initial: str, clip: bool, limits_V: tuple[float, float] | None
 ) -> Compensation:
-    """Find the voltage whose displacement is the reference, without JAX; see `compensate`."""
-    wanted = reference.displacement_um
-    voltage, clipped = follow(loop, reference, wanted, initial, clip, within_range(loop.range_V, limits_V))
-    return Compensation(voltage, loop.respond(voltage, initial), wanted, clipped)
+    """Find the voltage whose displacement under a hysteresis alone is the reference; see `compensate`."""
+    wanted = np.asarray(reference.displacement_um)
+    voltage, clipped = follow(law, reference, wanted, initial, clip, within_range(law.range_V, limits_V))
+    return Compensation(voltage, law.respond(voltage, initial), wanted, clipped)
 
 
 def within_range(range_V: tuple[float, float], limits_V: tuple[float, float] | None) -> tuple[float, float]:
@@ -123,7 +108,7 @@ def within_range(range_V: tuple[float, float], limits_V: tuple[float, float] | N
 
 
 def _within(
-    law: Law, wanted_um: np.ndarray, initial: str, limits: tuple[float, float]
+    law: PlainLoop, wanted_um: np.ndarray, initial: str, limits: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Voltage within the limits, and what could have been reached at every sample."""
     n = len(wanted_um)
@@ -146,7 +131,7 @@ def _within(
     raise DataError("the reference keeps crossing what the voltage limits allow; widen --limits or shrink it.")
 
 
-def _reach(law: Law, reached_V: np.ndarray, limit_V: float, initial: str) -> np.ndarray:
+def _reach(law: PlainLoop, reached_V: np.ndarray, limit_V: float, initial: str) -> np.ndarray:
     """Displacement at a voltage limit, after each of the running extremes on the other side.
 
     Going to a limit wipes out all that happened within the limits. What remains is what the start remembers beyond

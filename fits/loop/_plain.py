@@ -5,15 +5,17 @@ outputs counts operators that share a grid.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
+from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, refuse_outside, too_deep
 
+INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 # Perturbations at a time, which with a few thousand samples stay in a processor's cache.
 _BATCH = 32
 _SWINGS = 31  # of a demagnetised state, as in `microid`
@@ -150,23 +152,30 @@ class Perturbations:
 
 @dataclass(frozen=True)
 class PlainLoop:
-    """What a model file holds of a hysteresis on a grid; see `microid.Preisach` and `fits.ModelFile`."""
+    """A hysteresis, and what its model file says beside; see `microid.Preisach` and `fits.ModelFile`."""
 
     surface: Surface
     offset_um: float
-    uncertainty: Perturbations
-    report: Mapping[str, Any]
+    uncertainty: Perturbations | None = None
+    report: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def range_V(self) -> tuple[float, float]:
         """Range of the switching voltages."""
         return self.surface.lower_V, self.surface.upper_V
 
+    @property
+    def reach_um(self) -> tuple[float, float]:
+        """Displacements at the ends of the range."""
+        saturated = Path.of(*np.array(self.range_V)[:, None])
+        return self.offset_um, self.offset_um + float(self.surface.respond(saturated)[0, 0])
+
     def predict(self, record: Record, initial: str) -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
         refuse_outside(record, *self.range_V)
         path = self._path(record.voltage_V, initial)
-        return Prediction(self.offset_um + self.surface.respond(path)[:, 0], self.uncertainty.sd_um(path))
+        sd_um = np.full(len(record), np.nan) if self.uncertainty is None else self.uncertainty.sd_um(path)
+        return Prediction(self.offset_um + self.surface.respond(path)[:, 0], sd_um)
 
     def respond(self, voltage_V: np.ndarray, initial: str) -> np.ndarray:
         """Displacement along a voltage, `(n,)`, in um; a `DataError` where it nests too deeply."""
@@ -181,10 +190,8 @@ class PlainLoop:
 
     def invert(self, wanted_um: np.ndarray, initial: str) -> tuple[np.ndarray, float, float]:
         """Voltage whose displacement is the one wanted, `(n,)`, and the ends of what can be reached, in um."""
-        surface, before = self.surface, extremes_V(initial, *self.range_V)
-        saturated = Path.of(np.array([surface.lower_V]), [surface.upper_V])
-        lowest, highest = self.offset_um, self.offset_um + float(surface.respond(saturated)[0, 0])
-        already = self.offset_um + surface.respond(Path.of(before[:0], before))[:, 0]
+        before, (lowest, highest) = extremes_V(initial, *self.range_V), self.reach_um
+        already = self.offset_um + self.surface.respond(Path.of(before[:0], before))[:, 0]
         rounding = 8 * _EPS * max(abs(lowest), abs(highest))
         within = (wanted_um >= lowest - rounding) & (wanted_um <= highest + rounding)
         # The reference has its own memory: the displacements at the remembered extremes.
@@ -242,7 +249,13 @@ class PlainLoop:
 
 
 def extremes_V(initial: str, lower_V: float, upper_V: float) -> np.ndarray:
-    """Extremes that a memory begins with, by its name, oldest first; see `microid.Staircase`."""
+    """Extremes that a memory begins with, oldest first, by its name; see `microid.Staircase`.
+
+    Negative saturation stands in for an unknown state, as the samples that would show the difference are not used. A
+    `DataError` refuses another name.
+    """
+    if initial not in INITIAL_STATES:
+        raise DataError(f"unknown initial state {initial!r}: choose one of {', '.join(INITIAL_STATES)}")
     if initial == "demagnetised":
         rest, left = (lower_V + upper_V) / 2, 1 - np.arange(_SWINGS) / _SWINGS
         return np.append(rest + left[:, None] * (np.array([lower_V, upper_V]) - rest), rest)

@@ -15,6 +15,7 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import columns_beside
 from fits.loop._past import past_columns
+from fits.loop._plain import extremes_V
 from fits.loop._prediction import MOST_EXTREMES, PIECE, too_deep
 
 # A hundred arrays of so many values are 8 GB.
@@ -26,7 +27,6 @@ _FEWEST = 50
 _SHORTEST = 4096
 # Told what is being done, a sentence at a time.
 Progress = Callable[[str], None]
-INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 
 
 class Samples(eqx.Module):
@@ -246,17 +246,9 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
 
 
 def initial_state(name: str, lower_V: float, upper_V: float) -> m.Staircase:
-    """Make the memory before a record from its name, one of `INITIAL_STATES`; a `DataError` for another name.
-
-    Negative saturation stands in for an unknown state, as the samples that would show the difference are not used.
-    """
-    if name in ("negative", "unknown"):
-        return m.negative_saturation(lower_V)
-    if name == "positive":
-        return m.positive_saturation(lower_V, upper_V)
-    if name == "demagnetised":
-        return m.demagnetised(lower_V, upper_V)
-    raise DataError(f"unknown initial state {name!r}: choose one of {', '.join(INITIAL_STATES)}")
+    """Make the memory before a record from its name; see `extremes_V`."""
+    extremes = extremes_V(name, lower_V, upper_V)
+    return resized(m.Staircase(jnp.asarray(extremes), jnp.asarray(len(extremes), jnp.int32)), _STAIRCASES[0])
 
 
 def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:
