@@ -6,12 +6,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _command import columns_of, run, without_jax
-from _models import LEVELS, densities_of, ends_um, limits_V, nested_voltages, random_model, stroke_um
+from _models import (
+    LEVELS,
+    compiled,
+    densities_of,
+    ends_um,
+    limits_V,
+    nested_voltages,
+    random_model,
+    starts,
+    stroke_um,
+)
 from _reference import branches, play_relays, relay_weights_um
 
 import microid as m
-from fits import DataError, Record, Reference, Uncertainty, compensate, predict, save_model
-from fits.control._follow import compensate_loop
+from fits import DataError, Record, Uncertainty, predict, save_model
 from fits.io._model_text import read_model_text
 from fits.loop import _plain_file
 from fits.loop._design import Grid
@@ -23,6 +32,7 @@ STATES = ("negative", "positive", "demagnetised")
 EXACT = 1e-12
 SAMPLES = 300
 
+inverse = compiled(m.invert)
 pytestmark = pytest.mark.usefixtures("compiled_fast")
 
 
@@ -68,27 +78,16 @@ def test_predictions_are_those_of_jax(levels, rng, tmp_path):
 
 
 @pytest.mark.parametrize("state", STATES)
-def test_voltages_are_those_of_jax(state, rng, file):
+def test_the_inverse_is_that_of_jax(state, rng, file):
     model, _, path = file
-    loop, (lower_V, upper_V), (lowest_um, highest_um) = plainly(path), limits_V(model), ends_um(model)
-    within_V = lower_V + (upper_V - lower_V) * np.array([rng.uniform(0, 0.4), rng.uniform(0.6, 1)])
+    (lower_V, upper_V), (lowest_um, highest_um) = limits_V(model), ends_um(model)
     wanted_um = nested_voltages(rng, lowest_um - 1, highest_um + 1, SAMPLES)
-    wanted_um[:2] = lowest_um, highest_um
-    reference = Reference(times_s(SAMPLES), wanted_um, "wanted.csv")
-    for limits in (None, tuple(within_V)):
-        found, expected = (
-            invert(one, reference, state, True, limits)
-            for invert, one in ((compensate_loop, loop), (compensate, model))
-        )
-        np.testing.assert_array_equal(found.clipped, expected.clipped)
-        np.testing.assert_allclose(found.voltage_V, expected.voltage_V, rtol=0, atol=1e-11 * (upper_V - lower_V))
-        exact = {"rtol": 0, "atol": EXACT * stroke_um(model)}
-        np.testing.assert_allclose(found.displacement_um, expected.displacement_um, **exact)
-        with pytest.raises(DataError) as plain:
-            compensate_loop(loop, reference, state, False, limits)
-        with pytest.raises(DataError) as refusal:
-            compensate(model, reference, state, False, limits)
-        assert str(plain.value) == str(refusal.value)
+    wanted_um[:4] = lowest_um, highest_um, highest_um, np.nextafter(highest_um, np.inf)
+    voltage_V, *found_um = plainly(path).invert(wanted_um, state)
+    expected = inverse(model, wanted_um, starts(model)[state])
+    np.testing.assert_allclose(voltage_V, expected.voltage_V, rtol=0, atol=1e-11 * (upper_V - lower_V))
+    expected_um = float(expected.lowest_um), float(expected.highest_um)
+    np.testing.assert_allclose(found_um, expected_um, rtol=0, atol=EXACT * stroke_um(model))
 
 
 def test_relays_agree_exactly_at_the_edges_of_cells(rng, file):
