@@ -190,6 +190,7 @@ def test_jax_and_pandas_are_not_imported(file, tmp_path):
         arguments = command, path, tmp_path / csv, "--out", tmp_path / "y.csv"
         done = without_jax(*arguments, and_without=("pandas", "scipy"))
         assert (done.returncode, done.stderr) == (0, "")
+    assert without_jax("export", path, "--out", tmp_path / "c").returncode == 0
 
 
 @pytest.mark.parametrize("command", ["simulate", "compensate"])

@@ -6,19 +6,22 @@ import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from string import Template
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.control._compensate import plain_loop_of
 from fits.control._follow import within_range
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 from fits.io._version import written_by
-from microid import Preisach
+from fits.loop._plain import PlainLoop
+
+if TYPE_CHECKING:
+    from microid import Preisach
 
 
 def export_c(
-    model: Preisach,
+    model: "Preisach | PlainLoop",
     folder: str | os.PathLike[str],
     name: str = "compensator",
     *,
@@ -44,9 +47,11 @@ def export_c(
         )
     if not 8 <= size <= 65_536:
         raise DataError(f"--memory: expected 8 to 65536 extremes, found {size}; 128 suit most references.")
-    fields = _fields(
-        model, name, size, within_range((float(model.density.lower_V), float(model.density.upper_V)), limits_V)
-    )
+    if not isinstance(model, PlainLoop):
+        from fits.control._compensate import plain_loop_of  # with JAX, which a model in NumPy does without
+
+        model = plain_loop_of(model)
+    fields = _fields(model, name, size, within_range(model.range_V, limits_V))
     with file_set() as files:
         place = files.folder(folder, "--out")
         for ending in ("h", "c"):
@@ -56,8 +61,7 @@ def export_c(
     return [Path(folder) / f"{name}.{ending}" for ending in ("h", "c")]
 
 
-def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]) -> dict[str, str]:
-    law = plain_loop_of(model)
+def _fields(law: PlainLoop, name: str, size: int, limits_V: tuple[float, float]) -> dict[str, str]:
     surface, (lower, upper), (lowest, highest) = law.surface, law.range_V, law.reach_um
     window, branch = surface.window_um.ravel(), surface.branch_um[..., 0]
     if not np.isfinite([*window, *branch.ravel(), lower, upper, lowest]).all():
