@@ -262,6 +262,13 @@ def extremes_V(initial: str, lower_V: float, upper_V: float) -> np.ndarray:
     return np.array([lower_V, upper_V] if initial == "positive" else [lower_V])
 
 
+def spread(packed: np.ndarray, levels: int) -> np.ndarray:
+    """Values row by row over the half-plane, `(N (N + 1) / 2, k)` to `(N, N, k)`."""
+    nodes = np.zeros((levels, levels, packed.shape[1]))
+    nodes[np.tril_indices(levels)] = packed
+    return nodes
+
+
 def _sums(values: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fits.loop._plain import Perturbations, PlainLoop, Surface
+from fits.loop._plain import Perturbations, PlainLoop, Surface, spread
 
 # Samples times perturbations, and times a hundred for the memory and the inverse, beyond which JAX is done first
 # although it takes seconds to start.
@@ -47,10 +47,10 @@ def plain_loop(content: Mapping[str, Any], samples: int) -> PlainLoop | None:
         return None
     with np.errstate(all="ignore"):
         weights = (weights_um / _node_areas(len(slope_um_per_V))[own])[:, None]
-        nodes = _spread(weights, len(slope_um_per_V)) / (upper_V - lower_V) ** 2
+        nodes = spread(weights, len(slope_um_per_V)) / (upper_V - lower_V) ** 2
         surface = Surface.of(nodes, slope_um_per_V[:, None], lower_V, upper_V)
         range_V = grid_V[1] - grid_V[0]
-        moved = _spread(columns_um[:, :size].T, levels) / range_V**2, columns_um[:, size:].T / range_V
+        moved = spread(columns_um[:, :size].T, levels) / range_V**2, columns_um[:, size:].T / range_V
     sound = all(np.isfinite(one).all() for one in (surface.window_um, surface.branch_um, *moved))
     if not (lower_V < upper_V and range_V > 0 and sound):
         return None
@@ -77,13 +77,6 @@ def _array(item: Mapping[str, Any], axes: int, unit: str | None = None, least: f
     if not (plain and sized and unit in (None, item["unit"])):
         raise ValueError("another form")
     return array.astype(np.float64)
-
-
-def _spread(packed: np.ndarray, levels: int) -> np.ndarray:
-    """Values row by row over the half-plane, `(N (N + 1) / 2, k)` to `(N, N, k)`."""
-    nodes = np.zeros((levels, levels, packed.shape[1]))
-    nodes[np.tril_indices(levels)] = packed
-    return nodes
 
 
 def _node_areas(levels: int) -> np.ndarray:
