@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from fits.io._late import late as _late
 
 if TYPE_CHECKING:
-    from fits.control._compensate import Compensation, compensate
+    from fits.control._compensate import compensate
     from fits.control._export_c import export_c
+    from fits.control._follow import Compensation
     from fits.control._network_inverse import NetworkInverse, fit_network_inverse
     from fits.control._tune import tune_controller
     from fits.control._tune_problem import Goal, LoopReport, Tuning
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
     from fits.io._record import Record, Reference
     from fits.loop._choose_grid import LADDER
     from fits.loop._fit import fit
+    from fits.loop._prediction import Prediction
     from fits.loop._result import FitError, FitResult, FitStatus, LevelTrial, ParameterEstimate, RunReport
-    from fits.loop._uncertainty import AbstractUncertainty, Prediction, Uncertainty
+    from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
     from fits.machining._allocate import Allocation, AllocationError, allocate
     from fits.machining._budget import AxisBudget, Budget, Driving, budget
     from fits.machining._claims import Claim, describe_claims, paper_claims, sign_change_guides

@@ -1,6 +1,10 @@
 """Running the `microid` command in tests, and looking at what it writes."""
 
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
@@ -13,6 +17,21 @@ OFF = {"MICROID_CACHE": "off"}
 
 def run(*arguments):
     return CliRunner(env=OFF).invoke(cli, [str(argument) for argument in arguments])
+
+
+def without_jax(*arguments, and_without=()):
+    """Run a command, of which it is known in the end that it did not load JAX, nor other libraries."""
+    asked = "import sys; from fits.cli._main import main; sys.argv[0] = 'microid'; main()"
+    loaded = f"atexit.register(lambda: print({{'jax', *{tuple(and_without)}}} & set(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", f"import atexit, sys; {loaded}; {asked}", *map(str, arguments)],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.endswith("set()\n"), done.stderr + done.stdout
+    return done
 
 
 def files(folder):

@@ -113,9 +113,10 @@ def test_new_files_of_lax_users_are_no_trouble(folder):
 
 def test_the_command_says_it_in_one_sentence(folder, tmp_path):
     group_writable(folder)
-    (tmp_path / "x.csv").write_text("time_s,voltage_V\n0,1\n1,2\n")
+    rows = "".join(f"{k},{k % 7},{k % 5}\n" for k in range(60))
+    (tmp_path / "x.csv").write_text(f"time_s,voltage_V,displacement_um\n{rows}")
     done = subprocess.run(
-        [sys.executable, "-m", "fits", "simulate", "model.json", "x.csv", "--out", "y.csv"],
+        [sys.executable, "-m", "fits", "fit", "x.csv", "--out", "y.json", "--quiet"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,

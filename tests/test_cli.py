@@ -9,11 +9,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from _command import OFF, columns_of, files, refused, run
+from _command import OFF, columns_of, files, refused, run, without_jax
 
 from fits.cli._main import cli
 from fits.io._jax_setup import _cache_folder
-from fits.loop._run import INITIAL_STATES
+from fits.loop._plain import INITIAL_STATES
 from microid import FAMILIES
 
 ROOT = Path(__file__).parents[1]
@@ -123,21 +123,6 @@ def test_json_and_info_agree(bench, tmp_path):
     words = run("info", out)
     assert words.exit_code == 0
     assert fit.stdout.split("\n\nmodel ")[0] in words.stdout
-
-
-def without_jax(*arguments):
-    """Run a command, which prints at its end whether it loaded JAX."""
-    asked = "import sys; from fits.cli._main import main; sys.argv[0] = 'microid'; main()"
-    loaded = "import atexit, sys; atexit.register(lambda: print('jax' in sys.modules))"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{loaded}; {asked}", *map(str, arguments)],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.stdout.endswith("False\n"), done.stderr
-    return done
 
 
 def test_info_does_not_wait_for_jax(bench):

@@ -1,7 +1,6 @@
 """A whole stage in feedforward: what it follows, and what is refused or said, from Python and from the command."""
 
 import ctypes
-import dataclasses
 import json
 import shutil
 import subprocess
@@ -11,12 +10,11 @@ import pytest
 from _command import run, whole_picture
 from _models import ends_um, limits_V, play, random_model
 from _plant_reference import driver_and_mechanics, mechanics_alone, states
-from test_compensate import model_file, read
+from test_compensate import read
 
 import microid
-from fits import DataError, Reference, compensate, load_model
+from fits import DataError, Reference, compensate, save_model
 
-__all__ = ["model_file"]
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 SAMPLES, HALF = 400, 200
 
@@ -144,14 +142,10 @@ def test_the_driver_alone_can_be_what_asks_for_too_much(rng):
     assert lower_V / 2 <= found.voltage_V.min() <= found.voltage_V.max() <= upper_V / 2
 
 
-def test_the_command_takes_stages(rng, model_file, tmp_path, monkeypatch):
-    """Reading them from a file is tested elsewhere: here the model in the file is put into a stage."""
-    law, path = model_file
-    stage = stage_of(rng, law)
-    loaded = load_model(path)
-    monkeypatch.setattr(
-        "fits.stage._model_file.load_model", lambda _: dataclasses.replace(loaded, model=stage, uncertainty=None)
-    )
+def test_the_command_takes_stages(rng, tmp_path):
+    law = random_model(rng)
+    stage, path = stage_of(rng, law), tmp_path / "stage.json"
+    save_model(path, stage, None, {})
     wanted, stroke = smooth_reference(stage)
     csv, out = tmp_path / "r.csv", tmp_path / "v.csv"
     rows = zip(wanted.time_s.tolist(), wanted.displacement_um.tolist(), strict=True)

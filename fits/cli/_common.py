@@ -233,8 +233,22 @@ def stage_or_preisach(path: str, loaded: "late.ModelFile") -> "late.Preisach | l
     raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
 
 
-def predicted_by(path: str, loaded: "late.ModelFile", program: "late.Record", initial: str) -> "late.Prediction":
+def opened(path: str, samples: int, plain: bool = True) -> "late.ModelFile | late.PlainLoop":
+    """Read a model for so many samples: without JAX where `plain_loop` can, and what is asked for is plain."""
+    content = late.read_model_text(path)
+    loop = late.plain_loop(content, samples) if plain else None
+    if loop is not None:
+        return loop
+    late.start_jax()
+    return late.load_model(path)
+
+
+def predicted_by(
+    path: str, loaded: "late.ModelFile | late.PlainLoop", program: "late.Record", initial: str
+) -> "late.Prediction":
     """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
+    if isinstance(loaded, late.PlainLoop):
+        return loaded.predict(program, initial)
     model = stage_or_preisach(path, loaded)
     if loaded.uncertainty is None and isinstance(model, late.Preisach):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")

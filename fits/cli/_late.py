@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from fits.control._compensate import compensate
     from fits.control._compensate_stage import static_equivalent
     from fits.control._export_c import export_c
+    from fits.control._follow import compensate_loop
     from fits.control._gains import read_gains
     from fits.control._make import Loop, Maker
     from fits.control._setup import setup
@@ -18,15 +19,17 @@ if TYPE_CHECKING:
     from fits.io._atomic import finite_json, refuse_nonfinite, write_csv
     from fits.io._inspect import inspect_table
     from fits.io._jax_setup import start_jax
-    from fits.io._limits import allowed, check_command, joined, parse_limits, ranges_json, reached_in
+    from fits.io._limits import allowed, check_command, joined, measured_ranges, parse_limits, ranges_json, reached_in
     from fits.io._model_text import read_model_text
     from fits.io._quantity import Quantity
     from fits.io._read_csv import read_reference, read_runs, read_table
     from fits.io._record import Record
     from fits.io._units import parse_columns
     from fits.loop._fit import fit
+    from fits.loop._plain import PlainLoop
+    from fits.loop._plain_file import plain_loop
+    from fits.loop._prediction import Prediction
     from fits.loop._result import FitError
-    from fits.loop._uncertainty import Prediction
     from fits.machining._budget import budget
     from fits.machining._claims import describe_claims, paper_claims
     from fits.machining._design import Design, paper_design

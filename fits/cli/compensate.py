@@ -1,5 +1,8 @@
 """The command `microid compensate`: its options, and the work."""
 
+from dataclasses import replace
+from typing import Any
+
 import click
 
 from fits.cli import _common as common
@@ -37,10 +40,9 @@ def compensate(given: common.Given) -> None:
     common.refuse_overwriting(given.out, [given.model, given.reference])
     volts, stated = common.parse_rig_limits(given.limits, given.limit, given.margin)
     wanted = late.read_reference(given.reference, **common.reading(given))
-    # Only now, so that what cannot be read is refused at once.
-    late.start_jax()
-    loaded = late.load_model(given.model)
-    stage = common.stage_or_preisach(given.model, loaded)
+    every = bool({"velocity", "acceleration", "current"} & set(stated))
+    loaded = common.opened(given.model, len(wanted), plain=given.way == "static" and not (every or given.plots))
+    stage: Any = loaded if isinstance(loaded, late.PlainLoop) else common.stage_or_preisach(given.model, loaded)
     if given.way == "dynamic" and isinstance(stage, late.Preisach):
         raise DataError(
             f"{given.model}: expected a model with mechanics for --dynamic, found a Preisach model, which has none; "
@@ -48,10 +50,14 @@ def compensate(given: common.Given) -> None:
         )
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
-        found = late.compensate(stage, wanted, given.initial, given.clip, volts, given.way)
+        asked = stage, wanted, given.initial, given.clip, volts
+        plain = isinstance(stage, late.PlainLoop)
+        found = late.compensate_loop(*asked) if plain else late.compensate(*asked, given.way)
         program = late.Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
-        every = bool({"velocity", "acceleration", "current"} & set(stated))
-        predicted = late.predicted_ranges(stage, program, found.displacement_um, given.initial, every)
+        if plain:
+            predicted = late.measured_ranges(replace(program, displacement_um=found.displacement_um))
+        else:
+            predicted = late.predicted_ranges(stage, program, found.displacement_um, given.initial, every)
         said = late.check_command(wanted.source, predicted, late.reached_in(loaded.report), stated, given.margin)
         sd_um = None
         if loaded.uncertainty is not None:
@@ -71,7 +77,7 @@ def compensate(given: common.Given) -> None:
         "clipped": int(found.clipped.sum()),
         "voltage_min_V": float(found.voltage_V.min()),
         "voltage_max_V": float(found.voltage_V.max()),
-        "offset_um": float(late.static_equivalent(stage).offset_um),
+        "offset_um": float((stage if plain else late.static_equivalent(stage)).offset_um),
         "error_max_um": float(off.max()),
         "error_max_within_reach_um": float(off[~found.clipped].max(initial=0.0)),
         "displacement_sd_median_um": None if sd_um is None else float(np.median(sd_um)),

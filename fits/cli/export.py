@@ -1,5 +1,7 @@
 """The command `microid export`: its options, and the work."""
 
+from typing import Any
+
 import click
 
 from fits.cli import _common as common
@@ -20,13 +22,18 @@ def export(given: common.Given) -> None:
 
     The header and the source need no library and allocate nothing.
     """
-    late.start_jax()
-    stage = common.stage_or_preisach(given.model, late.load_model(given.model))
-    limits_V = common.parse_limits_V(given.limits)
-    made = late.export_c(late.static_equivalent(stage), given.out, given.name, size=given.memory, limits_V=limits_V)
+    loaded, limits_V = common.opened(given.model, 0), common.parse_limits_V(given.limits)
+    law: Any = loaded
+    remarks = list[str]()
+    if not isinstance(loaded, late.PlainLoop):
+        stage = common.stage_or_preisach(given.model, loaded)
+        law = late.static_equivalent(stage)
+        if isinstance(stage, late.Stage):
+            # The inverse of mechanics needs the samples to come, which a controller does not have.
+            remarks = [
+                "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
+            ]
+    made = late.export_c(law, given.out, given.name, size=given.memory, limits_V=limits_V)
     files = [str(file) for file in made]
-    # The inverse of mechanics needs the samples to come, which a controller does not have.
-    static = "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
-    remarks = [static] if isinstance(stage, late.Stage) else []
     lines = [*(f"Note: {remark}" for remark in remarks), *files]
     common.print_result(given, {"files": files, "remarks": remarks}, lines)

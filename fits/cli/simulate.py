@@ -25,9 +25,7 @@ def simulate(given: common.Given) -> None:
 
     common.refuse_overwriting(given.out, [given.model, given.program])
     record = late.read_table(given.program, required=("time_s", "voltage_V"), **common.reading(given))
-    # Only now, so that what cannot be read is refused at once.
-    late.start_jax()
-    loaded = late.load_model(given.model)
+    loaded = common.opened(given.model, len(record))
     prediction = common.predicted_by(given.model, loaded, record, given.initial)
     displacement_um, sd_um = prediction.displacement_um, prediction.displacement_sd_um
     known = loaded.uncertainty is not None

@@ -6,20 +6,22 @@ import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from string import Template
+from typing import TYPE_CHECKING
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
 
-from fits.control._compensate import within_range
+from fits.control._follow import within_range
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
 from fits.io._version import written_by
-from microid import Everett, Preisach
+from fits.loop._plain import PlainLoop
+
+if TYPE_CHECKING:
+    from microid import Preisach
 
 
 def export_c(
-    model: Preisach,
+    model: "Preisach | PlainLoop",
     folder: str | os.PathLike[str],
     name: str = "compensator",
     *,
@@ -45,7 +47,11 @@ def export_c(
         )
     if not 8 <= size <= 65_536:
         raise DataError(f"--memory: expected 8 to 65536 extremes, found {size}; 128 suit most references.")
-    fields = _fields(model, name, size, within_range(model, limits_V))
+    if not isinstance(model, PlainLoop):
+        from fits.control._compensate import plain_loop_of  # with JAX, which a model in NumPy does without
+
+        model = plain_loop_of(model)
+    fields = _fields(model, name, size, within_range(model.range_V, limits_V))
     with file_set() as files:
         place = files.folder(folder, "--out")
         for ending in ("h", "c"):
@@ -55,17 +61,10 @@ def export_c(
     return [Path(folder) / f"{name}.{ending}" for ending in ("h", "c")]
 
 
-@eqx.filter_jit
-def _tables(model: Preisach) -> tuple[Everett, Float[Array, ""]]:
-    surface = model.everett
-    return surface, surface(surface.upper_V, surface.lower_V)
-
-
-def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]) -> dict[str, str]:
-    surface, stroke = _tables(model)
-    window, branch = np.asarray(surface.window_um), np.asarray(surface.branch_um)
-    lower, upper, offset, stroke_um = map(float, (surface.lower_V, surface.upper_V, model.offset_um, stroke))
-    if not np.isfinite([*window, *branch.ravel(), lower, upper, offset]).all():
+def _fields(law: PlainLoop, name: str, size: int, limits_V: tuple[float, float]) -> dict[str, str]:
+    surface, (lower, upper), (lowest, highest) = law.surface, law.range_V, law.reach_um
+    window, branch = surface.window_um.ravel(), surface.branch_um[..., 0]
+    if not np.isfinite([*window, *branch.ravel(), lower, upper, lowest]).all():
         raise DataError("the model holds numbers that are not finite, which no controller can use; fit it again.")
     n = surface.intervals
     return {
@@ -76,9 +75,9 @@ def _fields(model: Preisach, name: str, size: int, limits_V: tuple[float, float]
         "upper_V": repr(upper),
         "lowest_V": repr(limits_V[0]),
         "highest_V": repr(limits_V[1]),
-        "lowest_um": repr(offset),
-        "highest_um": repr(offset + stroke_um),
-        "rounding_um": repr(2 * float(np.finfo(float).eps) * max(abs(offset), abs(offset + stroke_um))),
+        "lowest_um": repr(lowest),
+        "highest_um": repr(highest),
+        "rounding_um": repr(2 * float(np.finfo(float).eps) * max(abs(lowest), abs(highest))),
         "size": str(size),
         "swings": str(min(31, (size - 4) // 2)),  # at most those of a demagnetised staircase in `microid`
         "intervals": str(n),

@@ -3,12 +3,12 @@
 from functools import lru_cache
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from microid import GridDensity, Preisach, Reversible, Staircase, everett, forest_sum, node_areas, remember
+from fits.loop._plain import Surface, spread
+from microid import GridDensity, Preisach, Reversible, Staircase, forest_sum, node_areas, remember
 
 
 class Grid(eqx.Module):
@@ -113,14 +113,11 @@ def _rectangles(high: Float[Array, "m N"], low: Float[Array, "m N"]) -> Float[Ar
 
 @lru_cache(maxsize=16)
 def branch_table(levels: int) -> np.ndarray:
-    """Branch polynomials of every column, taken from the model itself, shape `(4, 2 (levels - 1), D)`."""
-    return np.asarray(_branch_table(Grid(jnp.zeros(()), jnp.ones(()), levels)))
-
-
-@eqx.filter_jit
-def _branch_table(unit: Grid) -> Float[Array, "4 k D"]:
-    def branch(column: Float[Array, " D"]) -> Float[Array, "4 k"]:
-        nodes, slopes = unit.nodes(column[: unit.weights]), column[unit.weights :]
-        return everett(nodes, slopes, unit.lower_V, unit.upper_V).branch_um
-
-    return jnp.moveaxis(jax.vmap(branch)(jnp.eye(unit.columns)), 0, -1)
+    """Branch polynomials of every column, shape `(4, 2 (levels - 1), D)`."""
+    size = levels * (levels + 1) // 2
+    tables = []
+    # Some at a time, as each has a window of its own.
+    for k in range(0, size + levels, 256):
+        unit = np.eye(size + levels, min(256, size + levels - k), -k)
+        tables.append(Surface.of(spread(unit[:size], levels), unit[size:], 0.0, 1.0).branch_um)
+    return np.concatenate(tables, axis=2)

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 from fits.io._limits import Ranges, measured_ranges
 from fits.io._record import Record
 from fits.loop._misfit import Misfit
+from fits.loop._prediction import Prediction
 from fits.loop._run import Run
-from fits.loop._uncertainty import AbstractUncertainty, Prediction
+from fits.loop._uncertainty import AbstractUncertainty
 from fits.stats._metrics import Errors, errors, loop_width_pct
 from microid import Everett, Preisach, Stage, Staircase, innermost
 

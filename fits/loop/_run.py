@@ -15,19 +15,18 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import columns_beside
 from fits.loop._past import past_columns
+from fits.loop._plain import extremes_V
+from fits.loop._prediction import MOST_EXTREMES, PIECE, too_deep
 
 # A hundred arrays of so many values are 8 GB.
 _MOST_STEPS = 10_000_000
-# All records pass through the same compiled functions in pieces of this many samples.
-_PIECE = 8192
-_STAIRCASES = (64, 512, 4096)
+_STAIRCASES = (64, 512, MOST_EXTREMES)
 # Samples that a run must leave to fit.
 _FEWEST = 50
 # Samples that a shorter run is padded to, so that runs of many lengths share what is compiled.
 _SHORTEST = 4096
 # Told what is being done, a sentence at a time.
 Progress = Callable[[str], None]
-INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 
 
 class Samples(eqx.Module):
@@ -140,10 +139,10 @@ class Run:
         """The voltage followed by the memory, as the fit of a hysteresis alone needs it."""
         voltage = self.voltage_V
         # The last piece is filled up with its final value, which changes no memory.
-        padded = np.pad(voltage, (0, -len(voltage) % _PIECE), mode="edge")
+        padded = np.pad(voltage, (0, -len(voltage) % PIECE), mode="edge")
         for size in _STAIRCASES:
             memory, anchors, risings, pieces = resized(self.start, size), [], [], []
-            for piece in map(jnp.asarray, padded.reshape(-1, _PIECE)):
+            for piece in map(jnp.asarray, padded.reshape(-1, PIECE)):
                 pieces.append((piece, memory))
                 anchor, rising, memory = _remember(piece, memory)
                 anchors.append(anchor)
@@ -153,10 +152,7 @@ class Run:
                     break
             else:
                 return Path(tuple(pieces), *(np.concatenate(each)[: len(voltage)] for each in (anchors, risings)))
-        raise DataError(
-            f"the voltage nests more than {_STAIRCASES[-1]} loops into each other: that is noise, not a drive; "
-            "use the commanded voltage"
-        )
+        raise too_deep()
 
     @cached_property
     def samples(self) -> Samples:
@@ -250,17 +246,9 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
 
 
 def initial_state(name: str, lower_V: float, upper_V: float) -> m.Staircase:
-    """Make the memory before a record from its name, one of `INITIAL_STATES`; a `DataError` for another name.
-
-    Negative saturation stands in for an unknown state, as the samples that would show the difference are not used.
-    """
-    if name in ("negative", "unknown"):
-        return m.negative_saturation(lower_V)
-    if name == "positive":
-        return m.positive_saturation(lower_V, upper_V)
-    if name == "demagnetised":
-        return m.demagnetised(lower_V, upper_V)
-    raise DataError(f"unknown initial state {name!r}: choose one of {', '.join(INITIAL_STATES)}")
+    """Make the memory before a record from its name; see `extremes_V`."""
+    extremes = extremes_V(name, lower_V, upper_V)
+    return resized(m.Staircase(jnp.asarray(extremes), jnp.asarray(len(extremes), jnp.int32)), _STAIRCASES[0])
 
 
 def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:

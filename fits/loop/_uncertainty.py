@@ -1,7 +1,6 @@
 """How sure a prediction is."""
 
 from abc import abstractmethod
-from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,19 +11,9 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid
+from fits.loop._prediction import Prediction, refuse_outside
 from fits.loop._run import Run, prepare_run, simulate_run
 from microid import Preisach, Stage, Staircase, everett, remember
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Predicted displacement of a voltage program, and its standard deviation, shape `(n,)` each.
-
-    The latter comes from noise and smoothing, sensor noise not included; NaN where it is not known.
-    """
-
-    displacement_um: np.ndarray
-    displacement_sd_um: np.ndarray
 
 
 class AbstractUncertainty(eqx.Module):
@@ -86,16 +75,3 @@ def _sd(uncertainty: Uncertainty, voltage_V: Float[Array, " n"], start: Staircas
     # In batches: all at once would take k times the memory of a simulation.
     each = lax.map(variance, (uncertainty.columns_um, uncertainty.offset_um), batch_size=32)
     return jnp.sqrt(jnp.sum(each, axis=0) + uncertainty.discrepancy_um**2)
-
-
-def refuse_outside(record: Record, lower_V: float, upper_V: float) -> None:
-    """Refuse, in a `DataError`, a program that leaves the range that a model was fitted on."""
-    slack = 1e-9 * (upper_V - lower_V) if np.isfinite(upper_V - lower_V) else 0.0
-    outside = np.flatnonzero((record.voltage_V < lower_V - slack) | (record.voltage_V > upper_V + slack))
-    if len(outside):
-        first = int(outside[0])
-        raise DataError(
-            f"{record.source}: sample {first + 1} (time {record.time_s[first]:g} s) asks for "
-            f"{record.voltage_V[first]:g} V, but the model was fitted between {lower_V:g} and {upper_V:g} V: "
-            "clip the program or fit runs that cover it"
-        )

@@ -6,8 +6,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from fits.control._compensate import Compensation
 from fits.control._compensate_stage import simulate_model
+from fits.control._follow import Compensation
 from fits.control._tune_start import slope_array
 from fits.io._errors import AnyPath
 from fits.io._record import Record, Reference

@@ -10,9 +10,10 @@ from scipy import fft
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
+from fits.loop._prediction import Prediction
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
-from fits.loop._uncertainty import AbstractUncertainty, Prediction, Uncertainty
+from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
 from fits.stage._moments import Chain, along, offsets_out
 from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free

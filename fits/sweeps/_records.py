@@ -16,8 +16,8 @@ from fits.io._read_csv import read_table
 from fits.io._record import Record
 from fits.io._typed import typed
 from fits.io._units import parse_columns
+from fits.loop._plain import INITIAL_STATES
 from fits.loop._result import FitError
-from fits.loop._run import INITIAL_STATES
 from fits.sweeps._programs import Program, read_program
 from fits.sweeps._stages import requested_stage, simulated, stage_parameters
 from fits.sweeps._types import Block, Output, Parameter, Request, Rows

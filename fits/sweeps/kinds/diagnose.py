@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from fits.io._record import Record
 from fits.io._typed import typed
-from fits.loop._run import INITIAL_STATES
+from fits.loop._plain import INITIAL_STATES
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, each_alone, requested_records
 from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows, choice
 

@@ -16,8 +16,9 @@ from fits.io._record import Record
 from fits.io._typed import typed
 from fits.loop._design import branch_table
 from fits.loop._fit import fit
+from fits.loop._plain import INITIAL_STATES
 from fits.loop._prior import roughness
-from fits.loop._run import INITIAL_STATES, initial_state, known_samples
+from fits.loop._run import initial_state, known_samples
 from fits.stats._metrics import errors
 from fits.sweeps._devices import in_turn, place
 from fits.sweeps._fit_batch import fit_batch
