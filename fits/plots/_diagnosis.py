@@ -78,6 +78,10 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
     if not runs:
         return None
     points = max(_POINTS // (2 * len(runs)), 200)
+    # What is left out at the start of a run, as its past is unknown, may be off by much more than all that counts.
+    shown = [(run.before_um, run.after_um)[side][np.argmax(run.fitted) :] for run in runs for side in (0, 1)]
+    highest_um = max((float(np.nanmax(np.abs(one))) for one in shown if np.isfinite(one).any()), default=0.0)
+    highest_um = max(highest_um, 2.2 * diagnosis.noise_um if np.isfinite(diagnosis.noise_um) else 0.0)
 
     def draw(width_in: float) -> Figure:
         height_in = 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0)
@@ -98,6 +102,8 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
                 for edge in (-band, band):
                     axes.axhline(edge, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=3)
             axes.set_xlim(run.time_s[0], run.time_s[-1])
+            if highest_um > 0:
+                axes.set_ylim(-1.08 * per_um * highest_um, 1.08 * per_um * highest_um)
             axes.set_title(verbatim(run.source, int(12 * width_in)), loc="left")
             label(axes, y=f"residual ({unit})" if len(runs) < 3 or width_in == _WIDE_in else unit)
         label(grid[-1, 0], "time (s)")
