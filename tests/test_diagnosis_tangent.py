@@ -64,10 +64,8 @@ EFFECTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["driver_saturation", *(pytest.param(name, marks=pytest.mark.study) for name in ("backlash", "slew_limit"))],
-)
+@pytest.mark.study
+@pytest.mark.parametrize("name", EFFECTS)
 def test_the_tangent_goes_through_what_levels_off(name, rng):
     baseline, effect = baseline_of(rng), EFFECTS[name]
     dressed, plain = (regress(baseline, kinds, [own, own]) for kinds, own in ((None, [effect]), ((), [])))

@@ -181,6 +181,7 @@ def test_what_is_calibrated_is_within_five_percent(short):
             assert figure["ours"] == pytest.approx(figure["paper"], rel=0.05), name
 
 
+@pytest.mark.study
 def test_what_is_measured_is_what_the_bench_can_do(short):
     """Independent bounds: no true error is below what a sensor of this noise allows a loop, and none is absurd."""
     _, _, content = short
@@ -195,6 +196,7 @@ def test_what_is_measured_is_what_the_bench_can_do(short):
     assert readings["HC+CMAC-PID", "e_rms_pct"] > track["e_rms_pct"]["ours"]
 
 
+@pytest.mark.study
 def test_the_file_has_the_schema(short):
     out, result, content = short
     assert content["schema"] == "microid.paper/1"
@@ -211,6 +213,7 @@ def test_the_file_has_the_schema(short):
     assert "tracking along x, HC+CMAC-PID" in result.stderr
 
 
+@pytest.mark.study
 def test_errors_below_the_sensors_last_digit_say_so(short):
     """100 nm are 5 % of 2 um, and 1.51 % of a step of 6.613 um."""
     _, _, content = short
@@ -233,6 +236,7 @@ def test_errors_below_the_sensors_last_digit_say_so(short):
     assert not flags["table2", "HC", "overshoot_pct"][1]
 
 
+@pytest.mark.study
 def test_rows_are_called_worse_that_are(short):
     """The list is what the figures in the same file say, to the digits of the paper."""
     _, result, content = short
