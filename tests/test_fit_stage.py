@@ -209,7 +209,6 @@ def test_slow_runs_alone_do_not_show_the_dynamics(rng):
     assert "chirp" in str(refusal.value) or "sample" in str(refusal.value)
 
 
-@pytest.mark.study
 def test_a_run_sampled_too_slowly_for_its_mode_is_refused(rig, rng):
     fast = rig.records["fast"]
     # Its rate falls to 1.5 times the resonance.
