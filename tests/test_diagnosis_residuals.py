@@ -207,6 +207,8 @@ def test_faults_have_the_variance_that_they_make(rng):
     assert name_faults(shaky, True) == []
     wave = Band(20.0, 0.08, 0.005, 10.0, 30.0, 1000.0, 1)
     assert [one.statistic for one in name_faults(faults(band=wave), False)] == ["band"]
+    # At an even speed a period in the position is a line in time.
+    assert name_faults(faults(band=wave), True) == []
     for other in (replace(wave, frequency_Hz=50.0), replace(wave, quality=1.0), replace(wave, z=3.0)):
         assert name_faults(faults(band=other), False) == []
 

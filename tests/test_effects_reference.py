@@ -135,7 +135,13 @@ def test_backlash_drags_along(rng):
     for value in path:
         place = min(max(place, value - gap), value + gap)
         truth.append(place)
-    np.testing.assert_allclose(through(BY_NAME["backlash", ""](gap, start), 1e-3, path), truth, atol=1e-12)
+    for form in ("", "output"):
+        np.testing.assert_allclose(through(BY_NAME["backlash", form](gap, start), 1e-3, path), truth, atol=1e-12)
+    # One drives the mechanics, which ring on; the other holds what the mechanics do.
+    stage = m.Stage.of(piezo=m.Piezo(0.1), mechanics=m.Mechanics(60.0, 0.05))
+    inside, outside = (m.effects.extend(stage, BY_NAME["backlash", form](gap, start)) for form in ("", "output"))
+    assert inside.names == ("piezo", "backlash", "mechanics")
+    assert outside.names == ("piezo", "mechanics", "backlash")
 
 
 def dahl(path, state=0.0, slope=0.2, amplitude=1.0, length=8.0):

@@ -125,7 +125,10 @@ class Fault:
 
 
 def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLDS) -> list[Fault]:
-    """Which of them explain enough of what is left; what repeats itself with the position (`cyclic`) is no jitter."""
+    """Which of them explain enough of what is left.
+
+    What repeats itself with the position (`cyclic`) is no jitter, and at an even speed it looks like a narrow band.
+    """
     found = []
     total = float(np.mean([n.total_um**2 for n in faults.noise]))
     bad = np.concatenate(faults.spikes)
@@ -144,7 +147,7 @@ def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLD
         jitter = "jitter_s", faults.jitter_s, faults.jitter_s / (2 * max(faults.jitter_z, 1e-9)), "s"
         found.append(Fault("jitter", faults.jitter_z, (jitter,), faults.jitter_um**2))
     band = faults.band
-    narrow = band.z > thresholds.strong_z and band.narrow and not band.mains
+    narrow = band.z > thresholds.strong_z and band.narrow and not (band.mains or cyclic)
     if narrow and band.size_um**2 > thresholds.minor_share / 3 * total:
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"
         size_of_band = "amplitude_um", band.size_um, band.sd_um, "um"

@@ -1,4 +1,4 @@
-"""Backlash: clearance in a joint between the piezo and the mechanics."""
+"""Backlash: clearance in a joint between the piezo and the mechanics, or behind these."""
 
 from typing import Any, ClassVar, Self
 
@@ -12,24 +12,12 @@ from microid.effects._base import AbstractEffect, Place, Scales, register
 from microid.hysteresis._play import _plays
 
 
-@register
-class Backlash(AbstractEffect):
-    r"""A play: an output that stays until one side of the clearance pushes it.
-
-    .. math:: y_k = \min(\max(y_{k-1}, w_k - b), w_k + b)
-
-    Attributes
-    ----------
-    half_gap_um
-        `b`.
-    start
-        Where in its clearance it stands before the first sample, from -1 to 1: at 1 where it came down to rest.
-    """
+class _AbstractBacklash(AbstractEffect):
+    """A play: an output that stays until one side of the clearance pushes it."""
 
     name: ClassVar[str] = "backlash"
     takes: ClassVar[str] = "um"
     gives: ClassVar[str] = "um"
-    place: ClassVar[Place] = "mechanics"
     strength: ClassVar[tuple[str, ...]] = ("half_gap_um",)
     finite: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
@@ -53,3 +41,39 @@ class Backlash(AbstractEffect):
         """Drag the output along."""
         place = signal.before + self.start * self.half_gap_um
         return Signal(_plays(signal.values, self.half_gap_um[None], place[None])[:, 0], place, signal.hold)
+
+
+@register
+class Backlash(_AbstractBacklash):
+    r"""Clearance between the piezo and the mechanics, which a play drives.
+
+    .. math:: y_k = \min(\max(y_{k-1}, w_k - b), w_k + b)
+
+    Attributes
+    ----------
+    half_gap_um
+        `b`.
+    start
+        Where in its clearance it stands before the first sample, from -1 to 1: at 1 where it came down to rest.
+    """
+
+    place: ClassVar[Place] = "mechanics"
+
+
+@register
+class OutputBacklash(_AbstractBacklash):
+    r"""Clearance behind the mechanics, as of a guide, which the mass drags along.
+
+    .. math:: y_k = \min(\max(y_{k-1}, x_k - b), x_k + b)
+
+    Attributes
+    ----------
+    half_gap_um
+        `b`.
+    start
+        Where in its clearance it stands before the first sample, from -1 to 1: at 1 where it came down to rest.
+    """
+
+    form: ClassVar[str] = "output"
+    place: ClassVar[Place] = "environment"
+    fast: ClassVar[bool] = True
