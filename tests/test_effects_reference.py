@@ -9,6 +9,7 @@ from _models import compiled, random_model
 from scipy import integrate, signal
 
 import microid as m
+from fits.stage._fit import default_stage
 from microid import effects as fx
 from microid._part import Scene, Signal
 
@@ -138,10 +139,10 @@ def test_backlash_drags_along(rng):
     for form in ("", "output"):
         np.testing.assert_allclose(through(BY_NAME["backlash", form](gap, start), 1e-3, path), truth, atol=1e-12)
     # One drives the mechanics, which ring on; the other holds what the mechanics do.
-    stage = m.Stage.of(piezo=m.Piezo(0.1), mechanics=m.Mechanics(60.0, 0.05))
-    inside, outside = (m.effects.extend(stage, BY_NAME["backlash", form](gap, start)) for form in ("", "output"))
-    assert inside.names == ("piezo", "backlash", "mechanics")
-    assert outside.names == ("piezo", "mechanics", "backlash")
+    stage = default_stage()
+    inside, outside = (fx.extend(stage, BY_NAME["backlash", form](gap, start)) for form in ("", "output"))
+    assert inside.names == ("driver", "hysteresis", "backlash", "mechanics")
+    assert outside.names == ("driver", "hysteresis", "mechanics", "backlash")
 
 
 def dahl(path, state=0.0, slope=0.2, amplitude=1.0, length=8.0):
