@@ -20,7 +20,7 @@ from fits.stage._checks import check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simulate_stage
 from fits.stage._solve import Problem, Solved
-from fits.stage._steps import Plan, refine_problem, start_problem
+from fits.stage._steps import Plan, present_problem, refine_problem, start_problem, starts_as_it_is
 from fits.stage._uncertainty import Precision
 from fits.stats._metrics import TWO_SIDED_95, WHITE
 from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
@@ -170,7 +170,13 @@ def solve_stage(
         accept_best=accept_best,
         estimated=estimated,
     )
-    found = _refined(plan, start_problem(plan, stage, levels, finest) if onward is None else onward)
+    if onward is not None:
+        problem = onward
+    elif starts_as_it_is(stage):
+        plan, problem = present_problem(plan, stage)
+    else:
+        problem = start_problem(plan, stage, levels, finest)
+    found = _refined(plan, problem)
     settled = plan.behind(found.solved)
     if settled is None:
         return found

@@ -283,7 +283,9 @@ def _step(
             raise FitError(FitStatus.NONFINITE)
         prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)
     information = marginal_information(total, size, prior, variance)
-    return step, columns, hyper, variance, max(float(step @ information @ step) / len(step), 0.0) ** 0.5
+    # However short the damping makes a step, it is far from the optimum where a whole one is long.
+    whole = step if size else split_moments(total, 0, 0.0)[1]
+    return step, columns, hyper, variance, max(float(whole @ information @ whole) / len(step), 0.0) ** 0.5
 
 
 def marginal_information(total: Moments, size: int, prior: np.ndarray | None, variance: float) -> np.ndarray:
