@@ -181,7 +181,7 @@ def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
         # What never switches is a constant, which the run's own offset takes up.
         moves = np.abs(apart_um - apart_um[-1]) > 1e-3 * np.ptp(low_um)
         settled = np.arange(n) > (np.flatnonzero(moves)[-1] if moves.any() else -1)
-        return settled if 2 * (settled & run.fitted).sum() > run.fitted.sum() else everything
+        return settled if 2 * (settled & run.known).sum() > run.known.sum() else everything
     if not place or initial != "unknown":
         return everything
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.

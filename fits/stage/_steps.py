@@ -101,14 +101,14 @@ class Plan:
 
 
 def starts_as_it_is(stage: Stage) -> bool:
-    """Whether all of a stage is fitted from its present values: a law that no regression solves for is to be moved."""
+    """Whether all of a stage is fitted from its present values, as a law that no regression solves for moves."""
     place = place_of_hysteresis(stage)
     to_move = place is not None and stage.names[place] not in stage.frozen
     if yields_inside(stage):
         if to_move and free_grid(stage) is not None:
             raise DataError(
-                f"the weights of {stage.names[place or 0]} are solved for only ahead of linear parts, and a hysteresis "
-                "inside the mechanics comes behind them: freeze these weights, or take another law there"
+                f"the weights of {stage.names[place or 0]} are solved for only ahead of linear parts, and behind them "
+                "comes a hysteresis inside the mechanics: freeze these weights, or take another law there"
             )
         return True
     return to_move and free_grid(stage) is None and not isinstance(innermost(hysteresis_of(stage)), Preisach)
@@ -227,7 +227,7 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
         precision = Precision(solved)
         inside = yields_inside(solved.stage)
-        if stride == _FINEST or not (inside or (plan.gain is not None and stride == 1)):
+        if not inside and (plan.gain is None or stride > 1):
             return solved, precision
         moved = np.zeros(len(solved.z))
         for own, run, halved in zip(precision.influence, runs, plan.runs(2 * stride), strict=True):
@@ -238,6 +238,9 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         excess = float(np.max(np.abs(moved) / precision.sd)) / (0.75 * 0.15)
         if excess <= 1:
             return solved, precision
+        if stride == _FINEST:
+            said = f"{stride} steps per sample are few: more would move a parameter by {0.15 * excess:.2g} sd"
+            return replace(solved, problem=replace(problem, remarks=(*problem.remarks, said))), precision
         stride = min(_FINEST, stride * 2 ** math.ceil(math.log2(excess) / 2))
         plan.progress(f"{stride} steps per sample")
         problem = replace(solved.onward, z=_restart_driver(plan, solved))
