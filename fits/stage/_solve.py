@@ -189,6 +189,10 @@ def solve_chain(
         while True:
             try:
                 step, columns, hyper, variance, distance = _step(problem, total, columns_um, hyper, weights, damping)
+                if hyper is None:
+                    # A law that a far start makes useless would be lost at a bound.
+                    most = np.maximum(1.0, 0.5 * np.abs(z))
+                    step = np.clip(step, -most, most)
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR

@@ -107,15 +107,18 @@ def starts_as_it_is(stage: Stage) -> bool:
     if yields_inside(stage):
         if to_move and free_grid(stage) is not None:
             raise DataError(
-                f"the weights of {stage.names[place or 0]} are solved for only ahead of linear parts, and behind them "
-                "comes a hysteresis inside the mechanics: freeze these weights, or take another law there"
+                f"the weights of {stage.names[place or 0]} are solved for only ahead of linear parts, and a part "
+                "behind them has a hysteresis inside: freeze these weights, or take another law there"
             )
         return True
     return to_move and free_grid(stage) is None and not isinstance(innermost(hysteresis_of(stage)), Preisach)
 
 
 def present_problem(plan: Plan, stage: Stage) -> tuple[Plan, Problem]:
-    """Begin at the present values of a stage, and leave out what its runs do not show the past of."""
+    """Begin at the present values of a stage, or at poles read off the runs where those fit better.
+
+    Samples that depend on where a hysteresis inside the mechanics was before are left out.
+    """
     stage = stage.with_substeps(1)
     try:
         problem = Problem.of(stage, None, np.zeros(0), None, 1.0)
@@ -124,10 +127,26 @@ def present_problem(plan: Plan, stage: Stage) -> tuple[Plan, Problem]:
     runs = plan.runs(1)
     if yields_inside(stage):
         plan = replace(plan, settled=plan.settled_for(stage, runs))
-    if len(runs) > 1:
-        plan.progress("from the present values")
-        problem = solve_chain(problem, plan.runs(1), plan.loss, plan.progress, rough=True).onward
-    return plan, problem
+        return plan, _best_start(plan, [problem], plan.runs(1)).onward
+    drives = hysteresis_alone(stage, runs)
+    poles = start_stages(stage, [measure_response(*each) for each in zip(runs, drives, strict=True)])
+    problems = [problem, *(replace(problem, z=np.asarray(problem.chain.coordinates.of(one))) for one in poles)]
+    return plan, _best_start(plan, problems, runs).onward
+
+
+def _best_start(plan: Plan, problems: Sequence[Problem], runs: list[Run]) -> Solved:
+    """Fit roughly from several starts, and take the best; the last `FitError` where each fails."""
+    found: list[Solved] = []
+    failure = FitError(FitStatus.NONFINITE)
+    for number, problem in enumerate(problems):
+        plan.progress(f"start {number + 1} of {len(problems)}")
+        try:
+            found.append(solve_chain(problem, runs, plan.loss, plan.progress, rough=True))
+        except FitError as error:
+            failure = error
+    if not found:
+        raise failure
+    return min(found, key=lambda one: one.cost)
 
 
 def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> Problem:
@@ -156,19 +175,8 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     drives = hysteresis_alone(stage, runs)
     fast = [k for k in range(len(plan.records)) if k not in slow] or slow
     responses = [measure_response(runs[k], drives[k]) for k in fast]
-    candidates = start_stages(stage, responses)
-    found: list[Solved] = []
-    failure = FitError(FitStatus.NONFINITE)
-    for number, candidate in enumerate(candidates):
-        plan.progress(f"poles: start {number + 1} of {len(candidates)}")
-        problem = Problem.of(candidate, grid, columns, None, stroke)
-        try:
-            found.append(solve_chain(problem, runs, plan.loss, plan.progress, rough=True))
-        except FitError as error:
-            failure = error
-    if not found:
-        raise failure
-    solved = replace(min(found, key=lambda one: one.cost), hyper=hyper)
+    starts = [Problem.of(one, grid, columns, None, stroke) for one in start_stages(stage, responses)]
+    solved = replace(_best_start(plan, starts, runs), hyper=hyper)
     problem = solved.onward
     try:
         dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
