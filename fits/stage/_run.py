@@ -169,8 +169,8 @@ def _after_rest(stage: m.Stage, samples: Samples, rest_V: Float[Array, ""]) -> F
 def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
     """Mark what no longer depends on a past that is `initial`, behind the lag ahead of the hysteresis.
 
-    With a hysteresis inside the mechanics, what hardly depends on where the whole stage was at rest before. All of
-    them, where less than half of those that are fitted would be left.
+    All of them, where less than half of those that are fitted would be left. With a hysteresis inside the mechanics,
+    what hardly depends on where the whole stage was at rest before; the first half is left out at most.
     """
     place, n = place_of_hysteresis(stage), len(run.record)
     everything = np.ones(n, dtype=bool)
@@ -180,8 +180,7 @@ def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
         apart_um = high_um - low_um
         # What never switches is a constant, which the run's own offset takes up.
         moves = np.abs(apart_um - apart_um[-1]) > 1e-3 * np.ptp(low_um)
-        settled = np.arange(n) > (np.flatnonzero(moves)[-1] if moves.any() else -1)
-        return settled if 2 * (settled & run.known).sum() > run.known.sum() else everything
+        return np.arange(n) > min(np.max(np.flatnonzero(moves), initial=-1), n // 2)
     if not place or initial != "unknown":
         return everything
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.
