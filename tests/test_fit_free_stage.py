@@ -70,7 +70,7 @@ def test_an_oscillator_that_yields_is_found_from_a_start_some_way_off(rig):
     assert fitted.status is fits.FitStatus.CONVERGED
     for name, value in SEEN.items():
         assert abs(fitted[name].value - value) < 4 * fitted[name].sd
-        assert fitted[name].sd < 0.1 * abs(value)
+        assert fitted[name].sd < 0.2 * abs(value)
         assert fitted[name].lower < fitted[name].value < fitted[name].upper
     gains = "piezo.gain_um_per_V", "mechanics.inner.gain"
     assert {p.name for p in fitted.parameters} == {*SEEN, *gains}
