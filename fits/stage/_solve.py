@@ -189,7 +189,7 @@ def solve_chain(
         while True:
             try:
                 step, columns, hyper, variance, distance = _step(problem, total, columns_um, hyper, weights, damping)
-                if hyper is None:
+                if chain.grid is None:
                     # A law that a far start makes useless would be lost at a bound.
                     most = np.maximum(1.0, 0.5 * np.abs(z))
                     step = np.clip(step, -most, most)
@@ -288,7 +288,7 @@ def _step(
         prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)
     information = marginal_information(total, size, prior, variance)
     # However short the damping makes a step, it is far from the optimum where a whole one is long.
-    whole = step if size else split_moments(total, 0, 0.0)[1]
+    whole = split_moments(total, 0, 0.0)[1] if chain.grid is None else step
     return step, columns, hyper, variance, max(float(whole @ information @ whole) / len(step), 0.0) ** 0.5
 
 
