@@ -180,7 +180,8 @@ def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
         apart_um = high_um - low_um
         # What never switches is a constant, which the run's own offset takes up.
         moves = np.abs(apart_um - apart_um[-1]) > 1e-3 * np.ptp(low_um)
-        return np.arange(n) > min(np.max(np.flatnonzero(moves), initial=-1), n // 2)
+        last = int(np.flatnonzero(moves)[-1]) if moves.any() else -1
+        return np.asarray(np.arange(n) > min(last, n // 2))
     if not place or initial != "unknown":
         return everything
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.
