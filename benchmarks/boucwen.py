@@ -15,10 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from scipy.io import loadmat
 
 import data_synth
+import fits
 import microid as m
 
 jax.config.update("jax_enable_x64", True)
@@ -47,36 +47,6 @@ def respond(stage: m.Stage, force_N: jax.Array) -> jax.Array:
     return jax.vmap(lambda force: stage(jnp.asarray(INTERVAL_s), force, rest))(force_N)
 
 
-def identify(stage: m.Stage, force_N: np.ndarray, measured_um: np.ndarray) -> tuple[m.Stage, np.ndarray]:
-    """Fit to periods in steady state, shape `(k, n)`; each is played twice, and the first time is left out."""
-    coordinates = m.Coordinates(stage, stage.free)
-    twice, length = jnp.asarray(np.tile(force_N, 2)), force_N.shape[1]
-    measured = jnp.asarray(measured_um)
-
-    def residual(vector: jax.Array, substeps: int) -> jax.Array:
-        off = measured - respond(coordinates(vector).with_substeps(substeps), twice)[:, length:]
-        return (off - jnp.mean(off, axis=1, keepdims=True)).ravel() / NOISE_um
-
-    place = coordinates.of(stage)
-    for substeps in (2, 5, 10):
-        jacobian = eqx.filter_jit(jax.jacfwd(residual))(place, substeps)
-        # In units of one standard deviation each.
-        scale = jnp.linalg.norm(jacobian, axis=0)
-        origin = place
-        solution = optx.least_squares(
-            lambda x, args: residual(args[0] + x / args[1], substeps),  # noqa: B023
-            optx.LevenbergMarquardt(rtol=1e-6, atol=1e-3),
-            jnp.zeros_like(place),
-            args=(origin, scale),
-            options={"jac": "fwd"},
-            max_steps=100,
-        )
-        place = origin + solution.value / scale
-    covariance = np.linalg.inv(np.asarray(jacobian.T @ jacobian))
-    slopes = np.diagonal(np.asarray(jax.jacfwd(coordinates.values)(place)))
-    return coordinates(place), slopes * np.sqrt(np.diagonal(covariance))
-
-
 def test_records(rng: np.random.Generator) -> tuple[str, np.ndarray, np.ndarray]:
     """Force in N and displacement in m of the multisine test, official where it is at hand."""
     if OFFICIAL.is_dir():
@@ -102,7 +72,14 @@ def main() -> None:
     clean_um = np.stack([1e6 * data_synth.boucwen_response(one) for one in force_N])
     begin = time.perf_counter()
     start = oscillator(25.0, 26.0, 0.03, m.BoucWen(0.0, 1.3, 5e-4, 0.0))
-    fitted, sd = identify(start, force_N, clean_um + rng.normal(0, NOISE_um, clean_um.shape))
+    time_s = INTERVAL_s * np.arange(force_N.shape[1])
+    records = [
+        fits.Record(time_s, force, clean + rng.normal(0, NOISE_um, clean.shape), source=f"realization {k + 1}")
+        for k, (force, clean) in enumerate(zip(force_N, clean_um, strict=True))
+    ]
+    # Of a steady state what came before is unknown, and what depends on it is left out.
+    result = fits.fit_stage(records, stage=start, holdout=0.0)
+    fitted = result.model
     print(
         f"{options.realizations} x 8,192 samples fitted in {time.perf_counter() - begin:.0f} s, seed {options.seed}"
     )
@@ -114,9 +91,10 @@ def main() -> None:
     )
     exact = oscillator(1e6 / stiffness, float(linear.natural_frequency_Hz), float(linear.damping_ratio), law)
     coordinates = m.Coordinates(exact, exact.free)
-    values = (coordinates.values(coordinates.of(stage)) for stage in (exact, fitted))
-    for info, true, found, deviation in zip(coordinates.table, *map(np.asarray, values), sd, strict=True):
-        print(f"{exact.named(info.path):40} {found:12.6g} +- {deviation:.2g}, true {true:.6g} {info.spec.unit}")
+    for one, true in zip(result.parameters, np.asarray(coordinates.values(coordinates.of(exact))), strict=True):
+        print(f"{one.name:40} {one.value:12.6g} +- {one.sd:.2g}, true {true:.6g} {one.unit}")
+    for line in (*result.remarks, *(f"{run.source}: {run.unknown} samples left out" for run in result.runs)):
+        print(line)
 
     which, force, moved = test_records(rng)
     for name, stage in (("true parameters", exact), ("fitted", fitted)):

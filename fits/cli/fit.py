@@ -24,6 +24,12 @@ _HOLDS: dict[str, "late.Hold"] = {"lines": "first", "steps": "zero", "curves": "
     show_default=True,
     help="Hysteresis alone, from slow runs; or the whole stage with driver and mechanics, from slow and fast ones.",
 )
+@click.option(
+    "--start",
+    metavar="START.json",
+    help="Model file of the stage to fit in place of the default one, such as one with a hysteresis inside its "
+    "mechanics; without a Preisach operator on a grid it starts from its present values. Implies --model stage.",
+)
 @click.option("--family", metavar="NAME", help="Density: grid, mixture or network (default grid).")
 @click.option("--levels", type=int, help="Number of switching voltages; found from the data by default.")
 @click.option("--lag", is_flag=True, help="Fit a lag of the readings beside a hysteresis alone.")
@@ -66,13 +72,14 @@ def fit(given: common.Given) -> None:
     The files are runs of one rig, with the columns time_s, voltage_V and displacement_um. A stage needs a slow run
     over the whole range, and one with steps, a chirp or a multisine beyond the resonance.
     """
+    given.model = "stage" if given.start else given.model
     slow = given.model == "loop" and bool(given.lag or given.relaxations)
     asked = _for_stage(given) if given.model == "stage" else _for_slow(given) if slow else _for_loop(given)
     initial = list(given.initial) if len(given.initial) > 1 else (given.initial or ("unknown",))[0]
     progress = common.progress_to_stderr(given.quiet)
     how = common.reading(given)
     fraction, files = common.fraction_or_files(given.holdout)
-    common.refuse_overwriting(given.out, [*given.runs, *files])
+    common.refuse_overwriting(given.out, [*given.runs, *files, *filter(None, [given.start])])
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         records = late.read_runs(given.runs, **how)
@@ -82,7 +89,7 @@ def fit(given: common.Given) -> None:
         estimate: Any = late.fit_slow if slow else late.fit
         if given.model == "stage":
             estimate = late.fit_stage
-            asked["stage"] = late.default_stage(_HOLDS[given.hold or "lines"])
+            asked["stage"] = _start(given)
         asked |= {"levels": given.levels, "loss": given.loss or "squares", "progress": progress}
         result = estimate(records, **same, **asked)
         report, drawn = late.fit_report(result), []
@@ -94,6 +101,19 @@ def fit(given: common.Given) -> None:
     places = common.paths_in(given.plots, drawn)
     lines = [late.describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)]
     common.print_result(given, {"out": given.out, "plots": places, **report}, lines)
+
+
+def _start(given: common.Given) -> "late.Stage":
+    """The stage to fit: that of a model file, or the default one."""
+    if given.start is None:
+        return late.default_stage(_HOLDS[given.hold or "lines"])
+    stage = late.load_model(given.start).model
+    if not isinstance(stage, late.Stage):
+        raise DataError(
+            f"{given.start}: expected a stage to start from, found a {type(stage).__name__}; name the model file of "
+            "a stage."
+        )
+    return stage.with_hold(_HOLDS[given.hold]) if given.hold else stage
 
 
 def _for_loop(given: common.Given) -> dict[str, Any]:

@@ -54,8 +54,10 @@ def _numbers(part: Any, path: str = "") -> Iterator[dict[str, Any]]:
 
 
 def _known_of_fit(path: str, held: dict[str, Any]) -> str:
-    if held["uncertainty"] is None:
+    if held["fit"].get("part_of") == "diagnosis" and held["uncertainty"] is None:
         return "written by 'microid diagnose', whose report says how well it predicts"
+    if held["uncertainty"] is None:
+        return "saved without the uncertainty of a fit, so how well it predicts is not known"
     try:
         return late.describe(held["fit"])
     except (LookupError, TypeError, ValueError, AttributeError):

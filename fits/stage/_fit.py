@@ -1,5 +1,6 @@
 """From slow and fast records to a whole fitted stage, in the terms of its user."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,12 +19,29 @@ from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate,
 from fits.loop._run import Progress, Run, prepare_run, refuse_many_steps
 from fits.stage._checks import check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
-from fits.stage._run import gain_ahead, place_of_hysteresis, residual_of, simulate_stage
+from fits.stage._run import (
+    gain_ahead,
+    place_of_hysteresis,
+    residual_of,
+    settled_samples,
+    simulate_stage,
+    yields_inside,
+)
 from fits.stage._solve import Problem, Solved
-from fits.stage._steps import Plan, refine_problem, start_problem
+from fits.stage._steps import Plan, present_problem, refine_problem, start_problem, starts_as_it_is
 from fits.stage._uncertainty import Precision
 from fits.stats._metrics import TWO_SIDED_95, WHITE
-from microid import Driver, GridDensity, Hold, Mechanics, Preisach, Reversible, Stage
+from microid import (
+    AbstractLinear,
+    Driver,
+    GridDensity,
+    Hold,
+    HystereticMechanics,
+    Mechanics,
+    Preisach,
+    Reversible,
+    Stage,
+)
 
 
 def default_stage(hold: Hold = "first") -> Stage:
@@ -68,12 +86,17 @@ def fit_stage(
     stage
         What is fitted: all its parameters that are not frozen. A `Preisach` operator on a grid is fitted as `fit`
         does, whatever its present values; drivers and mechanics start from the data; other parts start from their
-        present values. By default the stage of `default_stage`.
+        present values. A stage with another law of hysteresis, or with one inside its mechanics
+        (`HystereticMechanics`), starts from its present values altogether, by damped Gauss-Newton steps; the steps
+        between samples are chosen, and what its memory was before is the law's own default. By default the stage of
+        `default_stage`.
     levels
         Number of switching voltages; chosen from the slow runs by default.
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. One for all holds for records
-        that are held out, too; theirs is unknown where each fitted run has its own.
+        that are held out, too; theirs is unknown where each fitted run has its own. With a hysteresis inside the
+        mechanics all but `unknown` mean at rest; after an unknown past, such as a steady state, the samples are left
+        out that depend on where the stage was at rest before.
     holdout, loss, progress
         See `fit`, as for what is returned.
     """
@@ -102,6 +125,8 @@ def fit_stage(
     before, stage = initial if isinstance(initial, str) else "unknown", solved.stage
     settings = before, 1.0, runs[-1].stride, gain_ahead(stage), stage.hold
     held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
+    if yields_inside(stage):
+        held = [replace(run, known=run.known & settled_samples(stage, run, before)) for run in held]
     summary = summarise(found.precision, held)
     if undelayed is not None:
         summary = undelayed.widen(summary)
@@ -170,7 +195,15 @@ def solve_stage(
         accept_best=accept_best,
         estimated=estimated,
     )
-    found = _refined(plan, start_problem(plan, stage, levels, finest) if onward is None else onward)
+    if onward is not None:
+        problem = onward
+    elif starts_as_it_is(stage):
+        if levels is not None:
+            raise DataError(f"levels is {levels}, and the stage has no hysteresis on a grid: leave it out")
+        plan, problem = present_problem(plan, stage)
+    else:
+        problem = start_problem(plan, stage, levels, finest)
+    found = _refined(plan, problem)
     settled = plan.behind(found.solved)
     if settled is None:
         return found
@@ -227,10 +260,12 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
 
 
 def _with_offset(stage: Stage, offset_um: float) -> Stage:
-    """Put a sensor's offset where the stage has room for one."""
-    for name, part in zip(stage.names, stage.parts, strict=True):
-        if hasattr(part, "offset_um"):
-            return stage.swap(name, eqx.tree_at(lambda p: p.offset_um, part, part.offset_um + offset_um))
+    """Put a sensor's offset where the stage has room for one: ahead of a yielding spring it would load that."""
+    for place, (name, part) in enumerate(zip(stage.names, stage.parts, strict=True)):
+        behind = stage.parts[place + 1 :]
+        if hasattr(part, "offset_um") and not any(isinstance(one, HystereticMechanics) for one in behind):
+            gain = math.prod(float(one.static_gain) for one in behind if isinstance(one, AbstractLinear))
+            return stage.swap(name, eqx.tree_at(lambda p: p.offset_um, part, part.offset_um + offset_um / gain))
     return stage
 
 

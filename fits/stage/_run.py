@@ -155,13 +155,33 @@ def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""]
     return signal.values
 
 
+def yields_inside(stage: m.Stage) -> bool:
+    """Whether a hysteresis stands inside the mechanics of a stage."""
+    return any(isinstance(part, m.HystereticMechanics) for part in stage.parts)
+
+
+@eqx.filter_jit
+def _after_rest(stage: m.Stage, samples: Samples, rest_V: Float[Array, ""]) -> Float[Array, " n"]:
+    """Response after a rest at some command, in um, `(n,)`."""
+    return stage(samples.time_s, samples.voltage_V, m.Start(rest_V), samples.beside)[:: samples.stride]
+
+
 def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
     """Mark what no longer depends on a past that is `initial`, behind the lag ahead of the hysteresis.
 
-    All of them, where less than half of those that are fitted would be left.
+    All of them, where less than half of those that are fitted would be left. With a hysteresis inside the mechanics,
+    what hardly depends on where the whole stage was at rest before; the first half is left out at most.
     """
     place, n = place_of_hysteresis(stage), len(run.record)
     everything = np.ones(n, dtype=bool)
+    if initial == "unknown" and yields_inside(stage):
+        ends = (jnp.asarray(end_V / run.gain) for end_V in (run.lower_V, run.upper_V))
+        low_um, high_um = (np.asarray(_after_rest(stage, run.samples, rest))[:n] for rest in ends)
+        apart_um = high_um - low_um
+        # What never switches is a constant, which the run's own offset takes up.
+        moves = np.abs(apart_um - apart_um[-1]) > 1e-3 * np.ptp(low_um)
+        last = int(np.flatnonzero(moves)[-1]) if moves.any() else -1
+        return np.asarray(np.arange(n) > min(last, n // 2))
     if not place or initial != "unknown":
         return everything
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.

@@ -189,6 +189,10 @@ def solve_chain(
         while True:
             try:
                 step, columns, hyper, variance, distance = _step(problem, total, columns_um, hyper, weights, damping)
+                if chain.grid is None:
+                    # A law that a far start makes useless would be lost at a bound.
+                    most = np.maximum(1.0, 0.5 * np.abs(z))
+                    step = np.clip(step, -most, most)
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
@@ -283,7 +287,9 @@ def _step(
             raise FitError(FitStatus.NONFINITE)
         prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)
     information = marginal_information(total, size, prior, variance)
-    return step, columns, hyper, variance, max(float(step @ information @ step) / len(step), 0.0) ** 0.5
+    # However short the damping makes a step, it is far from the optimum where a whole one is long.
+    whole = split_moments(total, 0, 0.0)[1] if chain.grid is None else step
+    return step, columns, hyper, variance, max(float(whole @ information @ whole) / len(step), 0.0) ** 0.5
 
 
 def marginal_information(total: Moments, size: int, prior: np.ndarray | None, variance: float) -> np.ndarray:

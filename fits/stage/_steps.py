@@ -15,14 +15,24 @@ from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Progress, Run, prepare_run, simulate_run
 from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
 from fits.stage._moments import offsets_out
-from fits.stage._run import free_grid, hysteresis_of, named_parts, settled_samples, simulate_stage
+from fits.stage._run import (
+    free_grid,
+    hysteresis_of,
+    named_parts,
+    place_of_hysteresis,
+    settled_samples,
+    simulate_stage,
+    yields_inside,
+)
 from fits.stage._solve import Problem, Solved, solve_chain, try_chain
 from fits.stage._start import measure_response, start_stages
 from fits.stage._uncertainty import Precision
-from microid import Driver, Hold, Mechanics, Preisach, Stage
+from microid import Driver, Hold, Mechanics, Preisach, Stage, innermost
 
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
 _EVEN = 1.0
+# Steps per sample that a fit takes at most.
+_FINEST = 16
 
 
 @dataclass(frozen=True)
@@ -75,15 +85,68 @@ class Plan:
         """
         if self.estimated:
             return None
-        settled = [settled_samples(solved.stage, *each) for each in zip(solved.runs, self.states, strict=True)]
+        settled = self.settled_for(solved.stage, solved.runs)
         lost = [np.sum(run.fitted & ~own) / run.fitted.sum() for run, own in zip(solved.runs, settled, strict=True)]
         if max(lost) < 0.01:  # not worth another fit
             return None
-        return replace(self, settled=tuple(settled))
+        return replace(self, settled=settled)
+
+    def settled_for(self, stage: Stage, runs: Sequence[Run]) -> tuple[np.ndarray, ...]:
+        """What no longer depends on the past of each run, shape `(n,)`."""
+        return tuple(settled_samples(stage, *each) for each in zip(runs, self.states, strict=True))
 
     def shifted(self, shifts_s: np.ndarray) -> "Plan":
         """The same with the command of each run that much later, in s, shape `(runs,)`."""
         return replace(self, shifts_s=tuple(map(float, shifts_s)))
+
+
+def starts_as_it_is(stage: Stage) -> bool:
+    """Whether all of a stage is fitted from its present values, as a law that no regression solves for moves."""
+    place = place_of_hysteresis(stage)
+    to_move = place is not None and stage.names[place] not in stage.frozen
+    if yields_inside(stage):
+        if to_move and free_grid(stage) is not None:
+            raise DataError(
+                f"the weights of {stage.names[place or 0]} are solved for only ahead of linear parts, and a part "
+                "behind them has a hysteresis inside: freeze these weights, or take another law there"
+            )
+        return True
+    return to_move and free_grid(stage) is None and not isinstance(innermost(hysteresis_of(stage)), Preisach)
+
+
+def present_problem(plan: Plan, stage: Stage) -> tuple[Plan, Problem]:
+    """Begin at the present values of a stage, or at poles read off the runs where those fit better.
+
+    Samples that depend on where a hysteresis inside the mechanics was before are left out.
+    """
+    stage = stage.with_substeps(1)
+    try:
+        problem = Problem.of(stage, None, np.zeros(0), None, 1.0)
+    except ValueError as error:
+        raise DataError(f"{error}: thaw some of the stage") from error
+    runs = plan.runs(1)
+    if yields_inside(stage):
+        plan = replace(plan, settled=plan.settled_for(stage, runs))
+        return plan, _best_start(plan, [problem], plan.runs(1)).onward
+    drives = hysteresis_alone(stage, runs)
+    poles = start_stages(stage, [measure_response(*each) for each in zip(runs, drives, strict=True)])
+    problems = [problem, *(replace(problem, z=np.asarray(problem.chain.coordinates.of(one))) for one in poles)]
+    return plan, _best_start(plan, problems, runs).onward
+
+
+def _best_start(plan: Plan, problems: Sequence[Problem], runs: list[Run]) -> Solved:
+    """Fit roughly from several starts, and take the best; the last `FitError` where each fails."""
+    found: list[Solved] = []
+    failure = FitError(FitStatus.NONFINITE)
+    for number, problem in enumerate(problems):
+        plan.progress(f"start {number + 1} of {len(problems)}")
+        try:
+            found.append(solve_chain(problem, runs, plan.loss, plan.progress, rough=True))
+        except FitError as error:
+            failure = error
+    if not found:
+        raise failure
+    return min(found, key=lambda one: one.cost)
 
 
 def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> Problem:
@@ -112,19 +175,8 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     drives = hysteresis_alone(stage, runs)
     fast = [k for k in range(len(plan.records)) if k not in slow] or slow
     responses = [measure_response(runs[k], drives[k]) for k in fast]
-    candidates = start_stages(stage, responses)
-    found: list[Solved] = []
-    failure = FitError(FitStatus.NONFINITE)
-    for number, candidate in enumerate(candidates):
-        plan.progress(f"poles: start {number + 1} of {len(candidates)}")
-        problem = Problem.of(candidate, grid, columns, None, stroke)
-        try:
-            found.append(solve_chain(problem, runs, plan.loss, plan.progress, rough=True))
-        except FitError as error:
-            failure = error
-    if not found:
-        raise failure
-    solved = replace(min(found, key=lambda one: one.cost), hyper=hyper)
+    starts = [Problem.of(one, grid, columns, None, stroke) for one in start_stages(stage, responses)]
+    solved = replace(_best_start(plan, starts, runs), hyper=hyper)
     problem = solved.onward
     try:
         dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
@@ -182,10 +234,11 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         runs = plan.runs(stride)
         solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
         precision = Precision(solved)
-        if plan.gain is None or stride > 1:
+        inside = yields_inside(solved.stage)
+        if not inside and (plan.gain is None or stride > 1):
             return solved, precision
         moved = np.zeros(len(solved.z))
-        for own, run, halved in zip(precision.influence, runs, plan.runs(2), strict=True):
+        for own, run, halved in zip(precision.influence, runs, plan.runs(2 * stride), strict=True):
             off = simulate_stage(solved.stage, run) - simulate_stage(solved.stage, halved)
             moved += own @ (off - off[run.fitted].mean())
         # Halving the step takes three quarters of its error off, which falls with its square; it may move a parameter
@@ -193,7 +246,10 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         excess = float(np.max(np.abs(moved) / precision.sd)) / (0.75 * 0.15)
         if excess <= 1:
             return solved, precision
-        stride = min(16, 2 ** math.ceil(math.log2(excess) / 2))
+        if stride == _FINEST:
+            said = f"{stride} steps per sample are few: more would move a parameter by {0.15 * excess:.2g} sd"
+            return replace(solved, problem=replace(problem, remarks=(*problem.remarks, said))), precision
+        stride = min(_FINEST, stride * 2 ** math.ceil(math.log2(excess) / 2))
         plan.progress(f"{stride} steps per sample")
         problem = replace(solved.onward, z=_restart_driver(plan, solved))
 
