@@ -13,20 +13,21 @@ from jaxtyping import Array, Float
 from fits.loop._moments import Moments
 
 # Logarithms of the weights where the data say nothing: a density, of some strokes per squared range, whose slope is
-# ten per range, along the diagonal a third, and a reversible slope whose curvature is ten.
-_MIDDLING = (np.log(1e-2), 2.0, np.log(1e-2))
+# ten, along the diagonal a third, and whose curvature is free, and a reversible slope whose curvature is ten.
+_MIDDLING = (-12.0, np.log(1e-2), 2.0, np.log(1e-2))
 
 
 class Hyper(eqx.Module):
     """How smooth and how noisy, as natural logarithms; found from the data by the evidence.
 
-    `log_density` weighs the integrated squared slope of the density in all directions, `log_along` that along the
-    diagonal, as loops of one size are alike at all biases (exactly so in sums of plays), and `log_reversible` the
-    squared curvature of the reversible slope. What has small slopes only may still have kinks anywhere: a prior on
-    curvature would be too sure of what lies between the samples. `log_variance` is of noise, in squared strokes.
+    `log_density` weighs the integrated squared curvature of the density in all directions, `log_slope` its squared
+    slope, as a density may have kinks anywhere, of which curvature would be too sure, `log_along` its squared slope
+    along the diagonal, as loops of one size are alike at all biases (exactly so in sums of plays), and
+    `log_reversible` the squared curvature of the reversible slope. `log_variance` is of noise, in squared strokes.
     """
 
     log_density: Float[Array, ""]
+    log_slope: Float[Array, ""]
     log_along: Float[Array, ""]
     log_reversible: Float[Array, ""]
     log_variance: Float[Array, ""]
@@ -34,8 +35,8 @@ class Hyper(eqx.Module):
     @classmethod
     def start(cls) -> "Hyper":
         """Weights that are believed beforehand, and noise of a thousandth of the stroke."""
-        density, along, reversible = map(jnp.asarray, _MIDDLING)
-        return cls(density, along, reversible, jnp.asarray(np.log(1e-6)))
+        # Curvature is found where it counts to begin with.
+        return cls(*map(jnp.asarray, (np.log(1e-2), *_MIDDLING[1:])), jnp.asarray(np.log(1e-6)))
 
     def relaxed(self, efolds: float) -> "Hyper":
         """The same with all slopes and curvature counting less by so many e-folds."""
@@ -47,6 +48,7 @@ class Roughness(eqx.Module):
     """Quadratic forms that measure the squared slopes and curvature that `Hyper` weighs, in columns of a `Grid`."""
 
     density: Float[Array, "D D"]
+    slope: Float[Array, "D D"]
     along: Float[Array, "D D"]
     reversible: Float[Array, "D D"]
 
@@ -55,6 +57,7 @@ class Roughness(eqx.Module):
         """Prior precision of the columns in strokes, shape `(D, D)`; positive definite."""
         curvature = (
             jnp.exp(hyper.log_density) * self.density
+            + jnp.exp(hyper.log_slope) * self.slope
             + jnp.exp(hyper.log_along) * self.along
             + jnp.exp(hyper.log_reversible) * self.reversible
         )
@@ -65,7 +68,7 @@ class Roughness(eqx.Module):
 
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Roughness":
         """Keep only combinations of columns."""
-        return Roughness(*(jnp.asarray(basis.T @ f @ basis) for f in (self.density, self.along, self.reversible)))
+        return jax.tree.map(lambda form: jnp.asarray(basis.T @ form @ basis), self)
 
 
 def roughness(levels: int) -> Roughness:
@@ -74,18 +77,24 @@ def roughness(levels: int) -> Roughness:
 
 
 @lru_cache(maxsize=16)
-def _matrices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    step = np.array([-1.0, 1.0])
-    density = _squared(n, ((0, 0), (1, 0)), step) + _squared(n, ((0, 0), (0, 1)), step)
-    along = _squared(n, ((0, 0), (1, 1)), step)
-    slope = np.diff(np.eye(n), 2, axis=0)
+def _matrices(n: int) -> np.ndarray:
+    step, second = np.array([-1.0, 1.0]), np.array([1.0, -2.0, 1.0])
+    # Along alpha, along beta, and the mixed derivative, which counts twice.
+    density = (
+        _squared(n, ((-1, 0), (0, 0), (1, 0)), second)
+        + _squared(n, ((0, -1), (0, 0), (0, 1)), second)
+        + _squared(n, ((0, 0), (1, 0), (0, 1), (1, 1)), np.sqrt(2.0) * np.array([1.0, -1.0, -1.0, 1.0]))
+    )
+    slope = _squared(n, ((0, 0), (1, 0)), step) + _squared(n, ((0, 0), (0, 1)), step)
+    reversible = np.diff(np.eye(n), 2, axis=0)
     weights = len(density)
-    forms = np.zeros((3, weights + n, weights + n))
+    forms = np.zeros((4, weights + n, weights + n))
     # Over a step of 1 / (n - 1) a second difference is a derivative times the step squared, a first one times it.
-    forms[0, :weights, :weights] = density
-    forms[1, :weights, :weights] = along
-    forms[2, weights:, weights:] = slope.T @ slope * (n - 1) ** 3
-    return forms[0], forms[1], forms[2]
+    forms[0, :weights, :weights] = density * (n - 1) ** 2
+    forms[1, :weights, :weights] = slope
+    forms[2, :weights, :weights] = _squared(n, ((0, 0), (1, 1)), step)
+    forms[3, weights:, weights:] = reversible.T @ reversible * (n - 1) ** 3
+    return forms
 
 
 def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) -> np.ndarray:
@@ -164,7 +173,7 @@ def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array,
     misfit = moments.energy_um2 / variance - half @ half
     volume = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
     prior_volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(prior))))
-    weights = jnp.stack([hyper.log_density, hyper.log_along, hyper.log_reversible])
+    weights = jnp.stack([hyper.log_density, hyper.log_slope, hyper.log_along, hyper.log_reversible])
     # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
     unlikely = jnp.sum(((weights - jnp.asarray(_MIDDLING)) / 6.0) ** 2)
     return jnp.asarray(moments.count * hyper.log_variance + misfit + volume - prior_volume + unlikely) / 2
