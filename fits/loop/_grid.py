@@ -219,7 +219,7 @@ def grid_estimate(
     if levels > BELIEF_LEVELS:
         basis = interpolation(BELIEF_LEVELS, levels)
         moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
-        factor = basis @ Posterior.of(moments, roughness(BELIEF_LEVELS), solution.hyper).factor()
+        factor = jnp.asarray(basis) @ Posterior.of(moments, roughness(BELIEF_LEVELS), solution.hyper).factor()
     return Estimate(
         model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
         factor_um=factor * stroke_um,

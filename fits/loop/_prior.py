@@ -35,8 +35,9 @@ class Hyper(eqx.Module):
     @classmethod
     def start(cls) -> "Hyper":
         """Weights that are believed beforehand, and noise of a thousandth of the stroke."""
-        # Curvature is found where it counts to begin with.
-        return cls(*map(jnp.asarray, (np.log(1e-2), *_MIDDLING[1:])), jnp.asarray(np.log(1e-6)))
+        _, slope, along, reversible = map(jnp.asarray, _MIDDLING)
+        # Curvature is found from where it counts.
+        return cls(jnp.asarray(np.log(1e-2)), slope, along, reversible, jnp.asarray(np.log(1e-6)))
 
     def relaxed(self, efolds: float) -> "Hyper":
         """The same with all slopes and curvature counting less by so many e-folds."""
@@ -55,16 +56,16 @@ class Roughness(eqx.Module):
     @eqx.filter_jit
     def precision(self, hyper: Hyper) -> Float[Array, "D D"]:
         """Prior precision of the columns in strokes, shape `(D, D)`; positive definite."""
-        curvature = (
+        uneven = (
             jnp.exp(hyper.log_density) * self.density
             + jnp.exp(hyper.log_slope) * self.slope
             + jnp.exp(hyper.log_along) * self.along
             + jnp.exp(hyper.log_reversible) * self.reversible
         )
-        # What is straight has no curvature, but no density of 100 strokes is believed; and a great weight on the rest
+        # What is even costs nothing, but no density of 100 strokes is believed; and a great weight on the rest
         # must not make it negative by rounding.
-        floor = 1 / 100.0**2 + 1e-14 * jnp.max(jnp.diagonal(curvature))
-        return curvature + floor * jnp.eye(curvature.shape[0])
+        floor = 1 / 100.0**2 + 1e-14 * jnp.max(jnp.diagonal(uneven))
+        return uneven + floor * jnp.eye(uneven.shape[0])
 
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Roughness":
         """Keep only combinations of columns."""
