@@ -73,16 +73,16 @@ def test_evidence_is_the_density_of_the_data_under_the_prior(rng):
     design, target = _dense(grid, [run]), run.displacement_um - run.displacement_um.mean()
     rough = roughness(4)
 
-    def cost(density, along, reversible, variance):
-        hyper = Hyper(*(jnp.asarray(v) for v in (density, along, reversible, variance)))
+    def cost(*smooth, variance):
+        hyper = Hyper(*(jnp.asarray(v) for v in (*smooth, variance)))
         prior = np.asarray(rough.precision(hyper))
         covariance = np.exp(variance) * np.eye(len(target)) + design @ np.linalg.solve(prior, design.T)
         ours = float(_negative_log(hyper, (data.total, rough)))
-        smooth = np.array([density, along, reversible])
-        weak = np.sum(((smooth - [np.log(1e-2), 2.0, np.log(1e-2)]) / 6.0) ** 2) / 2
+        weak = np.sum(((np.array(smooth) - [-12.0, np.log(1e-2), 2.0, np.log(1e-2)]) / 6.0) ** 2) / 2
         return ours - weak, -multivariate_normal(np.zeros(len(target)), covariance).logpdf(target)
 
-    pairs = [cost(*point) for point in ((-3.0, -4.0, -2.0, -1.0), (1.0, 0.5, -1.0, -3.0), (-5.0, 0.0, 2.0, 0.0))]
+    points = ((-3.0, -1.0, -4.0, -2.0, -1.0), (1.0, -2.0, 0.5, -1.0, -3.0), (-5.0, 1.0, 0.0, 2.0, 0.0))
+    pairs = [cost(*point[:-1], variance=point[-1]) for point in points]
     gaps = [ours - exact for ours, exact in pairs]
     np.testing.assert_allclose(gaps, gaps[0], rtol=0, atol=1e-6)
     assert abs(pairs[0][1] - pairs[1][1]) > 1  # the points differ, so agreement means something
@@ -94,7 +94,7 @@ def test_evidence_is_the_density_of_the_data_under_the_prior(rng):
 
 def test_posterior_is_that_of_dense_bayesian_regression(problem):
     grid, runs, data = problem
-    hyper = Hyper(*(jnp.asarray(v) for v in (-2.0, -3.0, -1.0, -4.0)))
+    hyper = Hyper(*(jnp.asarray(v) for v in (-2.0, -1.0, -3.0, -1.0, -4.0)))
     rough = roughness(LEVELS)
     posterior = Posterior.of(data.total, rough, hyper)
     design = _dense(grid, runs)
@@ -123,6 +123,13 @@ def test_roughness_is_the_weighted_integral_of_squared_curvature_and_slope():
         *(0, 1, 0, lambda high: high),
     )
     np.testing.assert_allclose(columns @ rough.along @ columns, slope, rtol=0.15)
+    steep, _ = dblquad(
+        lambda low, high: (
+            ((2 * a * high + b * low) ** 2 + (b * high + 2 * c * low) ** 2) * ((high - low + 0.05) / 0.35) ** 2
+        ),
+        *(0, 1, 0, lambda high: high),
+    )
+    np.testing.assert_allclose(columns @ rough.slope @ columns, steep, rtol=0.15)
     np.testing.assert_allclose(columns @ rough.reversible @ columns, 16.0, rtol=0.1)
     straight = np.concatenate([3 + 2 * alpha - beta, 1 - v])
     for form in (rough.density, rough.reversible):

@@ -13,7 +13,7 @@ from fits.loop._prior import Hyper
 from fits.loop._result import FitError, LevelTrial
 from fits.loop._run import Progress, Run, simulate_run
 from fits.stats._metrics import WHITE
-from fits.stats._noise import correlation_samples, huber_weight, quantum_um
+from fits.stats._noise import correlation_samples, huber_weight, quantum_um, repeated_square
 
 # Resolutions in steps of the square root of two.
 LADDER = (16, 23, 32, 45, 64, 90)
@@ -99,6 +99,11 @@ def try_grid(
             solution = solve_grid(data, stroke, hyper, correlation)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
+    # What is finer than the samples looks like noise but for coming back with the voltage.
+    repeated = [
+        repeated_square(run.voltage_V[run.fitted], one, correlation) for run, one in zip(runs, left, strict=True)
+    ]
+    discrepancy = max(discrepancy, float(np.average(repeated, weights=[len(one) for one in left])) ** 0.5)
     return GridTrial(data, solution, correlation, error, discrepancy)
 
 

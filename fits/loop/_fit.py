@@ -15,12 +15,11 @@ from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._jax_setup import require_float64
 from fits.io._record import Record, refuse_repeats
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
-from fits.loop._design import Grid, columns_of
+from fits.loop._design import columns_of
 from fits.loop._grid import Estimate, grid_estimate
 from fits.loop._left_over import suggestions
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
-from fits.loop._prior import interpolation
 from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import Progress, Run, command_range_V, prepare_run, resized, simulate_run
 from fits.loop._shapes import solve_shape
@@ -157,13 +156,11 @@ def check_fit(
 
 def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
     """Perturbations by the columns of a factor of the covariance, and of the sensor offset alone."""
-    mean, response = data.means[0], data.means[0].response
-    if found.levels < data.grid.levels:
-        response = interpolation(found.levels, data.grid.levels).T @ response
-    grid = Grid(data.grid.lower_V, data.grid.upper_V, found.levels)
+    mean, grid = data.means[0], data.grid
     columns = jnp.concatenate([found.factor_um.T, jnp.zeros((1, grid.columns))])
     # The mean displacement of a run fixes the offset: it makes up for what a perturbation does to that.
-    moved, sd = -(jnp.asarray(response) @ found.factor_um), found.noise_um * (found.correlation / mean.count) ** 0.5
+    moved = -(jnp.asarray(mean.response) @ found.factor_um)
+    sd = found.noise_um * (found.correlation / mean.count) ** 0.5
     return Uncertainty(columns, jnp.append(moved, sd), jnp.asarray(found.discrepancy_um), grid)
 
 

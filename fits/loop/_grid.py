@@ -22,7 +22,8 @@ from microid import Preisach
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
 EVIDENCE_LEVELS = 16
-# And this many to say how sure predictions are; finer perturbations move no displacement.
+# And this many to say how sure predictions are; finer perturbations move no displacement. Here and above the prior
+# is that of the coarse grid itself: what is alike along its diagonal is not so where it is read off between nodes.
 BELIEF_LEVELS = 24
 _ATOL = 1e-6
 # By so many e-folds the smoothness may differ from what the evidence has.
@@ -33,13 +34,12 @@ _FARTHEST = 14.0
 class Estimate:
     """What every family's solver hands over: a model in um, with no offset, how sure it is, and what it leaves.
 
-    `factor_um @ factor_um.T` is the covariance of the columns of a grid of `levels`, which may be coarser than the
-    model's. `noise_um` is the standard deviation of the residual, of which so many samples as `correlation` are worth
-    one independent one. `discrepancy_um` is that of the model's own error that the covariance does not own up to.
+    `factor_um @ factor_um.T` is the covariance of the columns of the model's grid. `noise_um` is the standard
+    deviation of the residual, of which so many samples as `correlation` are worth one independent one.
+    `discrepancy_um` is that of the model's own error that the covariance does not own up to.
     """
 
     model: Preisach
-    levels: int
     factor_um: Float[Array, "D k"]
     noise_um: float
     correlation: float
@@ -65,7 +65,7 @@ def solve_grid(data: Data, stroke_um: float, start: Hyper, correlation: float = 
     rough = roughness(data.grid.levels)
     if data.grid.levels > EVIDENCE_LEVELS:
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
-        few, even = moments.project(basis), rough.project(basis)
+        few, even = moments.project(basis), roughness(EVIDENCE_LEVELS)
         hyper = maximise_evidence(few, even, start)
         posterior = Posterior.of(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
@@ -112,7 +112,7 @@ def relaxation_of(data: Data, stroke_um: float, white: Hyper) -> float:
     rough, blocks = roughness(data.grid.levels), data.blocks
     if data.grid.levels > BELIEF_LEVELS:
         basis = interpolation(BELIEF_LEVELS, data.grid.levels)
-        rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
+        rough, blocks = roughness(BELIEF_LEVELS), tuple(block.project(basis) for block in blocks)
     whole = reduce(operator.add, blocks)
 
     def error(efolds: float) -> float:
@@ -215,16 +215,14 @@ def grid_estimate(
     data: Data, solution: GridSolution, stroke_um: float, correlation: float, discrepancy_um: float
 ) -> Estimate:
     """Turn a solution in strokes into an estimate in um; the last two arguments are those of `Estimate`."""
-    levels = min(data.grid.levels, BELIEF_LEVELS)
-    posterior = solution.posterior
-    if levels < data.grid.levels:
-        basis = interpolation(levels, data.grid.levels)
+    factor, levels = solution.posterior.factor(), data.grid.levels
+    if levels > BELIEF_LEVELS:
+        basis = interpolation(BELIEF_LEVELS, levels)
         moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
-        posterior = Posterior.of(moments, roughness(data.grid.levels).project(basis), solution.hyper)
+        factor = jnp.asarray(basis) @ Posterior.of(moments, roughness(BELIEF_LEVELS), solution.hyper).factor()
     return Estimate(
         model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
-        levels=levels,
-        factor_um=posterior.factor() * stroke_um,
+        factor_um=factor * stroke_um,
         noise_um=float(jnp.exp(solution.hyper.log_variance / 2)) * stroke_um,
         correlation=correlation,
         discrepancy_um=discrepancy_um,
@@ -242,7 +240,7 @@ def cross_validate(
     rough, blocks, basis = roughness(data.grid.levels), data.blocks, None
     if levels < data.grid.levels:
         basis = interpolation(levels, data.grid.levels)
-        rough, blocks = rough.project(basis), tuple(block.project(basis) for block in blocks)
+        rough, blocks = roughness(levels), tuple(block.project(basis) for block in blocks)
     whole = reduce(operator.add, blocks)
     labels = [blocks_of(run, data.pieces) for run in runs]
     squares = shared = expected = count = 0.0

@@ -12,20 +12,22 @@ from jaxtyping import Array, Float
 
 from fits.loop._moments import Moments
 
-# Logarithms of the weights where the data say nothing: curvatures of about ten strokes per squared range, and a
-# density, of some strokes per squared range, that changes by a third of one from one end of the range to the other.
-_MIDDLING = (np.log(1e-2), 2.0, np.log(1e-2))
+# Logarithms of the weights where the data say nothing: a density, of some strokes per squared range, whose slope is
+# ten, along the diagonal a third, and whose curvature is free, and a reversible slope whose curvature is ten.
+_MIDDLING = (-12.0, np.log(1e-2), 2.0, np.log(1e-2))
 
 
 class Hyper(eqx.Module):
     """How smooth and how noisy, as natural logarithms; found from the data by the evidence.
 
-    `log_density` weighs the integrated squared curvature of the density in all directions, `log_along` its squared
-    slope along the diagonal, as loops of one size are alike at all biases (exactly so in sums of plays), and
+    `log_density` weighs the integrated squared curvature of the density in all directions, `log_slope` its squared
+    slope, as a density may have kinks anywhere, of which curvature would be too sure, `log_along` its squared slope
+    along the diagonal, as loops of one size are alike at all biases (exactly so in sums of plays), and
     `log_reversible` the squared curvature of the reversible slope. `log_variance` is of noise, in squared strokes.
     """
 
     log_density: Float[Array, ""]
+    log_slope: Float[Array, ""]
     log_along: Float[Array, ""]
     log_reversible: Float[Array, ""]
     log_variance: Float[Array, ""]
@@ -33,38 +35,41 @@ class Hyper(eqx.Module):
     @classmethod
     def start(cls) -> "Hyper":
         """Weights that are believed beforehand, and noise of a thousandth of the stroke."""
-        density, along, reversible = map(jnp.asarray, _MIDDLING)
-        return cls(density, along, reversible, jnp.asarray(np.log(1e-6)))
+        _, slope, along, reversible = map(jnp.asarray, _MIDDLING)
+        # Curvature is found from where it counts.
+        return cls(jnp.asarray(np.log(1e-2)), slope, along, reversible, jnp.asarray(np.log(1e-6)))
 
     def relaxed(self, efolds: float) -> "Hyper":
-        """The same with all curvature counting less by so many e-folds."""
+        """The same with all slopes and curvature counting less by so many e-folds."""
         weights = jax.tree.map(lambda weight: weight - efolds, self)
         return eqx.tree_at(lambda h: h.log_variance, weights, self.log_variance)
 
 
 class Roughness(eqx.Module):
-    """Quadratic forms that measure the squared curvatures and slope that `Hyper` weighs, in columns of a `Grid`."""
+    """Quadratic forms that measure the squared slopes and curvature that `Hyper` weighs, in columns of a `Grid`."""
 
     density: Float[Array, "D D"]
+    slope: Float[Array, "D D"]
     along: Float[Array, "D D"]
     reversible: Float[Array, "D D"]
 
     @eqx.filter_jit
     def precision(self, hyper: Hyper) -> Float[Array, "D D"]:
         """Prior precision of the columns in strokes, shape `(D, D)`; positive definite."""
-        curvature = (
+        uneven = (
             jnp.exp(hyper.log_density) * self.density
+            + jnp.exp(hyper.log_slope) * self.slope
             + jnp.exp(hyper.log_along) * self.along
             + jnp.exp(hyper.log_reversible) * self.reversible
         )
-        # What is straight has no curvature, but no density of 100 strokes is believed; and a great weight on the rest
+        # What is even costs nothing, but no density of 100 strokes is believed; and a great weight on the rest
         # must not make it negative by rounding.
-        floor = 1 / 100.0**2 + 1e-14 * jnp.max(jnp.diagonal(curvature))
-        return curvature + floor * jnp.eye(curvature.shape[0])
+        floor = 1 / 100.0**2 + 1e-14 * jnp.max(jnp.diagonal(uneven))
+        return uneven + floor * jnp.eye(uneven.shape[0])
 
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Roughness":
         """Keep only combinations of columns."""
-        return Roughness(*(jnp.asarray(basis.T @ f @ basis) for f in (self.density, self.along, self.reversible)))
+        return jax.tree.map(lambda form: jnp.asarray(basis.T @ form @ basis), self)
 
 
 def roughness(levels: int) -> Roughness:
@@ -73,23 +78,24 @@ def roughness(levels: int) -> Roughness:
 
 
 @lru_cache(maxsize=16)
-def _matrices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    second = np.array([1.0, -2.0, 1.0])
+def _matrices(n: int) -> np.ndarray:
+    step, second = np.array([-1.0, 1.0]), np.array([1.0, -2.0, 1.0])
     # Along alpha, along beta, and the mixed derivative, which counts twice.
     density = (
         _squared(n, ((-1, 0), (0, 0), (1, 0)), second)
         + _squared(n, ((0, -1), (0, 0), (0, 1)), second)
         + _squared(n, ((0, 0), (1, 0), (0, 1), (1, 1)), np.sqrt(2.0) * np.array([1.0, -1.0, -1.0, 1.0]))
     )
-    along = _squared(n, ((0, 0), (1, 1)), np.array([-1.0, 1.0]))
-    slope = np.diff(np.eye(n), 2, axis=0)
+    slope = _squared(n, ((0, 0), (1, 0)), step) + _squared(n, ((0, 0), (0, 1)), step)
+    reversible = np.diff(np.eye(n), 2, axis=0)
     weights = len(density)
-    forms = np.zeros((3, weights + n, weights + n))
+    forms = np.zeros((4, weights + n, weights + n))
     # Over a step of 1 / (n - 1) a second difference is a derivative times the step squared, a first one times it.
     forms[0, :weights, :weights] = density * (n - 1) ** 2
-    forms[1, :weights, :weights] = along
-    forms[2, weights:, weights:] = slope.T @ slope * (n - 1) ** 3
-    return forms[0], forms[1], forms[2]
+    forms[1, :weights, :weights] = slope
+    forms[2, :weights, :weights] = _squared(n, ((0, 0), (1, 1)), step)
+    forms[3, weights:, weights:] = reversible.T @ reversible * (n - 1) ** 3
+    return forms
 
 
 def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) -> np.ndarray:
@@ -168,7 +174,7 @@ def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array,
     misfit = moments.energy_um2 / variance - half @ half
     volume = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
     prior_volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(prior))))
-    weights = jnp.stack([hyper.log_density, hyper.log_along, hyper.log_reversible])
+    weights = jnp.stack([hyper.log_density, hyper.log_slope, hyper.log_along, hyper.log_reversible])
     # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
     unlikely = jnp.sum(((weights - jnp.asarray(_MIDDLING)) / 6.0) ** 2)
     return jnp.asarray(moments.count * hyper.log_variance + misfit + volume - prior_volume + unlikely) / 2

@@ -153,7 +153,6 @@ def solve_shape(
     shared = sum(shared_square(o) * len(o) for o in off) / sum(len(o) for o in off)
     estimate = Estimate(
         model=coordinates(z),
-        levels=grid.levels,
         factor_um=factor,
         noise_um=variance**0.5 * stroke_um,
         correlation=correlation,

@@ -37,6 +37,24 @@ def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     return float(max(1.0, time[inside[0]] if len(inside) else time.max(initial=1.0)))
 
 
+def repeated_square(place: np.ndarray, residual: np.ndarray, correlation: float) -> float:
+    """Variance of what a residual repeats wherever it comes back to the same place; 0 where noise may do that, too.
+
+    The products of pairs that are closest in place are compared, of samples so far apart in time that they share no
+    noise, if one in so many samples as `correlation` is independent.
+    """
+    order, centred = np.argsort(place, kind="stable"), residual - residual.mean()
+    one, other = (np.concatenate(part) for part in zip(*((order[k:], order[:-k]) for k in range(1, 9)), strict=True))
+    apart = np.abs(one - other) > 5 * correlation
+    one, other = one[apart], other[apart]
+    closest = np.argsort(np.abs(place[one] - place[other]), kind="stable")[: len(place) // 2]
+    if len(closest) < 50:
+        return 0.0
+    products = centred[one[closest]] * centred[other[closest]]
+    mean = float(products.mean())
+    return mean if mean > float(products.std()) * (correlation / len(products)) ** 0.5 else 0.0
+
+
 def huber_weight(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """Weigh samples by what they leave, shape `(n,)`: outliers count linearly (Huber)."""
     left = residual_um[fitted]

@@ -45,7 +45,7 @@ def fit_batch(
         moments = Moments(left.T @ left, left.T @ right, right @ right, count)
         weight_of = jnp.log(smoothness)
         # The noise is found from this start, in squared strokes, in a few rounds of a fixed point.
-        hyper = Hyper(weight_of, weight_of, weight_of, jnp.log(jnp.asarray(1e-6)))
+        hyper = Hyper(weight_of, jnp.asarray(-30.0), weight_of, weight_of, jnp.log(jnp.asarray(1e-6)))
 
         def renew(_: int, hyper: Hyper) -> Hyper:
             posterior = Posterior.of(moments, rough, hyper)
