@@ -20,7 +20,6 @@ from fits.diagnosis._extension import (
 from fits.diagnosis._findings import bounds, causes_of, with_held_gain
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
-from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._residual_tests import (
     Cycles,
@@ -228,7 +227,7 @@ def conclude(
 
 def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
     """What was found, in units of other noise."""
-    first, now = (Projector(one.regression, noise, one.roughness) for one in (found.first, found.projector))
+    first, now = (one.beside(noise) for one in (found.first, found.projector))
     plain = nothing(found.bench, first)
     model = refit(found.bench, now, found.model.laws, found.model.x, 2) if found.causes else plain
     explained = max(plain.cost - model.cost, 0.0)

@@ -118,7 +118,7 @@ def relearn_roughness(bench: Bench, projector: Projector, model: Refit) -> State
     if not any(new < _LESS * old for new, old in zip(rough, projector.roughness, strict=True)):
         return bench, projector, model
     less = tuple(map(min, rough, projector.roughness))
-    return fit_jointly(bench, Projector(projector.regression, projector.noise, less), model)
+    return fit_jointly(bench, projector.beside(roughness=less), model)
 
 
 def relearn_smoothness(bench: Bench, projector: Projector, model: Refit) -> State:
@@ -202,17 +202,18 @@ def relearn_noise(
     Noise is that of the sensor and what neither the causes nor any of the `candidates` explain.
     """
     sensor = find_faults(projector.regression, model.change_um, thresholds).noise
-    beside = Projector(projector.regression, sensor, projector.roughness)
+    beside = projector.beside(sensor)
     found = with_discrepancy(beside, candidates, model.change_um)
     less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
     noise = found if any(less) else projector.noise
-    beside = smoothed(Projector(projector.regression, noise, projector.roughness), model.change_um)
+    beside = smoothed(projector.beside(noise), model.change_um)
     is_smoother = _prior_precision(beside) > _SMOOTHER * _prior_precision(first)
     if not is_smoother:
-        return Projector(first.regression, noise, first.roughness) if any(less) else None
+        return first.beside(noise) if any(less) else None
     smooth = beside.regression
     baseline = replace(first.regression.baseline, prior=smooth.baseline.prior)
-    return Projector(replace(first.regression, baseline=baseline, root=smooth.root), noise, first.roughness)
+    regression = replace(first.regression, baseline=baseline, root=smooth.root)
+    return Projector(regression, noise, first.roughness, first.held)
 
 
 def is_smoothness_confirmed(projector: Projector, model: Refit) -> bool:
@@ -233,7 +234,8 @@ def _linearised_at(
     # What is finer than the grid hardly changes, but where derivatives go through effects.
     plain = not any(projector.regression.saturating) and not any(map(saturating, effects))
     regression = regress(baseline, projector.regression.finer if plain else None, effects)
-    return Bench(regression.baseline, finest=finest), Projector(regression, projector.noise, projector.roughness)
+    there = Projector(regression, projector.noise, projector.roughness).bounded(model.change_um)
+    return Bench(regression.baseline, finest=finest), there
 
 
 def _made_sensitive(projector: Projector, model: Refit) -> Baseline | None:

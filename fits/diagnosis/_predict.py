@@ -105,7 +105,7 @@ class Predictor:
             return projector
         effects = [self.hypotheses[k].effects(run) for run in range(len(self.bench.prepared))]
         regression = regress(self.bench.baseline, _same(projector.regression, effects), effects)
-        return Projector(regression, projector.noise, projector.roughness)
+        return Projector(regression, projector.noise, projector.roughness, projector.held)
 
     def _old_columns(self) -> list[list[np.ndarray]]:
         """Of all hypotheses, what they change in the runs at hand, and the derivatives of that."""

@@ -9,7 +9,7 @@ import numpy as np
 from fits.diagnosis._baseline import Baseline, fit_baseline, simulate
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
-from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
+from fits.diagnosis._projector import ROUGHEST, Projector, learn_roughness, with_discrepancy
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
@@ -86,7 +86,7 @@ class _Fit:
 
     @cached_property
     def projector(self) -> Projector:
-        return Projector(self.regression, self.faults.noise)
+        return Projector(self.regression, self.faults.noise).bounded()
 
     @cached_property
     def bench(self) -> Bench:
@@ -197,12 +197,13 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     baseline = replace(regression.baseline, remarks=(*regression.baseline.remarks, *said))
     progress(Step.ROUGHNESS)
     candidates = [column for probe in probes for column in probe.signatures]
-    rough = learn_roughness(here.projector, candidates)
+    # Where a run passes each voltage one way only, a rough density looks like any effect.
+    rough = (ROUGHEST,) * len(regression.finer) if ONE_WAY in said else learn_roughness(here.projector, candidates)
     # What is large and has been used makes room.
     del here
     drop_programs(records)
-    projector = Projector(regression, faults.noise, rough)
-    projector = Projector(regression, with_discrepancy(projector, candidates), rough)
+    projector = Projector(regression, faults.noise, rough).bounded()
+    projector = projector.beside(with_discrepancy(projector, candidates)).bounded()
     return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
 
 

@@ -20,9 +20,11 @@ from fits.stage._solve import prior_precision
 from fits.stats._noise import Noise, learn_noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
-_ROUGHEST = 0.5
+ROUGHEST = 0.5
 # Part of a column of the tangent, in squares, below which what the others leave of it is rounding.
 _SHOWN = 1e-9
+# Standard deviations by which the data press a column that is zero below that, beyond chance.
+_PRESSED_Z = 3.0
 # The farthest that a coordinate moves at a time.
 _FARTHEST = 3.0
 
@@ -32,11 +34,19 @@ class Projector:
 
     Signals are given per run, for all samples; inside they are whitened by the `noise` of each run, joined, and
     followed by one entry for each unknown that has a prior. `roughness` is the standard deviation of the relative
-    roughness of the density that its grid cannot follow, of each kind in `Regression.finer`.
+    roughness of the density that its grid cannot follow, of each kind in `Regression.finer`. Columns that are `held`,
+    shape `(D,)`, stay where they are.
     """
 
-    def __init__(self, regression: Regression, noise: Sequence[Noise], roughness: Sequence[float] = ()):
+    def __init__(
+        self,
+        regression: Regression,
+        noise: Sequence[Noise],
+        roughness: Sequence[float] = (),
+        held: np.ndarray | None = None,
+    ):
         self.regression, self.noise, self.roughness = regression, tuple(noise), tuple(roughness)
+        self.held = np.zeros(regression.baseline.chain.size, dtype=bool) if held is None else held
         self.masks = regression.masks
         self.count = sum(int(mask.sum()) for mask in self.masks)
         grid = regression.baseline.chain.size
@@ -62,13 +72,14 @@ class Projector:
         matrix /= self._scale
         self._gram = matrix.T @ matrix
         # A Cholesky factor, pivoted: columns that the others make up have nothing of their own to be projected on.
-        factor, pivots, rank, _ = dpstrf(self._gram, tol=_SHOWN, lower=1)
-        lower, order = np.tril(factor)[:, :rank], pivots - 1
-        self._inverse = np.zeros((len(order), rank))
+        self._moving = np.flatnonzero(~np.pad(self.held, (0, len(size) - grid)))
+        factor, pivots, rank, _ = dpstrf(self._gram[np.ix_(self._moving, self._moving)], tol=_SHOWN, lower=1)
+        lower, order = np.tril(factor)[:, :rank], self._moving[pivots - 1]
+        self._inverse = np.zeros((len(size), rank))
         self._inverse[order[:rank]] = solve_triangular(lower[:rank], np.eye(rank), lower=True).T
-        self._root = np.zeros((rank, len(order)))
+        self._root = np.zeros((rank, len(size)))
         self._root[:, order] = lower.T
-        self._bare = np.r_[0 : regression.size, at : len(order)]
+        self._bare = np.r_[0 : regression.size, at : len(size)]
         self._matrix: np.ndarray | None = matrix
         self._q: np.ndarray | None = None
         self.residual = self.join(regression.residuals)
@@ -77,7 +88,36 @@ class Projector:
     @cached_property
     def bare(self) -> "Projector":
         """The same without roughness of the density beyond its grid."""
-        return Projector(self.regression, self.noise) if any(self.roughness) else self
+        return self.beside(roughness=()) if any(self.roughness) else self
+
+    @cached_property
+    def whole(self) -> "Projector":
+        """The same with no column held."""
+        return Projector(self.regression, self.noise, self.roughness) if self.held.any() else self
+
+    def beside(self, noise: Sequence[Noise] | None = None, roughness: Sequence[float] | None = None) -> "Projector":
+        """The same with other noise or roughness."""
+        other = self.noise if noise is None else noise, self.roughness if roughness is None else roughness
+        return Projector(self.regression, *other, self.held)
+
+    def bounded(self, change_um: Sequence[np.ndarray] = ()) -> "Projector":
+        """Hold the columns that are zero and that the data press below that, under what effects change in each run.
+
+        The others are at their best then: without a bound, a few relays that one run does not reach would follow
+        whatever differs from run to run.
+        """
+        whole, zero = self.whole, self.regression.baseline.columns_um <= 0
+        joined = whole.residual - whole.join(change_um) if len(change_um) else whole.residual
+        cross, gram = whole._cross(joined), whole._gram
+        at, others = np.flatnonzero(zero), np.setdiff1d(np.arange(len(cross)), np.flatnonzero(zero))
+        half = _inverse_root(gram[np.ix_(others, others)])
+        along = gram[np.ix_(at, others)] @ half
+        left = np.diagonal(gram)[at] - np.sum(along**2, axis=1)
+        best = cross[at] - along @ (half.T @ cross[others])
+        held = np.zeros(len(zero), dtype=bool)
+        held[at] = best < -_PRESSED_Z * np.sqrt(np.maximum(left, _SHOWN))
+        same = np.array_equal(held, self.held)
+        return self if same else Projector(self.regression, self.noise, self.roughness, held)
 
     @property
     def freedom(self) -> float:
@@ -137,9 +177,11 @@ class Projector:
     @cached_property
     def _spread(self) -> np.ndarray:
         """Root of the covariance, in the order of its eigenvalues: that of pivots is up to rounding."""
-        value, vector = np.linalg.eigh(self._gram)
+        value, vector = np.linalg.eigh(self._gram[np.ix_(self._moving, self._moving)])
         shown = value > _SHOWN / 10 * value[-1]
-        return np.asarray(vector[:, shown] / np.sqrt(value[shown]))
+        spread = np.zeros((len(self._scale), int(shown.sum())))
+        spread[self._moving] = vector[:, shown] / np.sqrt(value[shown])
+        return spread
 
     def draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Steps of coordinates and columns to another baseline that the runs allow, drawn by their covariance."""
@@ -147,6 +189,12 @@ class Projector:
         answer = (spread @ rng.standard_normal(spread.shape[1])) / self._scale
         columns = self.regression.baseline.chain.size
         return answer[columns : self.regression.size], answer[:columns]
+
+    def _cross(self, joined: np.ndarray) -> np.ndarray:
+        """Products of the tangent's columns, scaled, and a joined signal; shape `(unknowns,)`."""
+        if self._matrix is None:
+            return np.asarray(self._root.T @ (self.orthonormal.T @ joined))
+        return np.asarray(self._matrix.T @ joined)
 
     def _answer(self, joined: np.ndarray) -> np.ndarray:
         along = self.orthonormal.T @ joined if self._matrix is None else self._inverse.T @ (self._matrix.T @ joined)
@@ -175,7 +223,7 @@ class Projector:
         """
         baseline, held = self.regression.baseline, 1.0
         while True:
-            dz, columns_um = self._followed(joined, held)
+            dz, columns_um = self.whole._followed(joined, held)
             if np.all(np.abs(dz) < _FARTHEST):
                 return baseline.moved(dz, columns_um - baseline.columns_um)
             # What the runs hardly show at this place says little of places far away.
@@ -187,7 +235,7 @@ class Projector:
         columns = baseline.chain.size
         scale = self._scale[self._bare]
         gram = self._gram[np.ix_(self._bare, self._bare)] * scale * scale[:, None]
-        cross = (self._root.T @ (self.orthonormal.T @ joined))[self._bare] * scale
+        cross = self._cross(joined)[self._bare] * scale
         live = self._live[self._bare][columns:]
         coordinate = np.arange(len(live)) < self.regression.size - columns
         block = gram[columns:, columns:][np.ix_(live, live)]
@@ -260,7 +308,7 @@ def learn_roughness(
     count = projector.count - projector.freedom - len(candidates)
 
     def unlikely(logs: np.ndarray) -> float:
-        scale = np.repeat(np.exp(np.minimum(logs, np.log(_ROUGHEST))), sizes)
+        scale = np.repeat(np.exp(np.minimum(logs, np.log(ROUGHEST))), sizes)
         inner = np.eye(len(scale)) + scale[:, None] * gram * scale[None, :]
         root = np.linalg.cholesky(inner)
         half = solve_triangular(root, scale * cross, lower=True)
@@ -273,7 +321,7 @@ def learn_roughness(
         found = minimize(unlikely, start, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 0.05, "maxiter": 80})
         if found.fun < best - 0.5:
             best, at = float(found.fun), found.x
-    return tuple(float(min(np.exp(a), _ROUGHEST)) if a > -12 else 0.0 for a in at)
+    return tuple(float(min(np.exp(a), ROUGHEST)) if a > -12 else 0.0 for a in at)
 
 
 def with_discrepancy(
@@ -320,4 +368,4 @@ def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector
     start = replace(Hyper.start(), log_variance=jnp.zeros(()))
     prior = prior_precision(baseline.chain, maximise_evidence(moments, rough, start), stroke_um)
     moved = replace(regression, baseline=replace(baseline, prior=prior), root=root_of(prior))
-    return Projector(moved, projector.noise, projector.roughness)
+    return Projector(moved, projector.noise, projector.roughness, projector.held)

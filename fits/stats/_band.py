@@ -21,6 +21,8 @@ _OCTAVES = 2
 _NARROW = 3.0
 # A Hann window makes a line so many bins wide.
 _LINE = 4
+# A level is looked for within so many e-folds.
+_REACH = 30.0
 # Qualities, and heights above the floor, from which the likelihood climbs.
 _QUALITIES, _HEIGHTS = tuple(2.0**k for k in range(9)), tuple(4.0**k for k in range(8))
 
@@ -157,7 +159,7 @@ class _Spectrum:
         start = floor if peak is None else np.concatenate([floor, peak])
         least, most = np.log(self.frequency_Hz[[0, -1]])
         shapes = [(None, None), (least, most), (0.0, np.log(_QUALITIES[-1]))]
-        bounds = [(None, None)] * knots + ([] if peak is None else shapes)
+        bounds = [*zip(floor - _REACH, floor + _REACH, strict=True), *([] if peak is None else shapes)]
         found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 300})
         return found.x, -float(found.fun)
 

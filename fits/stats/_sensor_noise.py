@@ -20,6 +20,8 @@ _MOST_TOGETHER, _COMPARED_SAMPLES = 3, 16
 _MOVED_SHARE, _TURNED_SHARE, _SAMPLES_AROUND = 0.02, 0.004, 6
 # There a spike is larger than this multiple of what is usual.
 _OUTLYING = 2.0
+# Median of the negative product of neighbouring bends of white noise of variance 1, by simulation.
+_OPPOSED = 0.3726
 # Jitter beside rounding has at least so many times its variance.
 _ROUNDING = 10.0
 
@@ -147,7 +149,7 @@ def jitter_s(
     bent = residual_um[1:-1] - (residual_um[2:] + residual_um[:-2]) / 2
     square = bent**2 / 1.5
     speed = rate_um_per_s[1:-1] ** 2
-    order = np.argsort(speed)
+    order = np.argsort(speed[:-1])
     slow, quick = order[: len(order) // 2], order[-len(order) // 10 :]
     base = max(float(np.median(square[slow])) / 0.4549, least_um**2)
     more = float(np.median(square[quick])) / 0.4549 - base
@@ -160,5 +162,9 @@ def jitter_s(
     most = float((max(more + apart_z * error, 0.0) / faster) ** 0.5)
     # Rounding is less where nothing moves, and there its median is not that of normal noise.
     if more <= _ROUNDING * least_um**2:
+        return 0.0, 0.0, most
+    # Noise of neighbours is independent, so that one bends as the other does not; what is no noise bends alike.
+    opposed = -bent[:-1] * bent[1:]
+    if float(np.median(opposed[quick]) - np.median(opposed[slow])) / _OPPOSED < more / 2:
         return 0.0, 0.0, most
     return float((more / faster) ** 0.5), float(more / error), most
