@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from fits.loop._plain import PlainLoop
     from fits.loop._plain_file import plain_loop
     from fits.loop._prediction import Prediction
+    from fits.loop._report import fit_report
+    from fits.loop._report_words import describe
     from fits.loop._result import FitError
     from fits.machining._budget import budget
     from fits.machining._claims import describe_claims, paper_claims
@@ -44,10 +46,7 @@ if TYPE_CHECKING:
     from fits.report._control import control_json, describe_control
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
-    from fits.report._fit import fit_report
-    from fits.report._fit_words import describe
-    from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
-    from fits.report._words import describe_diagnosis
+    from fits.report._machining import budget_json, sensitivity_json
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._model_file import ModelFile, load_model, model_text

@@ -58,7 +58,7 @@ def budget(given: common.Given) -> None:
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
     places = [("json", out), *(("plot", place) for place in common.paths_in(given.plots, drawn))]
-    common.print_words(given, text, late.describe_budget(found), places)
+    common.print_words(given, text, found.summary(), places)
 
 
 def _law(path: str) -> "late.Preisach":

@@ -78,9 +78,7 @@ def diagnose(given: common.Given) -> None:
     progress(late.Step.WRITING)
     content = late.diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)
-    common.print_result(
-        given, {"out": given.out, "files": places, **content}, [late.describe_diagnosis(diagnosis), "", *places]
-    )
+    common.print_result(given, {"out": given.out, "files": places, **content}, [diagnosis.summary(), "", *places])
 
 
 def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> list[str]:

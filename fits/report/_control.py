@@ -11,7 +11,7 @@ from fits.control._compensate_stage import respond
 from fits.control._gains import printed_gains
 from fits.control._make import Loop, Made
 from fits.control._tune_problem import Tuning
-from fits.report._json import strict
+from fits.io._json import strict
 from microid import ControlledRun, StepMetrics, step_metrics, tracking_errors
 
 

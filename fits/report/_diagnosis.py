@@ -6,12 +6,11 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from fits.diagnosis._result import Diagnosis, Experiment
+from fits.diagnosis._result import KINDS, Diagnosis, Experiment
 from fits.io._version import written_by
 from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
 from fits.report import _words
 from fits.report._words import (
-    KINDS,
     SIGMA,
     Lengths,
     chance,
