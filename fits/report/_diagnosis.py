@@ -10,6 +10,7 @@ from fits.diagnosis._result import KINDS, Diagnosis, Experiment
 from fits.io._version import written_by
 from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
 from fits.report import _words
+from fits.report._next_steps import next_steps, runs_read, stage_parameters
 from fits.report._words import (
     SIGMA,
     Lengths,
@@ -25,11 +26,13 @@ from fits.report._words import (
 )
 
 
-def report_html(diagnosis: Diagnosis) -> str:
-    """Write a diagnosis as an HTML page for screen, phone and paper, all in one; the same one gives the same text."""
+def report_html(diagnosis: Diagnosis, when: str = "") -> str:
+    """Write a diagnosis as an HTML page for screen, phone and paper, all in one; the same one gives the same text.
+
+    It says `when` the runs were read, where that is given.
+    """
     length, causes, ahead = Lengths(diagnosis), diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]
-    sources = list(dict.fromkeys(run.source for run in diagnosis.runs if run.source))
     asked = [one for one in diagnosis.upper_bounds if not one.reason]
     asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
     gain = diagnosis.gain
@@ -55,7 +58,10 @@ def report_html(diagnosis: Diagnosis) -> str:
         ahead=ahead,
         style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
         kind=KINDS[diagnosis.verdict],
-        sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
+        when=when,
+        steps=next_steps(diagnosis),
+        runs=runs_read(diagnosis.runs),
+        parameters=stage_parameters(diagnosis),
         tiles=_tiles(diagnosis, length),
         residuals=residuals(diagnosis, length.per_um, length.unit),
         some_aside=any((~run.fitted).any() for run in diagnosis.runs),
@@ -116,12 +122,13 @@ def _gained(diagnosis: Diagnosis, length: Lengths) -> str:
     before = gain.heldout_rms_before_um
     if not diagnosis.causes or gain.heldout_rms_after_um == before:
         return f"On data that were not used, the plain stage errs by {length(before)}, root mean square."
-    difference = before - gain.heldout_rms_after_um
+    difference, sd = before - gain.heldout_rms_after_um, gain.sd_of_difference_um
     size = length.bare(abs(difference))
-    if math.isfinite(gain.sd_of_difference_um):
-        size += f" ± {number(length.per_um * gain.sd_of_difference_um, 2)}"
+    if math.isfinite(sd):
+        size += f" ± {number(length.per_um * sd, 2)}"
     way, part = ("falls", f": by {percent(difference / before)}") if difference > 0 else ("rises", "")
-    return f"On data that were not used, the error {way} by {size} {length.unit}, root mean square{part}."
+    doubt = ", which may be chance" if abs(difference) < 2 * sd else ""
+    return f"On data that were not used, the error {way} by {size} {length.unit}, root mean square{part}{doubt}."
 
 
 def _bars(diagnosis: Diagnosis) -> list[tuple[str, str, float, float]]:

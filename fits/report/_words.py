@@ -10,6 +10,8 @@ from microid.effects import card_of
 
 # Below this, probabilities are those of tails that nobody has checked.
 _SMALLEST_P = 1e-9
+# A residual of more times the noise floor is not called noise.
+_NOISY = 1.2
 _UNITS = {"um": "µm", "degC": "°C"}
 # What stands for a number that is not known.
 NONE = "\N{EN DASH}"
@@ -152,9 +154,12 @@ def _found(diagnosis: Diagnosis, length: Lengths) -> str:
             f"{noise}, and no effect of the library explains it."
         )
     if not diagnosis.causes:
+        over, described = rms_um(diagnosis.runs, "before_um", fitted=True), "describes these records down to"
+        if over > _NOISY * diagnosis.noise_um:
+            described = f"leaves {length(over)}, root mean square, in which no effect shows, over"
         return (
-            f"The plain stage describes these records down to a noise floor of {noise}. Of records that hold "
-            f"no effect, {percent(diagnosis.false_alarm)} are given a cause by chance."
+            f"The plain stage {described} a noise floor of {noise}. Of records that hold no effect, "
+            f"{percent(diagnosis.false_alarm)} are given a cause by chance."
         )
     sentences = []
     for cause in diagnosis.causes:
@@ -178,8 +183,10 @@ def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
     if after == before:
         return [f"What {listed(modelled)} did in these runs is not in the model of the next."]
     change = "falls" if after < before else "does not fall: it goes"
+    change = f"{change} from {length(before)} to {length(after)}"
+    if length(before) == length(after):
+        change = f"stays at {length(after)}"
     return [
-        f"With {listed(modelled)} in the model, the error on data that were not "
-        f"used {change} from {length(before)} to {length(after)}, root mean square; the noise "
-        f"floor is {length(diagnosis.noise_um)}."
+        f"With {listed(modelled)} in the model, the error on data that were not used {change}, root mean square; the "
+        f"noise floor is {length(diagnosis.noise_um)}."
     ]
