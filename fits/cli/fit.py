@@ -84,6 +84,8 @@ def fit(given: common.Given) -> None:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         records = late.read_runs(given.runs, **how)
         same = {"holdout": [late.read_table(file, **how) for file in files] or fraction, "initial": initial}
+        if given.start:
+            late.read_model_text(given.start)
         # Only now, so that what cannot be read is refused at once.
         late.start_jax()
         estimate: Any = late.fit_slow if slow else late.fit
