@@ -214,7 +214,7 @@ def length_mm(option: str, text: str, units: Sequence[str], example: str) -> flo
 def refuse_overwriting(out: str, inputs: Iterable[str]) -> None:
     """Refuse to overwrite what is read."""
     for path in inputs:
-        if os.path.realpath(path) == os.path.realpath(out):
+        if os.path.realpath(late.numbered(path)[0]) == os.path.realpath(out):
             raise DataError(f"--out: {out} would overwrite what is read; choose another name.")
 
 

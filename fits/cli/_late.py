@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from fits.io._model_text import read_model_text
     from fits.io._quantity import Quantity
     from fits.io._read_csv import read_reference, read_runs, read_table
+    from fits.io._read_file import numbered
     from fits.io._record import Record
     from fits.io._units import parse_columns
     from fits.loop._fit import fit
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from fits.machining._idle import idle_noise, read_idle
     from fits.machining._sensitivity import sensitivities
     from fits.paper._regenerate import paper_result
+    from fits.plots._channels import plot_channels
     from fits.plots._control import plot_compensation, plot_control
     from fits.plots._fit import plot_fit, plot_stage
     from fits.plots._machining import plot_budget, plot_sensitivity
