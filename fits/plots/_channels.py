@@ -26,6 +26,6 @@ def plot_channels(found: Inspection, folder: AnyPath) -> list[Path]:
     for axes, each in zip(grid[:, 0], shown, strict=False):
         of_rows = np.arange(1.0, len(values[each.name]) + 1)
         curve(axes, values.get(time, of_rows), values[each.name], **MODEL)
-        label(axes, title=verbatim(f"{each.name}  {each.use and f'({each.use})'}".rstrip()))
+        label(axes, title=verbatim(each.name if each.use in ("", each.name) else f"{each.name}  ({each.use})"))
     label(grid[-1, 0], verbatim(time) if time in values else "row")
     return [save(picture, Path(folder) / "channels.png")]
