@@ -169,6 +169,11 @@ def paths_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
     return [str(Path(folder or "") / Path(file).name) for file in made]
 
 
+def page(given: Given) -> list[str]:
+    """The line on the page beside the pictures, where some are asked for."""
+    return [] if given.plots is None else [f"page   {Path(given.plots) / 'index.html'}"]
+
+
 def json_place(given: Given) -> str | None:
     """The JSON file to write, None where there is none or it is printed."""
     return None if given.json_file == "-" else given.json_file

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
     from fits.report._machining import budget_json, sensitivity_json
+    from fits.report._page import write_page
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._model_file import ModelFile, load_model, model_text

@@ -1,16 +1,15 @@
 """A diagnosis as one page that needs nothing else: pictures are in it, and it opens without a network."""
 
 import math
-from importlib.resources import files
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
 
 from fits.diagnosis._result import KINDS, Diagnosis, Experiment
-from fits.io._version import written_by
 from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
 from fits.report import _words
 from fits.report._next_steps import next_steps, runs_read, stage_parameters
+from fits.report._page import environment
 from fits.report._words import (
     SIGMA,
     Lengths,
@@ -51,12 +50,11 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
     further = _arrow("Largest error", gain.heldout_max_before_um, gain.heldout_max_after_um, length)
     driven = gain.feedforward_before_um, gain.feedforward_after_um
     further += _arrow("Error under feedforward, rms", *driven, length)
-    template = _environment().get_template("diagnosis.html")
+    template = _with_words().get_template("diagnosis.html")
     return template.render(
         diagnosis=diagnosis,
         length=length,
         ahead=ahead,
-        style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
         kind=KINDS[diagnosis.verdict],
         when=when,
         steps=next_steps(diagnosis),
@@ -76,14 +74,12 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
         ahead_facts=_facts(ahead) if ahead else (),
         extremes=extremes,
         weakest=max((cause.p_family for cause in causes), default=math.nan),
-        written_by=written_by(),
     )
 
 
-def _environment() -> Environment:
-    """Templates of this room, which escape whatever they are given."""
-    blocks: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
-    made = Environment(loader=PackageLoader("fits.report"), autoescape=True, undefined=StrictUndefined, **blocks)
+def _with_words() -> Environment:
+    """Templates, and the words of a diagnosis in them."""
+    made = environment()
     for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number"):
         made.filters[name] = getattr(_words, name)
     made.filters["without_dot"] = lambda text: text.rstrip(".")
