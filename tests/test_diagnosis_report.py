@@ -83,7 +83,7 @@ def test_the_summary_tells_parameters_with_units_and_is_what_a_notebook_shows(rn
     text = found.summary()
     assert text.splitlines()[0].startswith(("no effect found", "effect found", "unexplained error"))
     for cause in found.causes:
-        assert re.search(rf"{cause.name}.*: 24.3 standard deviations", text)
+        assert re.search(rf"{cause.name}.*: 24.3 standard deviations, by chance below 1e-09$", text, re.MULTILINE)
         assert re.search(r"gain_per_decade +0\.01542 \+- 0\.00031$", text, re.MULTILINE)
         assert re.search(r"onset_s +0\.1 \(95 %: nan to inf\) s$", text, re.MULTILINE)
     assert repr(found) == text

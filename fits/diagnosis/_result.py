@@ -16,6 +16,8 @@ Verdict = Literal["no_effect", "effect_found", "unexplained"]
 SCHEMA = "microid.diagnosis/1"
 # Verdicts in words.
 KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
+# Below this, probabilities are those of tails that nobody has checked.
+SMALLEST_P = 1e-9
 # The residual depends on something below this probability by chance.
 _SIGNIFICANT = 1e-3
 
@@ -201,7 +203,8 @@ class Diagnosis(AbstractSummary):
         lines = [f"{KINDS[self.verdict]}; noise {self.noise_um:.3g} um, {self.noise_source}"]
         for cause in self.causes:
             also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
-            lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {cause.p_family:.1g}")
+            chance = f"{cause.p_family:.1g}" if cause.p_family >= SMALLEST_P else f"below {SMALLEST_P:.0e}"
+            lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {chance}")
             if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
                 lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
             for each in cause.parameters:

@@ -16,7 +16,7 @@ from microid import ControlledRun, StepMetrics, step_metrics, tracking_errors
 
 # Feedback that takes off less than this share is hardly worth its trouble.
 _PAYS = 0.1
-_ALONE = "'microid compensate' does as well, as long as the stage stays as its model is"
+_ALONE = "'microid compensate' does {}, as long as the stage stays as its model is"
 
 
 def control_json(
@@ -154,7 +154,7 @@ def _said_of_worth(worth: Mapping[str, Any]) -> str:
     share, after, before = worth["share"] or 0.0, _said(worth["error_rms_um"]), _said(worth["without_um"])
     part = f"{100 * share:.3g} %" if share > 0 else "nothing"
     does = f"takes {part} off the error of the feedforward alone, {before} to {after} um over all plants"
-    return does if share >= _PAYS else f"{does}; {_ALONE}"
+    return does if share >= _PAYS else f"{does}; {_ALONE.format('as well' if share >= 0 else 'better')}"
 
 
 def _said(value: float | None) -> str:

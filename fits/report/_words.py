@@ -5,11 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fits.diagnosis._result import Diagnosis, EffectParameter, RunView
+from fits.diagnosis._result import SMALLEST_P, Diagnosis, EffectParameter, RunView
 from microid.effects import card_of
 
-# Below this, probabilities are those of tails that nobody has checked.
-_SMALLEST_P = 1e-9
 # A residual of more times the noise floor is not called noise.
 _NOISY = 1.2
 _UNITS = {"um": "µm", "degC": "°C"}
@@ -92,8 +90,8 @@ def percent(share: float) -> str:
 def chance(p: float) -> str:
     if not math.isfinite(p):
         return NONE
-    if p < _SMALLEST_P:
-        return f"below {number(_SMALLEST_P, 1).removeprefix(f'1 {_TIMES} ')}"
+    if p < SMALLEST_P:
+        return f"below {number(SMALLEST_P, 1).removeprefix(f'1 {_TIMES} ')}"
     return number(p, 2 if p >= 1e-3 else 1)
 
 
