@@ -1,13 +1,46 @@
 """What data teach: measured records, estimation, reports and the `microid` command.
 
-The public names are the imports below. Type checkers follow them; a name is imported when it is first used, so that
-the command's help does not wait for JAX and pandas.
+The public names stand below in groups. Type checkers follow the imports; a name is imported when it is first used, so
+that the command's help does not wait for JAX and pandas.
 """
-# ruff: noqa: F401
 
 from typing import TYPE_CHECKING
 
 from fits.io._late import late as _late
+
+# fmt: off
+__all__ = [  # noqa: RUF022
+    # Files and records
+    "DataError", "Record", "Reference", "read_csv", "read_reference", "read_runs", "read_table",
+    # A loop or a stage, fitted
+    "FitError", "FitResult", "FitStatus", "LADDER", "LevelTrial", "ModelFile", "ParameterEstimate", "Prediction",
+    "RunReport", "default_stage", "describe", "fit", "fit_report", "fit_slow", "fit_stage", "load_model", "predict",
+    "save_model",
+    # How sure a fit is
+    "AbstractUncertainty", "Draws", "Errors", "Profile", "StageUncertainty", "Uncertainty", "draw_plants", "errors",
+    "loop_width_pct", "profile_stage", "sample_posterior",
+    # Frequency responses
+    "ModalFit", "Multisine", "ResponseData", "estimate_response", "fit_hysteresis", "fit_response", "read_multisine",
+    "read_response", "relative_error",
+    # Diagnosis
+    "Bound", "Diagnosis", "EffectParameter", "Experiment", "FoundCause", "Gain", "NoiseBand", "NoiseLine",
+    "Thresholds", "diagnose", "diagnosis_json", "diagnosis_schema", "report_html",
+    # Compensation and control
+    "Compensation", "Goal", "LoopReport", "NetworkInverse", "Tuning", "UltimatePoint", "compensate", "export_c",
+    "fit_network_inverse", "relay_start", "steepest_slope", "tune_controller", "ultimate_point",
+    # Dimensions, tolerances and error budgets
+    "Allocation", "AllocationError", "AxisBudget", "AxisSensitivity", "AxisSpread", "Budget", "Claim", "Design",
+    "DimensionEffect", "Driving", "IdleNoise", "MonteCarlo", "SecondOrder", "SensitivityReport", "SobolIndices",
+    "Together", "allocate", "budget", "budget_json", "describe_claims", "idle_noise", "monte_carlo", "paper_claims",
+    "paper_design", "read_design", "read_idle", "second_order", "sensitivities", "sensitivity_json",
+    "sign_change_guides", "sobol", "write_design",
+    # Sweeps
+    "Outcome", "Sweep", "open_sweep", "read_sweep", "run_sweep",
+    # Pictures
+    "plot_budget", "plot_compensation", "plot_control", "plot_fit", "plot_idle", "plot_sensitivity", "plot_stage",
+    "plot_sweep",
+]
+# fmt: on
 
 if TYPE_CHECKING:
     from fits.control._compensate import compensate
@@ -26,6 +59,8 @@ if TYPE_CHECKING:
     from fits.loop._choose_grid import LADDER
     from fits.loop._fit import fit
     from fits.loop._prediction import Prediction
+    from fits.loop._report import fit_report
+    from fits.loop._report_words import describe
     from fits.loop._result import FitError, FitResult, FitStatus, LevelTrial, ParameterEstimate, RunReport
     from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
     from fits.machining._allocate import Allocation, AllocationError, allocate
@@ -43,10 +78,7 @@ if TYPE_CHECKING:
     from fits.plots._sweep import plot_sweep
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
-    from fits.report._fit import fit_report
-    from fits.report._fit_words import describe
-    from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
-    from fits.report._words import describe_diagnosis
+    from fits.report._machining import budget_json, sensitivity_json
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._frequency import Multisine, ResponseData, estimate_response, read_multisine, read_response
@@ -63,4 +95,4 @@ else:
     _HOMES, __getattr__ = _late(__name__, __file__)
 
     def __dir__():
-        return sorted(_HOMES)
+        return sorted(__all__)

@@ -1,141 +1,131 @@
 """Models of a piezo-driven micro-positioner as pure, differentiable JAX functions."""
 
-from microid._batch import respond_all as respond_all
-from microid._everett import Everett as Everett
-from microid._everett import everett as everett
-from microid._forest import forest_sum as forest_sum
-from microid._hysteretic_mechanics import HystereticMechanics as HystereticMechanics
-from microid._inverse import Inversion as Inversion
-from microid._inverse import invert as invert
-from microid._inverse_stage import StageInversion as StageInversion
-from microid._inverse_stage import driver_command as driver_command
-from microid._inverse_stage import invert_stage as invert_stage
-from microid._inverse_stage import piezo_demand as piezo_demand
-from microid._linear import Hold as Hold
-from microid._linear import LinearSystem as LinearSystem
-from microid._linear import recur as recur
-from microid._memory import Memory as Memory
-from microid._memory import Staircase as Staircase
-from microid._memory import demagnetised as demagnetised
-from microid._memory import negative_saturation as negative_saturation
-from microid._memory import positive_saturation as positive_saturation
-from microid._memory import remember as remember
-from microid._modes import HystereticModes as HystereticModes
-from microid._modes import Modes as Modes
-from microid._modes import with_plays as with_plays
-from microid._param import Coordinates as Coordinates
-from microid._param import ParameterInfo as ParameterInfo
-from microid._param import ParameterSpec as ParameterSpec
-from microid._param import array as array
-from microid._param import param as param
-from microid._param import parameter_table as parameter_table
-from microid._param import static as static
-from microid._part import AbstractHysteresis as AbstractHysteresis
-from microid._part import AbstractLinear as AbstractLinear
-from microid._part import AbstractPart as AbstractPart
-from microid._part import AbstractStepper as AbstractStepper
-from microid._part import Scene as Scene
-from microid._part import Signal as Signal
-from microid._part import innermost as innermost
-from microid._plant import Driver as Driver
-from microid._plant import Mechanics as Mechanics
-from microid._plant import Piezo as Piezo
-from microid._plant import Sensor as Sensor
-from microid._preisach import Preisach as Preisach
-from microid._refine import refined as refined
-from microid._reversible import Reversible as Reversible
-from microid._stage import Stage as Stage
-from microid._stage import Start as Start
-from microid.control import CONTROLLERS as CONTROLLERS
-from microid.control._base import AbstractController as AbstractController
-from microid.control._base import AbstractLinearController as AbstractLinearController
-from microid.control._base import ControlledPlant as ControlledPlant
-from microid.control._base import ControlTask as ControlTask
-from microid.control._base import Setting as Setting
-from microid.control._base import settings_of as settings_of
-from microid.control._errors import StepMetrics as StepMetrics
-from microid.control._errors import TrackingErrors as TrackingErrors
-from microid.control._errors import step_metrics as step_metrics
-from microid.control._errors import tracking_errors as tracking_errors
-from microid.control._learning import Learnt as Learnt
-from microid.control._learning import iterative_learning as iterative_learning
-from microid.control._learning import learn_once as learn_once
-from microid.control._loop import ControlledRun as ControlledRun
-from microid.control._loop import simulate_loop as simulate_loop
-from microid.control._margins import Margins as Margins
-from microid.control._margins import loop_gain as loop_gain
-from microid.control._margins import margins as margins
-from microid.control._margins import require_stable as require_stable
-from microid.control._sampled import AbstractPlant as AbstractPlant
-from microid.control._sampled import SampledStage as SampledStage
-from microid.control._two_degrees import TwoDegrees as TwoDegrees
-from microid.control._two_degrees import two_degrees as two_degrees
-from microid.control.bp_pid import BPPID as BPPID
-from microid.control.bp_pid import GainNetwork as GainNetwork
-from microid.control.cmac_pid import CMACPID as CMACPID
-from microid.control.pid import PID as PID
-from microid.control.resonant import ResonantPID as ResonantPID
-from microid.densities import FAMILIES as FAMILIES
-from microid.densities import AbstractDensity as AbstractDensity
-from microid.densities._base import node_areas as node_areas
-from microid.densities.grid import GridDensity as GridDensity
-from microid.densities.mixture import MixtureDensity as MixtureDensity
-from microid.densities.network import NetworkDensity as NetworkDensity
-from microid.effects import EFFECTS as EFFECTS
-from microid.effects import PLACES as PLACES
-from microid.effects import AbstractEffect as AbstractEffect
-from microid.effects import Scales as Scales
-from microid.effects import extend as extend
-from microid.effects import host as host
-from microid.hysteresis import BoucWen as BoucWen
-from microid.hysteresis import Dahl as Dahl
-from microid.hysteresis import Duhem as Duhem
-from microid.hysteresis import MaxwellSlip as MaxwellSlip
-from microid.hysteresis import PrandtlIshlinskii as PrandtlIshlinskii
-from microid.kinetostatics._axes import AXES as AXES
-from microid.kinetostatics._axes import MOTIONS as MOTIONS
-from microid.kinetostatics._axes import Axis as Axis
-from microid.kinetostatics._axes import Form as Form
-from microid.kinetostatics._axes import Motion as Motion
-from microid.kinetostatics._axes import Sensitivity as Sensitivity
-from microid.kinetostatics._axes import drive_of as drive_of
-from microid.kinetostatics._axes import gain as gain
-from microid.kinetostatics._axes import input_stiffness_N_per_um as input_stiffness_N_per_um
-from microid.kinetostatics._axes import loaded_um as loaded_um
-from microid.kinetostatics._axes import output as output
-from microid.kinetostatics._axes import sensitivity as sensitivity
-from microid.kinetostatics._axes import voltage_sensitivity as voltage_sensitivity
-from microid.kinetostatics._compliance import Constants as Constants
-from microid.kinetostatics._compliance import TwoPort as TwoPort
-from microid.kinetostatics._compliance import bridge as bridge
-from microid.kinetostatics._compliance import constants_of as constants_of
-from microid.kinetostatics._compliance import guide_stiffness_N_per_um as guide_stiffness_N_per_um
-from microid.kinetostatics._compliance import leaf_compliance as leaf_compliance
-from microid.kinetostatics._errors import DrivingError as DrivingError
-from microid.kinetostatics._errors import TotalError as TotalError
-from microid.kinetostatics._errors import driving_error as driving_error
-from microid.kinetostatics._errors import total_error as total_error
-from microid.kinetostatics._geometry import DIMENSIONS as DIMENSIONS
-from microid.kinetostatics._geometry import Dimension as Dimension
-from microid.kinetostatics._geometry import Geometry as Geometry
-from microid.kinetostatics._large_stroke import beam_alpha as beam_alpha
-from microid.kinetostatics._large_stroke import beam_gamma as beam_gamma
-from microid.kinetostatics._large_stroke import beam_x as beam_x
-from microid.kinetostatics._large_stroke import beam_z as beam_z
-from microid.kinetostatics._large_stroke import pseudo_rigid_alpha as pseudo_rigid_alpha
-from microid.kinetostatics._large_stroke import pseudo_rigid_z as pseudo_rigid_z
-from microid.kinetostatics._motion import f_alpha as f_alpha
-from microid.kinetostatics._motion import f_beta as f_beta
-from microid.kinetostatics._motion import f_gamma as f_gamma
-from microid.kinetostatics._motion import f_x as f_x
-from microid.kinetostatics._motion import f_y as f_y
-from microid.kinetostatics._motion import f_z as f_z
-from microid.kinetostatics._motion import link_leaf as link_leaf
-from microid.kinetostatics._motion import middle_bridge as middle_bridge
-from microid.kinetostatics._motion import tilt_arm_mm as tilt_arm_mm
-from microid.kinetostatics._stage_constants import Actuation as Actuation
-from microid.kinetostatics._stage_constants import StageConstants as StageConstants
-from microid.kinetostatics._stage_constants import stage_constants as stage_constants
+from microid._batch import respond_all
+from microid._everett import Everett, everett
+from microid._forest import forest_sum
+from microid._hysteretic_mechanics import HystereticMechanics
+from microid._inverse import Inversion, invert
+from microid._inverse_stage import StageInversion, driver_command, invert_stage, piezo_demand
+from microid._linear import Hold, LinearSystem, recur
+from microid._memory import Memory, Staircase, demagnetised, negative_saturation, positive_saturation, remember
+from microid._modes import HystereticModes, Modes, with_plays
+from microid._param import Coordinates, ParameterInfo, ParameterSpec, array, param, parameter_table, static
+from microid._part import AbstractHysteresis, AbstractLinear, AbstractPart, AbstractStepper, Scene, Signal, innermost
+from microid._plant import Driver, Mechanics, Piezo, Sensor
+from microid._preisach import Preisach
+from microid._refine import refined
+from microid._reversible import Reversible
+from microid._stage import Stage, Start
+from microid.control import CONTROLLERS
+from microid.control._base import (
+    AbstractController,
+    AbstractLinearController,
+    ControlledPlant,
+    ControlTask,
+    Setting,
+    settings_of,
+)
+from microid.control._errors import StepMetrics, TrackingErrors, step_metrics, tracking_errors
+from microid.control._learning import Learnt, iterative_learning, learn_once
+from microid.control._loop import ControlledRun, simulate_loop
+from microid.control._margins import Margins, loop_gain, margins, require_stable
+from microid.control._sampled import AbstractPlant, SampledStage
+from microid.control._two_degrees import TwoDegrees, two_degrees
+from microid.control.bp_pid import BPPID, GainNetwork
+from microid.control.cmac_pid import CMACPID
+from microid.control.pid import PID
+from microid.control.resonant import ResonantPID
+from microid.densities import FAMILIES, AbstractDensity
+from microid.densities._base import node_areas
+from microid.densities.grid import GridDensity
+from microid.densities.mixture import MixtureDensity
+from microid.densities.network import NetworkDensity
+from microid.effects import EFFECTS, PLACES, AbstractEffect, Scales, extend, host
+from microid.hysteresis import BoucWen, Dahl, Duhem, MaxwellSlip, PrandtlIshlinskii
+from microid.kinetostatics._axes import (
+    AXES,
+    MOTIONS,
+    Axis,
+    Form,
+    Motion,
+    Sensitivity,
+    drive_of,
+    gain,
+    input_stiffness_N_per_um,
+    loaded_um,
+    output,
+    sensitivity,
+    voltage_sensitivity,
+)
+from microid.kinetostatics._compliance import (
+    Constants,
+    TwoPort,
+    bridge,
+    constants_of,
+    guide_stiffness_N_per_um,
+    leaf_compliance,
+)
+from microid.kinetostatics._errors import DrivingError, TotalError, driving_error, total_error
+from microid.kinetostatics._geometry import DIMENSIONS, Dimension, Geometry
+from microid.kinetostatics._large_stroke import (
+    beam_alpha,
+    beam_gamma,
+    beam_x,
+    beam_z,
+    pseudo_rigid_alpha,
+    pseudo_rigid_z,
+)
+from microid.kinetostatics._motion import (
+    f_alpha,
+    f_beta,
+    f_gamma,
+    f_x,
+    f_y,
+    f_z,
+    link_leaf,
+    middle_bridge,
+    tilt_arm_mm,
+)
+from microid.kinetostatics._stage_constants import Actuation, StageConstants, stage_constants
+
+# fmt: off
+__all__ = [  # noqa: RUF022
+    # A stage and its parts
+    "Driver", "HystereticMechanics", "HystereticModes", "Mechanics", "Modes", "Piezo", "Reversible", "Sensor",
+    "Stage", "Start", "with_plays",
+    # What parts are made of
+    "AbstractHysteresis", "AbstractLinear", "AbstractPart", "AbstractStepper", "Hold", "LinearSystem", "Scene",
+    "Signal", "innermost", "recur", "refined",
+    # Hysteresis
+    "BoucWen", "Dahl", "Duhem", "Everett", "MaxwellSlip", "PrandtlIshlinskii", "Preisach", "everett", "forest_sum",
+    "respond_all",
+    # Densities
+    "AbstractDensity", "FAMILIES", "GridDensity", "MixtureDensity", "NetworkDensity", "node_areas",
+    # Memory
+    "Memory", "Staircase", "demagnetised", "negative_saturation", "positive_saturation", "remember",
+    # Parameters
+    "Coordinates", "ParameterInfo", "ParameterSpec", "array", "param", "parameter_table", "static",
+    # Inverses
+    "Inversion", "StageInversion", "driver_command", "invert", "invert_stage", "piezo_demand",
+    # Effects
+    "AbstractEffect", "EFFECTS", "PLACES", "Scales", "extend", "host",
+    # Control
+    "AbstractController", "AbstractLinearController", "AbstractPlant", "BPPID", "CMACPID", "CONTROLLERS",
+    "ControlTask", "ControlledPlant", "ControlledRun", "GainNetwork", "Learnt", "Margins", "PID", "ResonantPID",
+    "SampledStage", "Setting", "StepMetrics", "TrackingErrors", "TwoDegrees", "iterative_learning", "learn_once",
+    "loop_gain", "margins", "require_stable", "settings_of", "simulate_loop", "step_metrics", "tracking_errors",
+    "two_degrees",
+    # Kinetostatics of the stage
+    "AXES", "Actuation", "Axis", "Constants", "DIMENSIONS", "Dimension", "DrivingError", "Form", "Geometry",
+    "MOTIONS", "Motion", "Sensitivity", "StageConstants", "TotalError", "TwoPort", "bridge", "constants_of",
+    "drive_of", "driving_error", "gain", "guide_stiffness_N_per_um", "input_stiffness_N_per_um", "leaf_compliance",
+    "link_leaf", "loaded_um", "middle_bridge", "output", "sensitivity", "stage_constants", "tilt_arm_mm",
+    "total_error", "voltage_sensitivity",
+    # Motion functions
+    "beam_alpha", "beam_gamma", "beam_x", "beam_z", "f_alpha", "f_beta", "f_gamma", "f_x", "f_y", "f_z",
+    "pseudo_rigid_alpha", "pseudo_rigid_z",
+]
+# fmt: on
 
 
 def __getattr__(name: str) -> str:

@@ -8,12 +8,9 @@ import os
 import pkgutil
 import subprocess
 import sys
-import typing
 from pathlib import Path
 
 import pytest
-
-import microid
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("microid", "fits", "data_synth")
@@ -86,111 +83,6 @@ def test_files_stay_short(path):
 @pytest.mark.parametrize("path", sorted(Path(__file__).parent.glob("*.py")), ids=relative)
 def test_tests_stay_short(path):
     assert len(path.read_text(encoding="utf-8").splitlines()) <= 350
-
-
-def listed(package):
-    """Public names that a package's `__init__.py` lists by hand, each with the module it comes from."""
-    tree = ast.parse((ROOT / package.replace(".", "/") / "__init__.py").read_text(encoding="utf-8"))
-    names = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in PACKAGES:
-            for alias in node.names:
-                if (alias.asname or "").startswith("_"):
-                    continue
-                # `fits` imports them for type checkers alone, and each when it is first used.
-                late = package == "fits" and alias.asname is None
-                assert late or alias.asname == alias.name, f"{package} lists {alias.name} without `as {alias.name}`"
-                assert alias.name not in names, f"{package} lists {alias.name} twice"
-                names[alias.name] = node.module
-    return names
-
-
-def is_defined(value):
-    """Whether a name stands for a class or a function of its module, not for a constant or the name of a type."""
-    return callable(value) and typing.get_origin(value) is None
-
-
-@pytest.mark.parametrize(
-    "package", [*PACKAGES, "microid.control", "microid.densities", "microid.effects", "microid.hysteresis"]
-)
-def test_public_names_are_the_listed_ones(package):
-    module, names = importlib.import_module(package), listed(package)
-    assert names
-    for name, home in names.items():
-        value = getattr(module, name)
-        assert value is getattr(importlib.import_module(home), name)
-        if is_defined(value):
-            assert value.__module__.startswith(home), f"{package} lists {name} from where it is not defined"
-    submodules = {found.name for found in pkgutil.iter_modules(module.__path__)}
-    public = {name for name in dir(module) if not name.startswith("_")} - submodules
-    assert public - {"TYPE_CHECKING", "Any", "Path", "ast", "importlib", "pkgutil"} == set(names)
-
-
-def test_the_version_is_that_of_the_package():
-    assert microid.__version__ == importlib.metadata.version("microid")
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = microid.nothing
-
-
-def test_names_that_fits_looks_up_late_are_the_ones_it_declares():
-    import fits
-
-    assert listed("fits") == fits._HOMES
-    assert dir(fits) == sorted(fits._HOMES)
-    with pytest.raises(AttributeError, match="'fits' has no attribute 'nothing'"):
-        fits.nothing
-
-
-def test_names_of_data_synth_are_in_its_all():
-    import data_synth
-
-    assert sorted(data_synth.__all__) == sorted(listed("data_synth"))
-
-
-def test_everything_that_microid_defines_without_an_underscore_is_public():
-    names = set(listed("microid")) | set(listed("microid.densities")) | set(listed("microid.hysteresis"))
-    names |= set(listed("microid.effects"))
-    for path in (ROOT / "microid").rglob("*.py"):
-        defined = ast.parse(path.read_text(encoding="utf-8")).body
-        found = {node.name for node in defined if isinstance(node, ast.FunctionDef | ast.ClassDef)}
-        if path.stem == "_plugins":  # for packages of microid alone
-            continue
-        public = {name for name in found if name[0] != "_"}
-        if path.parent.name == "effects" and path.stem[0] != "_":
-            # An effect is public by being registered, so that a new one is one new file.
-            effects = {effect.__name__: effect.__module__ for effect in microid.EFFECTS}
-            assert public == {name for name, home in effects.items() if home == f"microid.effects.{path.stem}"}
-            continue
-        assert public <= names, relative(path)
-
-
-def test_modules_are_private():
-    for package in PACKAGES:
-        # Each file there is a plug-in, and named after what it adds.
-        public = ("cli", "columns", "control", "densities", "effects", "formats", "hysteresis", "kinds")
-        for path in (ROOT / package).rglob("*.py"):
-            assert path.name.startswith("_") or path.parent.name in public, relative(path)
-
-
-def documented(owner, value):
-    """The value, and what a class defines itself, as pairs of a name and whether there is a docstring."""
-    yield owner, bool(inspect.getdoc(value))
-    if inspect.isclass(value):
-        for name, member in vars(value).items():
-            function = getattr(member, "__func__", member)
-            if not name.startswith("_") and (inspect.isfunction(function) or isinstance(member, property)):
-                yield f"{owner}.{name}", bool(inspect.getdoc(member))
-
-
-@pytest.mark.parametrize(
-    "package", [*PACKAGES, "microid.control", "microid.densities", "microid.effects", "microid.hysteresis"]
-)
-def test_public_names_have_docstrings(package):
-    module = importlib.import_module(package)
-    values = {name: getattr(module, name) for name in listed(package)}
-    callables = {name: value for name, value in values.items() if is_defined(value)}
-    missing = [name for key, value in callables.items() for name, has in documented(key, value) if not has]
-    assert missing == []
 
 
 def classes():

@@ -1,9 +1,11 @@
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
 import jax
@@ -57,8 +59,12 @@ def test_fit_reports_in_words_and_writes_model_and_plots(bench):
         assert words in fit.stdout
     assert "8 levels" in fit.stderr
     assert "Traceback" not in fit.stderr
-    assert files(folder / "new") == ["plots", *(f"plots/{n}.png" for n in ("density", "everett", "heldout", "loops"))]
-    assert sorted(path.name for path in folder.iterdir()) == ["csv", "model.json", "new"]
+    pictures = [f"{name}.png" for name in ("density", "everett", "heldout", "loops")]
+    assert files(folder / "new") == ["plots", *sorted(f"plots/{name}" for name in (*pictures, "index.html"))]
+    page = (folder / "new" / "plots" / "index.html").read_text(encoding="utf-8")
+    assert sorted(re.findall(r'<img src="(.*?)"', page)) == pictures
+    told = unescape(re.search("<pre.*?>(.*?)</pre>", page, re.DOTALL)[1])
+    assert told == fit.stdout.partition("\n\nmodel ")[0]
 
 
 def test_prediction_agrees_with_the_truth_of_the_bench(bench, tmp_path):
@@ -293,7 +299,7 @@ def test_a_name_is_shown_as_it_is_whatever_is_in_it(bench, tmp_path):
     content = json.loads(fitted.stdout)
     assert [each["source"] for each in content["runs"]] == [r"a$x^$ \$\udcff.csv", r"<b>\x1b[31m\n.csv"]
     assert content["out"] == out
-    assert len(list(plots.iterdir())) == 4
+    assert len(list(plots.iterdir())) == 5
     # Through a real pipe, which has an encoding.
     process = shell("info", out)
     stdout, stderr = process.communicate()

@@ -12,6 +12,7 @@ from scipy.signal import TransferFunction, cont2discrete, lfilter, step
 import microid as m
 from fits import save_model
 from fits.cli._main import cli
+from fits.report._control import describe_control
 from microid.effects.slew_limit import SlewLimit
 
 T = 1e-3
@@ -94,6 +95,27 @@ def test_given_gains_are_run_as_scipy_runs_them(folder, tmp_path):
     assert again.exit_code == 0, again.output
     assert (tmp_path / "again.csv").read_text() == (tmp_path / "r.csv").read_text()
     assert "margins     1 plants" in again.stdout
+
+
+def test_it_says_what_feedback_is_worth(folder, tmp_path):
+    """Against what the feedforward leaves, which the same run with next to no gain shows."""
+    words = ("control", folder / "linear.json", folder / "sine.csv", "--out", tmp_path / "r.csv", "--gains")
+    weak = json.loads(run(*words, "1e-12,0,0", "--json").stdout)
+    told = json.loads(run(*words, "0.5,80,1e-3", "--json").stdout)
+    assert told["without_feedback"]["error_rms_um"] == pytest.approx(weak["tracking"]["error_rms_um"], rel=1e-6)
+    without, after = weak["tracking"]["error_rms_um"], told["tracking"]["error_rms_um"]
+    assert told["worth"]["share"] == pytest.approx(1 - after / without)
+    assert describe_control(told).count(f"feedback    takes {100 * (1 - after / without):.3g} % off") == 1
+    for share, part in (
+        (0.5, "takes 50 % off"),
+        (0.04, "takes 4 % off"),
+        (-0.5, "nothing off"),
+        (None, "nothing off"),
+    ):
+        said = describe_control(told | {"worth": told["worth"] | {"share": share}})
+        assert part in said
+        alone = "better" if share and share < 0 else "as well"
+        assert (f"'microid compensate' does {alone}" in said) == (share != 0.5)
 
 
 @pytest.mark.study

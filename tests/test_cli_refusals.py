@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from _command import files, refused, run
+from _command import files, refused, run, without_jax
 
 from fits import FitError, FitStatus
 from microid import FAMILIES
@@ -56,6 +56,13 @@ def good_csv(tmp_path):
     path = tmp_path / "good.csv"
     bad_csv(path, "good")
     return path
+
+
+@pytest.mark.parametrize("command", ["control none.json {}", "budget paper none.json {}", "fit {} --start none.json"])
+def test_a_missing_model_is_refused_before_jax_starts(tmp_path, good_csv, command):
+    out = [] if command.startswith("budget") else ["--out", tmp_path / "out"]
+    done = without_jax(*command.format(good_csv).split(), *out)
+    assert (done.returncode, done.stderr) == (2, "none.json: no such file; check the name and the folder.\n")
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,7 @@ def test_parameters_that_go_together_and_remarks_are_said(bench):
 
 def test_the_pictures_are_drawn(bench):
     folder, _, _, report = bench
-    assert [path.name for path in sorted((folder / "plots").iterdir())] == ["loop.png", "response.png", "runs.png"]
+    assert files(folder / "plots") == ["index.html", "loop.png", "response.png", "runs.png"]
     assert len(report["plots"]) == 3
     for place in report["plots"]:
         whole_picture(place)

@@ -77,6 +77,20 @@ def test_json_is_strict_and_keeps_to_its_schema(rng, kind):
     jsonschema.Draft202012Validator(schema).validate(content)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_summary_tells_parameters_with_units_and_is_what_a_notebook_shows(rng, kind):
+    found = diagnosis(rng, kind)
+    text = found.summary()
+    assert text.splitlines()[0].startswith(("no effect found", "effect found", "unexplained error"))
+    for cause in found.causes:
+        assert re.search(rf"{cause.name}.*: 24.3 standard deviations, by chance below 1e-09$", text, re.MULTILINE)
+        assert re.search(r"gain_per_decade +0\.01542 \+- 0\.00031$", text, re.MULTILINE)
+        assert re.search(r"onset_s +0\.1 \(95 %: nan to inf\) s$", text, re.MULTILINE)
+    assert repr(found) == text
+    assert "<script" not in found._repr_html_()
+    assert unescape(found._repr_html_()) == f"<pre>{text}</pre>"
+
+
 def test_json_says_what_the_diagnosis_says(rng):
     content = diagnosis_json(diagnosis(rng))
     assert content["causes"][0]["parameters"] == {

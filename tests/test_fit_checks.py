@@ -1,6 +1,7 @@
 """Loops that are not what they seem: each is refused, or named for what it is; clean ones are left in peace."""
 
 import re
+from html import unescape
 
 import numpy as np
 import pytest
@@ -28,9 +29,11 @@ def test_a_clean_record_gets_no_such_remark_and_its_noise_is_known(slow):
     assert not [remark for remark in result.remarks if any(word in remark for word in ALARMS)]
     assert not result.misfit.far
     assert result.misfit.noise_um == pytest.approx(0.05, rel=0.15)
-    first = fits.describe(fits.fit_report(result)).splitlines()[0]
+    first = result.summary().splitlines()[0]
     assert first.startswith("left over")
     assert "times the sensor's noise" in first
+    assert repr(result) == result.summary()
+    assert unescape(result._repr_html_()) == f"<pre>{result.summary()}</pre>"
 
 
 @pytest.mark.study
@@ -46,7 +49,7 @@ def test_two_rigs_in_two_files(slow):
     same = read(other, other.displacement_um, "second.csv")
     result = fit(slow, same)
     assert "not show one hysteresis" in said(result, "fit them apart")
-    first, *_ = fits.describe(fits.fit_report(result)).splitlines()
+    first, *_ = result.summary().splitlines()
     assert first.startswith("FAR FROM NOISE")
 
 
@@ -58,7 +61,7 @@ def test_two_rigs_joined_in_one_file(slow):
     assert abs(sample - len(slow)) < 0.02 * len(slow)
     ratio = float(re.search(r"moves ([\d.]+) times", remark)[1])
     assert ratio == pytest.approx(26 / 40, rel=0.1)
-    text = fits.describe(fits.fit_report(result))
+    text = result.summary()
     assert text.startswith("FAR FROM NOISE")
     assert "as well as" not in text
 

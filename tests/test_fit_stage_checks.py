@@ -49,7 +49,7 @@ def test_a_clean_rig_gets_no_such_remark(runs):
     assert not [remark for remark in result.remarks if any(word in remark for word in ALARMS)]
     assert not result.misfit.far
     assert result.misfit.noise_um == pytest.approx(0.05, rel=0.15)
-    assert fits.describe(fits.fit_report(result)).startswith("left over")
+    assert result.summary().startswith("left over")
     holds_the_truth(result)
 
 
@@ -76,7 +76,7 @@ def test_a_delay_is_named_and_the_intervals_own_up_to_it(runs, late, where):
         # With this rig the delay ruins the fit, or leaves none: it is refused.
         return
     holds_the_truth(result)
-    assert fits.describe(fits.fit_report(result)).startswith("FAR FROM NOISE")
+    assert result.summary().startswith("FAR FROM NOISE")
 
 
 @pytest.mark.study

@@ -212,7 +212,7 @@ def test_without_tolerances_nothing_changes():
     for effect in found.dimensions:
         assert effect.derivative != 0
         assert (effect.share_of_variance, effect.relative_change_pct, effect.relative_change_exact_pct) == (0, 0, 0)
-    assert "z: 9.14828 um/um" in fits.describe_sensitivity(fits.SensitivityReport(1, {"z": found}))
+    assert "z: 9.14828 um/um" in fits.SensitivityReport(1, {"z": found}).summary()
 
 
 def test_modulus_and_width_change_no_motion(paper):
@@ -251,7 +251,7 @@ def test_the_json_is_that_of_the_schema(paper):
 
 
 def test_the_table_names_axes_and_ranks(paper):
-    text = fits.describe_sensitivity(paper)
+    text = paper.summary()
     for words in (
         "x and y: 6.53222 um/um",
         "z: 9.14828",
@@ -262,7 +262,7 @@ def test_the_table_names_axes_and_ranks(paper):
     places = [text.index(f"\n  {name} ") for name in RANKED["x"][0]]
     assert places == sorted(places)
     assert "voltage" not in text
-    assert "t1 -2.52" in fits.describe_sensitivity(paper, voltage=True)
+    assert "t1 -2.52" in paper.summary(voltage=True)
 
 
 def verdicts(design):

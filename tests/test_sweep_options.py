@@ -105,7 +105,7 @@ def test_rows_do_not_depend_on_chunks_and_words_are_kept_as_such(tmp_path, seed)
     best = json.loads(run("sweep", "show", tmp_path / "a", "--best", "noise_um", *plots, "--json").stdout)["best"]
     assert best["rows"][0]["fit.initial"] in ("negative", "unknown")
     # Parallel coordinates, and a map of each pair of three axes.
-    assert len(list((tmp_path / "plots").iterdir())) == 4
+    assert len(list((tmp_path / "plots").iterdir())) == 5
     assert "fit.initial negative" in run("sweep", "show", tmp_path / "a", "--best", "noise_um").stdout
 
 

@@ -169,6 +169,11 @@ def paths_in(folder: str | None, made: Iterable[str | Path]) -> list[str]:
     return [str(Path(folder or "") / Path(file).name) for file in made]
 
 
+def page(given: Given) -> list[str]:
+    """The line on the page beside the pictures, where some are asked for."""
+    return [] if given.plots is None else [f"page   {Path(given.plots) / 'index.html'}"]
+
+
 def json_place(given: Given) -> str | None:
     """The JSON file to write, None where there is none or it is printed."""
     return None if given.json_file == "-" else given.json_file
@@ -214,7 +219,7 @@ def length_mm(option: str, text: str, units: Sequence[str], example: str) -> flo
 def refuse_overwriting(out: str, inputs: Iterable[str]) -> None:
     """Refuse to overwrite what is read."""
     for path in inputs:
-        if os.path.realpath(path) == os.path.realpath(out):
+        if os.path.realpath(late.numbered(path)[0]) == os.path.realpath(out):
             raise DataError(f"--out: {out} would overwrite what is read; choose another name.")
 
 

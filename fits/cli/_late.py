@@ -23,12 +23,15 @@ if TYPE_CHECKING:
     from fits.io._model_text import read_model_text
     from fits.io._quantity import Quantity
     from fits.io._read_csv import read_reference, read_runs, read_table
+    from fits.io._read_file import numbered
     from fits.io._record import Record
     from fits.io._units import parse_columns
     from fits.loop._fit import fit
     from fits.loop._plain import PlainLoop
     from fits.loop._plain_file import plain_loop
     from fits.loop._prediction import Prediction
+    from fits.loop._report import fit_report
+    from fits.loop._report_words import describe
     from fits.loop._result import FitError
     from fits.machining._budget import budget
     from fits.machining._claims import describe_claims, paper_claims
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
     from fits.machining._idle import idle_noise, read_idle
     from fits.machining._sensitivity import sensitivities
     from fits.paper._regenerate import paper_result
+    from fits.plots._channels import plot_channels
     from fits.plots._control import plot_compensation, plot_control
     from fits.plots._fit import plot_fit, plot_stage
     from fits.plots._machining import plot_budget, plot_sensitivity
@@ -44,10 +48,8 @@ if TYPE_CHECKING:
     from fits.report._control import control_json, describe_control
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
-    from fits.report._fit import fit_report
-    from fits.report._fit_words import describe
-    from fits.report._machining import budget_json, describe_budget, describe_sensitivity, sensitivity_json
-    from fits.report._words import describe_diagnosis
+    from fits.report._machining import budget_json, sensitivity_json
+    from fits.report._page import write_page
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._model_file import ModelFile, load_model, model_text

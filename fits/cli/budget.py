@@ -36,10 +36,12 @@ def budget(given: common.Given) -> None:
     is that of the tolerances in STAGE.toml, or of the paper's stage; the measuring error is what the sensor shows at
     rest in IDLE.csv, with the columns time_s and displacement_um.
     """
-    late.start_jax()
     out = common.json_place(given)
     for what, path in {"STAGE.toml": given.stage, "MODEL.json": given.model, "IDLE.csv": given.idle}.items():
         common.refuse_clashes({what: None if path == "paper" else path, "--json": out})
+    # What is no model is refused at once.
+    late.read_model_text(given.model)
+    late.start_jax()
     arm_mm = None if given.arm is None else common.length_mm("--arm", given.arm, ("mm", "m"), "50mm")
     if arm_mm is None and given.model_measures in late.AXES and late.MOTIONS[given.model_measures].unit == "rad":
         raise DataError(
@@ -58,7 +60,7 @@ def budget(given: common.Given) -> None:
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
     places = [("json", out), *(("plot", place) for place in common.paths_in(given.plots, drawn))]
-    common.print_words(given, text, late.describe_budget(found), places)
+    common.print_words(given, text, found.summary(), places)
 
 
 def _law(path: str) -> "late.Preisach":

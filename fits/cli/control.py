@@ -105,6 +105,9 @@ def control(given: common.Given) -> None:
             raise DataError(f"{_option(name)}: expected {steps}; leave it out for none.")
     stated = {_option(name): getattr(given, name) for name in _LIMITS}
     volts, allowed_here = common.parse_rig_limits(given.limits, given.limit, given.margin)
+    wanted = late.read_reference(given.reference, **common.reading(given))
+    # What is no model is refused at once.
+    late.read_model_text(given.model)
     late.start_jax()
     tuned_to = [name for name, each in late.CONTROLLERS.items() if "frequency_Hz" in each.own]
     if given.frequency and given.controller not in tuned_to:
@@ -118,7 +121,6 @@ def control(given: common.Given) -> None:
     known_gains = None if given.gains is None else late.read_gains(given.gains)
     loaded = late.load_model(given.model)
     plant = common.stage_or_preisach(given.model, loaded)
-    wanted = late.read_reference(given.reference, **common.reading(given))
     with file_set() as files:
         unfinished, drawings = files.file(given.out), files.folder(given.plots)
         try:
@@ -174,7 +176,7 @@ def control(given: common.Given) -> None:
         drawn = [] if drawings is None else late.plot_control(*to_draw, drawings, delay=given.delay)
         about = {"controller": given.controller, "out": given.out, "plots": common.paths_in(given.plots, drawn)}
         # Before the file is in its place: what cannot be told is not left behind either.
-        summary = late.control_json(loop, made, run, about, [*wanted.warnings, *ready.remarks, *more])
+        summary = late.control_json(loop, made, played, about, [*wanted.warnings, *ready.remarks, *more])
         told = late.finite_json(summary) if given.as_json else late.describe_control(summary)
     click.echo(told)
 

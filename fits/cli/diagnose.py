@@ -1,6 +1,7 @@
 """The command `microid diagnose`: its options, and the work."""
 
 import os
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -78,9 +79,7 @@ def diagnose(given: common.Given) -> None:
     progress(late.Step.WRITING)
     content = late.diagnosis_json(diagnosis)
     places = _write(diagnosis, content, given.out)
-    common.print_result(
-        given, {"out": given.out, "files": places, **content}, [late.describe_diagnosis(diagnosis), "", *places]
-    )
+    common.print_result(given, {"out": given.out, "files": places, **content}, [diagnosis.summary(), "", *places])
 
 
 def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> list[str]:
@@ -100,7 +99,8 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
             raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error
 
     # All are composed before the first is written.
-    texts = {_REPORT: late.report_html(diagnosis), _JSON: f"{late.finite_json(content)}\n"}
+    page = late.report_html(diagnosis, f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC")
+    texts = {_REPORT: page, _JSON: f"{late.finite_json(content)}\n"}
     texts |= {_BASELINE: model("baseline"), _EXTENDED: model("extended")}
     ahead = diagnosis.next_experiment
     with file_set() as files:

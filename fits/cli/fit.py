@@ -16,7 +16,7 @@ _HOLDS: dict[str, "late.Hold"] = {"lines": "first", "steps": "zero", "curves": "
 @click.command()
 @options.runs
 @click.option("--out", required=True, metavar="MODEL.json", help="Model file to write.")
-@options.plots("plots")
+@options.plots("plots and a page of them")
 @click.option(
     "--model",
     type=click.Choice(["loop", "stage"]),
@@ -84,6 +84,8 @@ def fit(given: common.Given) -> None:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         records = late.read_runs(given.runs, **how)
         same = {"holdout": [late.read_table(file, **how) for file in files] or fraction, "initial": initial}
+        if given.start:
+            late.read_model_text(given.start)
         # Only now, so that what cannot be read is refused at once.
         late.start_jax()
         estimate: Any = late.fit_slow if slow else late.fit
@@ -93,13 +95,15 @@ def fit(given: common.Given) -> None:
         asked |= {"levels": given.levels, "loss": given.loss or "squares", "progress": progress}
         result = estimate(records, **same, **asked)
         report, drawn = late.fit_report(result), []
+        words = late.describe(report)
         if drawings is not None:
             progress("drawing")
             draw: Any = late.plot_stage if slow or given.model == "stage" else late.plot_fit
             drawn = draw(result, records, drawings, **same)
+            late.write_page(drawings, f"Fit of {', '.join(one.source for one in records)}", words, drawn)
         unfinished.write_text(late.model_text(result.model, result.uncertainty, report), encoding="utf-8")
     places = common.paths_in(given.plots, drawn)
-    lines = [late.describe(report), "", f"model  {given.out}", *(f"plot   {place}" for place in places)]
+    lines = [words, "", f"model  {given.out}", *(f"plot   {place}" for place in places), *common.page(given)]
     common.print_result(given, {"out": given.out, "plots": places, **report}, lines)
 
 

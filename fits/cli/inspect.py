@@ -7,11 +7,13 @@ import click
 from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
+from fits.io._file_set import file_set
 from fits.io._printable import printable
 
 
 @click.command()
 @click.argument("file", metavar="FILE")
+@options.plots("a plot of the channels")
 @options.json_output
 @common.in_sentences
 def inspect(given: common.Given) -> None:
@@ -30,7 +32,13 @@ def inspect(given: common.Given) -> None:
         lines.append(_row(str(each.number), each.name, each.unit or "-", low, high, words))
     lines += [f"Note: {remark}" for remark in found.remarks]
     lines += ["", found.command or "no columns of voltage and displacement were found; name them with --columns"]
-    common.print_result(given, asdict(found), map(printable, lines))
+    drawn = []
+    with file_set() as files:
+        drawings = files.folder(given.plots)
+        if drawings is not None:
+            drawn = common.paths_in(given.plots, late.plot_channels(found, drawings))
+    lines += [f"plot   {place}" for place in drawn]
+    common.print_result(given, {**asdict(found), "plots": drawn}, map(printable, lines))
 
 
 def _row(number: str, name: str, unit: str, low: str, high: str, use: str) -> str:

@@ -48,7 +48,7 @@ def sensitivity(given: common.Given) -> None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
         if unfinished_stage is not None:
             unfinished_stage.write_text(late.design_text(design), encoding="utf-8")
-    words = late.describe_sensitivity(report, given.voltage)
+    words = report.summary(given.voltage)
     if claims:
         words += f"\n\n{late.describe_claims(claims)}"
     plots = [("plot", place) for place in common.paths_in(given.plots, drawn)]

@@ -78,7 +78,7 @@ def run(given: common.Given) -> None:
 @click.argument("folder", metavar="DIR")
 @click.option("--best", metavar="OUTPUT", help="Output by which rows are ranked; the first by default.")
 @click.option("--largest", is_flag=True, help="Large is good.")
-@options.plots("heat maps and parallel coordinates")
+@options.plots("heat maps, parallel coordinates and a page of them")
 @options.json_output
 @common.in_sentences
 def show(given: common.Given) -> None:
@@ -86,6 +86,9 @@ def show(given: common.Given) -> None:
     summary = late.summarise(given.folder, given.best, given.largest)
     with file_set() as files:
         drawings = files.folder(given.plots)
-        drawn = [] if drawings is None else late.plot_sweep(given.folder, drawings, given.best)
+        drawn, words = [], late.describe_sweep(summary)
+        if drawings is not None:
+            drawn = late.plot_sweep(given.folder, drawings, given.best)
+            late.write_page(drawings, f"Sweep in {given.folder}", words, drawn)
     places = [f"plot  {place}" for place in common.paths_in(given.plots, drawn)]
-    common.print_result(given, summary, [late.describe_sweep(summary), *places])
+    common.print_result(given, summary, [words, *places, *common.page(given)])

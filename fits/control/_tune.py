@@ -237,4 +237,4 @@ def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> Iterator[str
             yield f"{row.path} is at the edge of what is searched: it hardly matters, or the start was far off"
     pressing = [name for name, share in best.over.items() if np.max(share) > -_TOLERANCE]
     if pressing:
-        yield f"at its limit: {', '.join(pressing)}"
+        yield f"at its limit, which is kept to {100 * _TOLERANCE:g} %: {', '.join(pressing)}"

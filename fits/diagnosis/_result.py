@@ -1,6 +1,7 @@
 """What a diagnosis gives back."""
 
 import enum
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
@@ -8,10 +9,15 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from fits.io._limits import Extreme
+from fits.io._summary import AbstractSummary
 from microid import Stage
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]
 SCHEMA = "microid.diagnosis/1"
+# Verdicts in words.
+KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
+# Below this, probabilities are those of tails that nobody has checked.
+SMALLEST_P = 1e-9
 # The residual depends on something below this probability by chance.
 _SIGNIFICANT = 1e-3
 
@@ -29,7 +35,10 @@ class Step(enum.StrEnum):
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """One parameter of an effect that was found: estimate, standard deviation and 95 % interval, in its unit."""
+    """One parameter of an effect that was found, in its unit.
+
+    The estimate is `value`, its standard deviation `sd`, and the ends of its 95 % interval `lower` and `upper`.
+    """
 
     name: str
     value: float
@@ -159,8 +168,8 @@ class Experiment:
     extremes: tuple[Extreme, ...] = ()
 
 
-@dataclass(frozen=True)
-class Diagnosis:
+@dataclass(frozen=True, repr=False)
+class Diagnosis(AbstractSummary):
     """What a fitted stage gets wrong, why, and what is gained by extending it.
 
     The verdict is `unexplained` where something is left that no effect of the library explains, of the size
@@ -188,3 +197,32 @@ class Diagnosis:
     runs: tuple[RunView, ...]
     false_alarm: float
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    def summary(self) -> str:
+        """Say the verdict, the causes with their parameters in units, and the gain, in a few lines."""
+        lines = [f"{KINDS[self.verdict]}; noise {self.noise_um:.3g} um, {self.noise_source}"]
+        for cause in self.causes:
+            also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
+            chance = f"{cause.p_family:.1g}" if cause.p_family >= SMALLEST_P else f"below {SMALLEST_P:.0e}"
+            lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {chance}")
+            if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
+                lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
+            for each in cause.parameters:
+                unit = "" if each.unit == "1" else f" {each.unit}"
+                below, above = each.value - each.lower, each.upper - each.value
+                # An interval that ends at a bound, or reaches farther to one side, is no standard deviation.
+                spread = f"+- {each.sd:.2g}{unit}"
+                if not min(below, above) > 0.8 * max(below, above):
+                    spread = f"(95 %: {each.lower:.3g} to {each.upper:.3g}){unit}"
+                lines.append(f"    {each.name:24} {each.value:.4g} {spread}")
+        if self.unexplained_rms_um > 0:
+            lines.append(f"  unexplained: {self.unexplained_rms_um:.3g} um")
+        gain = self.gain
+        if math.isfinite(gain.heldout_rms_before_um):
+            line = f"error on held-out data: {gain.heldout_rms_before_um:.3g} um"
+            if self.causes and math.isfinite(gain.heldout_rms_after_um):
+                line += f" without, {gain.heldout_rms_after_um:.3g} um with what was found"
+            lines.append(line)
+        if self.next_experiment is not None:
+            lines.append(f"next experiment: {self.next_experiment.purpose}")
+        return "\n".join([*lines, *(f"Note: {remark}" for remark in self.remarks)])

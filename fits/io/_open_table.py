@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fits.io._errors import AnyPath, DataError
-from fits.io._read_file import MOST_CSV_BYTES, read_bytes, unpack
+from fits.io._read_file import MOST_CSV_BYTES, numbered, read_bytes, unpack
 from fits.io._table import Table, gathered, of_frame
 from fits.io.formats import FORMATS, Format
 
@@ -19,8 +19,8 @@ _CSV = "a CSV file"
 def open_table(source: AnyPath | Any) -> Table:
     """Read a file, or take a pandas `DataFrame`, an xarray `Dataset` or a mapping of arrays.
 
-    Formats are known by their first bytes and by the ending of the name, text by neither. A `DataError` says that it
-    cannot be read, or has no columns.
+    Formats are known by their first bytes and by the ending of the name, text by neither; of several tables in a text
+    `runs.csv#2` is the second. A `DataError` says that it cannot be read, or has no columns.
     """
     if hasattr(source, "to_dataframe"):  # xarray
         source = source.to_dataframe()
@@ -36,10 +36,13 @@ def open_table(source: AnyPath | Any) -> Table:
             "give one of these."
         )
     shown = os.fspath(source)
-    data = read_bytes(shown, _format_of(shown, b"").name, MOST_CSV_BYTES)
-    if data.startswith(b"\x1f\x8b") or shown.lower().endswith(".gz"):
-        data = unpack(data, shown, MOST_CSV_BYTES)
-    form = _format_of(shown, data)
+    file, number = numbered(shown)
+    data = read_bytes(file, _format_of(file, b"").name, MOST_CSV_BYTES)
+    if data.startswith(b"\x1f\x8b") or file.lower().endswith(".gz"):
+        data = unpack(data, file, MOST_CSV_BYTES)
+    form = _format_of(file, data)
+    if number is not None and form.name != _CSV:
+        raise DataError(f"{shown}: expected {_CSV} with several tables, found {form.name}; leave out #{number}.")
     try:
         # What a library has to say of damage is said below, in one sentence.
         with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):

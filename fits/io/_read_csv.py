@@ -165,13 +165,12 @@ class KnownColumns:
         if more is not None:
             sources = {name: sources[name] for name in (*required, *more) if name in sources}
         strict = {source.column for source in sources.values()}
-        left_out: tuple[str, ...] = ()
-        kept = None
+        left_out, kept = tuple(filter(None, [table.remark])), None
         if missing == "drop":
             table, kept = table.without_missing(strict)
             if not kept.all():
                 rows = f"{np.sum(~kept)} of {kept.size} rows"
-                left_out = (f"{table.path}: {rows} were left out, as a number that is needed is missing there.",)
+                left_out += (f"{table.path}: {rows} were left out, as a number that is needed is missing there.",)
         found, problems = table.read(strict)
         arrays = {}
         for name, source in sources.items():

@@ -5,6 +5,7 @@ import io
 import json
 import math
 import os
+import re
 import stat
 import tomllib
 import zlib
@@ -18,6 +19,12 @@ MOST_JSON_BYTES = 64_000_000
 MOST_TOML_BYTES = 1_000_000
 MOST_DEPTH = 32
 _LARGEST_INTEGER = 2**63 - 1
+
+
+def numbered(path: str) -> tuple[str, int | None]:
+    """Tell a file from the number of a table in it, as in `runs.csv#2`; a file of that very name comes first."""
+    found = re.fullmatch(r"(.+)#([1-9]\d{0,3})", path)
+    return (found[1], int(found[2])) if found and not os.path.lexists(path) else (path, None)
 
 
 def read_bytes(path: AnyPath, what: str, most: int) -> bytes:

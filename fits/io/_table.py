@@ -29,13 +29,14 @@ class Table(ABC):
     """A file whose columns have names, which end in their units where they are known.
 
     `interval_s` is what the file says of even sampling, or None; `headed` is False where names are numbers from 1 on,
-    as the file has none.
+    as the file has none; `remark` is a sentence on what else is in the file, or empty.
     """
 
     path: str
     names: tuple[str, ...]
     interval_s: float | None
     headed: bool
+    remark: str
 
     @abstractmethod
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
@@ -65,6 +66,7 @@ class ArrayTable(Table):
     arrays: Mapping[str, FloatArray]
     interval_s: float | None = None
     headed: bool = True
+    remark: str = ""
     rows: NDArray[np.int64] | None = None
 
     @property
@@ -92,7 +94,7 @@ class ArrayTable(Table):
         """Leave out rows with NaN; see `Table`."""
         kept = ~np.any([np.isnan(self.arrays[name]) for name in strict], axis=0)
         arrays = {name: array[kept] for name, array in self.arrays.items()}
-        return ArrayTable(self.path, arrays, self.interval_s, self.headed, np.flatnonzero(kept)), kept
+        return ArrayTable(self.path, arrays, self.interval_s, self.headed, rows=np.flatnonzero(kept)), kept
 
     def place(self, row: int | None = None) -> str:
         """Rows are counted from 1."""

@@ -40,6 +40,7 @@ class TextTable(Table):
     interval_s: float | None = None
     headed: bool = True
     clocks: frozenset[str] = field(default_factory=frozenset)
+    remark: str = ""
 
     def read(self, strict: Collection[str]) -> tuple[dict[str, FloatArray], dict[str, Problem]]:
         if next(self._lines(), None) is None:

@@ -10,12 +10,15 @@ from jaxtyping import Array, Float
 
 from fits.io._limits import Ranges, measured_ranges
 from fits.io._record import Record
+from fits.io._summary import AbstractSummary
 from fits.loop._misfit import Misfit
 from fits.loop._prediction import Prediction
+from fits.loop._report import fit_report, preisach_of
+from fits.loop._report_words import describe
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty
 from fits.stats._metrics import Errors, errors, loop_width_pct
-from microid import Everett, Preisach, Stage, Staircase, innermost
+from microid import Everett, Preisach, Stage, Staircase
 
 _M = TypeVar("_M", Preisach, Stage)
 
@@ -55,7 +58,8 @@ class LevelTrial:
 class ParameterEstimate:
     """One parameter of a stage, by part and field, such as `mechanics.natural_frequency_Hz`.
 
-    Standard deviation and ends of the 95 % interval, within the bounds, count the noise as coloured as the residual.
+    The `value`, its standard deviation `sd`, and the ends `lower` and `upper` of the 95 % interval are in its unit.
+    The interval is within the bounds, and both count the noise as coloured as the residual.
     """
 
     name: str
@@ -120,8 +124,8 @@ class RunReport:
         )
 
 
-@dataclass(frozen=True)
-class FitResult(Generic[_M]):
+@dataclass(frozen=True, repr=False)
+class FitResult(AbstractSummary, Generic[_M]):
     """A fitted hysteresis or stage, and how far to trust it.
 
     The `model` is the Preisach operator, or the stage, with the offset of the first run; `uncertainty` says how sure
@@ -176,11 +180,10 @@ class FitResult(Generic[_M]):
     @property
     def hysteresis(self) -> Preisach:
         """The Preisach operator, be it the model or a part of it; a `ValueError` where there is none."""
-        parts = [self.model] if isinstance(self.model, Preisach) else map(innermost, self.model.parts)
-        for part in parts:
-            if isinstance(part, Preisach):
-                return part
-        raise ValueError("the stage holds no Preisach operator")
+        found = preisach_of(self.model)
+        if found is None:
+            raise ValueError("the stage holds no Preisach operator")
+        return found
 
     @property
     def weights_um(self) -> Float[Array, "N N"]:
@@ -204,6 +207,10 @@ class FitResult(Generic[_M]):
     def held_out(self) -> Errors | None:
         """Errors on all held-out samples together; None where nothing was held out."""
         return _pool(run.held_out for run in self.runs)
+
+    def summary(self) -> str:
+        """Say what was fitted, parameters with units, standard deviations and 95 % intervals, and how well."""
+        return describe(fit_report(self))
 
     def predict(self, record: Record, initial: str = "negative") -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""

@@ -13,10 +13,12 @@ import microid as m
 from fits.control._compensate_stage import static_equivalent
 from fits.io._errors import DataError
 from fits.io._jax_setup import require_float64
+from fits.io._summary import AbstractSummary
 from fits.machining._design import Design
 from fits.machining._gains import once_per_function, quick_jit
 from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import derivatives_of, output_scale, refuse_infinite
+from fits.machining._words import describe_budget
 
 Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
 MEASURES: tuple[Measures, ...] = ("pzt", *m.AXES)
@@ -97,8 +99,8 @@ class AxisBudget:
         return dict(zip(("driving", "machining", "measuring"), shares, strict=True))
 
 
-@dataclass(frozen=True)
-class Budget:
+@dataclass(frozen=True, repr=False)
+class Budget(AbstractSummary):
     """The error budgets of some axes by name, and what they rest on.
 
     These are the driving error of the piezo; what the displacement of the model was, the piezo's elongation (`pzt`)
@@ -119,6 +121,10 @@ class Budget:
     def __getitem__(self, axis: m.Axis) -> AxisBudget:
         """Budget of an axis by its name."""
         return self.axes[axis]
+
+    def summary(self) -> str:
+        """Tell the errors of each axis, in its unit, in a table and sentences."""
+        return describe_budget(self)
 
 
 def budget(

@@ -30,10 +30,10 @@ class SecondOrder:
     """Spread of the gain of an axis as a quadratic function of the errors of the `k` dimensions that it depends on.
 
     The unit of the gain is `um/um` or `rad/um`; per um of free elongation with `voltage`. It is that at the nominal
-    dimensions, with its derivatives per mm or rad, shapes `(k,)` and `(k, k)`. The standard deviation of first order
-    is from the gradient alone; the mean is shifted against the gain at the nominal dimensions. `pairs` is what each
-    pair adds to the variance at second order, shape `(k, k)`; the sum of all counts, and two equal halves of a pair
-    stand at either side of the diagonal.
+    dimensions, with its derivatives per mm or rad, `gradient` of shape `(k,)` and `hessian` of `(k, k)`. The standard
+    deviation of first order is from the gradient alone; the mean is shifted against the gain at the nominal
+    dimensions. `pairs` is what each pair adds to the variance at second order, shape `(k, k)`; the sum of all counts,
+    and two equal halves of a pair stand at either side of the diagonal.
     """
 
     axis: Axis
@@ -93,9 +93,10 @@ def second_order(
 class AxisSpread:
     """How the gain of an axis spreads, in um/um or rad/um; per um of free elongation with a fixed voltage.
 
-    After the gain at the nominal dimensions come statistics of the draws: the standard error of `sd` is from the
-    fourth moment, and quantiles are by percentage: 0.135, 2.5, 50, 97.5 and 99.865. The standard deviation of first
-    order is from the gradient, and the expansion to second order is there where `flagged`, else `None`.
+    After the gain at the nominal dimensions come statistics of the draws: `mean`; standard deviation `sd` with its
+    standard error, from the fourth moment; `skewness`, without a unit; and quantiles by percentage: 0.135, 2.5, 50,
+    97.5 and 99.865. The standard deviation of first order is from the gradient, and the expansion to second order is
+    there where `flagged`, else `None`.
     """
 
     axis: Axis

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 import microid as m
 from fits.io._errors import DataError
 from fits.io._jax_setup import require_float64
+from fits.io._summary import AbstractSummary
 from fits.machining._design import Design, uniform_tolerance
 from fits.machining._gains import check_axes, gain_model, gains_of_few, once_per_function, quick_jit, twin
 from fits.machining._tolerances import tolerances
+from fits.machining._words import describe_sensitivity
 
 # So short a stroke that all motions are in proportion to it, to the last digit.
 SHORT_um = 1e-6
@@ -26,11 +28,12 @@ SHORT_um = 1e-6
 class DimensionEffect:
     """What an error of one dimension does to one axis, the piezo's elongation being imposed.
 
-    The dimension is in mm or rad. The derivative is that of the gain, in its unit per mm or rad; relative changes are
-    those of the output at an error of plus one tolerance, to first order and without linearising. With correlated
-    dimensions the share of the variance, to first order, can be negative; it is zero where no tolerance has any
-    effect, otherwise the shares of an axis add up to 1. `output_change_per_10um` is that at the full stroke of the
-    loaded piezo, to first order, in um or urad per 10 um of a length, or of 10 um across the leg of an angle.
+    The `value` of the dimension and its tolerance are in mm or rad. The derivative is that of the gain, in its unit
+    per mm or rad; relative changes are those of the output at an error of plus one tolerance, to first order and
+    without linearising. With correlated dimensions the share of the variance, to first order, can be negative; it is
+    zero where no tolerance has any effect, otherwise the shares of an axis add up to 1. `output_change_per_10um` is
+    that at the full stroke of the loaded piezo, to first order, in um or urad per 10 um of a length, or of 10 um
+    across the leg of an angle.
     """
 
     name: str
@@ -79,8 +82,8 @@ class AxisSensitivity:
         return effects[name]
 
 
-@dataclass(frozen=True)
-class SensitivityReport:
+@dataclass(frozen=True, repr=False)
+class SensitivityReport(AbstractSummary):
     """The sensitivities of some axes by name, and the level they hold at."""
 
     level: int
@@ -89,6 +92,10 @@ class SensitivityReport:
     def __getitem__(self, axis: m.Axis) -> AxisSensitivity:
         """Sensitivities of an axis by its name."""
         return self.axes[axis]
+
+    def summary(self, voltage: bool = False) -> str:
+        """Rank the dimensions of each axis in tables; with `voltage` add the relative changes at a fixed voltage."""
+        return describe_sensitivity(self, voltage)
 
     def alike(self) -> list[list[AxisSensitivity]]:
         """Group axes that are the same function of the same dimensions."""

@@ -11,18 +11,22 @@ from fits.control._compensate_stage import respond
 from fits.control._gains import printed_gains
 from fits.control._make import Loop, Made
 from fits.control._tune_problem import Tuning
-from fits.report._json import strict
+from fits.io._json import strict
 from microid import ControlledRun, StepMetrics, step_metrics, tracking_errors
+
+# Feedback that takes off less than this share is hardly worth its trouble.
+_PAYS = 0.1
+_ALONE = "'microid compensate' does {}, as long as the stage stays as its model is"
 
 
 def control_json(
-    loop: Loop, made: Made, run: ControlledRun, about: Mapping[str, Any], remarks: Sequence[str]
+    loop: Loop, made: Made, played: Sequence[ControlledRun], about: Mapping[str, Any], remarks: Sequence[str]
 ) -> dict[str, Any]:
-    """Put a run of a loop with a controller into JSON values, `microid.control/1`; what is not finite is None.
+    """Put runs of a loop with a controller, one for each plant, into JSON values, `microid.control/1`.
 
-    What it is `about` comes first, and more remarks may follow those that are known.
+    What is not finite is None. What it is `about` comes first, and more remarks may follow those that are known.
     """
-    kept = slice(loop.skip, None)
+    run, kept = played[0], slice(loop.skip, None)
     wanted, moved, command = (np.asarray(x) for x in (run.reference_um, run.displacement_um, run.command_V))
     rms = _rms(np.asarray(run.error_um)[kept])
     sensor = {"noise": loop.noise_um, "resolution": loop.resolution_um or 0.0}
@@ -33,7 +37,7 @@ def control_json(
             f"the error, {rms:.3g} um rms, is that of the model's own displacement and below the sensor's "
             f"{' and its '.join(below)}: a bench cannot show it in single readings"
         )
-    every = loop.margins(made.controller)
+    every, without = loop.margins(made.controller), _without(loop, kept)
     found = {
         "schema": "microid.control/1",
         **about,
@@ -50,7 +54,8 @@ def control_json(
             "sensitivity_peak": max(float(one.sensitivity_peak) for one in every),
         },
         "tracking": _tracking(wanted[kept], moved[kept]),
-        "without_feedback": _without(loop, wanted, kept),
+        "without_feedback": without and _tracking(wanted[kept], without[0]),
+        "worth": without and _worth(wanted[kept], [np.asarray(one.displacement_um)[kept] for one in played], without),
         "step": _step(np.asarray(run.time_s), wanted, moved),
         "command_min_V": command.min(),
         "command_max_V": command.max(),
@@ -80,14 +85,19 @@ def _tracking(wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any]:
     return {**sizes, "e_rms_pct": shares.e_rms_pct, "e_max_pct": shares.e_max_pct}
 
 
-def _without(loop: Loop, wanted_um: np.ndarray, kept: slice) -> dict[str, Any] | None:
-    """What the feedforward does alone, by the model."""
+def _without(loop: Loop, kept: slice) -> list[np.ndarray] | None:
+    """Displacement of every plant under the feedforward alone; None where there is none."""
     ready = loop.ready
     if ready.feedforward_V is None:
         return None
     command = np.clip(ready.feedforward_V, *ready.limits_V)
-    moved = respond(loop.plants[0], ready.interval_s, command, ready.start)
-    return _tracking(wanted_um[kept], moved[kept])
+    return [respond(plant, ready.interval_s, command, ready.start)[kept] for plant in loop.plants]
+
+
+def _worth(wanted_um: np.ndarray, with_um: list[np.ndarray], without_um: list[np.ndarray]) -> dict[str, Any]:
+    """What feedback takes off the error of the feedforward alone, over all plants."""
+    after, before = (_rms(np.concatenate([wanted_um - one for one in each])) for each in (with_um, without_um))
+    return {"error_rms_um": after, "without_um": before, "share": 1 - after / before if before > 0 else None}
 
 
 def _step(time_s: np.ndarray, wanted_um: np.ndarray, moved_um: np.ndarray) -> StepMetrics | None:
@@ -118,7 +128,8 @@ def describe_control(summary: Mapping[str, Any]) -> str:
         f"{_said(worst['phase_margin_deg'])} degrees, peak of the sensitivity {_said(worst['sensitivity_peak'])}"
     )
     lines.append(f"tracking    {_tracked(summary['tracking'])}")
-    lines += [] if without is None else [f"  without   {_tracked(without)}"]
+    if without is not None:
+        lines += [f"  without   {_tracked(without)}", f"feedback    {_said_of_worth(summary['worth'])}"]
     if (step := summary["step"]) is not None:
         time_s = step["settling_time_s"]
         settled = "not settled within the record" if time_s is None else f"settled in {time_s:.4g} s"
@@ -136,6 +147,14 @@ def _tracked(found: Mapping[str, Any]) -> str:
     # A reference that stands still has no range to count in.
     shares = ["" if found[name] is None else f" ({found[name]:.4g} %)" for name in ("e_rms_pct", "e_max_pct")]
     return f"rms {_said(found['error_rms_um'])} um{shares[0]}, at most {_said(found['error_max_um'])} um{shares[1]}"
+
+
+def _said_of_worth(worth: Mapping[str, Any]) -> str:
+    """Say whether the feedback pays."""
+    share, after, before = worth["share"] or 0.0, _said(worth["error_rms_um"]), _said(worth["without_um"])
+    part = f"{100 * share:.3g} %" if share > 0 else "nothing"
+    does = f"takes {part} off the error of the feedforward alone, {before} to {after} um over all plants"
+    return does if share >= _PAYS else f"{does}; {_ALONE.format('as well' if share >= 0 else 'better')}"
 
 
 def _said(value: float | None) -> str:

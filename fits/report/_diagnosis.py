@@ -1,17 +1,16 @@
 """A diagnosis as one page that needs nothing else: pictures are in it, and it opens without a network."""
 
 import math
-from importlib.resources import files
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
 
-from fits.diagnosis._result import Diagnosis, Experiment
-from fits.io._version import written_by
+from fits.diagnosis._result import KINDS, Diagnosis, Experiment
 from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
 from fits.report import _words
+from fits.report._next_steps import next_steps, runs_read, stage_parameters
+from fits.report._page import environment
 from fits.report._words import (
-    KINDS,
     SIGMA,
     Lengths,
     chance,
@@ -26,11 +25,13 @@ from fits.report._words import (
 )
 
 
-def report_html(diagnosis: Diagnosis) -> str:
-    """Write a diagnosis as an HTML page for screen, phone and paper, all in one; the same one gives the same text."""
+def report_html(diagnosis: Diagnosis, when: str = "") -> str:
+    """Write a diagnosis as an HTML page for screen, phone and paper, all in one; the same one gives the same text.
+
+    It says `when` the runs were read, where that is given.
+    """
     length, causes, ahead = Lengths(diagnosis), diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]
-    sources = list(dict.fromkeys(run.source for run in diagnosis.runs if run.source))
     asked = [one for one in diagnosis.upper_bounds if not one.reason]
     asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
     gain = diagnosis.gain
@@ -49,14 +50,16 @@ def report_html(diagnosis: Diagnosis) -> str:
     further = _arrow("Largest error", gain.heldout_max_before_um, gain.heldout_max_after_um, length)
     driven = gain.feedforward_before_um, gain.feedforward_after_um
     further += _arrow("Error under feedforward, rms", *driven, length)
-    template = _environment().get_template("diagnosis.html")
+    template = _with_words().get_template("diagnosis.html")
     return template.render(
         diagnosis=diagnosis,
         length=length,
         ahead=ahead,
-        style=files("fits.report").joinpath("report.css").read_text(encoding="utf-8"),
         kind=KINDS[diagnosis.verdict],
-        sources=", ".join(sources[:6]) + (f" and {len(sources) - 6} more" if len(sources) > 6 else ""),
+        when=when,
+        steps=next_steps(diagnosis),
+        runs=runs_read(diagnosis.runs),
+        parameters=stage_parameters(diagnosis),
         tiles=_tiles(diagnosis, length),
         residuals=residuals(diagnosis, length.per_um, length.unit),
         some_aside=any((~run.fitted).any() for run in diagnosis.runs),
@@ -71,14 +74,12 @@ def report_html(diagnosis: Diagnosis) -> str:
         ahead_facts=_facts(ahead) if ahead else (),
         extremes=extremes,
         weakest=max((cause.p_family for cause in causes), default=math.nan),
-        written_by=written_by(),
     )
 
 
-def _environment() -> Environment:
-    """Templates of this room, which escape whatever they are given."""
-    blocks: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
-    made = Environment(loader=PackageLoader("fits.report"), autoescape=True, undefined=StrictUndefined, **blocks)
+def _with_words() -> Environment:
+    """Templates, and the words of a diagnosis in them."""
+    made = environment()
     for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number"):
         made.filters[name] = getattr(_words, name)
     made.filters["without_dot"] = lambda text: text.rstrip(".")
@@ -117,12 +118,13 @@ def _gained(diagnosis: Diagnosis, length: Lengths) -> str:
     before = gain.heldout_rms_before_um
     if not diagnosis.causes or gain.heldout_rms_after_um == before:
         return f"On data that were not used, the plain stage errs by {length(before)}, root mean square."
-    difference = before - gain.heldout_rms_after_um
+    difference, sd = before - gain.heldout_rms_after_um, gain.sd_of_difference_um
     size = length.bare(abs(difference))
-    if math.isfinite(gain.sd_of_difference_um):
-        size += f" ± {number(length.per_um * gain.sd_of_difference_um, 2)}"
+    if math.isfinite(sd):
+        size += f" ± {number(length.per_um * sd, 2)}"
     way, part = ("falls", f": by {percent(difference / before)}") if difference > 0 else ("rises", "")
-    return f"On data that were not used, the error {way} by {size} {length.unit}, root mean square{part}."
+    doubt = ", which may be chance" if abs(difference) < 2 * sd else ""
+    return f"On data that were not used, the error {way} by {size} {length.unit}, root mean square{part}{doubt}."
 
 
 def _bars(diagnosis: Diagnosis) -> list[tuple[str, str, float, float]]:

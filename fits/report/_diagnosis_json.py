@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from fits.diagnosis._result import SCHEMA, Diagnosis, Experiment, FoundCause, RunView
+from fits.io._json import strict
 from fits.io._version import written_by
-from fits.report._json import strict
 from fits.report._words import rms_um, verdict_sentence
 
 

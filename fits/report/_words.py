@@ -5,18 +5,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fits.diagnosis._result import Diagnosis, EffectParameter, RunView
+from fits.diagnosis._result import SMALLEST_P, Diagnosis, EffectParameter, RunView
 from microid.effects import card_of
 
-# Below this, probabilities are those of tails that nobody has checked.
-_SMALLEST_P = 1e-9
+# A residual of more times the noise floor is not called noise.
+_NOISY = 1.2
 _UNITS = {"um": "µm", "degC": "°C"}
 # What stands for a number that is not known.
 NONE = "\N{EN DASH}"
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _MINUS = "\N{MINUS SIGN}"
 _TIMES = "\N{MULTIPLICATION SIGN}"
-KINDS = {"no_effect": "no effect found", "effect_found": "effect found", "unexplained": "unexplained error"}
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -91,8 +90,8 @@ def percent(share: float) -> str:
 def chance(p: float) -> str:
     if not math.isfinite(p):
         return NONE
-    if p < _SMALLEST_P:
-        return f"below {number(_SMALLEST_P, 1).removeprefix(f'1 {_TIMES} ')}"
+    if p < SMALLEST_P:
+        return f"below {number(SMALLEST_P, 1).removeprefix(f'1 {_TIMES} ')}"
     return number(p, 2 if p >= 1e-3 else 1)
 
 
@@ -153,9 +152,12 @@ def _found(diagnosis: Diagnosis, length: Lengths) -> str:
             f"{noise}, and no effect of the library explains it."
         )
     if not diagnosis.causes:
+        over, described = rms_um(diagnosis.runs, "before_um", fitted=True), "describes these records down to"
+        if over > _NOISY * diagnosis.noise_um:
+            described = f"leaves {length(over)}, root mean square, in which no effect shows, over"
         return (
-            f"The plain stage describes these records down to a noise floor of {noise}. Of records that hold "
-            f"no effect, {percent(diagnosis.false_alarm)} are given a cause by chance."
+            f"The plain stage {described} a noise floor of {noise}. Of records that hold no effect, "
+            f"{percent(diagnosis.false_alarm)} are given a cause by chance."
         )
     sentences = []
     for cause in diagnosis.causes:
@@ -179,37 +181,10 @@ def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
     if after == before:
         return [f"What {listed(modelled)} did in these runs is not in the model of the next."]
     change = "falls" if after < before else "does not fall: it goes"
+    change = f"{change} from {length(before)} to {length(after)}"
+    if length(before) == length(after):
+        change = f"stays at {length(after)}"
     return [
-        f"With {listed(modelled)} in the model, the error on data that were not "
-        f"used {change} from {length(before)} to {length(after)}, root mean square; the noise "
-        f"floor is {length(diagnosis.noise_um)}."
+        f"With {listed(modelled)} in the model, the error on data that were not used {change}, root mean square; the "
+        f"noise floor is {length(diagnosis.noise_um)}."
     ]
-
-
-def describe_diagnosis(diagnosis: Diagnosis) -> str:
-    """Put a diagnosis into a few lines, without a newline at the end: verdict, causes with parameters, and gain."""
-    lines = [f"{KINDS[diagnosis.verdict]}; noise {diagnosis.noise_um:.3g} um, {diagnosis.noise_source}"]
-    for cause in diagnosis.causes:
-        also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
-        lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {cause.p_family:.1g}")
-        if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
-            lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
-        for each in cause.parameters:
-            unit = "" if each.unit == "1" else f" {each.unit}"
-            below, above = each.value - each.lower, each.upper - each.value
-            # An interval that ends at a bound, or reaches farther to one side, is no standard deviation.
-            spread = f"+- {each.sd:.2g}{unit}"
-            if not min(below, above) > 0.8 * max(below, above):
-                spread = f"(95 %: {each.lower:.3g} to {each.upper:.3g}){unit}"
-            lines.append(f"    {each.name:24} {each.value:.4g} {spread}")
-    if diagnosis.unexplained_rms_um > 0:
-        lines.append(f"  unexplained: {diagnosis.unexplained_rms_um:.3g} um")
-    gain = diagnosis.gain
-    if math.isfinite(gain.heldout_rms_before_um):
-        line = f"error on held-out data: {gain.heldout_rms_before_um:.3g} um"
-        if diagnosis.causes and math.isfinite(gain.heldout_rms_after_um):
-            line += f" without, {gain.heldout_rms_after_um:.3g} um with what was found"
-        lines.append(line)
-    if diagnosis.next_experiment is not None:
-        lines.append(f"next experiment: {diagnosis.next_experiment.purpose}")
-    return "\n".join([*lines, *(f"Note: {remark}" for remark in diagnosis.remarks)])

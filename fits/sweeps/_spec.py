@@ -31,7 +31,10 @@ class _Run(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that can run: its TOML and its place, the files it names, its rows and what is done with each."""
+    """A sweep that can run: its TOML and its place, the files it names, its rows and what is done with each.
+
+    Chunks take at most so much memory, or so many rows where `chunk_rows` is stated.
+    """
 
     text: str
     name: str

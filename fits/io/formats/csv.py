@@ -3,8 +3,10 @@
 import io
 import itertools
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 
+from fits.io._read_file import numbered
 from fits.io._table import MOST_COLUMNS, Table, data_error, with_unit
 from fits.io._text_table import TextTable, is_clock, looks_numeric, split_cells
 from fits.io._units import known_unit, recognise
@@ -16,14 +18,45 @@ _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-
 _EXPORT = "export it as CSV text (UTF-8)"
 # So many lines are looked at for the first rows of numbers, and so many of these in a row are a table.
 _HEAD, _ENOUGH = 300, 3
+# What may stand between two tables, and how far a second one is looked for behind it, in characters and lines.
+_GAP = re.compile(r"\n(?:[ \t,;]*\n)+")
+_AHEAD, _FEW_LINES = 4000, 8
 
 # Number from 1, beginning and text of a line that is neither blank nor a comment.
 _Line = tuple[int, int, str]
 
 
 def open_csv(path: str, data: bytes) -> Table:
-    """Find the header in a text; a `DataError` says that this is none, or has no rows."""
-    text = decode(path, data)
+    """Find the table in a text, or the one that the path numbers; a `DataError` says that there is none."""
+    text, (file, number) = decode(path, data), numbered(path)
+    starts = [*_beginnings(text), len(text)]
+    if len(starts) == 2 and number in (None, 1):
+        return _open_text(path, text)
+    if number is not None and number >= len(starts):
+        raise data_error(path, f"expected a table from 1 to {len(starts) - 1}, found number {number}; choose another")
+    begin, end = starts[(number or 1) - 1 : (number or 1) + 1]
+    above = text.count("\n", 0, begin)
+    remark = f"{file}: it holds {len(starts) - 1} tables, and the first was read; the second is {file}#2."
+    # Blank lines, so that lines keep their numbers.
+    return replace(_open_text(path, "\n" * above + text[begin:end]), remark="" if number else remark)
+
+
+def _beginnings(text: str) -> Iterator[int]:
+    """Where tables begin: at the top, and at names of as many columns as follow, after rows and a blank line."""
+    yield 0
+    for gap in _GAP.finditer(text):
+        before = text[text.rfind("\n", 0, gap.start()) + 1 : gap.start()]
+        lines = [before, *text[gap.end() : gap.end() + _AHEAD].split("\n")[:_FEW_LINES]]
+        lines = [line for line in lines if line.strip() and not line.lstrip().startswith(("#", "%"))]
+        rows = [_names(line, _separator(line)) for line in lines]
+        numbers = [all(looks_numeric(cell) or is_clock(cell) for cell in row) for row in rows]
+        if numbers[:2] == [True, False] and True in numbers[2:]:
+            first = numbers.index(True, 2)
+            if len(rows[first]) > 1 and any(len(row) == len(rows[first]) for row in rows[1:first]):
+                yield gap.end()
+
+
+def _open_text(path: str, text: str) -> TextTable:
     separator, lines = _first_lines(text)
     if not lines:
         raise data_error(path, "expected a header and rows of numbers, found only comments; export again", "line 1")

@@ -1,25 +1,24 @@
 """The fit of a hysteresis or a stage in JSON values."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fits.io._json import strict
 from fits.io._limits import ranges_json
 from fits.loop._misfit import Misfit
-from fits.loop._result import FitResult, RunReport
-from fits.report._json import strict
-from fits.stage._run import hysteresis_of
 from fits.stats._metrics import Errors
-from microid import Preisach, Stage
+from microid import Preisach, Stage, innermost
+
+if TYPE_CHECKING:
+    from fits.loop._result import FitResult, RunReport
 
 
-def fit_report(result: FitResult[Any]) -> dict[str, Any]:
+def fit_report(result: "FitResult[Any]") -> dict[str, Any]:
     """Put what is known of a fit into JSON values, kept under `fit` in model files; what does not exist is None."""
-    model = result.model
-    law: Any = model
+    model, law = result.model, preisach_of(result.model)
     parts: dict[str, Any] = {}
     if isinstance(model, Stage):
-        law = hysteresis_of(model)
         named = zip(model.names, model.parts, strict=True)
         parts["parts"] = [{"name": name, "type": type(part).__name__} for name, part in named]
         known = {name: strict(getattr(result, name)) for name in ("parameters", "correlation", "unseen")}
@@ -27,7 +26,7 @@ def fit_report(result: FitResult[Any]) -> dict[str, Any]:
         known = {name: getattr(result, name) for name in ("noise_um", "correlation_samples", "smoothness")}
         known["trials"] = [dict(vars(trial)) for trial in result.trials]
     grid = dict.fromkeys(("family", "levels", "lower_V", "upper_V"))
-    if isinstance(law, Preisach):
+    if law is not None:
         lower, upper = float(law.density.lower_V), float(law.density.upper_V)
         grid = {"family": law.density.family, "levels": law.density.levels, "lower_V": lower, "upper_V": upper}
     return {
@@ -44,6 +43,12 @@ def fit_report(result: FitResult[Any]) -> dict[str, Any]:
     }
 
 
+def preisach_of(model: Preisach | Stage) -> Preisach | None:
+    """The Preisach operator that a model is, or has among its parts; None where there is none."""
+    parts = [model] if isinstance(model, Preisach) else map(innermost, model.parts)
+    return next((part for part in parts if isinstance(part, Preisach)), None)
+
+
 def _misfit(misfit: Misfit | None) -> dict[str, Any] | None:
     if misfit is None:
         return None
@@ -57,7 +62,7 @@ def _errors(errors: Errors | None) -> dict[str, Any] | None:
     return {**vars(errors), "e_rms_pct": errors.e_rms_pct, "e_max_pct": errors.e_max_pct}
 
 
-def _run(run: RunReport, of_stage: bool) -> dict[str, Any]:
+def _run(run: "RunReport", of_stage: bool) -> dict[str, Any]:
     # Of a run of a stage; None where it was not fitted.
     more = ("noise_um", "correlation_samples", "substeps") if of_stage else ()
     return {

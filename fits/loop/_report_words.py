@@ -5,7 +5,7 @@ from itertools import combinations
 from math import floor, log10
 from typing import Any
 
-from fits.report._json import columns
+from fits.io._json import columns
 from fits.stats._metrics import WHITE
 
 # Held-out errors up to this many times the fitted ones count as equal.

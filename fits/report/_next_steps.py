@@ -1,0 +1,87 @@
+"""What a diagnosis asks its reader to do, what it has read, and what became of the stage."""
+
+import math
+import shlex
+from collections.abc import Sequence
+from itertools import chain
+from operator import attrgetter
+
+import numpy as np
+
+from fits.diagnosis._result import Diagnosis, RunView
+from fits.report._words import NONE, Lengths, listed, number, percent, plain, shown_unit
+from microid import Stage, parameter_table
+from microid.effects import card_of
+
+
+def next_steps(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Sentences that say what to do now, each with the command to paste, which may be empty."""
+    ahead = diagnosis.next_experiment
+    steps = [_use(diagnosis)]
+    needs = {column: None for cause in diagnosis.causes for column in card_of(cause.name).needs}
+    if needs and "extended.json" in steps[0][1]:
+        steps.append((f"What was found needs more columns in reference.csv: {listed(list(needs))}.", ""))
+    if ahead is not None and ahead.time_s.size > 1:
+        fitted = [run.source for run in diagnosis.runs if run.fitted.any()]
+        aside = [("--holdout", run.source) for run in diagnosis.runs if not run.fitted.any()]
+        again = ["microid", "diagnose", *fitted, "answer.csv", *chain(*aside), "--out", "again"]
+        words = "Play next_experiment.csv on the rig, record answer.csv, and diagnose all runs together"
+        steps.append((f"{words}. {ahead.purpose}", shlex.join(again)))
+    elif diagnosis.verdict == "unexplained":
+        steps.append(("Record a run at another speed, with holds and with the temperature, and diagnose again.", ""))
+    return steps
+
+
+def _use(diagnosis: Diagnosis) -> tuple[str, str]:
+    """Which stage to go on with, and why."""
+    gain, modelled = diagnosis.gain, [one.name for one in diagnosis.causes if not card_of(one.name).statistic]
+    before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
+    name, length = "baseline.json", Lengths(diagnosis)
+    if modelled and not (after >= before):
+        name, words = "extended.json", f"Compensate with the extended stage, which has {listed(modelled)}"
+        if not math.isfinite(after):
+            words += ". Hold a run out first to learn what that is worth on new data"
+    elif modelled:
+        words = f"Keep to the plain stage: with {listed(modelled)} it predicts data that were not used no better"
+    elif diagnosis.verdict == "unexplained":
+        left = length(diagnosis.unexplained_rms_um)
+        words = f"Expect errors of {left}, root mean square, where the plain stage is used"
+    elif diagnosis.causes:
+        named = listed([one.name for one in diagnosis.causes])
+        words = f"Mend {named} where it arises: it is in the readings, and no model of the stage takes it away"
+    else:
+        words = "Use the plain stage: these records need no more"
+    return f"{words}.", f"microid compensate {name} reference.csv --dynamic --out voltage.csv"
+
+
+def runs_read(runs: Sequence[RunView]) -> list[tuple[str, ...]]:
+    """Name, samples, duration in s, range of the command in V, and use of every run."""
+    rows: list[tuple[str, ...]] = []
+    for run in runs:
+        share = float(run.fitted.mean()) if run.fitted.size else 0.0
+        use = "held out" if share == 0 else "fitted" if share == 1 else f"{percent(share)} fitted"
+        span_s, volts = (number(float(np.ptp(one))) if one.size else NONE for one in (run.time_s, run.voltage_V))
+        rows.append((run.source or NONE, f"{run.time_s.size}", span_s, volts, use))
+    return rows
+
+
+def stage_parameters(diagnosis: Diagnosis) -> list[tuple[str, str, str, str]]:
+    """Name, values in the plain and the extended stage, and unit of what both have fitted beside the hysteresis."""
+    before, after = (_single_numbers(stage) for stage in (diagnosis.baseline, diagnosis.extended))
+    return [
+        (plain(name.replace(".", " ")), number(value, 4), number(after[name][0], 4), shown_unit(unit) or "1")
+        for name, (value, unit) in before.items()
+        if value and name in after
+    ]
+
+
+def _single_numbers(stage: Stage) -> dict[str, tuple[float, str]]:
+    """Parameters of one number that are not frozen, with their unit, by part and field."""
+    found = {}
+    for part_name, part in zip(stage.names, stage.parts, strict=True):
+        for info in parameter_table(part):
+            name = f"{part_name}.{info.path}"
+            frozen = any(name == one or name.startswith(f"{one}.") for one in stage.frozen)
+            if info.shape == () and "[" not in info.path and not frozen:
+                found[name.removesuffix(f"_{info.spec.unit}")] = float(attrgetter(info.path)(part)), info.spec.unit
+    return found
