@@ -81,6 +81,37 @@ def test_the_projection_is_generalised_least_squares(rng):
     assert abs(found @ other) <= np.linalg.norm(found) * np.linalg.norm(other)
 
 
+def test_columns_that_are_pressed_below_zero_stay_there(rng):
+    # Against least squares with one zero column at a time beside those that are above zero.
+    reg = regression(rng, kinds=0)
+    reg.baseline.columns_um = np.where(np.arange(12) < 6, 0.0, 1.0)
+    reg.root = 1e-6 * np.eye(12)
+    noise = [Noise(1.0, WHITE), Noise(1.0, WHITE)]
+    push = np.array([-0.6, 0.6, -0.3, -0.03, 0.0, 0.0])
+    reg.residuals = tuple(one + rows[:, :6] @ push for one, rows in zip(reg.residuals, reg.rows, strict=True))
+    found = Projector(reg, noise).bounded()
+    run = np.repeat([0, 1], [280, 380])
+    rows = np.concatenate([r[20:] for r in reg.rows])
+    others = np.concatenate([rows[:, 6:], run[:, None] == [0, 1]], axis=1)
+    target = np.concatenate([r[20:] for r in reg.residuals])
+    pressed = []
+    for k in range(6):
+        design = np.concatenate([rows[:, k : k + 1], others], axis=1)
+        best = np.linalg.lstsq(design, target, rcond=None)[0][0]
+        pressed.append(best / np.sqrt(np.linalg.inv(design.T @ design)[0, 0]) < -3)
+    assert pressed[0]
+    assert not pressed[1]
+    assert found.held.tolist() == [*pressed, *[False] * 6]
+    # What they alone make is followed no more, but for what the others have in common with it by chance.
+    signal = [r[:, 0] for r in reg.rows]
+    off = found.off(found.join(signal))
+    assert np.linalg.norm(off) > 0.9 * np.linalg.norm(found.join(signal))
+    assert found.whole.off(found.join(signal)) == pytest.approx(0, abs=1e-4)
+    # Effects that make all of it leave nothing that presses.
+    change = [rows[:, :6] @ push for rows in reg.rows]
+    assert found.bounded(change).held.sum() <= 1
+
+
 def probe(signatures, positive=False):
     effect = next(form for form in EFFECTS if form.name == "thermal_drift")
     return Probe((SimpleNamespace(name=effect.name, finite=False),), tuple(signatures), positive)

@@ -57,6 +57,18 @@ def test_jitter_is_noise_that_grows_with_the_speed(rng):
     assert most > 1e-4
 
 
+def test_what_bends_alike_in_neighbours_is_no_jitter(rng):
+    # A staircase that a rough model leaves, only where the stage is fast.
+    time = np.arange(20_000) / 1000
+    speed = 500 * np.cos(2 * np.pi * time)
+    noise = 0.02 * rng.standard_normal(len(time))
+    fast = np.abs(speed) > 450
+    left = noise + np.where(fast, 1.5 * np.abs((np.arange(len(time)) % 14) / 14 - 0.5) ** 2, 0.0)
+    assert jitter_s(left, speed, 0.0, THRESHOLDS.apart_z)[0] == 0
+    found = jitter_s(left + 1e-4 * speed * rng.standard_normal(len(time)), speed, 0.0, THRESHOLDS.apart_z)[0]
+    assert found == pytest.approx(1e-4, rel=0.3)
+
+
 def test_hum_is_no_part_of_the_floor(rng):
     mains = rng.choice([50.0, 60.0]) * (1 + rng.uniform(-1e-3, 1e-3))
     voltage = np.concatenate([np.linspace(0, 100, 1000), np.full(3000, 100.0)])
