@@ -78,3 +78,18 @@ def test_the_command_takes_both(record, tmp_path):
     assert said["parts"][0]["name"] == "hysteresis"
     assert said["held_out"]["rms_um"] < 1.3 * NOISE_um
     refused(run(*asked, "--model", "stage", "--out", tmp_path / "other.json"), "--lag")
+
+
+def test_relaxations_of_fast_runs_are_no_faster_than_a_model_file_may_hold(tmp_path):
+    rng = np.random.default_rng(seed_of("fast_relaxations"))
+    time_s = np.arange(3000) * 2e-4
+    voltage_V = 50 + 50 * np.sin(2 * np.pi * 10 * time_s)
+    moved_um = 0.1 * voltage_V + 0.003 * lsim(([1.0], [0.05, 1.0]), voltage_V, time_s)[1]
+    quick = fits.Record(time_s, voltage_V, moved_um + rng.normal(0, 0.001, len(time_s)), source="quick.csv")
+    result = fits.fit_slow([quick], relaxations=2, levels=8)
+    fits.save_model(tmp_path / "model.json", result.model, result.uncertainty, fits.fit_report(result))
+    constants_s = [float(part.time_constant_s) for part in fits.load_model(tmp_path / "model.json").model.parts[1:]]
+    assert all(constant >= 0.02 for constant in constants_s)
+    short = fits.Record(time_s[:300], voltage_V[:300], moved_um[:300], source="quick.csv")
+    with pytest.raises(fits.DataError, match=r"relaxations from 0\.02 s on show in runs of 0\.08 s or more"):
+        fits.fit_slow([short], relaxations=2, levels=8)

@@ -105,7 +105,7 @@ def refuse_unidentifiable(
                 f"{noise[loudest] / min(noise):.3g} times as much as of the quietest run; {remedy}, {_OR_ALONE}"
             )
         raise DataError(
-            f"{sources}: the displacement follows the voltage without delay or ringing, so these runs hold nothing "
+            f"{sources}: no delay and no ringing is told from the hysteresis here, so these runs hold nothing "
             f"of the driver and the mechanics; {_BEYOND}, check that voltage and displacement are not exchanged, "
             f"{_OR_ALONE}"
         )

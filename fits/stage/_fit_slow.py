@@ -15,6 +15,7 @@ from fits.loop._fit import check_fit
 from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
 from fits.loop._run import Progress, Run, prepare_run
+from fits.stage._encode import spec_of
 from fits.stage._fit import completed, default_stage, summarise
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem, solve_chain
@@ -52,8 +53,8 @@ def fit_slow(
         Whether readings follow the displacement with a lag of the first order, whose time constant is fitted.
     relaxations
         Number of Kelvin-Voigt elements behind the hysteresis, at most 6. Their time constants are spread evenly over
-        the logarithm, from 20 samples to a quarter of the longest run, and their gains are fitted; those that the
-        runs do not show are left out.
+        the logarithm, from 20 samples, or 20 ms, to a quarter of the longest run, and their gains are fitted; those
+        that the runs do not show are left out.
     records, levels, holdout, initial, loss, progress
         See `fit`; a number of levels of at most 32 is chosen.
     """
@@ -98,9 +99,17 @@ def _stage(records: Sequence[Record], lag: bool, relaxations: int) -> Stage:
     """A hysteresis, as many relaxations, and a lag of the first order."""
     interval = min(float(np.median(np.diff(record.time_s))) for record in records)
     longest = _LONGEST * max(record.duration_s for record in records)
-    constants = np.geomspace(min(_SHORTEST * interval, longest), longest, relaxations)
     relaxing: Any = next(form for form in EFFECTS if form.relaxation)
     lagging: Any = next(form for form in EFFECTS if form.lag)
+    spec = spec_of(relaxing.__dataclass_fields__[relaxing.relaxation])
+    # What is faster is a lag.
+    least = 0.0 if spec is None else spec.lower
+    if relaxations and longest < least:
+        raise DataError(
+            f"the longest run takes {longest / _LONGEST:.3g} s, and relaxations from {least:g} s on show in runs of "
+            f"{least / _LONGEST:g} s or more: record it for longer, or fit a lag"
+        )
+    constants = np.geomspace(min(max(_SHORTEST * interval, least), longest), longest, relaxations)
     parts: dict[str, AbstractPart] = {"hysteresis": default_stage()["hysteresis"]}
     for k, constant in enumerate(constants):
         parts[f"relaxation_{k + 1}"] = relaxing(

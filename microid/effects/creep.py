@@ -163,7 +163,7 @@ class KelvinVoigtCreep(AbstractEffect):
     relaxation: ClassVar[str] = "time_constant_s"
     held: ClassVar[str] = "gain_per_decade"
     gain: Float[Array, ""] = param(unit="1", lower=0.0, upper=_MOST_IN_ALL)
-    time_constant_s: Float[Array, ""] = param(unit="s", lower=1e-6, upper=1e5)
+    time_constant_s: Float[Array, ""] = param(unit="s", lower=0.02, upper=1e5)
     before_um: Float[Array, ""] = param(default=0.0, unit="um")
 
     @classmethod
