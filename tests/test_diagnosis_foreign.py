@@ -167,3 +167,24 @@ def test_a_regression_is_bounded_where_block_pivoting_gives_up(rng, monkeypatch)
     # Karush, Kuhn and Tucker's conditions.
     np.testing.assert_allclose(slope[np.asarray(found) > 0], 0, atol=1e-8)
     assert np.all(slope > -1e-8)
+
+
+@pytest.mark.study
+def test_a_lag_at_two_rates_is_no_hum(rng):
+    """Triangles of 20 and 40 Hz, whose third harmonics are lines of 60 Hz mains, at a hundredth of usual noise."""
+    lag_s = rng.uniform(4e-4, 7e-4)
+    records = []
+    for frequency_Hz, duration_s in ((20.0, 0.75), (40.0, 0.5)):
+        settled = 3 / frequency_Hz
+        fine = np.arange(round((settled + duration_s) * 10_000) * 4) / 40_000
+        voltage = 100 * (0.5 + np.arcsin(np.sin(2 * np.pi * frequency_Hz * fine)) / np.pi)
+        moved = lsim(([1.0], [lag_s, 1.0]), plays(voltage) - plays(voltage[:1]), fine)[1]
+        kept = slice(round(settled * 10_000) * 4, None, 4)
+        reading = moved[kept] + 0.001 * rng.standard_normal(len(moved[kept]))
+        time = np.arange(len(reading)) / 10_000
+        records.append(Record(time, voltage[kept], reading, source=f"triangles_{frequency_Hz:g}_Hz.csv"))
+    found = diagnose(records)
+    assert [cause.name for cause in found.causes] == ["sensor_lowpass"]
+    value = found.causes[0].parameters[0].value
+    assert value == pytest.approx(lag_s, rel=0.05)
+    assert found.gain.heldout_rms_after_um < 0.1 * found.gain.heldout_rms_before_um

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import fits
@@ -34,3 +35,14 @@ def test_creep_is_read_off_what_a_controller_took_back():
     gain = next(one for one in found.causes[0].parameters if one.name == "gain_per_decade")
     assert gain.value == pytest.approx(0.015, rel=0.2)
     assert any("a controller held the displacement" in words for words in found.remarks)
+
+
+@pytest.mark.study
+def test_one_branch_shows_no_effect_that_a_density_does_not():
+    # Up from an unknown past and down again: any function of the voltage is a density there.
+    path = DATA / "afm_z_piezo_5um.csv"
+    if not path.exists():
+        pytest.skip(f"the measured record {path.name} is not here")
+    found = fits.diagnose([fits.read_csv(path)])
+    assert found.verdict == "unexplained"
+    assert found.unexplained_rms_um < 0.001 * np.ptp(fits.read_csv(path).displacement_um)
