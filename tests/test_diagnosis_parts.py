@@ -13,8 +13,9 @@ from scipy.signal import lfilter
 
 from fits import Record
 from fits.diagnosis import _effects
+from fits.diagnosis._discrepancy import learn_roughness, with_discrepancy
 from fits.diagnosis._effects import drop_programs
-from fits.diagnosis._projector import Projector, learn_roughness, with_discrepancy
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Family, Probe, score
 from fits.stage._motion import program
 from fits.stats._band import band_of

@@ -11,8 +11,9 @@ from test_diagnosis_parts import WHITE, regression
 from test_diagnosis_tangent import baseline_of
 
 from fits import Record
+from fits.diagnosis._discrepancy import smoothed
 from fits.diagnosis._noise import Faults, find_faults, name_faults
-from fits.diagnosis._projector import Projector, smoothed
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 from fits.diagnosis._residual_tests import (
     Regressors,

@@ -7,9 +7,10 @@ from typing import TypeAlias
 import numpy as np
 
 from fits.diagnosis._baseline import Baseline, simulate
+from fits.diagnosis._discrepancy import learn_roughness, smoothed, with_discrepancy
 from fits.diagnosis._effects import Bench, scaled
 from fits.diagnosis._noise import find_faults
-from fits.diagnosis._projector import Projector, learn_roughness, smoothed, with_discrepancy
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
 from fits.diagnosis._thresholds import Thresholds

@@ -7,9 +7,10 @@ from functools import cached_property
 import numpy as np
 
 from fits.diagnosis._baseline import Baseline, fit_baseline, simulate
+from fits.diagnosis._discrepancy import ROUGHEST, learn_roughness, with_discrepancy
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
-from fits.diagnosis._projector import ROUGHEST, Projector, learn_roughness, with_discrepancy
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
