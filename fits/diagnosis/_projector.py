@@ -1,6 +1,7 @@
 """What a re-fitted baseline leaves of a signal: projection off its tangent space, in units of the noise."""
 
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property
 
 import jax.numpy as jnp
@@ -65,29 +66,49 @@ class Projector:
         self._scale = np.where(self._live, size, 1.0)
         matrix /= self._scale
         self._gram = matrix.T @ matrix
-        # A Cholesky factor, pivoted: columns that the others make up have nothing of their own to be projected on.
-        self._moving = np.flatnonzero(~np.pad(self.held, (0, len(size) - grid)))
-        factor, pivots, rank, _ = dpstrf(self._gram[np.ix_(self._moving, self._moving)], tol=_SHOWN, lower=1)
-        lower, order = np.tril(factor)[:, :rank], self._moving[pivots - 1]
-        self._inverse = np.zeros((len(size), rank))
-        self._inverse[order[:rank]] = solve_triangular(lower[:rank], np.eye(rank), lower=True).T
-        self._root = np.zeros((rank, len(size)))
-        self._root[:, order] = lower.T
         self._bare = np.r_[0 : regression.size, at : len(size)]
         self._matrix: np.ndarray | None = matrix
-        self._q: np.ndarray | None = None
         self.residual = self.join(regression.residuals)
         self.residual[self.count : self.count + grid] = -root @ regression.baseline.columns_um
+        self._whole: Projector | None = None
+        self._factor()
+
+    def _factor(self) -> None:
+        """Factorise the tangent of what is not held."""
+        self._q: np.ndarray | None = None
+        self._moving = np.flatnonzero(~np.pad(self.held, (0, len(self._scale) - len(self.held))))
+        # A Cholesky factor, pivoted: columns that the others make up have nothing of their own to be projected on.
+        factor, pivots, rank, _ = dpstrf(self._gram[np.ix_(self._moving, self._moving)], tol=_SHOWN, lower=1)
+        lower, order = np.tril(factor)[:, :rank], self._moving[pivots - 1]
+        self._inverse = np.zeros((len(self._scale), rank))
+        self._inverse[order[:rank]] = solve_triangular(lower[:rank], np.eye(rank), lower=True).T
+        self._root = np.zeros((rank, len(self._scale)))
+        self._root[:, order] = lower.T
 
     @cached_property
     def bare(self) -> "Projector":
         """The same without roughness of the density beyond its grid."""
         return self.beside(roughness=()) if any(self.roughness) else self
 
-    @cached_property
+    @property
     def whole(self) -> "Projector":
         """The same with no column held."""
-        return Projector(self.regression, self.noise, self.roughness) if self.held.any() else self
+        if self._whole is None and self.held.any():
+            self._whole = Projector(self.regression, self.noise, self.roughness)
+        return self._whole or self
+
+    def _holding(self, held: np.ndarray) -> "Projector":
+        """The same with columns held, which shares all but the factors."""
+        if not held.any():
+            return self
+        if self._matrix is None:
+            return Projector(self.regression, self.noise, self.roughness, held)
+        other = copy(self)
+        for name in ("bare", "_spread"):
+            other.__dict__.pop(name, None)
+        other.held, other._whole = held, self
+        other._factor()
+        return other
 
     def beside(self, noise: Sequence[Noise] | None = None, roughness: Sequence[float] | None = None) -> "Projector":
         """The same with other noise or roughness."""
@@ -110,8 +131,7 @@ class Projector:
         best = cross[at] - along @ (half.T @ cross[others])
         held = np.zeros(len(zero), dtype=bool)
         held[at] = best < -_PRESSED_Z * np.sqrt(np.maximum(left, _SHOWN))
-        same = np.array_equal(held, self.held)
-        return self if same else Projector(self.regression, self.noise, self.roughness, held)
+        return self if np.array_equal(held, self.held) else whole._holding(held)
 
     @property
     def freedom(self) -> float:
