@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from microid._param import _as_inexact
+from microid._precision import full_precision
 
 Hold = Literal["first", "zero", "smooth"]
 Times = Float[Array, " t"] | Float[Array, ""]
@@ -70,6 +71,7 @@ class LinearSystem(eqx.Module):
             other.gain * self.offset + other.offset,
         )
 
+    @full_precision
     def respond(
         self,
         time_s: Times,
@@ -261,6 +263,7 @@ def _orbit(
     return columns.T, over[..., 0]
 
 
+@full_precision
 def recur(step: Float[Array, "t n n"], push: Float[Array, "t n"]) -> Float[Array, "t n"]:
     """Solve `z[t] = step[t] @ z[t - 1] + push[t]` from zero on.
 

@@ -17,4 +17,4 @@ def test_flags_of_the_user_come_before_the_commands(stated, monkeypatch):
         names = [flag.partition("=")[0] for flag in flags]
         assert len(set(names)) == len(names)
         assert set(stated.split()) <= set(flags)
-        assert "--xla_cpu_use_fusion_emitters=false" in flags
+        assert "--xla_cpu_parallel_codegen_split_count=1" in flags

@@ -8,6 +8,7 @@ import pytest
 from _models import compiled, random_model
 from _plant_reference import driver_and_mechanics, mechanics_alone, play_positions, smoothed, states
 from _reference import central_differences
+from jax.extend.core import jaxprs_in_params
 
 import microid as m
 
@@ -158,6 +159,29 @@ def test_many_stages_in_single_precision_at_once(rng):
     )
     assert wide.shape == (2, SAMPLES)
     assert wide.dtype == np.float32
+
+
+def equations_in(jaxpr):
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jaxprs_in_params(equation.params):
+            yield from equations_in(inner)
+
+
+@pytest.mark.parametrize("even", [True, False], ids=["even", "uneven"])
+def test_no_product_of_matrices_is_left_to_the_default_precision(even, rng):
+    """Which on a GPU is ten bits in single precision: there a response was wrong by 2e-4 of its amplitude."""
+    stage, voltage_V = full_stage(rng), rng.uniform(-40, 40, SAMPLES)
+    time_s = np.asarray(1e-3) if even else np.arange(SAMPLES) * 1e-3
+
+    def gradient(stage, voltage_V):
+        return eqx.filter_grad(lambda both: both[0](time_s, both[1]).sum())((stage, voltage_V))
+
+    jaxpr = eqx.filter_make_jaxpr(gradient)(stage, voltage_V)[0].jaxpr
+    products = [each for each in equations_in(jaxpr) if each.primitive.name == "dot_general"]
+    assert len(products) > 10
+    highest = (jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)
+    assert all(each.params["precision"] == highest for each in products)
 
 
 def test_new_data_of_the_same_shape_compile_nothing(rng):

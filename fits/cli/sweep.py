@@ -53,7 +53,7 @@ def run(given: common.Given) -> None:
     DIR will hold results.zarr, which xarray opens, results.parquet, and what is needed to go on. A row that fails is
     kept with its reason and stops nothing else. Without --cluster all is computed in this process.
     """
-    late.start_jax()
+    late.start_jax(accelerator=True)
     progress = common.progress_to_stderr(given.quiet)
     sweep = late.read_sweep(given.file)
     try:

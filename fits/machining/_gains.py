@@ -41,9 +41,10 @@ def check_axes(axes: Iterable[str]) -> None:
 
 def quick_jit(function: Callable[..., _Result]) -> Callable[..., _Result]:
     """Compile fast: a call takes microseconds however it is compiled, and compiling with optimisation seconds."""
-    # Without its fusion emitters, which a user's flags may switch off, XLA compiles what is not fused wrongly.
-    options = {"xla_disable_hlo_passes": "fusion", "xla_cpu_use_fusion_emitters": True}
-    options |= {"xla_backend_optimization_level": 0}
+    options: dict[str, Any] = {"xla_disable_hlo_passes": "fusion", "xla_backend_optimization_level": 0}
+    if jax.__version_info__ < (0, 11):
+        # Without its fusion emitters, which a user's flags may switch off, XLA compiles what is not fused wrongly.
+        options["xla_cpu_use_fusion_emitters"] = True
     return eqx.filter_jit(function, compiler_options=options)  # type: ignore[call-overload]
 
 

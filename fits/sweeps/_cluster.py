@@ -189,7 +189,7 @@ def _sweep(payload: _Payload) -> Sweep:
     if payload.digest not in _SWEEPS:
         from fits.io._jax_setup import start_jax
 
-        start_jax()
+        start_jax(accelerator=True)
         sweep = parse_sweep(payload.text, payload.name, payload.inputs.__getitem__, Path(payload.folder))
         if sweep.digest != payload.digest:
             raise DataError(f"{payload.folder} holds other files there")

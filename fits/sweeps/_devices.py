@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import wraps
 from typing import Any
 
@@ -66,6 +67,11 @@ def by_rows(*own: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     return decorate
 
 
+def on_cpu() -> AbstractContextManager[Any]:
+    """Compute on one CPU what follows."""
+    return jax.default_device(jax.local_devices(backend="cpu")[0])
+
+
 def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
     """Call a function for block after block on one CPU; arguments and results have the rows along their first axis.
 
@@ -73,7 +79,7 @@ def in_turn(function: Callable[..., Any], *rows: Any) -> Any:
     several CPU devices that factor many matrices at once wait for each other for ever.
     """
     count, found = _shares(rows), []
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+    with on_cpu():
         for k in range(count):
             block = jax.tree.map(lambda each, k=k: jnp.asarray(np.split(each, count)[k]), rows)
             found.append(jax.device_get(function(*block)))

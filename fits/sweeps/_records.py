@@ -18,6 +18,7 @@ from fits.io._typed import typed
 from fits.io._units import parse_columns
 from fits.loop._plain import INITIAL_STATES
 from fits.loop._result import FitError
+from fits.sweeps._devices import on_cpu
 from fits.sweeps._programs import Program, read_program
 from fits.sweeps._stages import requested_stage, simulated, stage_parameters
 from fits.sweeps._types import Block, Output, Parameter, Request, Rows
@@ -122,13 +123,17 @@ def requested_records(request: Request) -> Files | Simulated:
 def each_alone(
     outputs: Sequence[Output], records: Sequence[Record | str], find: Callable[..., dict[str, Any]], *options: Any
 ) -> Rows:
-    """Rows of what is found in one record after the other, each with its options, or why nothing is."""
+    """Rows of what is found in one record after the other, each with its options, or why nothing is.
+
+    On a CPU: what is computed for one record is a chain of small programs.
+    """
     found: list[dict[str, Any] | str] = []
-    for record, *own in zip(records, *options, strict=True):
-        try:
-            found.append(record if isinstance(record, str) else find(record, *own))
-        except (DataError, FitError) as error:
-            found.append(" ".join(str(error).split()))
+    with on_cpu():
+        for record, *own in zip(records, *options, strict=True):
+            try:
+                found.append(record if isinstance(record, str) else find(record, *own))
+            except (DataError, FitError) as error:
+                found.append(" ".join(str(error).split()))
     return Rows.one_by_one(outputs, found)
 
 
