@@ -13,6 +13,7 @@ from microid._everett import Everett
 from microid._forest import forest_sum
 from microid._memory import Staircase, negative_saturation, remember
 from microid._part import AbstractLinear, Signal, _joined, _run_linear
+from microid._platform import _by_platform
 from microid._preisach import Preisach
 from microid._stage import Stage, Start
 
@@ -53,7 +54,7 @@ def respond_all(
     interval = jnp.asarray(interval_s, dtype=voltage_V.dtype)
     if stages.substeps > 1 or not all(isinstance(part, AbstractLinear | Preisach) for part in stages.parts):
         return _mapped(stages, interval, voltage_V, memory)
-    return lax.platform_dependent(stages, interval, voltage_V, memory, cpu=_by_links, default=_mapped)
+    return _by_platform(stages, interval, voltage_V, memory, cpu=_by_links, default=_mapped)
 
 
 def _mapped(

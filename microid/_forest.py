@@ -5,6 +5,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from microid._platform import _by_platform
+
 
 def forest_sum(step: Float[Array, " m *more"], anchor: Int[Array, " m"]) -> Float[Array, " m *more"]:
     """Solve `total[t] = step[t] + total[anchor[t]]`, with `total[0] = step[0]` at the root.
@@ -30,10 +32,10 @@ def forest_sum(step: Float[Array, " m *more"], anchor: Int[Array, " m"]) -> Floa
         return total - total[anchor].at[0].set(0)
 
     def solve(_: object, rhs: Array) -> Array:
-        return lax.platform_dependent(anchor, rhs, cpu=_down, default=_down_by_jumping)
+        return _by_platform(anchor, rhs, cpu=_down, default=_down_by_jumping)
 
     def transpose_solve(_: object, rhs: Array) -> Array:
-        return lax.platform_dependent(anchor, rhs, cpu=_up, default=_up_by_jumping)
+        return _by_platform(anchor, rhs, cpu=_up, default=_up_by_jumping)
 
     # The implicit form has a cheap transpose; differentiating the loops themselves would store every pass.
     return lax.custom_linear_solve(residual, step, solve, transpose_solve)

@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from microid._param import _as_inexact
+from microid._platform import _by_platform
 from microid._precision import full_precision
 
 Hold = Literal["first", "zero", "smooth"]
@@ -288,12 +289,12 @@ def recur(step: Float[Array, "t n n"], push: Float[Array, "t n"]) -> Float[Array
         return z.at[1:].add(-jnp.einsum("tij,tj->ti", step[1:], z[:-1]))
 
     def solve(_: object, rhs: Array) -> Array:
-        return lax.platform_dependent(step, rhs, cpu=_one_by_one, default=_all_at_once)
+        return _by_platform(step, rhs, cpu=_one_by_one, default=_all_at_once)
 
     def transpose_solve(_: object, rhs: Array) -> Array:
         # Backwards in time, by the transposed matrix of the following sample.
         back = jnp.swapaxes(jnp.roll(step, -1, axis=0), 1, 2)[::-1]
-        return lax.platform_dependent(back, rhs[::-1], cpu=_one_by_one, default=_all_at_once)[::-1]
+        return _by_platform(back, rhs[::-1], cpu=_one_by_one, default=_all_at_once)[::-1]
 
     # The implicit form needs one more pass per derivative; differentiating the scan itself is several times slower.
     return lax.custom_linear_solve(residual, push, solve, transpose_solve)

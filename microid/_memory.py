@@ -7,6 +7,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from microid._param import _as_inexact
+from microid._platform import _by_platform
 
 _SIZE = 64
 
@@ -143,7 +144,7 @@ def _filled(start: Staircase) -> Float[Array, " size"]:
 
 
 def _branches(path: Float[Array, " m"]) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:
-    return lax.platform_dependent(lax.stop_gradient(path), cpu=_by_stack, default=_by_lifting)
+    return _by_platform(lax.stop_gradient(path), cpu=_by_stack, default=_by_lifting)
 
 
 def remember(voltage_V: Float[Array, " n"], start: Staircase) -> Memory:

@@ -25,6 +25,12 @@ def random_model(rng, levels=LEVELS):
     return m.Preisach(density, reversible, rng.normal(0, 5))
 
 
+def without_a_cpu(monkeypatch):
+    """Let models run as on an accelerator: what is traced from now on takes the other algorithms."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *operands, default, **_: default(*operands))
+
+
 def limits_V(model):
     return float(model.density.lower_V), float(model.density.upper_V)
 

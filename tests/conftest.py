@@ -20,7 +20,7 @@ from hypothesis import settings
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Tests compile much and compute little: what makes code fast is not worth its time here. Without the fusion emitters
 # most programs compile in half the time, but wrongly if nothing is fused (`xla_disable_hlo_passes=fusion`).
-QUICK = ["backend_optimization_level=0", "cpu_parallel_codegen_split_count=1"]
+QUICK = ["backend_optimization_level=0", "cpu_parallel_codegen_split_count=1", "llvm_disable_expensive_passes=true"]
 if jax.__version_info__ < (0, 11):  # later ones have no other emitters, and XLA aborts at a flag it does not know
     QUICK.append("cpu_use_fusion_emitters=false")
 os.environ.setdefault("XLA_FLAGS", " ".join(f"--xla_{flag}" for flag in QUICK))
@@ -80,7 +80,7 @@ def pytest_collection_finish() -> None:
 
 # Every compiled function maps some memory, of which a process on Linux may have 65530 pieces. Beyond that it crashes.
 # One diagnosis takes up to 35,000. Between the tests of a module less is forgotten, as they share what is compiled.
-_BETWEEN_MODULES, _BETWEEN_TESTS = 10_000, 20_000
+_BETWEEN_MODULES, _BETWEEN_TESTS = 20_000, 30_000
 
 
 def _forget_beyond(most: int) -> None:
@@ -101,15 +101,6 @@ def _few_mappings() -> Iterator[None]:
     # To count them takes a while, too, and what is quick has compiled little.
     if time.monotonic() - began > 1:
         _forget_beyond(_BETWEEN_TESTS)
-
-
-@pytest.fixture(scope="module")
-def compiled_fast() -> Iterator[None]:
-    """For programs that run for a second, and take much longer to optimise."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture

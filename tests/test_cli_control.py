@@ -20,7 +20,6 @@ SAMPLES = 120
 TAU_s, NATURAL_Hz, DAMPING, GAIN, OFFSET = 2e-3, 60.0, 0.3, 0.12, 1.5
 GIVEN = ("--gains", "0.5,80,1e-3")
 LIVELY = ("--gains", "0.5,1700,1e-3", "--feedforward", "none")
-pytestmark = pytest.mark.usefixtures("compiled_fast")
 
 
 def write(path, time_s, displacement_um):

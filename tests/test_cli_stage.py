@@ -70,7 +70,6 @@ TRUTH = {
     "mechanics.damping_ratio": 0.05,
 }
 LEVELS = 6
-pytestmark = pytest.mark.usefixtures("compiled_fast")
 
 
 @pytest.fixture(scope="module")

@@ -32,6 +32,12 @@ from microid.effects.transport_delay import TransportDelay
 LEVELS, RANGE_V = 10, (0.0, 100.0)
 
 
+@pytest.fixture(autouse=True)
+def _no_padding(monkeypatch):
+    """The runs below are all of one length."""
+    monkeypatch.setattr("fits.loop._run._SHORTEST", 1)
+
+
 def two_runs():
     """A slow decaying loop, and a fast chirp that the mechanics does not follow."""
     slow_s, fast_s = np.linspace(0, 20, 900), np.linspace(0, 0.5, 900)

@@ -12,6 +12,9 @@ import data_synth
 import fits
 import microid as m
 from fits import Record
+from fits.loop._misfit import Misfit
+from fits.loop._run import prepare_run
+from fits.stage._checks import refuse_undersampled
 
 SCENARIO = """
 name = "small"
@@ -19,7 +22,7 @@ description = "slow loops, a fast multisine, and motion to check with"
 
 [rig]
 kind = "plays"
-plays = 2000
+plays = {plays}
 
 [plant]
 time_constant_s = {tau}
@@ -85,13 +88,12 @@ class Rig:
     true_um: dict[str, np.ndarray]
 
 
-@pytest.fixture(scope="module")
-def rig():
+def rig_of(plays):
     seed = seed_of("test_fit_stage")
     rng = np.random.default_rng(seed)
     tau, frequency, damping = 10 ** rng.uniform(-3.7, -2.8), rng.uniform(80, 150), rng.uniform(0.02, 0.1)
     bench = data_synth.simulate(
-        data_synth.parse_scenario(SCENARIO.format(tau=tau, frequency=frequency, damping=damping)), seed
+        data_synth.parse_scenario(SCENARIO.format(plays=plays, tau=tau, frequency=frequency, damping=damping)), seed
     )
     truth = {
         "driver.time_constant_s": tau,
@@ -102,6 +104,17 @@ def rig():
         r.name: Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in bench.records
     }
     return Rig(truth, records, {r.name: r.true_displacement_um for r in bench.records})
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return rig_of(2000)
+
+
+@pytest.fixture(scope="module")
+def rough_rig():
+    """Records that are refused need no smooth hysteresis."""
+    return rig_of(60)
 
 
 @pytest.fixture(scope="module")
@@ -184,8 +197,8 @@ def test_an_amplifier_of_known_gain_scales_the_command_and_nothing_else(rig, fit
         result.predict(rig.records["check"])
 
 
-def test_a_gain_beside_the_operator_is_refused(rig):
-    runs = [rig.records["slow"], rig.records["fast"]]
+def test_a_gain_beside_the_operator_is_refused(rough_rig):
+    runs = [rough_rig.records["slow"], rough_rig.records["fast"]]
     stage = fits.default_stage().thaw("mechanics.gain")
     with pytest.raises(fits.DataError, match=r"mechanics.gain and the weights of hysteresis .* not each: freeze"):
         fits.fit_stage(runs, stage=stage, initial="negative", levels=8)
@@ -209,6 +222,27 @@ def test_slow_runs_alone_do_not_show_the_dynamics(rng):
     assert "chirp" in str(refusal.value) or "sample" in str(refusal.value)
 
 
+def test_a_resonance_that_samples_cannot_show_is_refused(rng):
+    stage = m.Stage.of(piezo=m.Piezo(0.2), mechanics=m.Mechanics(100.0, 0.05, 1.0))
+
+    def refused(rate_Hz, residual_um):
+        # Steps at random have as much in the upper half of the band as in the lower.
+        record = Record(
+            np.arange(300) / rate_Hz, rng.uniform(0, 100, 300), rng.uniform(0, 20, 300), source="thinned.csv"
+        )
+        left = Misfit("thinned.csv", residual_um, 100 * residual_um / 20, 0.1, "its idle stretches")
+        refuse_undersampled(stage, [prepare_run(record, (0.0, 100.0), "negative", 0.0)], [left])
+
+    with pytest.raises(fits.DataError, match=r"thinned.csv: sampled at 300 Hz, .* would lie near 100 Hz"):
+        refused(300.0, 1.0)
+    with pytest.raises(fits.DataError, match=r"thinned.csv: sampled at 40 Hz, .* would lie far beyond"):
+        refused(40.0, 1.0)
+    # No more than noise is left, or the samples are many.
+    refused(300.0, 0.1)
+    refused(600.0, 1.0)
+
+
+@pytest.mark.study
 def test_a_run_sampled_too_slowly_for_its_mode_is_refused(rig, rng):
     fast = rig.records["fast"]
     # Its rate falls to 1.5 times the resonance.
@@ -237,7 +271,9 @@ def test_runs_of_different_rigs_are_refused(rig):
 @pytest.mark.study
 def test_a_command_held_in_steps_is_fitted(tau, seed):
     """Slow loops lag by what a slow driver takes, and whole samples see nothing of a quick one."""
-    text = SCENARIO.format(tau=tau, frequency=120.0, damping=0.05).replace("[plant]", '[plant]\nhold = "zero"')
+    text = SCENARIO.format(plays=2000, tau=tau, frequency=120.0, damping=0.05).replace(
+        "[plant]", '[plant]\nhold = "zero"'
+    )
     bench = data_synth.simulate(data_synth.parse_scenario(text), seed)
     runs = [Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in bench.records[:2]]
     result = fits.fit_stage(runs, stage=fits.default_stage("zero"), initial="negative", levels=16, holdout=0.0)
@@ -251,8 +287,8 @@ def test_a_command_held_in_steps_is_fitted(tau, seed):
         fits.fit_stage(runs, stage=linear)
 
 
-def test_a_run_given_twice_is_refused(rig):
-    slow = rig.records["slow"]
+def test_a_run_given_twice_is_refused(rough_rig):
+    slow = rough_rig.records["slow"]
     again = dataclasses.replace(slow, source="again.csv")
     with pytest.raises(fits.DataError, match=r"slow.csv and again.csv hold the same samples"):
         fits.fit_stage([slow, again])
@@ -269,9 +305,9 @@ def test_a_run_given_twice_is_refused(rig):
         ({"holdout": 0.95}, "fraction held out is 0.95"),
     ],
 )
-def test_settings_that_cannot_be_honoured_are_refused(rig, settings, sentence):
+def test_settings_that_cannot_be_honoured_are_refused(rough_rig, settings, sentence):
     with pytest.raises(fits.DataError, match=sentence):
-        fits.fit_stage([rig.records["slow"], rig.records["fast"]], **settings)
+        fits.fit_stage([rough_rig.records["slow"], rough_rig.records["fast"]], **settings)
     with pytest.raises(fits.DataError, match="no record"):
         fits.fit_stage([])
 

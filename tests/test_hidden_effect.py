@@ -16,7 +16,7 @@ from fits.report._diagnosis_json import diagnosis_schema
 FOUND = ("creep",)
 # Without an effect, a rig in a thousand may be accused.
 FALSE_ALARM = 0.001
-SAMPLES = {"slow_samples": 2500, "fast_samples": 4000}
+SAMPLES = {"slow_samples": 1500, "fast_samples": 2500}
 
 
 def diagnosed(folder, effects, *options):

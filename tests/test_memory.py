@@ -4,12 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _models import compiled
+from _models import compiled, without_a_cpu
 from _reference import branches, forest_totals, reduced
+from jax import lax
 
 import microid as m
 from microid._forest import _down, _down_by_jumping, _up, _up_by_jumping
 from microid._memory import _by_lifting, _by_stack
+from microid._platform import _by_platform
 
 LENGTH = 60
 SEARCHES = {"stack": compiled(_by_stack), "lifting": compiled(_by_lifting)}
@@ -150,7 +152,7 @@ def test_sums_along_a_forest_and_their_transposes(variant, columns, rng):
 @pytest.mark.parametrize("variant", SUMS)
 def test_forest_sum_is_linear_in_both_modes(variant, rng, monkeypatch):
     if variant == "jumping":
-        monkeypatch.setattr(jax.lax, "platform_dependent", lambda *operands, default, **_: default(*operands))
+        without_a_cpu(monkeypatch)
 
     @compiled
     def all_modes(step, anchor, tangent, cotangent):
@@ -185,3 +187,16 @@ def test_memory_carries_no_derivative_but_the_voltages_do(rng):
     expected = np.equal.outer(anchor, np.arange(9, LENGTH + 9)).astype(float)
     np.testing.assert_array_equal(of_anchors, expected)
     assert np.all(of_end.sum(axis=1)[1:] == 1)
+
+
+def test_on_a_cpu_the_algorithms_of_other_devices_are_not_traced(monkeypatch):
+    def refuse(_):
+        raise AssertionError("traced")
+
+    assert _by_platform(np.ones(3), cpu=lax.neg, default=refuse).tolist() == [-1.0] * 3
+    # Where there are other devices the place of the arrays decides.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    found = jax.jit(lambda x: _by_platform(x, cpu=lax.neg, default=lax.abs))(np.ones(3))
+    assert found.tolist() == [-1.0] * 3
+    with pytest.raises(AssertionError, match="traced"):
+        jax.jit(lambda x: _by_platform(x, cpu=lax.neg, default=refuse))(np.ones(3))

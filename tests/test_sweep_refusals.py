@@ -129,14 +129,23 @@ def made_up(sweep, chunk, tell=lambda _: None):
     return Rows(outputs, tuple("wrong" if row % 7 == 6 else "" for row in rows))
 
 
+@pytest.fixture(scope="module")
+def once(tmp_path_factory):
+    """A folder with a sweep of made-up rows that has run."""
+    folder = tmp_path_factory.mktemp("once")
+    (folder / "sweep.toml").write_text(small(1))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(_run, "compute_chunk", made_up)
+        run_sweep(read_sweep(folder / "sweep.toml"), str(folder / "out"))
+    return folder
+
+
 @pytest.fixture
-def kept(tmp_path, monkeypatch):
+def kept(once, tmp_path, monkeypatch):
     """A sweep of made-up rows, its text in a file, and its folder."""
     monkeypatch.setattr(_run, "compute_chunk", made_up)
-    file, out = tmp_path / "sweep.toml", tmp_path / "out"
-    file.write_text(small(1))
-    run_sweep(read_sweep(file), str(out))
-    return file, out
+    shutil.copytree(once, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "sweep.toml", tmp_path / "out"
 
 
 @pytest.mark.parametrize("cluster", ["local:x", "local:0", "local:99999"])

@@ -21,9 +21,6 @@ SAMPLES = 160
 PLANT, GAIN, OFFSET = np.array([2e-3, 60.0, 0.3]), 0.12, 1.5
 
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
-
 def stage_of(plant, gain=GAIN):
     return linear_stage_of(plant, gain, OFFSET)
 

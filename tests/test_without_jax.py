@@ -33,7 +33,6 @@ EXACT = 1e-12
 SAMPLES = 300
 
 inverse = compiled(m.invert)
-pytestmark = pytest.mark.usefixtures("compiled_fast")
 
 
 def uncertainty_of(rng, model):

@@ -4,6 +4,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from microid._platform import _by_platform
+
 
 def _plays(
     signal: Float[Array, " t"], slack: Float[Array, " k"], start: Float[Array, " k"] | None = None
@@ -26,7 +28,7 @@ def _plays(
     start = jnp.zeros_like(slack) if start is None else start
     low, high = signal[:, None] - slack[None], signal[:, None] + slack[None]
     fixed = lax.stop_gradient((low, high, start))
-    position = lax.platform_dependent(*fixed, cpu=_one_by_one, default=_all_at_once)
+    position = _by_platform(*fixed, cpu=_one_by_one, default=_all_at_once)
     before = jnp.concatenate([fixed[2][None], position[:-1]])
     rising, falling = fixed[0] >= before, fixed[1] <= before
     index = jnp.arange(1, signal.shape[0] + 1, dtype=jnp.int32)[:, None]
