@@ -142,15 +142,19 @@ def _one_more(bench: Bench, projector: Projector, model: Refit, scored: Sequence
 def _ranked(
     bench: Bench, projector: Projector, fitted: list[Rival], before: float, thresholds: Thresholds
 ) -> list[Rival]:
-    """Put effects in order, the best and those about as good by what they leave once the baseline has followed."""
+    """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
+
+    About as good are those that are behind the best by no more than it gains by that.
+    """
     order = sorted(fitted, key=lambda one: one.criterion)
     out = []
+    near = max(thresholds.apart_z**2, _NEAR * (before - order[0].cost)) if order else 0.0
     for place, one in enumerate(order):
-        behind = one.cost - order[0].cost
-        if place >= _NEAREST or behind > max(thresholds.apart_z**2, _NEAR * (before - order[0].cost)):
+        if place >= _NEAREST or one.cost - order[0].cost > near:
             out.append(one)
             continue
         end = fit_jointly(bench, projector, one.refit)
+        near = max(near, one.cost - end[-1].cost) if place == 0 else near
         if end[-1].possible(bench):
             out.append(replace(one, cost=end[-1].cost, criterion=end[-1].criterion(projector.count), end=end))
     # Of an effect the best form counts, which may be another once the baseline has followed.
