@@ -72,6 +72,7 @@ class LinearSystem(eqx.Module):
             other.gain * self.offset + other.offset,
         )
 
+    @eqx.filter_jit
     @full_precision
     def respond(
         self,

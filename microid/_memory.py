@@ -1,6 +1,7 @@
 """What a hysteresis remembers: the extremes of its input that have not been wiped out."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -147,6 +148,7 @@ def _branches(path: Float[Array, " m"]) -> tuple[Int[Array, " m"], Bool[Array, "
     return _by_platform(lax.stop_gradient(path), cpu=_by_stack, default=_by_lifting)
 
 
+@jax.jit
 def remember(voltage_V: Float[Array, " n"], start: Staircase) -> Memory:
     """Find, for every sample of a voltage, the remembered extreme that its branch hangs from.
 
