@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from _diagnosis import KINDS, diagnosis, run_view
 
-from fits.diagnosis._result import EffectParameter, Gain, RunView
+from fits import ParameterEstimate
+from fits.diagnosis._result import Gain, RunView
 from fits.plots._residual_views import VIEWS
 from fits.plots._style import thinned
 from fits.report._diagnosis import report_html
@@ -97,6 +98,11 @@ def test_json_says_what_the_diagnosis_says(rng):
         "gain_per_decade": {"value": 0.01542, "sd": 0.00031, "unit": "1", "lower": 0.0148, "upper": 0.016},
         "onset_s": {"value": 0.1, "sd": None, "unit": "s", "lower": None, "upper": None},
     }
+    assert content["baseline_parameters"]["mechanics.natural_frequency_Hz"]["sd"] == 0.21
+    assert (
+        content["extended_parameters"]["creep.gain_per_decade"]
+        == content["causes"][0]["parameters"]["gain_per_decade"]
+    )
     assert content["causes"][0]["also_consistent"] == ["thermal_drift"]
     assert content["upper_bounds"][1]["bound_um"] is None
     assert content["gain"]["heldout_rms_after_um"] == 0.0123
@@ -145,6 +151,8 @@ def test_report_is_one_whole_page(rng, kind):
         assert shown in words
     if found.causes:
         assert "0.01542" in words
+        # The stage before and after, down to the second digit of its standard deviation.
+        assert "149.80149.39 to 150.21150.020149.950 to 150.090Hz" in words
         assert "47.1 nm" in words
         assert found.next_experiment.purpose in words
     assert "<b>" not in text
@@ -212,7 +220,7 @@ def test_the_view_of_hum_shows_its_line(rng):
 def test_numbers_have_sensible_digits():
     shown = [number(x) for x in (0.0, 1234.5, 12.345, 0.09996, -0.000123, 2.5e-7, np.nan, 999.96)]
     assert shown == ["0", "1234", "12.3", "0.100", "−0.000123", "2.50 × 10⁻⁷", "–", "1000"]  # noqa: RUF001
-    assert estimate(EffectParameter("a", 12.3456, 0.0234, "1", 12.29, 12.41)) == (
+    assert estimate(ParameterEstimate("a", "1", 12.3456, 0.0234, 12.29, 12.41)) == (
         "12.346",
         "0.023",
         "12.290 to 12.410",
@@ -220,7 +228,9 @@ def test_numbers_have_sensible_digits():
     assert [percent(x) for x in (0.0, 0.004, 0.5, 0.999, 1.0)] == ["0 %", "< 1 %", "50 %", "> 99 %", "100 %"]
     assert (chance(1e-12), chance(0.0123)) == ("below 10⁻⁹", "0.012")
     assert [sigmas(z) for z in (0.04, -2.71, 24.31, 12345.0)] == ["0.0", "−2.7", "24.3", "12345"]  # noqa: RUF001
-    named = [parameter_name(EffectParameter(n, 1, 1, u, 1, 1)) for n, u in (("onset_s", "s"), ("a_um_per_s", "um/s"))]
+    named = [
+        parameter_name(ParameterEstimate(n, u, 1, 1, 1, 1)) for n, u in (("onset_s", "s"), ("a_um_per_s", "um/s"))
+    ]
     assert named == ["onset", "a"]
     assert [shown_unit(u) for u in ("1", "um", "um/K", "1/K", "um/V^2")] == ["", "µm", "µm/K", "1/K", "µm/V²"]
 

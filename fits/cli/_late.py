@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fits.io._atomic import finite_json, refuse_nonfinite, write_csv
     from fits.io._inspect import inspect_table
     from fits.io._jax_setup import start_jax
+    from fits.io._json import strict
     from fits.io._limits import allowed, check_command, joined, measured_ranges, parse_limits, ranges_json, reached_in
     from fits.io._model_text import read_model_text
     from fits.io._quantity import Quantity
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from fits.loop._plain_file import plain_loop
     from fits.loop._prediction import Prediction
     from fits.loop._report import fit_report
-    from fits.loop._report_words import describe
+    from fits.loop._report_words import describe, parameter_lines
     from fits.loop._result import FitError
     from fits.machining._budget import budget
     from fits.machining._claims import describe_claims, paper_claims

@@ -54,11 +54,13 @@ def _numbers(part: Any, path: str = "") -> Iterator[dict[str, Any]]:
 
 
 def _known_of_fit(path: str, held: dict[str, Any]) -> str:
-    if held["fit"].get("part_of") == "diagnosis" and held["uncertainty"] is None:
-        return "written by 'microid diagnose', whose report says how well it predicts"
-    if held["uncertainty"] is None:
+    diagnosed = held["fit"].get("part_of") == "diagnosis"
+    if held["uncertainty"] is None and not diagnosed:
         return "saved without the uncertainty of a fit, so how well it predicts is not known"
     try:
+        if diagnosed:
+            rows = late.parameter_lines(held["fit"].get("parameters", ()))
+            return "\n".join(["written by 'microid diagnose', whose report says how well it predicts", *rows])
         return late.describe(held["fit"])
     except (LookupError, TypeError, ValueError, AttributeError):
         # The format does not say what a report holds, and the words are made for that of a fit.
