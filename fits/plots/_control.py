@@ -11,19 +11,25 @@ from fits.control._follow import Compensation
 from fits.control._tune_start import slope_array
 from fits.io._errors import AnyPath
 from fits.io._record import Record, Reference
-from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save_all
 from fits.stats._metrics import TWO_SIDED_95
 from microid import AbstractController, ControlledRun, Preisach, Stage, loop_gain
 
 
 def plot_control(
-    run: ControlledRun, controller: AbstractController, plants: Sequence[Stage], folder: AnyPath, *, delay: int = 0
+    run: ControlledRun,
+    controller: AbstractController,
+    plants: Sequence[Stage],
+    folder: AnyPath,
+    *,
+    delay: int = 0,
+    form: str = "png",
 ) -> list[Path]:
     """Draw a run, and the loop gain and sensitivity of every plant.
 
     The run is from `microid.simulate_loop`, the controller and its delay in samples as they were given there; the
-    first plant is the one that was run. `run.png` and `margins.png` are written into an existing folder, at 200 dots
-    per inch; a `DataError` says if they cannot be.
+    first plant is the one that was run. `run` and `margins` are written into an existing folder, in the form `png`
+    (200 dots per inch), `svg` or `pdf`; a `DataError` says if they cannot be.
     """
     time_s = np.asarray(run.time_s)
     picture, (above, error, below) = panels(WIDE_in, 5.2, 3, 1, sharex=True, height_ratios=(1.6, 1, 1))
@@ -37,7 +43,7 @@ def plot_control(
     label(error, "", "error (µm)")
     label(below, "time (s)", "command (V)")
     legend(picture, (above,))
-    files = [save(picture, Path(folder) / "run.png")]
+    pictures = {"run": picture}
 
     linear = controller.linear()
     frequency = 0.5 / float(controller.interval_s) * np.logspace(-3.5, 0, 600)
@@ -56,7 +62,7 @@ def plot_control(
     label(turn, "", "phase (°)")
     label(peak, "frequency (Hz)", "sensitivity")
     legend(picture, (size,))
-    return [*files, save(picture, Path(folder) / "margins.png")]
+    return save_all(pictures | {"margins": picture}, folder, form)
 
 
 def plot_compensation(
@@ -67,6 +73,7 @@ def plot_compensation(
     folder: AnyPath,
     *,
     initial: str = "negative",
+    form: str = "png",
 ) -> list[Path]:
     """Draw the loop, the inverse loop, the compensated output against its reference, and the error.
 
@@ -74,8 +81,8 @@ def plot_compensation(
     voltage over its reference. The error is that of the model, with the band in which the stage is expected, by the
     standard deviation of the displacement from `predict`, shape `(n,)`; without one no band is drawn.
 
-    Model, reference and initial memory are those that `compensate` was given. `compensation.png` is written into an
-    existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
+    Model, reference and initial memory are those that `compensate` was given. `compensation` is written into an
+    existing folder, in the form `png` (200 dots per inch), `svg` or `pdf`; a `DataError` says if it cannot be.
     """
     wanted, voltage, reached = compensation.reference_um, compensation.voltage_V, compensation.displacement_um
     # A voltage proportional to the reference, within the voltages used.
@@ -101,4 +108,4 @@ def plot_compensation(
             curve(error, reference.time_s, off + side, name, color=DARK, linestyle=":", linewidth=0.7)
     label(error, "time (s)", "error (µm)", "error")
     legend(picture, (loop, inverse, error))
-    return [save(picture, Path(folder) / "compensation.png")]
+    return save_all({"compensation": picture}, folder, form)

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from fits.io._errors import AnyPath
-from fits.plots._style import WIDE_in, label, panels, save, verbatim
+from fits.plots._style import WIDE_in, label, panels, save_all, verbatim
 from fits.sweeps._show import open_sweep, readable, summarise
 from fits.sweeps._store import about_of
 from fits.sweeps._types import DONE
@@ -27,8 +28,11 @@ class _Rows:
     values: np.ndarray
 
 
-def plot_sweep(folder: AnyPath, out: Path, by: str | None = None) -> list[Path]:
-    """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back."""
+def plot_sweep(folder: AnyPath, out: AnyPath, by: str | None = None, *, form: str = "png") -> list[Path]:
+    """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back.
+
+    The form is `png` (200 dots per inch), `svg` or `pdf`.
+    """
     names, data = about_of(folder)["parameters"], open_sweep(folder)
     with readable(folder):
         by = by or summarise(folder)["best"]["by"]
@@ -44,12 +48,12 @@ def plot_sweep(folder: AnyPath, out: Path, by: str | None = None) -> list[Path]:
             if found.dtype.kind != "f":
                 rows.words[name], found = np.unique(found.astype(str), return_inverse=True)
             rows.swept[name] = found
-    made = [_parallel(out / "parallel.svg", rows)]
     pairs = list(itertools.combinations(names, 2))[:6]
-    return made + [_heat(out / f"heat_{k}.svg", rows, pair) for k, pair in enumerate(pairs)]
+    maps = {f"heat_{k}": _heat(rows, pair) for k, pair in enumerate(pairs)}
+    return save_all({"parallel": _parallel(rows)} | maps, out, form)
 
 
-def _parallel(path: Path, rows: _Rows) -> Path:
+def _parallel(rows: _Rows) -> Figure:
     every = max(1, -(-len(rows.values) // 400))  # more lines do not show
     columns = np.stack([*rows.swept.values(), rows.values], axis=1)[::every]
     low, high = columns.min(axis=0), columns.max(axis=0)
@@ -63,10 +67,10 @@ def _parallel(path: Path, rows: _Rows) -> Path:
     axes.set_xticks(range(len(ranges)), [f"{verbatim(name)}\n{each}" for name, each in ranges.items()], fontsize=6)
     axes.set_yticks([])
     label(axes)
-    return save(picture, path)
+    return picture
 
 
-def _heat(path: Path, rows: _Rows, pair: tuple[str, str]) -> Path:
+def _heat(rows: _Rows, pair: tuple[str, str]) -> Figure:
     logs = [name not in rows.words and _logarithmic(rows.swept[name]) for name in pair]
     x, y = (np.log10(rows.swept[name]) if log else rows.swept[name] for name, log in zip(pair, logs, strict=True))
     edges = [_edges(x), _edges(y)]
@@ -83,7 +87,7 @@ def _heat(path: Path, rows: _Rows, pair: tuple[str, str]) -> Path:
     for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
         if name in rows.words:
             axis.set_ticks(range(len(rows.words[name])), [verbatim(word, 24) for word in rows.words[name]])
-    return save(picture, path)
+    return picture
 
 
 def _logarithmic(found: np.ndarray) -> bool:
