@@ -254,6 +254,7 @@ def opened(text, width_px, folder):
         "frame.addEventListener('load', () => { const w = frame.contentWindow, d = w.document;"
         "document.getElementById('seen').textContent = JSON.stringify({width: w.innerWidth,"
         "needed: d.documentElement.scrollWidth, problems: w.problems,"
+        "lefts: [...d.querySelectorAll('article')].map(one => one.getBoundingClientRect().left),"
         "pictures: [...d.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().width),"
         "broken: [...d.images].filter(i => !i.complete || !i.naturalWidth).length}); });"
         f"frame.srcdoc = {page};</script></body>",

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from fits.loop._plain_file import plain_loop
     from fits.loop._prediction import Prediction
     from fits.loop._report import fit_report
-    from fits.loop._report_words import describe, parameter_lines
+    from fits.loop._report_words import describe
     from fits.loop._result import FitError
     from fits.machining._budget import budget
     from fits.machining._claims import describe_claims, paper_claims
@@ -49,7 +49,9 @@ if TYPE_CHECKING:
     from fits.report._control import control_json, describe_control
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
+    from fits.report._gallery import gallery_html
     from fits.report._machining import budget_json, sensitivity_json
+    from fits.report._model_words import model_kind, model_numbers, model_words
     from fits.report._page import write_page
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow
