@@ -134,7 +134,7 @@ class Page(html.parser.HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] not in ("style", "script"):
             self.text += data
 
 
@@ -158,7 +158,7 @@ def test_report_is_one_whole_page(rng, kind):
     assert "<b>" not in text
     for link in page.links:
         assert link.startswith(("#", "data:"))
-    assert not re.search(r"@import|url\((?!#)|<script", text)
+    assert not re.search(r"@import|url\((?!#)|<script[^>]|fetch\(|import\(", text)
     assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
     assert "nan" not in re.sub(r"[a-z]{4,}", "", words.lower()).split()
     assert len(set(page.ids)) == len(page.ids)
@@ -240,8 +240,11 @@ def browser():
     return next(filter(None, map(shutil.which, names)), None)
 
 
-def opened(text, width_px, folder):
-    """What a browser says of a page in a frame of a width; a window cannot be as narrow as a phone."""
+def opened(text, width_px, folder, act="null"):
+    """What a browser says of a page in a frame of a width; a window cannot be as narrow as a phone.
+
+    `act` is what is done there before, with the window `w` and the document `d`, and comes back as `acted`.
+    """
     watch = (
         "<script>window.problems = []; addEventListener('error', e => problems.push(String(e.message)), true);"
         "console.error = (...words) => problems.push(words.join(' '));</script>"
@@ -252,7 +255,8 @@ def opened(text, width_px, folder):
         f"<!DOCTYPE html><body><iframe id='frame' width='{width_px}' height='800' style='border:0'></iframe>"
         "<pre id='seen'></pre><script>const frame = document.getElementById('frame');"
         "frame.addEventListener('load', () => { const w = frame.contentWindow, d = w.document;"
-        "document.getElementById('seen').textContent = JSON.stringify({width: w.innerWidth,"
+        f"const acted = {act};"
+        "document.getElementById('seen').textContent = JSON.stringify({acted, width: w.innerWidth,"
         "needed: d.documentElement.scrollWidth, problems: w.problems,"
         "lefts: [...d.querySelectorAll('article')].map(one => one.getBoundingClientRect().left),"
         "pictures: [...d.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().width),"
@@ -286,3 +290,33 @@ def test_a_browser_shows_the_report_without_scrolling_sideways(rng, tmp_path, wi
     assert all(250 < width <= width_px for width in visible)
     wide = report_html(found).replace("<main>", '<main><div style="width: 3000px">x</div>', 1)
     assert opened(wide, width_px, tmp_path)["needed"] > width_px
+
+
+# Drags over the first panel from 40 to 60 % of its width, and says where its curve, ticks and hint are then.
+DRAG = """(() => {
+    const svg = d.querySelector(".wide svg[data-spans]"), pad = svg.querySelector("rect.zoom");
+    const box = pad.getBoundingClientRect(), curve = svg.querySelector("[id$=zoom0-0]");
+    const at = share => ({clientX: box.left + share * box.width, clientY: box.top + 5, bubbles: true});
+    const send = (name, share) => pad.dispatchEvent(new w.MouseEvent(name, at(share)));
+    const told = () => ({width: curve.getBoundingClientRect().width / box.width, texts:
+        [...svg.querySelectorAll("[id$=ticks0] > g")].filter(g => g.style.display !== "none")
+        .filter(g => g.querySelector("use")).map(g => g.querySelector("text").textContent)});
+    const before = told();
+    send("pointerdown", 0.4); send("pointermove", 0.6); send("pointerup", 0.6);
+    const zoomed = told();
+    send("dblclick", 0.5);
+    return {before, zoomed, after: told(), hint: !svg.closest("figure").querySelector(".hint").hidden};
+})()"""
+
+
+@pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the report with")
+def test_a_stretch_of_a_trace_is_enlarged_where_it_is_dragged_over(rng, tmp_path):
+    seen = opened(report_html(diagnosis(rng, n=2000, count=1)), 1200, tmp_path, DRAG)
+    acted, (before, zoomed) = seen["acted"], (seen["acted"][name]["texts"] for name in ("before", "zoomed"))
+    assert seen["problems"] == []
+    assert acted["hint"]
+    assert acted["after"] == acted["before"]
+    assert acted["zoomed"]["width"] == pytest.approx(5 * acted["before"]["width"], rel=0.01)
+    # The run takes 19.99 s, so that these are those from 8 s to just short of 12 s.
+    assert (float(before[0]), float(before[-1])) == (0.0, 17.5)
+    assert sorted(map(float, zoomed)) == [8.0, 9.0, 10.0, 11.0]

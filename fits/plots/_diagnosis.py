@@ -37,12 +37,20 @@ class Picture:
     narrow: str
 
 
-def _drawn(name: str, words: str, draw: Callable[[float], Figure]) -> Picture:
-    return Picture(*(_svg(draw(width), f"{name}-{width:.0f}-", words) for width in (_WIDE_in, _NARROW_in)))
+def _drawn(name: str, words: str, draw: Callable[[float], Figure], zoom: bool = False) -> Picture:
+    return Picture(*(_svg(draw(width), f"{name}-{width:.0f}-", words, zoom) for width in (_WIDE_in, _NARROW_in)))
 
 
-def _svg(picture: Figure, prefix: str, words: str) -> str:
-    """Write a figure as one `svg` element whose names do not meet those of other figures."""
+def _svg(picture: Figure, prefix: str, words: str, zoom: bool = False) -> str:
+    """Write a figure as one `svg` element whose names do not meet those of other figures.
+
+    With `zoom` the page's script finds there what it stretches of each panel, and from where to where that goes.
+    """
+    for k, axes in enumerate(picture.axes if zoom else ()):
+        axes.xaxis.set_gid(f"ticks{k}")
+        for n, each in enumerate([*axes.lines, *axes.patches]):
+            each.set_gid(f"zoom{k}-{n}")
+    spans = f' data-spans="{[[*map(float, axes.get_xlim())] for axes in picture.axes]}"' if zoom else ""
     for axes in picture.axes:
         axes.tick_params(width=0.6, length=2.5, color=INK)
         axes.spines[:].set(linewidth=0.6, color=INK)
@@ -61,7 +69,7 @@ def _svg(picture: Figure, prefix: str, words: str) -> str:
     text = re.sub(r' d="[^"]*"', lambda found: digits.sub(r"\1", found[0]).replace("\n", ""), text)
     for size in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
-    return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(words)}"', 1).strip()
+    return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(words)}"{spans}', 1).strip()
 
 
 def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
@@ -77,7 +85,7 @@ def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
     words = "Residual over time before and after the extension, with the band of the noise"
     if not shown_runs(diagnosis.runs):
         return None
-    return _drawn("residuals", words, lambda width_in: residual_figure(diagnosis, width_in, per_um, unit))
+    return _drawn("residuals", words, lambda width_in: residual_figure(diagnosis, width_in, per_um, unit), True)
 
 
 def residual_figure(
@@ -85,7 +93,8 @@ def residual_figure(
 ) -> Figure:
     """The same as a figure of a width; the band is that of two standard deviations of the noise."""
     runs = shown_runs(diagnosis.runs)
-    points = max(_POINTS // (2 * len(runs)), 200)
+    # Where there is room, as many as show when a stretch is enlarged.
+    points = max((3 if width_in == _WIDE_in else 1) * _POINTS // (2 * len(runs)), 200)
     # What is left out at the start of a run, as its past is unknown, may be off by much more than all that counts.
     shown = [(run.before_um, run.after_um)[side][np.argmax(run.fitted) :] for run in runs for side in (0, 1)]
     highest_um = max((float(np.nanmax(np.abs(one))) for one in shown if np.isfinite(one).any()), default=0.0)
@@ -163,4 +172,4 @@ def program(ahead: Experiment) -> Picture | None:
         label(axes, "time (s)", "voltage (V)")
         return picture
 
-    return _drawn("program", "Voltage of the next experiment over time", draw)
+    return _drawn("program", "Voltage of the next experiment over time", draw, True)
