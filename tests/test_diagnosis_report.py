@@ -159,7 +159,11 @@ def test_report_is_one_whole_page(rng, kind):
     for link in page.links:
         assert link.startswith(("#", "data:"))
     assert not re.search(r"@import|url\((?!#)|<script[^>]|fetch\(|import\(", text)
-    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
+    linked = {link[1:] for link in page.links if link.startswith("#")}
+    assert linked <= set(page.ids)
+    if kind == "effect_found":
+        # Every word that is explained is linked to from where it stands.
+        assert set(re.findall(r'<dt id="(\w+)">', text)) <= linked
     assert "nan" not in re.sub(r"[a-z]{4,}", "", words.lower()).split()
     assert len(set(page.ids)) == len(page.ids)
 
