@@ -64,11 +64,13 @@ def runs_read(runs: Sequence[RunView]) -> list[tuple[str, ...]]:
 
 
 def stage_parameters(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
-    """Name, value and 95 % interval in the plain and in the extended stage, and unit of what was fitted of both."""
-    after = {one.name: one for one in diagnosis.extended_parameters}
-    rows: list[tuple[str, ...]] = []
+    """Heads and rows of a table: what was fitted of the plain stage, and beside causes of both, with intervals."""
+    after = {one.name: one for one in diagnosis.extended_parameters if diagnosis.causes}
+    sides = ("Plain", "Extended") if after else ("Estimate",)
+    rows: list[tuple[str, ...]] = [
+        ("Parameter", *(head for side in sides for head in (side, "95 % interval")), "Unit")
+    ]
     for one in diagnosis.baseline_parameters:
-        if there := after.get(one.name):
-            cells = (cell for each in (one, there) for cell in estimate(each)[::2])
-            rows.append((plain(parameter_name(one).replace(".", " ")), *cells, shown_unit(one.unit) or "1"))
+        cells = (cell for each in (one, after.get(one.name, one))[: len(sides)] for cell in estimate(each)[::2])
+        rows.append((plain(parameter_name(one).replace(".", " ")), *cells, shown_unit(one.unit) or "1"))
     return rows
