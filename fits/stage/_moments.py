@@ -64,11 +64,10 @@ class Chain(eqx.Module):
     def parameters(self, z: np.ndarray) -> tuple[list[tuple[str, str]], np.ndarray, np.ndarray]:
         """Names and units of the parameters outside the grid, values, and derivatives by their own coordinates."""
         point = jnp.asarray(z)
+        stage = self.coordinates(point)
         named = [
-            (name + ("" if info.shape == () else str(list(place))), info.spec.unit)
-            for stage in [self.coordinates(point)]
+            (stage.named(info.path) + ("" if info.shape == () else str(list(place))), info.spec.unit)
             for info in self.coordinates.table
-            for name in [stage.named(info.path)]
             for place in np.ndindex(info.shape)
         ]
         value, slope = jax.jvp(self.coordinates.values, (point,), (jnp.ones_like(point),))
