@@ -23,7 +23,7 @@ __all__ = [  # noqa: RUF022
     "ModalFit", "Multisine", "ResponseData", "estimate_response", "fit_hysteresis", "fit_response", "read_multisine",
     "read_response", "relative_error",
     # Diagnosis
-    "Bound", "Diagnosis", "EffectParameter", "Experiment", "FoundCause", "Gain", "NoiseBand", "NoiseLine",
+    "Bound", "Diagnosis", "Experiment", "FoundCause", "Gain", "NoiseBand", "NoiseLine",
     "Thresholds", "diagnose", "diagnosis_json", "diagnosis_schema", "report_html",
     # Compensation and control
     "Compensation", "Goal", "LoopReport", "NetworkInverse", "Tuning", "UltimatePoint", "compensate", "export_c",
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from fits.control._tune_problem import Goal, LoopReport, Tuning
     from fits.control._tune_start import UltimatePoint, relay_start, steepest_slope, ultimate_point
     from fits.diagnosis._diagnose import diagnose
-    from fits.diagnosis._result import Bound, Diagnosis, EffectParameter, Experiment, FoundCause, Gain
+    from fits.diagnosis._result import Bound, Diagnosis, Experiment, FoundCause, Gain
     from fits.diagnosis._thresholds import Thresholds
     from fits.io._errors import DataError
     from fits.io._read_csv import read_csv, read_reference, read_runs, read_table

@@ -1,12 +1,13 @@
 """A diagnosis made by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from fits import default_stage
+from fits import ParameterEstimate, default_stage
 from fits.diagnosis._result import (
     Bound,
     Diagnosis,
-    EffectParameter,
     Experiment,
     FoundCause,
     Gain,
@@ -28,8 +29,8 @@ def run_view(rng, source, n):
 
 
 def cause(name, also=()):
-    gain = EffectParameter("gain_per_decade", 0.01542, 0.00031, "1", 0.0148, 0.016)
-    onset = EffectParameter("onset_s", 0.1, np.nan, "s", np.nan, np.inf)
+    gain = ParameterEstimate("gain_per_decade", "1", 0.01542, 0.00031, 0.0148, 0.016)
+    onset = ParameterEstimate("onset_s", "s", 0.1, np.nan, np.nan, np.inf)
     words = f"{name} shows {ODD}"
     return FoundCause(name, "log", also, 24.3, 3e-12, (gain, onset), 0.93, 0.045, words, "Steps.", "a book")
 
@@ -62,4 +63,9 @@ def diagnosis(rng, kind="effect_found", n=3000, count=2):
         extended=stage,
         runs=tuple(run_view(rng, f"{ODD}{k}.csv", n) for k in range(count)),
         false_alarm=0.01,
+        baseline_parameters=(ParameterEstimate("mechanics.natural_frequency_Hz", "Hz", 149.8, 0.21, 149.39, 150.21),),
+        extended_parameters=(
+            ParameterEstimate("mechanics.natural_frequency_Hz", "Hz", 150.02, 0.034, 149.95, 150.09),
+            *(replace(each, name=f"{one.name}.{each.name}") for one in names[kind] for each in one.parameters),
+        ),
     )

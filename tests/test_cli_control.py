@@ -9,6 +9,7 @@ from _command import columns_of, files, refused, run, whole_picture
 from _models import linear_stage_of
 from scipy.signal import TransferFunction, cont2discrete, lfilter, step
 
+import fits.plots._style
 import microid as m
 from fits import save_model
 from fits.cli._main import cli
@@ -58,7 +59,9 @@ def closed_by_scipy(gains, reference, start):
     return start + lfilter(padded, whole, reference - start)
 
 
-def test_given_gains_are_run_as_scipy_runs_them(folder, tmp_path):
+def test_given_gains_are_run_as_scipy_runs_them(folder, tmp_path, monkeypatch):
+    pictures, save = {}, fits.plots._style.save
+    monkeypatch.setattr("fits.plots._style.save", lambda *one: pictures.update({one[1].stem: one[0]}) or save(*one))
     gains = (0.5, 80.0, 1e-3)
     given = ",".join(map(str, gains))
     result = run(
@@ -85,6 +88,14 @@ def test_given_gains_are_run_as_scipy_runs_them(folder, tmp_path):
     assert [path.name for path in sorted((tmp_path / "plots").iterdir())] == ["margins.png", "run.png"]
     for place in told["plots"]:
         whole_picture(place)
+    # The limits are drawn, and the peak as high as is told, between the samples of a coarse line.
+    size, turn, peak = pictures["margins"].axes
+    dashed = [
+        line.get_ydata()[0] for axes in (size, turn, peak) for line in axes.lines if line.get_linestyle() == "--"
+    ]
+    assert dashed == [0.5, -150.0, 2.0]
+    highest = max(float(np.max(line.get_ydata())) for line in peak.lines if len(line.get_ydata()) > 2)
+    assert highest == pytest.approx(told["margins"]["sensitivity_peak"], rel=1e-3)
     # What --json printed is taken as gains again.
     (tmp_path / "gains.json").write_text(result.stdout)
     again = run(

@@ -60,6 +60,10 @@ def test_the_command_writes_everything(bench, rng):
     when = re.search(r"read on (20\d\d-\d\d-\d\d \d\d:\d\d UTC)", page)[1]
     assert page == report_html(bench.answer, when)
     assert json.loads((folder / "baseline.json").read_text())["model"]["type"] == "Stage"
+    told = run("info", folder / "extended.json").stdout
+    assert re.search(r"mechanics.natural_frequency_Hz +150.020 ± 0.034 +\(95 % 149.950..150.090\) +Hz", told)
+    assert re.search(r"creep.gain_per_decade +0.01542 ± 0.00031 ", told)
+    assert "natural_frequency_Hz  149.80 ± 0.21" in run("info", folder / "baseline.json").stdout
     as_json = json.loads(run("diagnose", "run.csv", "--out", "a/b", "--json", "--quiet").stdout)
     assert json.loads((folder / "diagnosis.json").read_text()).items() <= as_json.items()
     # What an earlier diagnosis advised is not left beside a later one without advice.

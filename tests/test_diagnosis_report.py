@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from _diagnosis import KINDS, diagnosis, run_view
 
-from fits.diagnosis._result import EffectParameter, Gain, RunView
+from fits import ParameterEstimate
+from fits.diagnosis._result import Gain, RunView
 from fits.plots._residual_views import VIEWS
 from fits.plots._style import thinned
 from fits.report._diagnosis import report_html
@@ -97,6 +98,11 @@ def test_json_says_what_the_diagnosis_says(rng):
         "gain_per_decade": {"value": 0.01542, "sd": 0.00031, "unit": "1", "lower": 0.0148, "upper": 0.016},
         "onset_s": {"value": 0.1, "sd": None, "unit": "s", "lower": None, "upper": None},
     }
+    assert content["baseline_parameters"]["mechanics.natural_frequency_Hz"]["sd"] == 0.21
+    assert (
+        content["extended_parameters"]["creep.gain_per_decade"]
+        == content["causes"][0]["parameters"]["gain_per_decade"]
+    )
     assert content["causes"][0]["also_consistent"] == ["thermal_drift"]
     assert content["upper_bounds"][1]["bound_um"] is None
     assert content["gain"]["heldout_rms_after_um"] == 0.0123
@@ -128,7 +134,7 @@ class Page(html.parser.HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] not in ("style", "script"):
             self.text += data
 
 
@@ -145,13 +151,21 @@ def test_report_is_one_whole_page(rng, kind):
         assert shown in words
     if found.causes:
         assert "0.01542" in words
+        # The stage before and after, down to the second digit of its standard deviation.
+        assert "149.80149.39 to 150.21150.020149.950 to 150.090Hz" in words
         assert "47.1 nm" in words
         assert found.next_experiment.purpose in words
+    else:
+        assert "frequency149.80149.39 to 150.21Hz" in words
     assert "<b>" not in text
     for link in page.links:
         assert link.startswith(("#", "data:"))
-    assert not re.search(r"@import|url\((?!#)|<script", text)
-    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
+    assert not re.search(r"@import|url\((?!#)|<script[^>]|fetch\(|import\(", text)
+    linked = {link[1:] for link in page.links if link.startswith("#")}
+    assert linked <= set(page.ids)
+    if kind == "effect_found":
+        # Every word that is explained is linked to from where it stands.
+        assert set(re.findall(r'<dt id="(\w+)">', text)) <= linked
     assert "nan" not in re.sub(r"[a-z]{4,}", "", words.lower()).split()
     assert len(set(page.ids)) == len(page.ids)
 
@@ -212,7 +226,7 @@ def test_the_view_of_hum_shows_its_line(rng):
 def test_numbers_have_sensible_digits():
     shown = [number(x) for x in (0.0, 1234.5, 12.345, 0.09996, -0.000123, 2.5e-7, np.nan, 999.96)]
     assert shown == ["0", "1234", "12.3", "0.100", "−0.000123", "2.50 × 10⁻⁷", "–", "1000"]  # noqa: RUF001
-    assert estimate(EffectParameter("a", 12.3456, 0.0234, "1", 12.29, 12.41)) == (
+    assert estimate(ParameterEstimate("a", "1", 12.3456, 0.0234, 12.29, 12.41)) == (
         "12.346",
         "0.023",
         "12.290 to 12.410",
@@ -220,7 +234,9 @@ def test_numbers_have_sensible_digits():
     assert [percent(x) for x in (0.0, 0.004, 0.5, 0.999, 1.0)] == ["0 %", "< 1 %", "50 %", "> 99 %", "100 %"]
     assert (chance(1e-12), chance(0.0123)) == ("below 10⁻⁹", "0.012")
     assert [sigmas(z) for z in (0.04, -2.71, 24.31, 12345.0)] == ["0.0", "−2.7", "24.3", "12345"]  # noqa: RUF001
-    named = [parameter_name(EffectParameter(n, 1, 1, u, 1, 1)) for n, u in (("onset_s", "s"), ("a_um_per_s", "um/s"))]
+    named = [
+        parameter_name(ParameterEstimate(n, u, 1, 1, 1, 1)) for n, u in (("onset_s", "s"), ("a_um_per_s", "um/s"))
+    ]
     assert named == ["onset", "a"]
     assert [shown_unit(u) for u in ("1", "um", "um/K", "1/K", "um/V^2")] == ["", "µm", "µm/K", "1/K", "µm/V²"]
 
@@ -230,8 +246,11 @@ def browser():
     return next(filter(None, map(shutil.which, names)), None)
 
 
-def opened(text, width_px, folder):
-    """What a browser says of a page in a frame of a width; a window cannot be as narrow as a phone."""
+def opened(text, width_px, folder, act="null"):
+    """What a browser says of a page in a frame of a width; a window cannot be as narrow as a phone.
+
+    `act` is what is done there before, with the window `w` and the document `d`, and comes back as `acted`.
+    """
     watch = (
         "<script>window.problems = []; addEventListener('error', e => problems.push(String(e.message)), true);"
         "console.error = (...words) => problems.push(words.join(' '));</script>"
@@ -242,8 +261,10 @@ def opened(text, width_px, folder):
         f"<!DOCTYPE html><body><iframe id='frame' width='{width_px}' height='800' style='border:0'></iframe>"
         "<pre id='seen'></pre><script>const frame = document.getElementById('frame');"
         "frame.addEventListener('load', () => { const w = frame.contentWindow, d = w.document;"
-        "document.getElementById('seen').textContent = JSON.stringify({width: w.innerWidth,"
+        f"const acted = {act};"
+        "document.getElementById('seen').textContent = JSON.stringify({acted, width: w.innerWidth,"
         "needed: d.documentElement.scrollWidth, problems: w.problems,"
+        "lefts: [...d.querySelectorAll('article')].map(one => one.getBoundingClientRect().left),"
         "pictures: [...d.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().width),"
         "broken: [...d.images].filter(i => !i.complete || !i.naturalWidth).length}); });"
         f"frame.srcdoc = {page};</script></body>",
@@ -275,3 +296,33 @@ def test_a_browser_shows_the_report_without_scrolling_sideways(rng, tmp_path, wi
     assert all(250 < width <= width_px for width in visible)
     wide = page.replace("<main>", '<main><div style="width: 3000px">x</div>', 1)
     assert opened(wide, width_px, tmp_path)["needed"] > width_px
+
+
+# Drags over the first panel from 40 to 60 % of its width, and says where its curve, ticks and hint are then.
+DRAG = """(() => {
+    const svg = d.querySelector(".wide svg[data-spans]"), pad = svg.querySelector("rect.zoom");
+    const box = pad.getBoundingClientRect(), curve = svg.querySelector("[id$=zoom0-0]");
+    const at = share => ({clientX: box.left + share * box.width, clientY: box.top + 5, bubbles: true});
+    const send = (name, share) => pad.dispatchEvent(new w.MouseEvent(name, at(share)));
+    const told = () => ({width: curve.getBoundingClientRect().width / box.width, texts:
+        [...svg.querySelectorAll("[id$=ticks0] > g")].filter(g => g.style.display !== "none")
+        .filter(g => g.querySelector("use")).map(g => g.querySelector("text").textContent)});
+    const before = told();
+    send("pointerdown", 0.4); send("pointermove", 0.6); send("pointerup", 0.6);
+    const zoomed = told();
+    send("dblclick", 0.5);
+    return {before, zoomed, after: told(), hint: !svg.closest("figure").querySelector(".hint").hidden};
+})()"""
+
+
+@pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the report with")
+def test_a_stretch_of_a_trace_is_enlarged_where_it_is_dragged_over(rng, tmp_path):
+    seen = opened(report_html(diagnosis(rng, n=2000, count=1)), 1200, tmp_path, DRAG)
+    acted, (before, zoomed) = seen["acted"], (seen["acted"][name]["texts"] for name in ("before", "zoomed"))
+    assert seen["problems"] == []
+    assert acted["hint"]
+    assert acted["after"] == acted["before"]
+    assert acted["zoomed"]["width"] == pytest.approx(5 * acted["before"]["width"], rel=0.01)
+    # The run takes 19.99 s, so that these are those from 8 s to just short of 12 s.
+    assert (float(before[0]), float(before[-1])) == (0.0, 17.5)
+    assert sorted(map(float, zoomed)) == [8.0, 9.0, 10.0, 11.0]

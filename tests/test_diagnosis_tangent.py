@@ -10,6 +10,7 @@ from scipy.signal import lsim
 
 from fits import Record
 from fits.diagnosis._baseline import Baseline, simulate, with_effects
+from fits.diagnosis._certainty import stage_estimates
 from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._joint_fit import fit_jointly
 from fits.diagnosis._predict import Hypothesis, Predictor
@@ -49,10 +50,10 @@ def two_runs():
     ]
 
 
-def baseline_of(rng):
+def baseline_of(rng, levels=LEVELS):
     """A plain stage with a density drawn at random, as no fit has to find it."""
     stage = default_stage()
-    grid = Grid(*RANGE_V, LEVELS)
+    grid = Grid(*RANGE_V, levels)
     columns_um = rng.uniform(0.2, 1.0, grid.columns)
     chain = Chain(offsets_out(stage, True), place_of_hysteresis(stage), grid)
     z = np.asarray(chain.coordinates.of(stage))
@@ -68,6 +69,42 @@ EFFECTS = {
     "driver_saturation": DriverSaturation(jnp.asarray(75.0)),
     "slew_limit": SlewLimit(jnp.asarray(6e3)),
 }
+
+
+@pytest.mark.study
+def test_the_intervals_of_a_stage_are_those_of_dense_least_squares(rng):
+    """Derivatives are differences of whole simulations; density, offsets and an effect are fitted beside."""
+    baseline, noise_um = baseline_of(rng, 3), 0.01
+    lag = SensorLowpass(jnp.asarray(2e-3))
+    bench, regression = Bench(baseline), regress(baseline, ((), ()), [[lag], [lag]])
+    projector = Projector(replace(regression, finer=()), [Noise(noise_um, np.zeros(0))] * 2)
+    model = refit(bench, projector, [law := Law([lag, lag])], [law.start], 0)
+    model = replace(model, residual=rng.standard_normal(len(model.residual)))
+    found = stage_estimates(projector, model, bench, baseline)
+
+    def response(moved):
+        z, columns_um, x = np.split(moved, [len(baseline.z), len(baseline.z) + len(baseline.columns_um)])
+        stage = baseline.moved(z, columns_um).stage
+        return [simulate(with_effects(stage, [law.effect(law.start + x, 0)]), run) for run in baseline.coarse]
+
+    size, steps = len(baseline.z) + len(baseline.columns_um) + law.size, []
+    for k in range(size):
+        step = 1e-4 * (np.arange(size) == k)
+        steps.append([(a - b) / 2e-4 for a, b in zip(response(step), response(-step), strict=True)])
+    blocks = [
+        np.column_stack([*(each[run] for each in steps), *(np.ones(900) * (run == other) for other in (0, 1))])
+        for run in (0, 1)
+    ]
+    prior = np.zeros((len(baseline.columns_um), size + 2))
+    prior[:, len(baseline.z) : -2 - law.size] = np.eye(len(prior))
+    design = np.concatenate([*(block / noise_um for block in blocks), prior])
+    sd = np.sqrt(np.diagonal(np.linalg.inv(design.T @ design)))[: len(baseline.z)]
+    # No more than chance makes sums of white noise over blocks wider.
+    z_sd = [one.sd / abs(slope) for one, slope in zip(found, baseline.chain.parameters(baseline.z)[2], strict=True)]
+    np.testing.assert_array_less(0.98 * sd, z_sd)
+    np.testing.assert_array_less(z_sd, 1.6 * sd)
+    for one in found:
+        assert one.lower < one.value < one.upper
 
 
 @pytest.mark.study

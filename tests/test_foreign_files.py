@@ -3,6 +3,7 @@
 import json
 import shlex
 import sys
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -237,10 +238,24 @@ def test_further_formats(tmp_path, name):
 
 def test_several_tables_in_a_labview_file_are_told_apart(tmp_path):
     path = tmp_path / "two.lvm"
-    labview(path, *signals())
-    path.write_text(path.read_text() + "\n" + LVM.partition("***End_of_Header***\t\n\t\n")[2] + "0\t1\t2\n")
-    with pytest.raises(fits.DataError, match=r"two\.lvm, line \d+: expected one table, found 2; split the file"):
-        fits.read_table(path)
+    t, v, y = signals()
+    labview(path, t, v, y)
+    # The second is in mV and nm, in its own header, and begins elsewhere.
+    second = LVM.partition("***End_of_Header***\t\n\t\n")[2].replace("Volts", "mV").replace("Micrometers", "nm")
+    path.write_text(f"{path.read_text()}\n{second}{rows(t, 2000 * v, 1000 * y, separator=chr(9))}")
+    record = fits.read_table(path)
+    assert record.warnings == (f"{path}: it holds 2 tables, and the first was read; the second is {path}#2.",)
+    assert_same(replace(record, warnings=()))
+    other = fits.read_table(f"{path}#2")
+    assert other.warnings == ()
+    np.testing.assert_allclose(other.voltage_V, 2 * v, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(other.displacement_um, y, rtol=0, atol=1e-9)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-1], f"x{lines[-1]}"]))
+    with pytest.raises(fits.DataError, match=rf"two\.lvm#2, line {len(lines)}, column 'time"):
+        fits.read_table(f"{path}#2")
+    with pytest.raises(fits.DataError, match="expected a table from 1 to 2, found number 3"):
+        fits.read_table(f"{path}#3")
 
 
 def test_missing_numbers_are_refused_or_dropped(tmp_path):

@@ -105,12 +105,22 @@ def test_the_extended_model_simulates_new_runs_better(case):
             out = case.folder / f"{which}_{csv.name}"
             done = run("simulate", model, csv, "--out", out, "--json")
             assert done.exit_code == 0, f"{case.seed}: {done.output}"
-            # A diagnosis gives its models no uncertainty, and none is made up.
+            # A diagnosis tells the intervals of parameters, not how they go together, and no more is made up.
             assert json.loads(done.stdout)["displacement_sd_median_um"] is None
             measured = np.genfromtxt(csv, delimiter=",", names=True)
             off_um = measured["displacement_um"] - np.genfromtxt(out, delimiter=",", names=True)["displacement_um"]
             squares[which] += np.sum((off_um - off_um.mean()) ** 2)
     assert squares["extended"] <= squares["baseline"], case.seed
+
+
+def test_the_stage_beside_the_cause_is_known_as_well_as_is_said(case):
+    found, plant = case.found["extended_parameters"], case.truth["plant"]
+    names = ("driver.time_constant_s", "mechanics.natural_frequency_Hz", "mechanics.damping_ratio")
+    for name in names:
+        one, true = found[name], plant[name.partition(".")[2]]
+        # Of a normal error, three in a million are as large.
+        assert abs(one["value"] - true) < 4.5 * one["sd"] < 0.1 * true, (case.seed, name)
+        assert one["lower"] < one["value"] < one["upper"], (case.seed, name)
 
 
 @pytest.mark.study

@@ -38,14 +38,14 @@ def other():
 
 def draw(design, axes, folder):
     figures = []
-    save = fits.plots._machining.save
+    save = fits.plots._style.save
 
     def remember(picture, path):
         figures.append(picture)
         return save(picture, path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fits.plots._machining, "save", remember)
+        patch.setattr("fits.plots._style.save", remember)
         patch.setattr(fits.plots._machining, "paper_claims", lambda _: CLAIMS)
         paths = fits.plot_sensitivity(design, fits.sensitivities(design, axes), folder)
     return paths, figures

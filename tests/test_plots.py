@@ -9,11 +9,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from _command import whole_picture
+from _diagnosis import diagnosis
 
 import fits
 import microid
 from fits import DataError, FitResult, FitStatus, LevelTrial, Record, RunReport, Uncertainty
+from fits.io._summary import AbstractSummary
 from fits.loop._design import Grid
+from fits.plots._results import picture_of
 from fits.plots._style import thinned
 
 LOWER_V, UPPER_V, LEVELS = 0.0, 100.0, 9
@@ -134,3 +137,33 @@ def test_thinning_keeps_every_extreme(rng):
         assert values[inside].min() <= inner.min()
     short = rng.normal(size=10)
     assert np.array_equal(thinned(short), np.arange(10))
+
+
+def test_every_result_with_a_summary_is_drawn_by_itself(rng, model, tmp_path):
+    """The figure is the caller's: nothing is written, and no window of Matplotlib's is open."""
+    results = {each for each in AbstractSummary.__subclasses__() if each.__module__.startswith("fits.")}
+    assert results <= set(picture_of.registry)
+    design = fits.paper_design()
+    stage = fits.default_stage().swap("hysteresis", model)
+    fitted = result_of(model, [report("run.csv")], rng)
+    for number, result in enumerate(
+        (diagnosis(rng), fits.sensitivities(design, ("x",)), fitted, replace(fitted, model=stage))
+    ):
+        picture = result.plot()
+        assert isinstance(picture, mpl.figure.Figure)
+        picture.savefig(tmp_path / f"{number}.png", dpi=200)
+        whole_picture(tmp_path / f"{number}.png")
+    assert plt.get_fignums() == []
+    loop, gain = picture.axes
+    # The static gain of driver and mechanics is 1 far below the resonance, and falls beyond it.
+    low, *_, high = gain.lines[0].get_ydata()
+    assert (low, high < 0.02) == (pytest.approx(1.0, abs=1e-3), True)
+    np.testing.assert_allclose(loop.lines[0].get_ydata()[0], 3.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("form", "first"), [("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_pictures_are_written_as_vectors_on_demand(rng, model, tmp_path, form, first):
+    measured = record(rng, model, waves(500, 2))
+    paths = fits.plot_fit(result_of(model, [report("run.csv")], rng), [measured], tmp_path, holdout=0.3, form=form)
+    assert [path.suffix for path in paths] == [f".{form}"] * 4
+    assert all(path.read_bytes().startswith(first) for path in paths)

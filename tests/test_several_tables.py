@@ -38,7 +38,9 @@ def test_of_several_tables_in_a_text_one_is_read_and_said(tmp_path):
     refused(run("simulate", tmp_path / "no.json", f"{path}#1", "--out", path), "would overwrite what is read")
     told = json.loads(run("inspect", f"{path}#3", "--json").stdout)
     assert told["command"] == f"microid fit '{path}#3' --out model.json"
-    assert "3 tables" in run("inspect", path).stdout
+    assert run("inspect", path).stdout.count("3 tables") == 1
+    (tmp_path / "tiny.csv").write_text("a,b\n1,2\n\nc,d\n3,4\n")
+    assert "it holds 2 tables" in run("inspect", tmp_path / "tiny.csv").stdout
     refused(run("inspect", f"{written(tmp_path, 'run.h5')}#2"), "several tables, found an HDF5 file; leave out #2")
     # A file of that very name is what is meant.
     (tmp_path / "all.csv#2").write_text(path.read_text().partition("\n\n")[0])

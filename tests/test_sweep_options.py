@@ -14,7 +14,7 @@ from fits import DataError, fit
 from fits.loop._design import branch_table
 from fits.loop._prior import roughness
 from fits.loop._run import initial_state, known_samples
-from fits.plots._sweep import _edges, _logarithmic
+from fits.plots._sweep import _edges, _heat, _logarithmic, _parallel, _Rows, _wrapped
 from fits.sweeps._chunks import chunk_count, compute_chunk
 from fits.sweeps._fit_batch import fit_batch
 from fits.sweeps._run import run_sweep
@@ -221,3 +221,23 @@ def test_heat_maps_have_a_cell_around_each_value(values, logarithmic):
     assert _logarithmic(values) == logarithmic
     shown = np.log10(values) if logarithmic else values
     assert np.histogram(np.repeat(shown, 3), _edges(shown))[0].tolist() == [3] * len(values)
+
+
+def test_rows_that_failed_are_drawn_as_such_and_names_whole():
+    swept = {"mechanics.gain": np.repeat([1.0, 2.0], 4), "program.shape": np.tile([0, 1, 0, 1], 2)}
+    values = np.array([np.nan, 2.0, 3.0, 5.0, 6.0, 7.0, np.nan, 9.0])
+    rows = _Rows(swept, {"program.shape": np.array(["sine", "triangle"])}, "width_pct", values)
+    heat, bar = _heat(rows, tuple(swept)).axes
+    (failed,) = heat.lines
+    assert failed.get_xydata().tolist() == [[1.0, 0.0], [2.0, 0.0]]
+    # Means by hand: what failed has no part in them.
+    np.testing.assert_allclose(heat.collections[0].get_array(), [[3.0, 6.0], [3.5, 8.0]])
+    assert bar.get_ylabel() == "mean width_pct"
+    axes, key = _parallel(rows).axes
+    assert key.get_ylabel() == "width_pct"
+    said = [text.get_text() for text in axes.texts]
+    for words in ("mechanics.gain", "program.shape", "width_pct", "sine", "triangle", "1.5", "9"):
+        assert words in said
+    red = [line for line in axes.lines if line.get_color() is not None and tuple(line.get_color()[:1]) == (0.8,)]
+    assert len(red) == 3  # two rows, and the key
+    assert _wrapped("hysteresis.density.packed_um", 12) == "hysteresis.\ndensity.\npacked_um"

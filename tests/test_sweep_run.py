@@ -322,7 +322,7 @@ def test_the_command_runs_shows_and_draws(finished, tmp_path):
     assert summary["left"] == 0
     assert summary["best"]["rows"][0]["row"] == found["stroke_um"].idxmax()
     assert summary["outputs"]["stroke_um"]["median"] == pytest.approx(found["stroke_um"].median(), rel=1e-12)
-    assert files(tmp_path / "plots") == ["heat_0.svg", "index.html", "parallel.svg"]
+    assert files(tmp_path / "plots") == ["heat_0.png", "index.html", "parallel.png"]
     assert "largest stroke_um" in run("sweep", "show", whole, "--best", "stroke_um", "--largest").stdout
 
 

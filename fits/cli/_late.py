@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fits.io._atomic import finite_json, refuse_nonfinite, write_csv
     from fits.io._inspect import inspect_table
     from fits.io._jax_setup import start_jax
+    from fits.io._json import strict
     from fits.io._limits import allowed, check_command, joined, measured_ranges, parse_limits, ranges_json, reached_in
     from fits.io._model_text import read_model_text
     from fits.io._quantity import Quantity
@@ -48,7 +49,9 @@ if TYPE_CHECKING:
     from fits.report._control import control_json, describe_control
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
+    from fits.report._gallery import gallery_html
     from fits.report._machining import budget_json, sensitivity_json
+    from fits.report._model_words import model_kind, model_numbers, model_words
     from fits.report._page import write_page
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow

@@ -68,7 +68,11 @@ def out_csv(metavar: str) -> Callable[[Any], Any]:
 
 
 def plots(what: str) -> Callable[[Any], Any]:
-    return click.option("--plots", metavar="DIR", help=f"Folder for {what}; it is made if need be.")
+    """Declare the options of pictures: where, and in what format."""
+    folder = click.option("--plots", metavar="DIR", help=f"Folder for {what}; it is made if need be.")
+    forms = click.Choice(["png", "svg", "pdf"])
+    form = click.option("--format", "form", type=forms, default="png", show_default=True, help="Of --plots.")
+    return lambda command: folder(form(command))
 
 
 def json_file(instead: str) -> Callable[[Any], Any]:

@@ -56,7 +56,7 @@ def budget(given: common.Given) -> None:
         how = {"measures": given.model_measures, "arm_mm": arm_mm, "zeroed": given.zeroed}
         found = late.budget(design, _law(given.model), noise, axes, **how)
         text = late.finite_json(late.budget_json(found))
-        drawn = [] if drawings is None else late.plot_budget(found, drawings)
+        drawn = [] if drawings is None else late.plot_budget(found, drawings, form=given.form)
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
     places = [("json", out), *(("plot", place) for place in common.paths_in(given.plots, drawn))]

@@ -64,7 +64,8 @@ def compensate(given: common.Given) -> None:
             sd_um = common.predicted_by(given.model, loaded, program, given.initial).displacement_sd_um
             late.refuse_nonfinite("displacement_sd_um", sd_um)
         to_draw = stage, wanted, found, sd_um
-        drawn = [] if drawings is None else late.plot_compensation(*to_draw, drawings, initial=given.initial)
+        same: dict[str, Any] = {"initial": given.initial, "form": given.form}
+        drawn = [] if drawings is None else late.plot_compensation(*to_draw, drawings, **same)
         table = {"time_s": wanted.time_s, "voltage_V": found.voltage_V, "displacement_um": found.displacement_um}
         late.write_csv(unfinished, table)
     off = np.abs(found.displacement_um - found.reference_um)

@@ -3,6 +3,7 @@
 import importlib.util
 import pkgutil
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -173,7 +174,8 @@ def control(given: common.Given) -> None:
         table = {name: np.asarray(getattr(run, name)) for name in names}
         late.write_csv(unfinished, table | {"time_s": wanted.time_s})
         to_draw = run, made.controller, loop.plants
-        drawn = [] if drawings is None else late.plot_control(*to_draw, drawings, delay=given.delay)
+        how: dict[str, Any] = {"delay": given.delay, "goal": goal, "form": given.form}
+        drawn = [] if drawings is None else late.plot_control(*to_draw, drawings, **how)
         about = {"controller": given.controller, "out": given.out, "plots": common.paths_in(given.plots, drawn)}
         # Before the file is in its place: what cannot be told is not left behind either.
         summary = late.control_json(loop, made, played, about, [*wanted.warnings, *ready.remarks, *more])

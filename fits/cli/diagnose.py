@@ -87,14 +87,13 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
 
     def model(which: str) -> str:
         stage = diagnosis.baseline if which == "baseline" else diagnosis.extended
-        # What is not known is not in the file.
-        uncertainty: Any = diagnosis.details.get(f"{which}_uncertainty")
         try:
             # Their own displacement is without an offset.
             reached = [late.ranges_json(one) for one in diagnosis.details.get("reached", ())]
             runs = [{"offset_um": 0.0, "reached": one} for one in reached]
-            about = {"part_of": "diagnosis", "stage": which, "runs": runs}
-            return late.model_text(stage, uncertainty, about)
+            known = late.strict(getattr(diagnosis, f"{which}_parameters"))
+            about = {"part_of": "diagnosis", "stage": which, "parameters": known, "runs": runs}
+            return late.model_text(stage, None, about)
         except DataError as error:
             raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error
 

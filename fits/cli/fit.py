@@ -99,7 +99,7 @@ def fit(given: common.Given) -> None:
         if drawings is not None:
             progress("drawing")
             draw: Any = late.plot_stage if slow or given.model == "stage" else late.plot_fit
-            drawn = draw(result, records, drawings, **same)
+            drawn = draw(result, records, drawings, **same, form=given.form)
             late.write_page(drawings, f"Fit of {', '.join(one.source for one in records)}", words, drawn)
         unfinished.write_text(late.model_text(result.model, result.uncertainty, report), encoding="utf-8")
     places = common.paths_in(given.plots, drawn)

@@ -36,7 +36,7 @@ def inspect(given: common.Given) -> None:
     with file_set() as files:
         drawings = files.folder(given.plots)
         if drawings is not None:
-            drawn = common.paths_in(given.plots, late.plot_channels(found, drawings))
+            drawn = common.paths_in(given.plots, late.plot_channels(found, drawings, given.form))
     lines += [f"plot   {place}" for place in drawn]
     common.print_result(given, {**asdict(found), "plots": drawn}, map(printable, lines))
 

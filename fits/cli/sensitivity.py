@@ -43,7 +43,7 @@ def sensitivity(given: common.Given) -> None:
         text = late.finite_json(late.sensitivity_json(report))
         claimed = [] if given.stage or given.json_file == "-" else late.paper_claims(design)
         claims = [claim for claim in claimed if {*claim.axes} & {*axes}]
-        drawn = [] if drawings is None else late.plot_sensitivity(design, report, drawings)
+        drawn = [] if drawings is None else late.plot_sensitivity(design, report, drawings, form=given.form)
         if unfinished is not None:
             unfinished.write_text(f"{text}\n", encoding="utf-8")
         if unfinished_stage is not None:

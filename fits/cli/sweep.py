@@ -88,7 +88,7 @@ def show(given: common.Given) -> None:
         drawings = files.folder(given.plots)
         drawn, words = [], late.describe_sweep(summary)
         if drawings is not None:
-            drawn = late.plot_sweep(given.folder, drawings, given.best)
+            drawn = late.plot_sweep(given.folder, drawings, given.best, form=given.form)
             late.write_page(drawings, f"Sweep in {given.folder}", words, drawn)
     places = [f"plot  {place}" for place in common.paths_in(given.plots, drawn)]
     common.print_result(given, summary, [words, *places, *common.page(given)])

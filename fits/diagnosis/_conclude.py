@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from fits.diagnosis._certainty import stage_estimates
 from fits.diagnosis._experiment import Request, suggest
 from fits.diagnosis._extension import (
     Compared,
@@ -197,6 +198,13 @@ def conclude(
             f"{', '.join(silent)}: of what differs from run to run the extended stage has only what all have in "
             "common, so that it may explain these runs and not the next"
         )
+    before = after = stage_estimates(found.first, found.plain, found.bench, baseline)
+    if extension.effects:
+        modelled = [cause for cause in causes if not card_of(cause.name).statistic]
+        after = (
+            *stage_estimates(found.projector, model, found.bench, extension.baseline),
+            *(replace(one, name=f"{cause.name}.{one.name}") for cause in modelled for one in cause.parameters),
+        )
     likely = {cause.name for cause in causes} | {rival.name for cause in kept for rival in cause.rivals}
     return Diagnosis(
         verdict="unexplained" if unexplained else "effect_found" if causes else "no_effect",
@@ -214,6 +222,8 @@ def conclude(
         extended=extension.stage,
         runs=tuple(map(_run_view, compared)),
         false_alarm=false_alarm,
+        baseline_parameters=before,
+        extended_parameters=after,
         details={
             "selection": found,
             "ready": ready,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.diagnosis._baseline import simulate, with_effects
+from fits.diagnosis._baseline import Baseline, simulate, with_effects
 from fits.diagnosis._effects import Bench, at_samples
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit
@@ -37,9 +37,10 @@ class Compared:
 
 @dataclass(frozen=True)
 class Extension:
-    """A stage with effects, and its residuals in all runs beside the plain stage's, those held out whole last."""
+    """A stage with effects, a baseline with them, and residuals in all runs, those held out whole last."""
 
     stage: Stage
+    baseline: Baseline
     compared: tuple[Compared, ...]
     effects: tuple[AbstractEffect, ...]
 
@@ -53,7 +54,8 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Exte
     """Let the plain stage follow what the effects of a model leave, and compare the two; none for the plain stage."""
     baseline = ready.baseline
     if model is None or not model.laws:
-        return Extension(plain_stage(ready), _compare(ready, ready.bench, None, ready.regression, (), False), ())
+        compared = _compare(ready, ready.bench, None, ready.regression, (), False)
+        return Extension(plain_stage(ready), baseline, compared, ())
     # What followed along the tangent is put into the stage itself.
     beside = found.projector
     regression = regress(beside.move(beside.residual - beside.join(model.change_um)), ())
@@ -61,14 +63,14 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Exte
     steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))
     stage = with_effects(regression.baseline.stage, effects).with_substeps(steps)
     compared = _compare(ready, Bench(regression.baseline), model, regression, effects, found.finest)
-    return Extension(stage, compared, tuple(effects))
+    return Extension(stage, regression.baseline, compared, tuple(effects))
 
 
 def without_effects(ready: Prepared, extension: Extension) -> Extension:
     """The plain stage, which runs held out whole follow; the others stay compared with effects of their own."""
     runs = len(ready.baseline.runs)
     behind = (replace(one, after_um=one.before_um) for one in extension.compared[runs:])
-    return Extension(plain_stage(ready), (*extension.compared[:runs], *behind), ())
+    return Extension(plain_stage(ready), ready.baseline, (*extension.compared[:runs], *behind), ())
 
 
 def shared_effects(model: Refit, runs: int, spread: float = THRESHOLDS.minor_share) -> list[AbstractEffect]:

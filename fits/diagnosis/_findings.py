@@ -16,9 +16,10 @@ from fits.diagnosis._noise import Fault, Faults
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit
-from fits.diagnosis._result import Bound, EffectParameter, FoundCause
+from fits.diagnosis._result import Bound, FoundCause
 from fits.diagnosis._score import Scored, best_of
 from fits.diagnosis._select import Cause, Selection
+from fits.loop._result import ParameterEstimate
 from fits.stats._held import Held
 from fits.stats._metrics import TWO_SIDED_95
 from microid import EFFECTS, AbstractEffect, Coordinates
@@ -81,7 +82,7 @@ def causes_of(
         form = forms[fault.statistic]
         weight[form.name] = fault.variance_um2
         parameters = tuple(
-            EffectParameter(name, value, sd, unit, value - TWO_SIDED_95 * sd, value + TWO_SIDED_95 * sd)
+            ParameterEstimate(name, unit, value, sd, value - TWO_SIDED_95 * sd, value + TWO_SIDED_95 * sd)
             for name, value, sd, unit in fault.parameters
         )
         chance, share = float(2 * stats.norm.sf(fault.z)), fault.variance_um2 / max(total, fault.variance_um2, 1e-300)
@@ -95,7 +96,7 @@ def with_held_gain(held: Held, causes: Sequence[FoundCause]) -> tuple[FoundCause
     for cause in causes:
         if name := card_of(cause.name).held:
             low, high = (max(held.gain_per_decade + way * TWO_SIDED_95 * held.sd, 0.0) for way in (-1, 1))
-            shown = EffectParameter(name, held.gain_per_decade, held.sd, "1", low, high)
+            shown = ParameterEstimate(name, "1", held.gain_per_decade, held.sd, low, high)
             fitted = (replace(one, name=f"{one.name}, of the fit") for one in cause.parameters)
             cause = replace(cause, parameters=(shown, *fitted))
         out.append(cause)
@@ -107,7 +108,7 @@ def described(
     rivals: tuple[str, ...],
     z: float,
     p: float,
-    parameters: tuple[EffectParameter, ...],
+    parameters: tuple[ParameterEstimate, ...],
     share: float,
     rms_um: float,
 ) -> FoundCause:
@@ -124,14 +125,14 @@ def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:
 
 def _parameters(
     law: Law, x: np.ndarray, covariance: np.ndarray, along: Sequence[tuple[float, np.ndarray]]
-) -> tuple[EffectParameter, ...]:
+) -> tuple[ParameterEstimate, ...]:
     """Values in their units: of each run in which the effect shows where runs differ, the others by their place.
 
     Intervals reach as far to either side as the profile `along` coordinates that are so many deviations away each.
     """
     runs = len(law.maps) if law.form.per_run and law.each.any() else 1
-    shared: list[EffectParameter] = []
-    own: list[list[EffectParameter]] = []
+    shared: list[ParameterEstimate] = []
+    own: list[list[ParameterEstimate]] = []
     for run in range(runs):
         slope = np.zeros((len(law.places[run]), len(x)))
         slope[:, law.places[run]] = _slope(law.maps[run], jnp.asarray(law.vector(x, run)))
@@ -141,7 +142,7 @@ def _parameters(
         for away, there in along:
             moved = law.values(there, run)
             below, above = np.maximum(below, (values - moved) / away), np.maximum(above, (moved - values) / away)
-        mine: list[EffectParameter] = []
+        mine: list[ParameterEstimate] = []
         for info, place in law.entries:
             differs = runs > 1 and info.path in law.form.strength
             # What went on before a run is no property of the rig.
@@ -153,7 +154,7 @@ def _parameters(
                 low = max(value - TWO_SIDED_95 * less, info.spec.lower)
                 high = min(value + TWO_SIDED_95 * more, info.spec.upper)
                 name = f"{name} in run {run + 1}" if differs else name
-                one = EffectParameter(name, value, max(less, more), info.spec.unit, low, high)
+                one = ParameterEstimate(name, info.spec.unit, value, max(less, more), low, high)
                 (mine if differs else shared).append(one)
         own.append(mine)
     # At its bound a strength has no standard deviation to speak of: a run without the effect says nothing of it.

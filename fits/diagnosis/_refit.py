@@ -149,6 +149,19 @@ def _strength(
     return here, np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
 
 
+def changes_along(bench: Bench, model: Refit) -> list[np.ndarray]:
+    """Derivatives of what effects change along all their coordinates, per run, in um, shape `(n, k)`."""
+    counts = [law.size for law in model.laws]
+    out = [np.empty((len(um), sum(counts))) for um in model.change_um]
+    for k, step in enumerate(_STEP * np.eye(sum(counts))):
+        moves = zip(model.x, np.split(step, np.cumsum(counts)[:-1]), strict=True)
+        there = replace(model, x=tuple(x + move for x, move in moves))
+        for run, columns in enumerate(out):
+            moved = bench.respond_in(run, there.effects(run)) - bench.plain[run]
+            columns[:, k] = (moved - model.change_um[run]) / _STEP
+    return out
+
+
 def nothing(bench: Bench, projector: Projector) -> Refit:
     """The baseline without any effect."""
     residual = projector.off(projector.residual)

@@ -10,6 +10,7 @@ import numpy as np
 
 from fits.io._limits import Extreme
 from fits.io._summary import AbstractSummary
+from fits.loop._result import ParameterEstimate
 from microid import Stage
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]
@@ -34,21 +35,6 @@ class Step(enum.StrEnum):
 
 
 @dataclass(frozen=True)
-class EffectParameter:
-    """One parameter of an effect that was found, in its unit.
-
-    The estimate is `value`, its standard deviation `sd`, and the ends of its 95 % interval `lower` and `upper`.
-    """
-
-    name: str
-    value: float
-    sd: float
-    unit: str
-    lower: float
-    upper: float
-
-
-@dataclass(frozen=True)
 class FoundCause:
     """One effect that the records need.
 
@@ -64,7 +50,7 @@ class FoundCause:
     also_consistent: tuple[str, ...]
     z: float
     p_family: float
-    parameters: tuple[EffectParameter, ...]
+    parameters: tuple[ParameterEstimate, ...]
     share_of_misfit: float
     rms_um: float
     fingerprint: str
@@ -178,7 +164,8 @@ class Diagnosis(AbstractSummary):
     `upper_bounds` are those of all other effects; `tests` are of the plain stage's residual, and `gain` is on
     held-out data. `next_experiment` is None where nothing would help. `baseline` is the plain stage and `extended`
     the one with the causes, the same where there are none; of the `runs` those that were held out come last.
-    `false_alarm` is the probability of naming a cause where there is none.
+    `false_alarm` is the probability of naming a cause where there is none. The parameters that were fitted of the
+    plain and of the extended stage, which has those of its causes, too, are beside what the other may do.
     """
 
     verdict: Verdict
@@ -196,6 +183,8 @@ class Diagnosis(AbstractSummary):
     extended: Stage
     runs: tuple[RunView, ...]
     false_alarm: float
+    baseline_parameters: tuple[ParameterEstimate, ...] = ()
+    extended_parameters: tuple[ParameterEstimate, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def summary(self) -> str:

@@ -90,14 +90,15 @@ def inspect_table(path: AnyPath) -> Inspection:
     if interval_s is None:
         options += ["--sample-rate", "HZ"]
     still = "voltage_V" in sources and not np.ptp(found[sources["voltage_V"].column])
-    command, remarks = _command(os.fspath(path), {*sources}, options, still), []
+    command, remarks = _command(os.fspath(path), {*sources}, options, still), [table.remark]
     if interval_s is None:
         remarks.append("no column is a time: write the rate of the samples in place of HZ")
     elif command and not still:
         remarks += _remarks(path, ",".join(pairs), options, {*sources})
     rate_Hz = 1 / interval_s if interval_s and interval_s > 0 else None
     rows = max(map(len, found.values()), default=0)
-    return Inspection(os.fspath(path), rows, rate_Hz, even, tuple(channels), command, tuple(remarks))
+    said = tuple(filter(None, dict.fromkeys(remarks)))
+    return Inspection(os.fspath(path), rows, rate_Hz, even, tuple(channels), command, said)
 
 
 def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source]) -> dict[str, Source]:

@@ -20,7 +20,7 @@ def open_table(source: AnyPath | Any) -> Table:
     """Read a file, or take a pandas `DataFrame`, an xarray `Dataset` or a mapping of arrays.
 
     Formats are known by their first bytes and by the ending of the name, text by neither; of several tables in a text
-    `runs.csv#2` is the second. A `DataError` says that it cannot be read, or has no columns.
+    `runs.csv#2` or `runs.lvm#2` is the second. A `DataError` says that it cannot be read, or has no columns.
     """
     if hasattr(source, "to_dataframe"):  # xarray
         source = source.to_dataframe()
@@ -41,7 +41,7 @@ def open_table(source: AnyPath | Any) -> Table:
     if data.startswith(b"\x1f\x8b") or file.lower().endswith(".gz"):
         data = unpack(data, file, MOST_CSV_BYTES)
     form = _format_of(file, data)
-    if number is not None and form.name != _CSV:
+    if number is not None and not form.several:
         raise DataError(f"{shown}: expected {_CSV} with several tables, found {form.name}; leave out #{number}.")
     try:
         # What a library has to say of damage is said below, in one sentence.

@@ -2,6 +2,8 @@
 
 import abc
 import html
+import importlib
+from typing import Any
 
 
 class AbstractSummary(abc.ABC):
@@ -13,6 +15,11 @@ class AbstractSummary(abc.ABC):
 
     def __repr__(self) -> str:
         return self.summary()
+
+    def plot(self) -> Any:
+        """Draw the result as one `matplotlib.figure.Figure`, which is written nowhere."""
+        # By name: the room of pictures knows results, and not the other way round.
+        return importlib.import_module("fits.plots._results").drawn(self)
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(self.summary())}</pre>"

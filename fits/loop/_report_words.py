@@ -1,6 +1,6 @@
 """The report of a fit in words."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from math import floor, log10
 from typing import Any
@@ -105,18 +105,24 @@ def _verdict(report: Mapping[str, Any]) -> str:
     )
 
 
+def parameter_lines(parameters: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A table of parameters of a report: values, standard deviations, 95 % intervals and units."""
+    return columns(
+        [
+            (
+                one["name"],
+                f"{_value(one)} ± {'unknown' if one['sd'] is None else format(one['sd'], '.2g')}",
+                f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})",
+                "" if one["unit"] == "1" else one["unit"],
+            )
+            for one in parameters
+        ]
+    )
+
+
 def _parameters(report: Mapping[str, Any]) -> list[str]:
     """A table of the parameters, and the pairs whose errors go together."""
-    rows = [
-        (
-            one["name"],
-            f"{_value(one)} ± {'unknown' if one['sd'] is None else format(one['sd'], '.2g')}",
-            f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})",
-            "" if one["unit"] == "1" else one["unit"],
-        )
-        for one in report["parameters"]
-    ]
-    lines = ["", *columns(rows)]
+    lines = ["", *parameter_lines(report["parameters"])]
     names = [each["name"] for each in report["parameters"]]
     for i, j in combinations(range(len(names)), 2):
         value = report["correlation"][i][j]

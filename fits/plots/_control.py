@@ -2,28 +2,39 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from fits.control._compensate_stage import simulate_model
 from fits.control._follow import Compensation
+from fits.control._tune_problem import Goal
 from fits.control._tune_start import slope_array
 from fits.io._errors import AnyPath
 from fits.io._record import Record, Reference
-from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save_all
 from fits.stats._metrics import TWO_SIDED_95
 from microid import AbstractController, ControlledRun, Preisach, Stage, loop_gain
 
+_LIMITS = "gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max"
+
 
 def plot_control(
-    run: ControlledRun, controller: AbstractController, plants: Sequence[Stage], folder: AnyPath, *, delay: int = 0
+    run: ControlledRun,
+    controller: AbstractController,
+    plants: Sequence[Stage],
+    folder: AnyPath,
+    *,
+    delay: int = 0,
+    goal: Goal | None = None,
+    form: str = "png",
 ) -> list[Path]:
-    """Draw a run, and the loop gain and sensitivity of every plant.
+    """Draw a run, and the loop gain and sensitivity of every plant, beside the limits of a goal.
 
     The run is from `microid.simulate_loop`, the controller and its delay in samples as they were given there; the
-    first plant is the one that was run. `run.png` and `margins.png` are written into an existing folder, at 200 dots
-    per inch; a `DataError` says if they cannot be.
+    first plant is the one that was run. `run` and `margins` are written into an existing folder, in the form `png`
+    (200 dots per inch), `svg` or `pdf`; a `DataError` says if they cannot be.
     """
     time_s = np.asarray(run.time_s)
     picture, (above, error, below) = panels(WIDE_in, 5.2, 3, 1, sharex=True, height_ratios=(1.6, 1, 1))
@@ -37,26 +48,37 @@ def plot_control(
     label(error, "", "error (µm)")
     label(below, "time (s)", "command (V)")
     legend(picture, (above,))
-    files = [save(picture, Path(folder) / "run.png")]
+    pictures = {"run": picture}
 
     linear = controller.linear()
-    frequency = 0.5 / float(controller.interval_s) * np.logspace(-3.5, 0, 600)
+    coarse = 0.5 / float(controller.interval_s) * np.logspace(-3.5, 0, 600)
     picture, (size, turn, peak) = panels(WIDE_in, 4.4, 3, 1, sharex=True)
     for k, plant in reversed(list(enumerate(plants))):
-        slope = slope_array(plant)
-        gain = np.asarray(loop_gain(linear, plant, jnp.asarray(frequency), delay=delay, slope_um_per_V=slope))
+        how: dict[str, Any] = {"delay": delay, "slope_um_per_V": slope_array(plant)}
+        found = np.asarray(loop_gain(linear, plant, jnp.asarray(coarse), **how))
+        # The peak, which the margins are of, lies between two of these.
+        at = int(np.argmax(np.abs(1 / (1 + found))))
+        around = np.linspace(coarse[max(at - 1, 0)], coarse[min(at + 1, len(coarse) - 1)], 200)
+        frequency = np.unique(np.concatenate([coarse, around]))
+        gain = np.asarray(loop_gain(linear, plant, jnp.asarray(frequency), **how))
         style = MODEL | {"linewidth": 0.9} if k == 0 else {"color": LIGHT, "linewidth": 0.7}
         words = {0: "the model", 1: "within its uncertainty"}.get(k, "")
         size.loglog(frequency, np.abs(gain), label=words, **style)
         turn.semilogx(frequency, np.degrees(np.unwrap(np.angle(gain))), **style)
         peak.semilogx(frequency, np.abs(1 / (1 + gain)), **style)
-    for axes, level in ((size, 1.0), (turn, -180.0), (peak, 1.0)):
+    least, phase_deg, most = (getattr(goal, name, None) for name in _LIMITS)
+    ends = 1 / least if least else None, phase_deg - 180 if phase_deg is not None else None, most
+    words = "limit: gain at -180°, phase at gain 1, peak"
+    for axes, level, limit in zip((size, turn, peak), (1.0, -180.0, 1.0), ends, strict=True):
         axes.axhline(level, color=LIGHT, linewidth=0.6, zorder=0)
+        if limit is not None:
+            axes.axhline(limit, color=DARK, linewidth=0.7, linestyle="--", label=words if axes is size else "")
+    peak.set_xlim(coarse[0], coarse[-1])
     label(size, "", "loop gain")
     label(turn, "", "phase (°)")
     label(peak, "frequency (Hz)", "sensitivity")
     legend(picture, (size,))
-    return [*files, save(picture, Path(folder) / "margins.png")]
+    return save_all(pictures | {"margins": picture}, folder, form)
 
 
 def plot_compensation(
@@ -67,6 +89,7 @@ def plot_compensation(
     folder: AnyPath,
     *,
     initial: str = "negative",
+    form: str = "png",
 ) -> list[Path]:
     """Draw the loop, the inverse loop, the compensated output against its reference, and the error.
 
@@ -74,8 +97,8 @@ def plot_compensation(
     voltage over its reference. The error is that of the model, with the band in which the stage is expected, by the
     standard deviation of the displacement from `predict`, shape `(n,)`; without one no band is drawn.
 
-    Model, reference and initial memory are those that `compensate` was given. `compensation.png` is written into an
-    existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
+    Model, reference and initial memory are those that `compensate` was given. `compensation` is written into an
+    existing folder, in the form `png` (200 dots per inch), `svg` or `pdf`; a `DataError` says if it cannot be.
     """
     wanted, voltage, reached = compensation.reference_um, compensation.voltage_V, compensation.displacement_um
     # A voltage proportional to the reference, within the voltages used.
@@ -86,12 +109,12 @@ def plot_compensation(
 
     picture, ((loop, inverse), (output, error)) = panels(WIDE_in, 4.8, 2, 2, gap=0.08)
     curve(loop, straight_V, plain, "without compensation", **MEASURED)
-    label(loop, "voltage (V)", "displacement (µm)", "loop")
+    label(loop, "voltage (V)", "displacement (µm)", "loop, predicted by the model")
     curve(inverse, wanted, voltage, "with compensation", **MODEL)
     label(inverse, "reference (µm)", "voltage (V)", "inverse loop")
     curve(output, wanted, plain, **MEASURED)
     curve(output, wanted, reached, **MODEL)
-    label(output, "reference (µm)", "displacement (µm)", "output")
+    label(output, "reference (µm)", "displacement (µm)", "output, predicted by the model")
     off = reached - wanted
     error.axhline(0.0, color=LIGHT, linewidth=0.6)
     curve(error, reference.time_s, off, **MODEL)
@@ -99,6 +122,6 @@ def plot_compensation(
         half = TWO_SIDED_95 * displacement_sd_um
         for side, name in ((-half, ""), (half, "95 % band of the model")):
             curve(error, reference.time_s, off + side, name, color=DARK, linestyle=":", linewidth=0.7)
-    label(error, "time (s)", "error (µm)", "error")
+    label(error, "time (s)", "error (µm)", "error, predicted by the model")
     legend(picture, (loop, inverse, error))
-    return [save(picture, Path(folder) / "compensation.png")]
+    return save_all({"compensation": picture}, folder, form)

@@ -37,12 +37,20 @@ class Picture:
     narrow: str
 
 
-def _drawn(name: str, words: str, draw: Callable[[float], Figure]) -> Picture:
-    return Picture(*(_svg(draw(width), f"{name}-{width:.0f}-", words) for width in (_WIDE_in, _NARROW_in)))
+def _drawn(name: str, words: str, draw: Callable[[float], Figure], zoom: bool = False) -> Picture:
+    return Picture(*(_svg(draw(width), f"{name}-{width:.0f}-", words, zoom) for width in (_WIDE_in, _NARROW_in)))
 
 
-def _svg(picture: Figure, prefix: str, words: str) -> str:
-    """Write a figure as one `svg` element whose names do not meet those of other figures."""
+def _svg(picture: Figure, prefix: str, words: str, zoom: bool = False) -> str:
+    """Write a figure as one `svg` element whose names do not meet those of other figures.
+
+    With `zoom` the page's script finds there what it stretches of each panel, and from where to where that goes.
+    """
+    for k, axes in enumerate(picture.axes if zoom else ()):
+        axes.xaxis.set_gid(f"ticks{k}")
+        for n, each in enumerate([*axes.lines, *axes.patches]):
+            each.set_gid(f"zoom{k}-{n}")
+    spans = f' data-spans="{[[*map(float, axes.get_xlim())] for axes in picture.axes]}"' if zoom else ""
     for axes in picture.axes:
         axes.tick_params(width=0.6, length=2.5, color=INK)
         axes.spines[:].set(linewidth=0.6, color=INK)
@@ -61,7 +69,7 @@ def _svg(picture: Figure, prefix: str, words: str) -> str:
     text = re.sub(r' d="[^"]*"', lambda found: digits.sub(r"\1", found[0]).replace("\n", ""), text)
     for size in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
-    return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(words)}"', 1).strip()
+    return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(words)}"{spans}', 1).strip()
 
 
 def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
@@ -74,42 +82,48 @@ def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
 
 def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
     """Residual of the plain and the extended stage over time, in a unit; None where there are no runs."""
-    runs = shown_runs(diagnosis.runs)
-    if not runs:
+    words = "Residual over time before and after the extension, with the band of the noise"
+    if not shown_runs(diagnosis.runs):
         return None
-    points = max(_POINTS // (2 * len(runs)), 200)
+    return _drawn("residuals", words, lambda width_in: residual_figure(diagnosis, width_in, per_um, unit), True)
+
+
+def residual_figure(
+    diagnosis: Diagnosis, width_in: float = _WIDE_in, per_um: float = 1.0, unit: str = "µm"
+) -> Figure:
+    """The same as a figure of a width; the band is that of two standard deviations of the noise."""
+    runs = shown_runs(diagnosis.runs)
+    # Where there is room, as many as show when a stretch is enlarged.
+    points = max((3 if width_in == _WIDE_in else 1) * _POINTS // (2 * len(runs)), 200)
     # What is left out at the start of a run, as its past is unknown, may be off by much more than all that counts.
     shown = [(run.before_um, run.after_um)[side][np.argmax(run.fitted) :] for run in runs for side in (0, 1)]
     highest_um = max((float(np.nanmax(np.abs(one))) for one in shown if np.isfinite(one).any()), default=0.0)
     highest_um = max(highest_um, 2.2 * diagnosis.noise_um if np.isfinite(diagnosis.noise_um) else 0.0)
-
-    def draw(width_in: float) -> Figure:
-        height_in = 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0)
-        picture, grid = panels(width_in, height_in, len(runs), sharey=True, squeeze=False)
-        for axes, run in zip(grid[:, 0], runs, strict=True):
-            # Shaded is what was not used for the fit; single samples without a value are not what was held out.
-            for begin, end in stretches(~np.asarray(run.fitted, bool)):
-                if end - begin > 0.01 * run.time_s.size:
-                    axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
-            band = 2.0 * diagnosis.noise_um * per_um
-            curves = [(run.before_um, BEFORE, 0.8)] + ([(run.after_um, AFTER, 0.7)] if diagnosis.causes else [])
-            for values, colour, line in curves:
-                keep = thinned(values, points)
-                axes.plot(run.time_s[keep], per_um * values[keep], color=colour, linewidth=line)
-            if np.isfinite(band):
-                axes.axhspan(-band, band, color=NOISE, linewidth=0)
-                # Over the curves, which else hide the band.
-                for edge in (-band, band):
-                    axes.axhline(edge, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=3)
-            axes.set_xlim(run.time_s[0], run.time_s[-1])
-            if highest_um > 0:
-                axes.set_ylim(-1.08 * per_um * highest_um, 1.08 * per_um * highest_um)
-            axes.set_title(verbatim(run.source, int(12 * width_in)), loc="left")
-            label(axes, y=f"residual ({unit})" if len(runs) < 3 or width_in == _WIDE_in else unit)
-        label(grid[-1, 0], "time (s)")
-        return picture
-
-    return _drawn("residuals", "Residual over time before and after the extension, with the band of the noise", draw)
+    height_in = 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0)
+    picture, grid = panels(width_in, height_in, len(runs), sharey=True, squeeze=False)
+    for axes, run in zip(grid[:, 0], runs, strict=True):
+        # Shaded is what was not used for the fit; single samples without a value are not what was held out.
+        for begin, end in stretches(~np.asarray(run.fitted, bool)):
+            if end - begin > 0.01 * run.time_s.size:
+                axes.axvspan(run.time_s[begin], run.time_s[end - 1], color=ASIDE, linewidth=0)
+        band = 2.0 * diagnosis.noise_um * per_um
+        curves = [(run.before_um, BEFORE, 0.8, "plain stage")]
+        curves += [(run.after_um, AFTER, 0.7, "with what was found")] if diagnosis.causes else []
+        for values, colour, line, name in curves:
+            keep = thinned(values, points)
+            axes.plot(run.time_s[keep], per_um * values[keep], color=colour, linewidth=line, label=name)
+        if np.isfinite(band):
+            axes.axhspan(-band, band, color=NOISE, linewidth=0)
+            # Over the curves, which else hide the band.
+            for edge in (-band, band):
+                axes.axhline(edge, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=3)
+        axes.set_xlim(run.time_s[0], run.time_s[-1])
+        if highest_um > 0:
+            axes.set_ylim(-1.08 * per_um * highest_um, 1.08 * per_um * highest_um)
+        axes.set_title(verbatim(run.source, int(12 * width_in)), loc="left")
+        label(axes, y=f"residual ({unit})" if len(runs) < 3 or width_in == _WIDE_in else unit)
+    label(grid[-1, 0], "time (s)")
+    return picture
 
 
 def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, unit: str) -> tuple[Picture, str] | None:
@@ -158,4 +172,4 @@ def program(ahead: Experiment) -> Picture | None:
         label(axes, "time (s)", "voltage (V)")
         return picture
 
-    return _drawn("program", "Voltage of the next experiment over time", draw)
+    return _drawn("program", "Voltage of the next experiment over time", draw, True)

@@ -122,12 +122,13 @@ def plot_fit(
     *,
     holdout: float | Sequence[Record] = 0.2,
     initial: str = "unknown",
+    form: str = "png",
 ) -> list[Path]:
     """Draw a fit: loops, density, Everett surface and, where something was held out, its prediction.
 
     Records, holdout and initial memory are those that `fit` was given; a ValueError says that they are not those of
-    the result. `loops.png`, `density.png`, `everett.png` and `heldout.png` are written into an existing folder, at
-    200 dots per inch; a `DataError` says if they cannot be.
+    the result. `loops`, `density`, `everett` and `heldout` are written into an existing folder, in the form `png`
+    (200 dots per inch), `svg` or `pdf`; a `DataError` says if they cannot be.
     """
     fraction, aside = _held_out(holdout, len(records), len(result.runs))
     range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
@@ -143,7 +144,7 @@ def plot_fit(
     }
     if predicted := [each for each in drawn if each.run.held_out.any()]:
         pictures["heldout"] = _over_time(predicted, held_out_alone=True)
-    return [style.save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
+    return style.save_all(pictures, folder, form)
 
 
 def _simulated(result: FitResult[Preisach], run: Run, report: RunReport) -> _Drawn:
@@ -200,12 +201,14 @@ def plot_stage(
     *,
     holdout: float | Sequence[Record] = 0.2,
     initial: str | Sequence[str] = "unknown",
+    form: str = "png",
 ) -> list[Path]:
     """Draw the fit of a stage: frequency response, runs with their residuals, and the loop of the slowest run.
 
     Records, holdout and initial memory are those that `fit_stage` was given; a ValueError says that they are not
-    those of the result. `response.png` (where a run shows one), `runs.png`, `heldout.png` (where records were held
-    out) and `loop.png` are written into an existing folder, at 200 dots per inch; a `DataError` if they cannot be.
+    those of the result. `response` (where a run shows one), `runs`, `heldout` (where records were held out) and
+    `loop` are written into an existing folder, in the form `png` (200 dots per inch), `svg` or `pdf`; a `DataError`
+    if they cannot be.
     """
     fraction, aside = _held_out(holdout, len(records), len(result.runs))
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
@@ -243,7 +246,7 @@ def plot_stage(
     if predicted:
         pictures["heldout"] = _over_time(predicted)
     pictures["loop"] = _loops([min(fitted, key=lambda each: speed_Hz(each.run.record))])
-    return [style.save(picture, Path(folder) / f"{name}.png") for name, picture in pictures.items()]
+    return style.save_all(pictures, folder, form)
 
 
 def _highest_Hz(measured: MeasuredResponse) -> float:
@@ -252,7 +255,7 @@ def _highest_Hz(measured: MeasuredResponse) -> float:
     return float((sure if len(sure) else measured.frequency_Hz).max())
 
 
-def _linear(stage: Stage, frequency_Hz: np.ndarray) -> np.ndarray:
+def linear_gain(stage: Stage, frequency_Hz: np.ndarray) -> np.ndarray:
     """Frequency response of all linear parts over their static gain, complex, shape `(f,)`."""
     out = np.ones(len(frequency_Hz), dtype=complex)
     for part in stage.parts:
@@ -267,9 +270,9 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
     shown = measured.frequency_Hz <= high
     measured = MeasuredResponse(measured.frequency_Hz[shown], measured.response[shown], measured.coherence[shown])
     frequency = np.geomspace(low / _BEYOND, high, 600)
-    model = _linear(stage, frequency)
+    model = linear_gain(stage, frequency)
     phase = np.unwrap(np.angle(model))
-    at_lines = _linear(stage, measured.frequency_Hz)
+    at_lines = linear_gain(stage, measured.frequency_Hz)
     # The measured phase is drawn on the branch of the model's.
     near = np.interp(measured.frequency_Hz, frequency, phase) + np.angle(measured.response / at_lines)
 

@@ -2,7 +2,7 @@
 
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from fits.machining._claims import Claim, paper_claims
 from fits.machining._design import Design, lever_mm, paper_design
 from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import AxisSensitivity, SensitivityReport, gains_at
-from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save, verbatim
+from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save_all, verbatim
 
 AXIS_SIGNS: dict[m.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamma": r"$\gamma$"}
 UNIT_SIGNS = {"um": "µm", "urad": "µrad"}
@@ -49,25 +49,31 @@ class _Panel:
     curves: dict[str, NDArray[np.float64]]
 
 
-def plot_sensitivity(design: Design, report: SensitivityReport, folder: AnyPath) -> list[Path]:
+def plot_sensitivity(design: Design, report: SensitivityReport, folder: AnyPath, *, form: str = "png") -> list[Path]:
     """Draw which dimensions matter, and the output error over the machining error of each (Fig. 7).
 
     Where the design has the paper's dimensions, what the paper reads in its figure is judged below each panel. The
-    report is that of the design, from `sensitivities`. `tornado.png` and `machining_error.png` are written into an
-    existing folder, at 200 dots per inch; a `DataError` says if they cannot be.
+    report is that of the design, from `sensitivities`. `tornado` and `machining_error` are written into an existing
+    folder, in the form `png` (200 dots per inch), `svg` or `pdf`; a `DataError` says if they cannot be.
     """
-    panels = []
-    for axes in report.alike():
-        title = ", ".join(AXIS_SIGNS.get(each.axis, each.axis) for each in axes)
-        panels.append(_Panel(axes[0], title, _curves(design, axes[0].axis)))
+    panels = _panels(report, lambda axis: _curves(design, axis))
     paper = paper_design()
     same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
     same = same and design.guides == paper.guides and design.tolerance == paper.tolerance
     claims = paper_claims(design) if same else ()
-    return [
-        save(_tornado(panels), Path(folder) / "tornado.png"),
-        save(_machining_error(design, panels, claims), Path(folder) / "machining_error.png"),
-    ]
+    pictures = {"tornado": _tornado(panels), "machining_error": _machining_error(design, panels, claims)}
+    return save_all(pictures, folder, form)
+
+
+def tornado(report: SensitivityReport) -> Figure:
+    """Draw which dimensions matter, to first order."""
+    return _tornado(_panels(report, lambda _: {}))
+
+
+def _panels(report: SensitivityReport, curves: Callable[[m.Axis], dict[str, NDArray[np.float64]]]) -> list[_Panel]:
+    groups = report.alike()
+    titles = (", ".join(AXIS_SIGNS.get(each.axis, each.axis) for each in axes) for axes in groups)
+    return [_Panel(axes[0], title, curves(axes[0].axis)) for axes, title in zip(groups, titles, strict=True)]
 
 
 def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
@@ -97,13 +103,16 @@ def _draw_bars(axes: Axes, panel: _Panel) -> None:
     effects = panel.axis.dimensions
     places = range(len(effects))
     changes = np.array([effect.relative_change_pct for effect in effects])
-    exact = 100 * np.array([panel.curves[effect.name][[0, -1]] for effect in effects])
+    # Of a report without its design there are none.
+    ends = [panel.curves[effect.name][[0, -1]] for effect in effects if panel.curves]
+    exact = 100 * np.array(ends).reshape(-1, 2)
     for name, values, color in (("plus", changes, "0.45"), ("minus", -changes, "0.9")):
         words = f"{name} one tolerance, first order"
         axes.barh(places, values, 0.72, color=color, label=words, linewidth=0.4, edgecolor=DARK)
     marks: dict[str, Any] = {"markersize": 3, "color": "0.0", "markeredgewidth": 0.6}
     for name, values, color in (("plus", exact[:, 1], "0.0"), ("minus", exact[:, 0], "1.0")):
-        axes.plot(values, places, "D", label=f"{name}, exact", markerfacecolor=color, **marks)
+        words = f"{name}, exact" if panel.curves else ""
+        axes.plot(values, places[: len(values)], "D", label=words, markerfacecolor=color, **marks)
     axes.axvline(0, color=DARK, linewidth=0.6)
     axes.set_ylim(len(effects) - 0.4, -0.6)
     units = ["mrad" if effect.unit == "rad" else "µm" for effect in effects]
@@ -221,11 +230,17 @@ def symbol(name: str) -> str:
     return f"${stem}_{{{index}}}$" if index else f"${stem}$"
 
 
-def plot_budget(found: Budget, folder: AnyPath) -> list[Path]:
+def plot_budget(found: Budget, folder: AnyPath, *, form: str = "png") -> list[Path]:
     """Draw the parts of the worst case of each axis in percent of its stroke, and the root sum of squares.
 
-    `budget.png` is written into an existing folder, at 200 dots per inch; a `DataError` says if it cannot be.
+    `budget` is written into an existing folder, in the form `png` (200 dots per inch), `svg` or `pdf`; a `DataError`
+    says if it cannot be.
     """
+    return save_all({"budget": budget_bars(found)}, folder, form)
+
+
+def budget_bars(found: Budget) -> Figure:
+    """The picture of `plot_budget`."""
     axes = list(found.axes.values())
     places = range(len(axes))
     picture = figure(WIDE_in, 0.9 + 0.34 * len(axes))
@@ -251,14 +266,14 @@ def plot_budget(found: Budget, folder: AnyPath) -> list[Path]:
     bars.tick_params(axis="y", length=0)
     label(bars, x="error (% of the stroke)")
     legend(picture, [bars])
-    return [save(picture, Path(folder) / "budget.png")]
+    return picture
 
 
-def plot_idle(reference: Reference, noise: IdleNoise, folder: AnyPath) -> list[Path]:
+def plot_idle(reference: Reference, noise: IdleNoise, folder: AnyPath, *, form: str = "png") -> list[Path]:
     """Draw an idle record with its histogram, its spectrum with the lines found, and its Allan deviation.
 
-    The noise is that of the record, from `idle_noise`. `idle.png` is written into an existing folder, at 200 dots per
-    inch; a `DataError` says if it cannot be.
+    The noise is that of the record, from `idle_noise`. `idle` is written into an existing folder, in the form `png`
+    (200 dots per inch), `svg` or `pdf`; a `DataError` says if it cannot be.
     """
     picture = figure(WIDE_in, 4.8, gap=0.08)
     grid = picture.add_gridspec(2, 8)
@@ -269,7 +284,7 @@ def plot_idle(reference: Reference, noise: IdleNoise, folder: AnyPath) -> list[P
     _draw_spectrum(spectrum, noise)
     _draw_allan(allan, noise)
     legend(picture, (readings,))
-    return [save(picture, Path(folder) / "idle.png")]
+    return save_all({"idle": picture}, folder, form)
 
 
 def _draw_readings(axes: Axes, margin: Axes, reference: Reference, noise: IdleNoise) -> None:

@@ -1,6 +1,6 @@
 """The look of all pictures, set on the figures themselves: Matplotlib's own settings stay as the user has them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 
 from fits.io._atomic import atomic_path
+from fits.io._errors import AnyPath
 from fits.io._printable import printable
 
 # One and two columns of a journal, 90 mm and 180 mm.
@@ -90,13 +91,24 @@ def dots(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "") -> None:
     axes.plot(x[::every], y[::every], ".", label=name, color=DARK, markersize=1.2, markeredgewidth=0, rasterized=True)
 
 
-def save(picture: Figure, path: Path) -> Path:
-    """Write a figure, whole or not at all."""
+def styled(picture: Figure) -> Figure:
+    """Give a figure the lines and letters of all pictures."""
     for axes in picture.axes:
         axes.tick_params(labelsize=_FONT_pt, width=0.6, length=2.5)
         axes.spines[:].set_linewidth(0.6)
     for text in picture.findobj(Text):
         text.set_fontsize(min(_FONT_pt, text.get_fontsize()))
+    return picture
+
+
+def save_all(pictures: Mapping[str, Figure], folder: AnyPath, form: str) -> list[Path]:
+    """Write figures by name into a folder, in a format: `png`, `svg` or `pdf`."""
+    return [save(picture, Path(folder) / f"{name}.{form}") for name, picture in pictures.items()]
+
+
+def save(picture: Figure, path: Path) -> Path:
+    """Write a figure, whole or not at all."""
+    styled(picture)
     with atomic_path(path) as unfinished:
         picture.savefig(unfinished, dpi=200)
     return path

@@ -2,24 +2,30 @@
 
 import itertools
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 
 from fits.io._errors import AnyPath
-from fits.plots._style import WIDE_in, label, panels, save, verbatim
+from fits.plots._style import DARK, WIDE_in, label, legend, panels, save_all, verbatim
 from fits.sweeps._show import open_sweep, readable, summarise
 from fits.sweeps._store import about_of
-from fits.sweeps._types import DONE
+from fits.sweeps._types import DONE, FAILED
 
 _CELLS = 12
 _HIGH_in = 2.6
+_FAILED = (0.8, 0.1, 0.1, 1.0)
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """Swept parameters and the output that is drawn, of rows that are done; a word is its number in `words`."""
+    """Swept parameters and the output that is drawn, NaN where a row failed; a word is its number in `words`."""
 
     swept: dict[str, np.ndarray]
     words: dict[str, np.ndarray]
@@ -27,63 +33,96 @@ class _Rows:
     values: np.ndarray
 
 
-def plot_sweep(folder: AnyPath, out: Path, by: str | None = None) -> list[Path]:
-    """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back."""
+def plot_sweep(folder: AnyPath, out: AnyPath, by: str | None = None, *, form: str = "png") -> list[Path]:
+    """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back.
+
+    Rows that failed are drawn as such. The form is `png` (200 dots per inch), `svg` or `pdf`.
+    """
     names, data = about_of(folder)["parameters"], open_sweep(folder)
     with readable(folder):
         by = by or summarise(folder)["best"]["by"]
         if by is None or not names:
             return []
+        failed, values = data["status"].values == FAILED, data[by].values
         # What has no finite number, such as the settling time of a loop that does not settle, has no place in a mean.
-        done = (data["status"].values == DONE) & np.isfinite(data[by].values)
+        done = (data["status"].values == DONE) & np.isfinite(values)
         if done.sum() < 2:
             return []
-        rows = _Rows({}, {}, by, data[by].values[done])
+        shown = done | failed
+        rows = _Rows({}, {}, by, np.where(done, values, math.nan)[shown])
         for name in names:
-            found = data[name].values[done]
+            found = data[name].values[shown]
             if found.dtype.kind != "f":
                 rows.words[name], found = np.unique(found.astype(str), return_inverse=True)
             rows.swept[name] = found
-    made = [_parallel(out / "parallel.svg", rows)]
     pairs = list(itertools.combinations(names, 2))[:6]
-    return made + [_heat(out / f"heat_{k}.svg", rows, pair) for k, pair in enumerate(pairs)]
+    maps = {f"heat_{k}": _heat(rows, pair) for k, pair in enumerate(pairs)}
+    return save_all({"parallel": _parallel(rows)} | maps, out, form)
 
 
-def _parallel(path: Path, rows: _Rows) -> Path:
+def _parallel(rows: _Rows) -> Figure:
     every = max(1, -(-len(rows.values) // 400))  # more lines do not show
-    columns = np.stack([*rows.swept.values(), rows.values], axis=1)[::every]
-    low, high = columns.min(axis=0), columns.max(axis=0)
-    scaled = (columns - low) / np.where(high > low, high - low, 1)
-    picture, axes = panels(WIDE_in, _HIGH_in)
-    colours = np.argsort(np.argsort(columns[:, -1])) / max(1, len(columns) - 1)
+    names, columns = [*rows.swept, rows.by], np.stack([*rows.swept.values(), rows.values], axis=1)
+    low, high = np.nanmin(columns, axis=0), np.nanmax(columns, axis=0)
+    size = np.where(high > low, high - low, 1)
+    scaled = ((columns - low) / size)[::every]
+    picture, axes = panels(WIDE_in, _HIGH_in + 0.4)
+    shades = ScalarMappable(Normalize(low[-1], high[-1]), "viridis")
+    colours = np.where(np.isfinite(scaled[:, -1:]), shades.to_rgba(columns[::every, -1]), _FAILED)
     for line, colour in zip(scaled, colours, strict=True):
-        axes.plot(line, color=(colour, 0.25, 1 - colour), linewidth=0.4, alpha=0.6)
-    ranges = {name: f"{a:.3g} to {b:.3g}" for name, a, b in zip([*rows.swept, rows.by], low, high, strict=True)}
-    ranges |= {name: verbatim(", ".join(each)) for name, each in rows.words.items()}
-    axes.set_xticks(range(len(ranges)), [f"{verbatim(name)}\n{each}" for name, each in ranges.items()], fontsize=6)
-    axes.set_yticks([])
-    label(axes)
-    return save(picture, path)
+        axes.plot(line, color=colour, linewidth=0.4, alpha=0.6)
+    if np.isnan(columns).any():
+        axes.plot([], [], color=_FAILED, linewidth=0.8, label="failed")
+        legend(picture, (axes,))
+    box: dict[str, Any] = {"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 0.6}
+    for k, name in enumerate(names):
+        axes.axvline(k, color=DARK, linewidth=0.6)
+        ticks = np.arange(len(rows.words[name])) if name in rows.words else np.linspace(low[k], high[k], 5)
+        for tick in ticks if high[k] > low[k] else ticks[:1]:
+            words = verbatim(rows.words[name][int(tick)], 24) if name in rows.words else f"{tick:.3g}"
+            beside = (k, (tick - low[k]) / size[k]), (-3 if k == len(names) - 1 else 3, 0)
+            side = "right" if k == len(names) - 1 else "left"
+            axes.annotate(words, *beside, textcoords="offset points", ha=side, va="center", fontsize=6, bbox=box)
+        below = _wrapped(name, 110 // len(names))
+        axes.text(k, -0.04, below, ha="center", va="top", fontsize=6, transform=axes.get_xaxis_transform())
+    axes.set_axis_off()
+    picture.colorbar(shades, ax=axes, label=verbatim(rows.by))
+    return picture
 
 
-def _heat(path: Path, rows: _Rows, pair: tuple[str, str]) -> Path:
+def _wrapped(name: str, most: int) -> str:
+    """A name in lines of a few characters, broken behind its dots and underscores."""
+    lines = [""]
+    for part in re.findall(r"[^._]*[._]?", name):
+        if lines[-1] and len(lines[-1]) + len(part) > most:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(map(verbatim, lines))
+
+
+def _heat(rows: _Rows, pair: tuple[str, str]) -> Figure:
     logs = [name not in rows.words and _logarithmic(rows.swept[name]) for name in pair]
     x, y = (np.log10(rows.swept[name]) if log else rows.swept[name] for name, log in zip(pair, logs, strict=True))
-    edges = [_edges(x), _edges(y)]
-    count, *_ = np.histogram2d(x, y, bins=edges)
-    total, *_ = np.histogram2d(x, y, bins=edges, weights=rows.values)
+    edges, done = [_edges(x), _edges(y)], np.isfinite(rows.values)
+    count, *_ = np.histogram2d(x[done], y[done], bins=edges)
+    total, *_ = np.histogram2d(x[done], y[done], bins=edges, weights=rows.values[done])
     with np.errstate(invalid="ignore"):
         mean = np.where(count > 0, total / np.maximum(count, 1), math.nan)
     picture, axes = panels(WIDE_in / 2, _HIGH_in)
     corners = [10**ends if log else ends for ends, log in zip(edges, logs, strict=True)]
     drawn = axes.pcolormesh(*corners, mean.T, cmap="viridis")
+    if not done.all():
+        there = (rows.swept[name][~done] for name in pair)
+        axes.plot(*there, "x", color=_FAILED, markersize=3, markeredgewidth=0.7, label="failed")
+        legend(picture, (axes,))
     axes.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
+    axes.set(xlim=corners[0][[0, -1]], ylim=corners[1][[0, -1]])
     picture.colorbar(drawn, label=f"mean {verbatim(rows.by)}")
     label(axes, verbatim(pair[0]), verbatim(pair[1]))
     for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
         if name in rows.words:
             axis.set_ticks(range(len(rows.words[name])), [verbatim(word, 24) for word in rows.words[name]])
-    return save(picture, path)
+    return picture
 
 
 def _logarithmic(found: np.ndarray) -> bool:

@@ -1,14 +1,16 @@
 """A diagnosis as JSON, and the schema that it keeps to."""
 
 import json
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
-from fits.diagnosis._result import SCHEMA, Diagnosis, Experiment, FoundCause, RunView
+from fits.diagnosis._result import SCHEMA, Diagnosis, Experiment, RunView
 from fits.io._json import strict
 from fits.io._version import written_by
+from fits.loop._result import ParameterEstimate
 from fits.report._words import rms_um, verdict_sentence
 
 
@@ -32,7 +34,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "verdict": diagnosis.verdict,
         "sentence": verdict_sentence(diagnosis),
         **{name: getattr(diagnosis, name) for name in noise},
-        "causes": [vars(cause) | {"parameters": _by_name(cause)} for cause in diagnosis.causes],
+        "causes": [vars(cause) | {"parameters": _by_name(cause.parameters)} for cause in diagnosis.causes],
+        "baseline_parameters": _by_name(diagnosis.baseline_parameters),
+        "extended_parameters": _by_name(diagnosis.extended_parameters),
         **{name: getattr(diagnosis, name) for name in kept},
         "next_experiment": None if ahead is None else _experiment(ahead),
         "remarks": diagnosis.remarks,
@@ -41,9 +45,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     return dict(strict(found))
 
 
-def _by_name(cause: FoundCause) -> dict[str, Any]:
-    parameters = [dict(vars(each)) for each in cause.parameters]
-    return {each.pop("name"): each for each in parameters}
+def _by_name(parameters: Sequence[ParameterEstimate]) -> dict[str, Any]:
+    each = [dict(vars(one)) for one in parameters]
+    return {one.pop("name"): one for one in each}
 
 
 def _experiment(ahead: Experiment) -> dict[str, Any]:

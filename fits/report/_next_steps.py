@@ -4,13 +4,11 @@ import math
 import shlex
 from collections.abc import Sequence
 from itertools import chain
-from operator import attrgetter
 
 import numpy as np
 
 from fits.diagnosis._result import Diagnosis, RunView
-from fits.report._words import NONE, Lengths, listed, number, percent, plain, shown_unit
-from microid import Stage, parameter_table
+from fits.report._words import NONE, Lengths, estimate, listed, number, parameter_name, percent, plain, shown_unit
 from microid.effects import card_of
 
 
@@ -65,23 +63,14 @@ def runs_read(runs: Sequence[RunView]) -> list[tuple[str, ...]]:
     return rows
 
 
-def stage_parameters(diagnosis: Diagnosis) -> list[tuple[str, str, str, str]]:
-    """Name, values in the plain and the extended stage, and unit of what both have fitted beside the hysteresis."""
-    before, after = (_single_numbers(stage) for stage in (diagnosis.baseline, diagnosis.extended))
-    return [
-        (plain(name.replace(".", " ")), number(value, 4), number(after[name][0], 4), shown_unit(unit) or "1")
-        for name, (value, unit) in before.items()
-        if value and name in after
+def stage_parameters(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
+    """Heads and rows of a table: what was fitted of the plain stage, and beside causes of both, with intervals."""
+    after = {one.name: one for one in diagnosis.extended_parameters if diagnosis.causes}
+    sides = ("Plain", "Extended") if after else ("Estimate",)
+    rows: list[tuple[str, ...]] = [
+        ("Parameter", *(head for side in sides for head in (side, "95 % interval")), "Unit")
     ]
-
-
-def _single_numbers(stage: Stage) -> dict[str, tuple[float, str]]:
-    """Parameters of one number that are not frozen, with their unit, by part and field."""
-    found = {}
-    for part_name, part in zip(stage.names, stage.parts, strict=True):
-        for info in parameter_table(part):
-            name = f"{part_name}.{info.path}"
-            frozen = any(name == one or name.startswith(f"{one}.") for one in stage.frozen)
-            if info.shape == () and "[" not in info.path and not frozen:
-                found[name.removesuffix(f"_{info.spec.unit}")] = float(attrgetter(info.path)(part)), info.spec.unit
-    return found
+    for one in diagnosis.baseline_parameters:
+        cells = (cell for each in (one, after.get(one.name, one))[: len(sides)] for cell in estimate(each)[::2])
+        rows.append((plain(parameter_name(one).replace(".", " ")), *cells, shown_unit(one.unit) or "1"))
+    return rows

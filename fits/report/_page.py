@@ -21,7 +21,8 @@ def environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    made.globals["style"] = files("fits.report").joinpath("report.css").read_text(encoding="utf-8")
+    for name, file in (("style", "report.css"), ("zoom", "zoom.js")):
+        made.globals[name] = files("fits.report").joinpath(file).read_text(encoding="utf-8")
     made.globals["written_by"] = written_by()
     return made
 

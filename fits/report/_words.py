@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fits.diagnosis._result import SMALLEST_P, Diagnosis, EffectParameter, RunView
+from fits.diagnosis._result import SMALLEST_P, Diagnosis, RunView
+from fits.loop._result import ParameterEstimate
 from microid.effects import card_of
 
 # A residual of more times the noise floor is not called noise.
@@ -48,7 +49,7 @@ def number(value: float, digits: int = 3) -> str:
     return _decimals(value, max(digits - 1 - exponent, 0))
 
 
-def estimate(parameter: EffectParameter) -> tuple[str, str, str]:
+def estimate(parameter: ParameterEstimate) -> tuple[str, str, str]:
     """Write estimate, standard deviation and 95 % interval, rounded to two digits of the standard deviation."""
     sd = parameter.sd
     size = abs(parameter.value) if math.isfinite(parameter.value) else 0.0
@@ -72,7 +73,7 @@ def sigmas(z: float) -> str:
     return _decimals(z, 1) if abs(z) < 1e3 else number(z)
 
 
-def parameter_name(parameter: EffectParameter) -> str:
+def parameter_name(parameter: ParameterEstimate) -> str:
     """Name a parameter in words, without the unit, which stands beside it."""
     suffix = "_" + parameter.unit.replace("/", "_per_").replace("^", "")
     return plain(parameter.name.removesuffix(suffix))

@@ -67,7 +67,7 @@ def refuse_unidentifiable(
     """
     stage = solved.stage
     information = marginal_information(solved.weighing.total(solved.sums), 0, None, solved.weighing.least_um**2)
-    named, value, derivative = solved.parameters()
+    named, value, derivative = solved.problem.chain.parameters(solved.z)
     slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
     spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     # At a bound the slope vanishes, however far the coordinate may run.

@@ -15,7 +15,7 @@ from fits.io._record import Record
 from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
 from fits.loop._misfit import misfits, remarks_on, worst
-from fits.loop._result import FitError, FitResult, FitStatus, ParameterEstimate, RunReport
+from fits.loop._result import FitError, FitResult, FitStatus, RunReport
 from fits.loop._run import Progress, Run, prepare_run, refuse_many_steps
 from fits.stage._checks import check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
@@ -29,8 +29,8 @@ from fits.stage._run import (
 )
 from fits.stage._solve import Problem, Solved
 from fits.stage._steps import Plan, present_problem, refine_problem, start_problem, starts_as_it_is
-from fits.stage._uncertainty import Precision
-from fits.stats._metrics import TWO_SIDED_95, WHITE
+from fits.stage._uncertainty import Precision, estimates
+from fits.stats._metrics import WHITE
 from microid import (
     AbstractLinear,
     Driver,
@@ -223,18 +223,11 @@ def _refined(plan: Plan, problem: Problem) -> Solution:
 
 def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     """Put the fit of a stage, and held-out runs, into figures; a `DataError` if the runs are not of one rig."""
-    coordinates, solved, stage = precision.chain.coordinates, precision.solved, precision.solved.stage
+    solved, stage = precision.solved, precision.solved.stage
     remarks = check_gains(stage, solved.runs, refuse=True)
     covariance = precision.covariance
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    names, value, slope = solved.parameters()
-    ends = [np.asarray(coordinates.values(jnp.asarray(solved.z + sign * TWO_SIDED_95 * sd))) for sign in (-1, 1)]
-    # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
-    width = np.where(sd > 0.5, np.abs(ends[1] - ends[0]) / (2 * TWO_SIDED_95), np.abs(slope) * sd)
-    parameters = tuple(
-        ParameterEstimate(name, unit, *map(float, figures))
-        for (name, unit), *figures in zip(names, value, width, *ends, strict=True)
-    )
+    names, value, slope = precision.chain.parameters(solved.z)
     unseen = unseen_directions(
         precision.information, [name for name, _ in names], slope / np.where(value == 0, np.inf, value)
     )
@@ -253,7 +246,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
         remarks=(*remarks, *unseen),
         runs=tuple(reports),
         smoothness=None if solved.hyper is None else float(np.exp(solved.hyper.log_density)),
-        parameters=parameters,
+        parameters=estimates(precision.chain, solved.z, sd),
         correlation=covariance / np.maximum(np.outer(sd, sd), 1e-300),
         unseen=unseen,
     )

@@ -61,6 +61,18 @@ class Chain(eqx.Module):
             return stage
         return stage.swap(stage.names[self.place], self.grid.model(columns_um, jnp.zeros(())))
 
+    def parameters(self, z: np.ndarray) -> tuple[list[tuple[str, str]], np.ndarray, np.ndarray]:
+        """Names and units of the parameters outside the grid, values, and derivatives by their own coordinates."""
+        point = jnp.asarray(z)
+        stage = self.coordinates(point)
+        named = [
+            (stage.named(info.path) + ("" if info.shape == () else str(list(place))), info.spec.unit)
+            for info in self.coordinates.table
+            for place in np.ndindex(info.shape)
+        ]
+        value, slope = jax.jvp(self.coordinates.values, (point,), (jnp.ones_like(point),))
+        return named, np.asarray(value), np.asarray(slope)
+
 
 @eqx.filter_jit
 def _linearised(

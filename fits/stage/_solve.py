@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -130,18 +129,6 @@ class Solved:
     def stage(self) -> Stage:
         """The stage that it stands for, without an offset."""
         return self.problem.chain.stage(jnp.asarray(self.z), jnp.asarray(self.columns_um))
-
-    def parameters(self) -> tuple[list[tuple[str, str]], np.ndarray, np.ndarray]:
-        """Names and units of the parameters outside the grid, values, and derivatives by their own coordinates."""
-        stage, coordinates = self.stage, self.problem.chain.coordinates
-        named = [
-            (stage.named(info.path) + ("" if info.shape == () else str(list(place))), info.spec.unit)
-            for info in coordinates.table
-            for place in np.ndindex(info.shape)
-        ]
-        point = jnp.asarray(self.z)
-        value, slope = jax.jvp(coordinates.values, (point,), (jnp.ones_like(point),))
-        return named, np.asarray(value), np.asarray(slope)
 
     @property
     def onward(self) -> Problem:

@@ -12,12 +12,13 @@ from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._prediction import Prediction
 from fits.loop._prior import interpolation
+from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
 from fits.stage._moments import Chain, along, offsets_out
 from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
-from fits.stats._metrics import WHITE
+from fits.stats._metrics import TWO_SIDED_95, WHITE
 from fits.stats._noise import correlation_samples, shared_square
 from microid import Preisach, Stage
 
@@ -139,6 +140,18 @@ class Precision:
             jnp.asarray(max(0.0, shared) ** 0.5),
             grid,
         )
+
+
+def estimates(chain: Chain, z: np.ndarray, sd: np.ndarray) -> tuple[ParameterEstimate, ...]:
+    """Parameters outside the grid with standard deviations and 95 % intervals, from those of their coordinates."""
+    names, value, slope = chain.parameters(z)
+    ends = [np.asarray(chain.coordinates.values(jnp.asarray(z + sign * TWO_SIDED_95 * sd))) for sign in (-1, 1)]
+    # Of what is hardly seen the interval alone says how wide it is: at a bound the slope vanishes.
+    width = np.where(sd > 0.5, np.abs(ends[1] - ends[0]) / (2 * TWO_SIDED_95), np.abs(slope) * sd)
+    return tuple(
+        ParameterEstimate(name, unit, *map(float, figures))
+        for (name, unit), *figures in zip(names, value, width, *ends, strict=True)
+    )
 
 
 def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:

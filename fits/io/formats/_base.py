@@ -11,13 +11,15 @@ class Format:
     """A kind of file that holds columns. To add one, put one file that registers it into this folder.
 
     `name` is as in "expected a CSV file". A file is of this format if it begins with one of `starts` or, where no
-    format is found so, if its name ends in one of `endings`. `open` makes a table of its name and its bytes.
+    format is found so, if its name ends in one of `endings`. `open` makes a table of its name, which may end in the
+    number of one of several where the format has those, and its bytes.
     """
 
     name: str
     endings: tuple[str, ...]
     starts: tuple[bytes, ...]
     open: Callable[[str, bytes], Table]
+    several: bool = False
 
 
 # By name, in the order of the files.

@@ -28,17 +28,22 @@ _Line = tuple[int, int, str]
 
 def open_csv(path: str, data: bytes) -> Table:
     """Find the table in a text, or the one that the path numbers; a `DataError` says that there is none."""
-    text, (file, number) = decode(path, data), numbered(path)
+    text = decode(path, data)
     starts = [*_beginnings(text), len(text)]
-    if len(starts) == 2 and number in (None, 1):
-        return _open_text(path, text)
-    if number is not None and number >= len(starts):
-        raise data_error(path, f"expected a table from 1 to {len(starts) - 1}, found number {number}; choose another")
-    begin, end = starts[(number or 1) - 1 : (number or 1) + 1]
+    number, remark = chosen(path, len(starts) - 1)
+    begin, end = starts[number - 1 : number + 1]
     above = text.count("\n", 0, begin)
-    remark = f"{file}: it holds {len(starts) - 1} tables, and the first was read; the second is {file}#2."
     # Blank lines, so that lines keep their numbers.
-    return replace(_open_text(path, "\n" * above + text[begin:end]), remark="" if number else remark)
+    return replace(_open_text(path, "\n" * above + text[begin:end]), remark=remark)
+
+
+def chosen(path: str, count: int) -> tuple[int, str]:
+    """Which of so many tables of a file is meant, from 1, and what is to be said where none was named."""
+    file, number = numbered(path)
+    if number is not None and number > count:
+        raise data_error(path, f"expected a table from 1 to {count}, found number {number}; choose another")
+    remark = f"{file}: it holds {count} tables, and the first was read; the second is {file}#2."
+    return number or 1, "" if number or count == 1 else remark
 
 
 def _beginnings(text: str) -> Iterator[int]:
@@ -181,4 +186,4 @@ def _is_unit(cell: str) -> bool:
     return cell.strip(" []()") in ("", "-", "1", "%") or known_unit(f"x[{cell.strip(' []()')}]") is not None
 
 
-register(Format("a CSV file", (".csv", ".txt", ".dat", ".asc", ".tsv"), (), open_csv))
+register(Format("a CSV file", (".csv", ".txt", ".dat", ".asc", ".tsv"), (), open_csv, several=True))

@@ -1,15 +1,15 @@
 """LabVIEW measurement files (.lvm): a header that states separator, units and sampling, then columns."""
 
-import itertools
 import math
 from contextlib import suppress
+from dataclasses import replace
 
 from fits.io._table import Table, data_error, with_unit
 from fits.io._text_table import TextTable, looks_numeric
 from fits.io.formats._base import Format, register
-from fits.io.formats.csv import checked, cut, decode
+from fits.io.formats.csv import checked, chosen, cut, decode
 
-_END = "***End_of_Header***"
+_END, _TOP = "***End_of_Header***", "Channels"
 _START = "LabVIEW Measurement"
 
 
@@ -19,14 +19,16 @@ def open_labview(path: str, data: bytes) -> Table:
     lines = text.split("\n")
     separator = "," if any(line.startswith("Separator,") for line in lines[:40]) else "\t"
     ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
-    if len(ends) > 2:
-        what = f"expected one table, found {len(ends) - 1}; split the file where the next header begins"
-        raise data_error(path, what, f"line {ends[2] + 1}")
+    # Every table has a header of its own, below the one of the file, which begins with the number of its channels.
+    number, remark = chosen(path, max(len(ends) - 1, 1))
+    tops = [k for k, line in enumerate(lines) if line.startswith(_TOP)][number - 1 : number + 1]
+    own = range(tops[0] if number > 1 and tops else 0, ends[min(number, len(ends) - 1)] if ends else 0)
+    lines = lines[: tops[1] if len(tops) > 1 else None]
     keys = {}
-    for line in lines[: ends[-1]] if ends else ():
+    for line in (lines[k] for k in (*range(ends[0] if ends else 0), *own)):
         key, *cells = line.split(separator)
         keys[key] = [cell.strip() for cell in cells]
-    head = next((k for k in range(ends[-1] + 1, len(lines)) if lines[k].strip()), None) if ends else None
+    head = next((k for k in range(own.stop + 1, len(lines)) if lines[k].strip()), None) if ends else None
     if head is None:
         raise data_error(path, f"expected {_END} and a line of names below it, found none; export it again", "line 1")
     names = [name.strip() for name in lines[head].split(separator)]
@@ -49,9 +51,9 @@ def open_labview(path: str, data: bytes) -> Table:
             interval_s = interval_s if math.isfinite(interval_s) and interval_s > 0 else None
     # Without a column of x its cells are there, and empty.
     skip = int(keys.get("X_Columns", [""])[0] == "No" and names[:1] in (["time[s]"], ["X_Value"]))
-    ends_at = sum(len(line) + 1 for line in itertools.islice(lines, head + 1))
-    body = "\n".join(_cells_of(line, separator, skip, len(names)) for line in text[ends_at:].split("\n"))
-    return checked(TextTable(path, tuple(names[skip:]), head + 1, separator, body, interval_s))
+    body = "\n".join(_cells_of(line, separator, skip, len(names)) for line in lines[head + 1 :])
+    found = checked(TextTable(path, tuple(names[skip:]), head + 1, separator, body, interval_s))
+    return replace(found, remark=remark)
 
 
 def _cells_of(line: str, separator: str, skip: int, width: int) -> str:
@@ -61,4 +63,4 @@ def _cells_of(line: str, separator: str, skip: int, width: int) -> str:
     return separator.join(cells[skip : width if commented else None])
 
 
-register(Format("a LabVIEW measurement file", (".lvm",), (_START.encode(),), open_labview))
+register(Format("a LabVIEW measurement file", (".lvm",), (_START.encode(),), open_labview, several=True))

@@ -1,0 +1,58 @@
+"""A model file in words: its numbers with their units, and what is known of its fit."""
+
+from collections.abc import Iterator
+from math import prod
+from typing import Any
+
+from fits.io._errors import DataError
+from fits.loop._report_words import describe, parameter_lines
+
+
+def model_numbers(part: Any, path: str = "") -> Iterator[dict[str, Any]]:
+    """Every field that holds numbers: its path, shape and unit, and the value of a single one."""
+    if isinstance(part, dict) and "unit" in part:
+        shape, value = [], part.get("value")
+        while isinstance(value, list):
+            shape.append(len(value))
+            value = value[0] if value else None
+        one = {"value": value} if not shape and isinstance(value, int | float) and abs(value) < 1e300 else {}
+        yield {"path": path, "shape": part.get("shape", shape), "unit": str(part["unit"]), **one}
+    elif isinstance(part, dict) and isinstance(part.get("parts"), list) and isinstance(part.get("names"), list):
+        for name, inner in zip(part["names"], part["parts"], strict=False):
+            yield from model_numbers(inner, f"{path}.{name}".lstrip("."))
+    elif isinstance(part, dict | list):
+        for name, inner in part.items() if isinstance(part, dict) else enumerate(part):
+            step = f"{path}.{name}".lstrip(".") if isinstance(part, dict) else f"{path}[{name}]"
+            yield from model_numbers(inner, step)
+
+
+def model_kind(path: str, held: dict[str, Any]) -> str:
+    """The class of a model that `read_model_text` reads; a `DataError` where there is none."""
+    if not isinstance(held["model"], dict) or not isinstance(held["model"].get("type"), str):
+        raise DataError(f"{path}: expected a model; write the file again with 'microid fit'.")
+    return str(held["model"]["type"])
+
+
+def model_words(path: str, held: dict[str, Any]) -> str:
+    """Put what `read_model_text` reads into words; a `DataError` where the report is not that of a fit."""
+    lines = [f"{model_kind(path, held)}, written by {held['written_by']}"]
+    for row in model_numbers(held["model"]):
+        unit = "" if row["unit"] == "1" else row["unit"]
+        size = "x".join(map(str, row["shape"])) if prod(row["shape"]) else "no"
+        shown = f"{row['value']:.6g} {unit}" if "value" in row else f"{size} numbers {unit and f'in {unit}'}"
+        lines.append(f"  {row['path']:34} {shown}".rstrip())
+    return "\n".join([*lines, "", _known_of_fit(path, held)])
+
+
+def _known_of_fit(path: str, held: dict[str, Any]) -> str:
+    diagnosed = held["fit"].get("part_of") == "diagnosis"
+    if held["uncertainty"] is None and not diagnosed:
+        return "saved without the uncertainty of a fit, so how well it predicts is not known"
+    try:
+        if diagnosed:
+            rows = parameter_lines(held["fit"].get("parameters", ()))
+            return "\n".join(["written by 'microid diagnose', whose report says how well it predicts", *rows])
+        return describe(held["fit"])
+    except (LookupError, TypeError, ValueError, AttributeError):
+        # The format does not say what a report holds, and the words are made for that of a fit.
+        raise DataError(f"{path}: its report is not that of a fit; fit again, or add --json to see it.") from None

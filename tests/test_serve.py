@@ -1,0 +1,85 @@
+"""The page of a folder, asked for as a browser asks, and opened in one where there is one."""
+
+import functools
+import json
+import shutil
+import threading
+import urllib.error
+import urllib.request
+from http.server import ThreadingHTTPServer
+
+import numpy as np
+import pytest
+from _command import refused, run
+from _diagnosis import diagnosis
+from _seed import seed_of
+from test_diagnosis_report import Page, browser, opened
+
+from fits import default_stage, save_model
+from fits.cli.serve import _Pages
+from fits.report._diagnosis import report_html
+from fits.sweeps._store import ABOUT, LEDGER
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """A folder of results on a free port, and its address."""
+    folder = tmp_path_factory.mktemp("results")
+    report = report_html(diagnosis(np.random.default_rng(seed_of("test_serve")), count=1))
+    for name in ("first", "se & cond"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "report.html").write_text(report, encoding="utf-8")
+        (folder / name / "diagnosis.json").write_text("{}")
+    save_model(folder / "stage.json", default_stage(), None, {})
+    shutil.copy(folder / "stage.json", folder / "first" / "extended.json")
+    (folder / "other.json").write_text(json.dumps({"schema": "another/1"}))
+    # A sweep that is broken says so in its place.
+    (folder / "sweep" / LEDGER).mkdir(parents=True)
+    (folder / "sweep" / ABOUT).write_text("{")
+    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Pages, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/"
+    server.shutdown()
+    server.server_close()
+
+
+def status_of(address, **headers):
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers)) as answer:
+            return answer.status
+    except urllib.error.HTTPError as refusal:
+        return refusal.code
+
+
+def test_results_stand_side_by_side_for_this_machine_alone(address):
+    with urllib.request.urlopen(address) as answer:
+        text = answer.read().decode()
+    page = Page(text)
+    assert text.count("<iframe") == 2
+    assert text.count("<article>") == 4
+    # A model by itself is shown, and that of a diagnosis by its report.
+    for words in ("stage.json", "natural_frequency_Hz", "first/report.html", "se & cond/report.html", ABOUT):
+        assert words in page.text
+    assert "extended.json" not in page.text
+    assert [status_of(address + link) for link in page.links if not link.startswith("data:")] == [200] * 4
+    assert status_of(address, Host="rebound.example:80") == 404
+    for inside in ("first/", "sweep/ledger", "../secret", "%2e%2e/secret"):
+        assert status_of(address + inside) == 404
+
+
+def test_what_cannot_be_served_is_said(address, tmp_path):
+    refused(run("serve", tmp_path / "none"), "none")
+    taken = address.rpartition(":")[2].strip("/")
+    refused(run("serve", tmp_path, "--port", taken), "--port", taken)
+
+
+@pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the page with")
+@pytest.mark.parametrize("width_px", [390, 1200])
+def test_a_browser_shows_results_side_by_side_where_there_is_room(address, tmp_path, width_px):
+    with urllib.request.urlopen(address) as answer:
+        text = answer.read().decode().replace("<head>", f'<head><base href="{address}">')
+    seen = opened(text, width_px, tmp_path)
+    assert (seen["problems"], seen["broken"]) == ([], 0)
+    assert seen["needed"] <= width_px
+    lefts = {round(left) for left in seen["lefts"]}
+    assert len(lefts) == (1 if width_px < 500 else 2)
