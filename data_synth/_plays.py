@@ -60,7 +60,7 @@ class PlaySum:
         """
         displacement_um = np.empty(len(voltage_V))
         for sample, voltage in enumerate(voltage_V.tolist()):
-            self._play_V = np.clip(self._play_V, voltage - self._radii_V, voltage + self._radii_V)
+            self._play_V = np.maximum(voltage - self._radii_V, np.minimum(voltage + self._radii_V, self._play_V))
             displacement_um[sample] = (self._play_V - self._lowest_V) @ self._weights_um_per_V
         return displacement_um
 
@@ -70,6 +70,6 @@ class PlaySum:
         Then each operator's state follows from its first state and the voltage now. Returns the same as `play`.
         """
         line_V = voltage_V[:, None]
-        plays_V = np.clip(self._play_V, line_V - self._radii_V, line_V + self._radii_V)
+        plays_V = np.maximum(line_V - self._radii_V, np.minimum(line_V + self._radii_V, self._play_V))
         self._play_V = plays_V[-1]
         return (plays_V - self._lowest_V) @ self._weights_um_per_V

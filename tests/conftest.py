@@ -49,15 +49,19 @@ gc.set_threshold(100_000, 50, 100)
 # Files that take longest: were one of them the last to begin, one worker would wait for the other.
 LONGEST = (
     "test_hidden_effect",
-    "test_fit_stage",
-    "test_fit_stage_checks",
     "test_plugins",
-    "test_sweep_controllers",
-    "test_cli_stage",
     "test_fit",
-    "test_cli_control",
-    "test_diagnosis_foreign",
-    "test_diagnosis_tangent",
+    "test_cli_stage",
+    "test_tune",
+    "test_synth_effects",
+    "test_fit_slow",
+    "test_cli",
+    "test_effects",
+    "test_control_loop",
+    "test_fit_free_stage",
+    "test_kinetostatics",
+    "test_sweep_run",
+    "test_sweep_kinds",
 )
 
 

@@ -37,7 +37,7 @@ def shell(*arguments, **options):
 def bench(tmp_path_factory):
     """A folder with example CSVs, and what `synth` and `fit` said about them."""
     folder = tmp_path_factory.mktemp("bench")
-    synth = run("synth", "quickstart", "--out", folder / "csv", "--seed", 5)
+    synth = run("synth", "plays", "--out", folder / "csv", "--seed", 5)
     train, heldout = folder / "csv" / "train.csv", folder / "csv" / "heldout.csv"
     out, plots = folder / "model.json", folder / "new" / "plots"
     fit = run("fit", train, "--holdout", heldout, "--levels", 8, "--out", out, "--plots", plots)
@@ -207,7 +207,7 @@ def test_synth_refuses_unknown_scenarios_and_places(tmp_path):
     listed = run("synth", "--list")
     assert listed.exit_code == 0
     assert {"quickstart", "plays"} <= {line.split()[0] for line in listed.stdout.splitlines()}
-    seeded = json.loads(run("synth", "quickstart", "--out", tmp_path / "q", "--seed", 3, "--json").stdout)
+    seeded = json.loads(run("synth", "plays", "--out", tmp_path / "q", "--seed", 3, "--json").stdout)
     assert seeded["seed"] == 3
     assert sorted(seeded["files"]) == [
         str(tmp_path / "q" / name) for name in ("heldout.csv", "train.csv", "truth.json")

@@ -99,7 +99,13 @@ def stages(rng):
 
 @pytest.mark.parametrize(
     ("name", "substeps"),
-    [("linear", 1), ("driver, hysteresis, mechanics", 3), ("no driver", 1), ("no mechanics", 2), ("plays", 1)],
+    [
+        ("linear", 1),
+        ("driver, hysteresis, mechanics", 3),
+        pytest.param("no driver", 1, marks=pytest.mark.study),
+        pytest.param("no mechanics", 2, marks=pytest.mark.study),
+        ("plays", 1),
+    ],
 )
 def test_without_feedback_the_loop_is_the_stage_under_a_held_command(name, substeps, rng):
     stage, memory = stages(rng)[name]

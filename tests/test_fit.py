@@ -17,7 +17,7 @@ def records(bench):
 
 @pytest.fixture(scope="module")
 def bench():
-    return data_synth.simulate(data_synth.load_scenario("quickstart"), seed=20240)
+    return data_synth.simulate(data_synth.load_scenario("plays"), seed=20240)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from _seed import seed_of
 from scipy.signal import lsim
 
 import fits
+from fits.stage._fit_slow import _stage
 
 NOISE_um, INTERVAL_s, LAG_s, GAIN, CONSTANT_s = 0.02, 0.02, 0.1, 0.08, 5.0
 TURNS_V = [0, 100, 0, 80, 20, 100, 40, 70, 30, 90, 0, 60, 10, 100, 100, 0, 0, 50, 5, 75, 25, 100, 0, 90, 20, 60, 0]
@@ -80,16 +81,25 @@ def test_the_command_takes_both(record, tmp_path):
     refused(run(*asked, "--model", "stage", "--out", tmp_path / "other.json"), "--lag")
 
 
-def test_relaxations_of_fast_runs_are_no_faster_than_a_model_file_may_hold(tmp_path):
+def fast_run():
     rng = np.random.default_rng(seed_of("fast_relaxations"))
     time_s = np.arange(3000) * 2e-4
     voltage_V = 50 + 50 * np.sin(2 * np.pi * 10 * time_s)
     moved_um = 0.1 * voltage_V + 0.003 * lsim(([1.0], [0.05, 1.0]), voltage_V, time_s)[1]
-    quick = fits.Record(time_s, voltage_V, moved_um + rng.normal(0, 0.001, len(time_s)), source="quick.csv")
-    result = fits.fit_slow([quick], relaxations=2, levels=8)
+    return fits.Record(time_s, voltage_V, moved_um + rng.normal(0, 0.001, len(time_s)), source="quick.csv")
+
+
+def test_relaxations_of_fast_runs_begin_where_a_model_file_may_hold_them():
+    quick = fast_run()
+    constants_s = [float(part.time_constant_s) for part in _stage([quick], False, 3).parts[1:]]
+    assert constants_s == pytest.approx([0.02, np.sqrt(0.02 * 0.15), 0.15], rel=1e-3)
+    with pytest.raises(fits.DataError, match=r"relaxations from 0\.02 s on show in runs of 0\.08 s or more"):
+        fits.fit_slow([quick[:300]], relaxations=2, levels=8)
+
+
+@pytest.mark.study
+def test_relaxations_of_fast_runs_are_saved_and_read(tmp_path):
+    result = fits.fit_slow([fast_run()], relaxations=2, levels=8)
     fits.save_model(tmp_path / "model.json", result.model, result.uncertainty, fits.fit_report(result))
     constants_s = [float(part.time_constant_s) for part in fits.load_model(tmp_path / "model.json").model.parts[1:]]
     assert all(constant >= 0.02 for constant in constants_s)
-    short = fits.Record(time_s[:300], voltage_V[:300], moved_um[:300], source="quick.csv")
-    with pytest.raises(fits.DataError, match=r"relaxations from 0\.02 s on show in runs of 0\.08 s or more"):
-        fits.fit_slow([short], relaxations=2, levels=8)

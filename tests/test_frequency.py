@@ -105,7 +105,7 @@ def test_a_long_run_of_periods_becomes_the_periodic_response(rng):
     )
 
 
-@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("coupled", [pytest.param(False, marks=pytest.mark.study), True])
 def test_modes_are_recovered_from_a_noisy_response(rng, coupled):
     parts = plant(rng, coupled)
     found = fits.fit_response(noisy(rng, parts, 1e-2), 2, coupled=coupled)
