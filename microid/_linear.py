@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from microid._param import _as_inexact
 from microid._platform import _by_platform
-from microid._precision import full_precision
+from microid._precision import _full_precision
 
 Hold = Literal["first", "zero", "smooth"]
 Times = Float[Array, " t"] | Float[Array, ""]
@@ -73,7 +73,7 @@ class LinearSystem(eqx.Module):
         )
 
     @eqx.filter_jit
-    @full_precision
+    @_full_precision
     def respond(
         self,
         time_s: Times,
@@ -265,7 +265,7 @@ def _orbit(
     return columns.T, over[..., 0]
 
 
-@full_precision
+@_full_precision
 def recur(step: Float[Array, "t n n"], push: Float[Array, "t n"]) -> Float[Array, "t n"]:
     """Solve `z[t] = step[t] @ z[t - 1] + push[t]` from zero on.
 

@@ -10,7 +10,7 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-def full_precision(function: Callable[_P, _T]) -> Callable[_P, _T]:
+def _full_precision(function: Callable[_P, _T]) -> Callable[_P, _T]:
     """Multiply matrices with all digits: by default a GPU keeps ten bits of factors in single precision."""
 
     @wraps(function)

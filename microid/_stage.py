@@ -21,7 +21,7 @@ from microid._part import (
     _joined,
     _run_linear,
 )
-from microid._precision import full_precision
+from microid._precision import _full_precision
 from microid._refine import _lines, refined
 
 # So many are exact to the last digit for any part; more take time and memory only.
@@ -113,7 +113,7 @@ class Stage(eqx.Module):
             if name not in self.names and not any(_below(path, name) for path in paths):
                 raise ValueError(f"there is nothing called {name!r} to freeze: choose some of {', '.join(paths)}")
 
-    @full_precision
+    @_full_precision
     def __call__(
         self,
         time_s: Times,

@@ -91,7 +91,7 @@ def test_the_stage_it_writes_is_the_one_it_used(stage, tmp_path):
     assert fits.read_design(level_0).tolerance["t4"] == 0.013
 
 
-def draw(design, report, folder):
+def draw(design, report, folder, *, form):
     assert isinstance(design, fits.Design)
     path = folder / f"{'_'.join(report.axes)}.png"
     path.write_bytes(b"drawn")
@@ -117,8 +117,8 @@ def test_plots_go_to_their_folder(stage, tmp_path, drawing):
 
 
 def test_an_interruption_leaves_nothing(stage, tmp_path, drawing):
-    def interrupt(design, report, folder):
-        draw(design, report, folder)
+    def interrupt(design, report, folder, **options):
+        draw(design, report, folder, **options)
         raise KeyboardInterrupt
 
     drawing(interrupt)

@@ -118,7 +118,7 @@ def test_what_the_runs_held_out_do_not_share_is_left_out_of_the_stage(rng):
     stage = default_stage()
     runs = (SimpleNamespace(samples=SimpleNamespace(stride=4)),)
     ready = SimpleNamespace(baseline=SimpleNamespace(runs=runs, fine=runs, stage=stage))
-    found = without_effects(ready, Extension(stage, (own, aside), ("load",)))
+    found = without_effects(ready, Extension(stage, ready.baseline, (own, aside), ("load",)))
     assert found.effects == ()
     assert found.stage.substeps == 4
     assert found.compared[0] is own

@@ -49,10 +49,13 @@ class Projector:
         sizes = [size for size in roughness if size > 0]
         priors = grid + sum(kind[0].shape[1] for kind in rough)
         self._priors = priors
-        shared = self.join(
-            [np.concatenate([rows, *(k[i] for k in rough)], axis=1) for i, rows in enumerate(regression.rows)]
-        )
-        matrix = np.concatenate([shared, self.nuisance_rows], axis=1)
+        blocks = [regression.rows, *rough]
+        nuisance = self.nuisance_rows
+        stops = np.cumsum([block[0].shape[1] for block in blocks])
+        matrix = np.empty((self.count + priors, stops[-1] + nuisance.shape[1]))
+        for block, stop in zip(blocks, stops, strict=True):
+            matrix[:, stop - block[0].shape[1] : stop] = self.join(block)
+        matrix[:, stops[-1] :] = nuisance
         root = regression.root
         matrix[self.count : self.count + grid, :grid] = root
         at, row = regression.size, self.count + grid
