@@ -226,6 +226,10 @@ def test_version():
     result = run("--version")
     assert result.exit_code == 0
     assert result.stdout.startswith("microid")
+    done = subprocess.run(
+        [sys.executable, "-m", "microid", "--version"], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout == result.stdout
 
 
 def test_compiled_functions_are_kept_where_the_user_says(tmp_path, monkeypatch):
