@@ -168,7 +168,8 @@ def test_derivatives_along_the_driver_go_through_what_comes_after(effect, rng):
     truth = (ahead - behind) / 2
     said, without = (np.linalg.norm(one.rows[1][:, -p:] @ dz - truth) for one in (beside, plain))
     print(f"off by {said / np.linalg.norm(truth):.2e}, the plain one by {without / np.linalg.norm(truth):.2e}")
-    assert said < 1e-3 * np.linalg.norm(truth)
+    # Derivatives are taken in fewer steps between samples.
+    assert said < 2e-3 * np.linalg.norm(truth)
     assert without > 0.02 * np.linalg.norm(truth)
 
 
