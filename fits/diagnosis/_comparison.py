@@ -144,17 +144,22 @@ def _ranked(
 ) -> list[Rival]:
     """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
 
-    About as good are those that are behind the best by no more than it gains by that.
+    About as good are also those that are behind the best by no more than it gains by that, until one ends behind it.
     """
     order = sorted(fitted, key=lambda one: one.criterion)
     out = []
-    near = max(thresholds.apart_z**2, _NEAR * (before - order[0].cost)) if order else 0.0
+    usual = max(thresholds.apart_z**2, _NEAR * (before - order[0].cost)) if order else 0.0
+    near, least = usual, np.inf
     for place, one in enumerate(order):
         if place >= _NEAREST or one.cost - order[0].cost > near:
             out.append(one)
             continue
         end = fit_jointly(bench, projector, one.refit)
-        near = max(near, one.cost - end[-1].cost) if place == 0 else near
+        if place == 0:
+            near = max(usual, one.cost - end[-1].cost)
+        elif end[-1].cost > least + thresholds.apart_z**2:
+            near = usual
+        least = min(least, end[-1].cost)
         if end[-1].possible(bench):
             out.append(replace(one, cost=end[-1].cost, criterion=end[-1].criterion(projector.count), end=end))
     # Of an effect the best form counts, which may be another once the baseline has followed.
