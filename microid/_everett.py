@@ -55,6 +55,7 @@ class Everett(eqx.Module):
         lost = self._branch(a, up) - _window(self.window_um, *a, *b) - self._branch(b, down)
         return lost.reshape(high.shape)
 
+    # Compiled by itself, so that it is traced once for all programs that it is part of.
     @eqx.filter_jit
     def respond(self, memory: Memory) -> Float[Array, " n"]:
         """Output along a record, zero at negative saturation (Eq. 11), in um."""

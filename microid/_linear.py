@@ -72,6 +72,7 @@ class LinearSystem(eqx.Module):
             other.gain * self.offset + other.offset,
         )
 
+    # Compiled by itself, so that it is traced once for all programs that it is part of.
     @eqx.filter_jit
     @_full_precision
     def respond(
