@@ -126,7 +126,7 @@ def headline(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "no_effect":
         return "No hidden effect was found."
     if diagnosis.verdict == "unexplained":
-        begin = f"There is {found}, and more" if found else "Something is wrong"
+        begin = f"The stage shows {found}, and more" if found else "Something is wrong"
         return f"{begin} that no known effect explains."
     if len(diagnosis.causes) == 1:
         (cause,) = diagnosis.causes
