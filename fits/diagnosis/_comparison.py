@@ -144,7 +144,8 @@ def _ranked(
 ) -> list[Rival]:
     """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
 
-    About as good are also those that are behind the best by no more than it gains by that, until one ends behind it.
+    About as good are also those that are behind the best by no more than twice what it gains by that, as they may
+    gain more, until one ends behind it.
     """
     order = sorted(fitted, key=lambda one: one.criterion)
     out = []
@@ -156,7 +157,7 @@ def _ranked(
             continue
         end = fit_jointly(bench, projector, one.refit)
         if place == 0:
-            near = max(usual, one.cost - end[-1].cost)
+            near = max(usual, 2 * (one.cost - end[-1].cost))
         elif end[-1].cost > least + thresholds.apart_z**2:
             near = usual
         least = min(least, end[-1].cost)
