@@ -19,7 +19,7 @@ from microid import EFFECTS, AbstractEffect
 _LEADERS, _FORMS, _NEAREST = 5, 2, 5
 # Scores below this share of the best are not worth a fit. The instant of an effect is not searched for, and the
 # baseline not fitted again beside it, where it leaves more than the best by these shares of what that explains.
-WORTH, _PROMISING, _NEAR = 0.4, 0.5, 0.1
+_WORTH, _PROMISING, _NEAR = 0.4, 0.5, 0.1
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def compare_rivals(
     """
     before, first = projector.held_out(model.change_um), len(model.laws)
     fits = list[tuple[Scored, Refit]]()
-    for one in _leaders(scores):
+    for one in leaders(scores):
         if not fits or has_time():
             fits.append((one, refit_beside(bench, projector, model, one)))
     least = min(found.cost for _, found in fits)
@@ -70,36 +70,34 @@ def compare_rivals(
             found = relocate(bench, projector, found, first)
         if not (_is_possible(projector, found, alone, thresholds) and has_occurred(bench, found)):
             continue
-        if _predicts_worse(before, projector.held_out(found.change_um), one, thresholds):
+        stands_out = one.robust_z > thresholds.determined_z or not len(before)
+        if not (stands_out or improvement_z(before, projector.held_out(found.change_um)) >= thresholds.worse_z):
             continue
         most = first + laws if has_time() else 0
         found = _add_occurrences(bench, projector, found, scored, most, thresholds)
         if one.form not in fitted or found.criterion(projector.count) < fitted[one.form].criterion(projector.count):
             fitted[one.form] = found
     rivals = [Rival(form.name, one, one.criterion(projector.count), one.cost) for form, one in fitted.items()]
-    return _ranked(bench, projector, rivals, model.cost, thresholds)
+    return _ranked(bench, projector, rivals, model.cost, before, thresholds)
 
 
-def _predicts_worse(before: np.ndarray, after: np.ndarray, one: Scored, thresholds: Thresholds) -> bool:
-    """Whether what was held out says no: it must be predicted better by what hardly stands out of the misfit."""
-    better = improvement_z(before, after)
-    if len(before) and not one.robust_z > thresholds.determined_z:
-        return better < thresholds.worse_z
+def _predicts_worse(before: np.ndarray, after: np.ndarray, thresholds: Thresholds) -> bool:
+    """Whether what was held out says no."""
     # What else is not simulated yet may make it a little worse.
     most = (1 + thresholds.model_error) * float(np.linalg.norm(before))
-    return better < -thresholds.worse_z and float(np.linalg.norm(after)) > most
+    return improvement_z(before, after) < -thresholds.worse_z and float(np.linalg.norm(after)) > most
 
 
-def _leaders(scores: Sequence[Scored]) -> list[Scored]:
+def leaders(scores: Sequence[Scored]) -> list[Scored]:
     """The best of those that explain most: of each effect the best of each form, or several without a strength."""
     best = best_of(scores)
     top = max(one.z for one in scores)
     found = []
-    for name in [name for name, one in best.items() if one.z > WORTH * top][:_LEADERS]:
+    for name in [name for name, one in best.items() if one.z > _WORTH * top][:_LEADERS]:
         tried: dict[type, int] = {}
         for one in sorted((one for one in scores if one.name == name), key=lambda s: -s.z):
             most = 1 if one.form.strength else _FORMS
-            if tried.get(one.form, 0) < most and one.z >= WORTH * best[name].z:
+            if tried.get(one.form, 0) < most and one.z >= _WORTH * best[name].z:
                 tried[one.form] = tried.get(one.form, 0) + 1
                 found.append(one)
     return found
@@ -140,29 +138,37 @@ def _one_more(bench: Bench, projector: Projector, model: Refit, scored: Sequence
 
 
 def _ranked(
-    bench: Bench, projector: Projector, fitted: list[Rival], before: float, thresholds: Thresholds
+    bench: Bench,
+    projector: Projector,
+    fitted: list[Rival],
+    cost: float,
+    held_out: np.ndarray,
+    thresholds: Thresholds,
 ) -> list[Rival]:
     """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
 
+    Without them there is a `cost`, and there are errors in what is `held_out`.
     About as good are also those that are behind the best by no more than twice what it gains by that, as they may
     gain more, until one ends behind it.
     """
     order = sorted(fitted, key=lambda one: one.criterion)
-    out = []
-    usual = max(thresholds.apart_z**2, _NEAR * (before - order[0].cost)) if order else 0.0
-    near, least = usual, np.inf
+    out = list[Rival]()
+    usual = max(thresholds.apart_z**2, _NEAR * (cost - order[0].cost)) if order else 0.0
+    near = least = np.inf
     for place, one in enumerate(order):
         if place >= _NEAREST or one.cost - order[0].cost > near:
             out.append(one)
             continue
         end = fit_jointly(bench, projector, one.refit)
-        if place == 0:
+        worse = _predicts_worse(held_out, end[1].held_out(end[-1].change_um), thresholds)
+        if worse or not end[-1].possible(bench):
+            continue
+        if least == np.inf:
             near = max(usual, 2 * (one.cost - end[-1].cost))
         elif end[-1].cost > least + thresholds.apart_z**2:
             near = usual
         least = min(least, end[-1].cost)
-        if end[-1].possible(bench):
-            out.append(replace(one, cost=end[-1].cost, criterion=end[-1].criterion(projector.count), end=end))
+        out.append(replace(one, cost=end[-1].cost, criterion=end[-1].criterion(projector.count), end=end))
     # Of an effect the best form counts, which may be another once the baseline has followed.
     best: dict[str, Rival] = {}
     for one in sorted(out, key=lambda one: one.criterion):

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._comparison import (
-    WORTH,
     Rival,
     compare_rivals,
     confusable_z,
     indistinguishable,
+    leaders,
     model_error,
 )
 from fits.diagnosis._effects import Bench
@@ -187,7 +187,7 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
         fitted = compare_rivals(
             bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds, search.has_time
         )
-        refused |= {s.name for s in open_ if s.z >= WORTH * top} if not fitted else set()
+        refused |= {s.name for s in leaders(open_)} - {rival.name for rival in fitted}
         found = []
         for rival in [rival for rival in fitted if rival.end is not None]:
             refused.add(rival.name)
