@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._certainty import stage_estimates
+from fits.diagnosis._effects import drop_programs
 from fits.diagnosis._experiment import Request, suggest
 from fits.diagnosis._extension import (
     Compared,
@@ -165,6 +166,7 @@ def conclude(
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)
         remarks.append(held.sentence)
+    drop_programs(records)
     ahead = None if request is None else suggest(ready, found, causes, request, progress)
     if request is None:
         remarks.append(

@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import takewhile
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.backend import get_backend
@@ -78,13 +79,16 @@ def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:
 
 
 def drop_programs(records: Sequence[Record]) -> None:
-    """Free the compiled programs that simulate parts, where records are long or programs are many.
+    """Free compiled programs, where records are long or programs are many.
 
-    Those of short runs serve the next diagnosis as well, but several hundred take as much memory as long records do.
-    What else the process has compiled stays.
+    Programs, and how JAX remembers them, take more memory than records of 30,000 samples do. Of long records all that
+    the process has compiled is freed; of short ones only what simulates parts, as the rest serves the next diagnosis.
     """
-    if sum(len(record) for record in records) >= _LONG or len(get_backend().live_executables()) > _MANY:
+    long = sum(len(record) for record in records) >= _LONG
+    if long or len(get_backend().live_executables()) > _MANY:
         program.cache_clear()
+    if long:
+        jax.clear_caches()
 
 
 def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float) -> AbstractEffect:
