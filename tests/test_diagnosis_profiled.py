@@ -148,3 +148,28 @@ def test_what_is_not_at_its_bound_stays(monkeypatch):
     inside = at_slope(0.7, 2.0)
     monkeypatch.setattr("fits.diagnosis._joint_fit._follow", lambda *_: at_slope(0.5, 0.5)[:2])
     assert leave_bounds(*inside, False) == inside
+
+
+def test_a_parameter_alone_in_its_effect_is_followed_with_the_other_effects_fitted_around_it():
+    form = next(one for one in EFFECTS if one.name == "voltage_dependent_capacitance")
+    first = 5 * np.linspace(-1, 1, 50)
+    second = first**3 / 25
+    laws = [Law([form(Driver(1e-3), jnp.asarray(slope), jnp.zeros(()), jnp.ones(()))]) for slope in (0.85, 0.3)]
+    assert [law.size for law in laws] == [1, 1]
+    bench = SimpleNamespace(
+        prepared=[None],
+        plain=[np.zeros(50)],
+        respond_in=lambda run, own: float(own[0].slope) * first + float(own[1].slope) * second,
+    )
+    measured = 0.85 * first + 0.3 * second
+    projector = SimpleNamespace(residual=measured, off=lambda joined: joined, join=lambda signals: signals[0])
+    model = refit(bench, projector, laws, [law.start for law in laws])
+    along = profile_likelihood(bench, projector, model, 0, np.eye(1))
+    slopes = np.array([float(laws[0].effect(there, 0).slope) for _, there in along])
+    left = measured - slopes[:, None] * first
+    # The second slope has bounds of its own.
+    others = np.clip(left @ second / (second @ second), -0.9, 0.9)
+    costs = np.sum((left - others[:, None] * second) ** 2, axis=1)
+    assert len(along) > 2
+    np.testing.assert_allclose([away for away, _ in along], np.maximum(np.sqrt(costs), 3), atol=0.02)
+    assert np.any(costs > 9)

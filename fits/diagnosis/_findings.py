@@ -15,7 +15,7 @@ from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._noise import Fault, Faults
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, refit
+from fits.diagnosis._refit import Refit, refit, refit_around
 from fits.diagnosis._result import Bound, FoundCause
 from fits.diagnosis._score import Scored, best_of
 from fits.diagnosis._select import Cause, Selection
@@ -201,10 +201,11 @@ def _profile_to(
         place = inside + way * step if outside is None else (inside + outside) / 2
         moved = np.array(_coordinates(last, which, law))
         moved[at] = place
-        # One by itself has nothing beside it that is fitted again.
-        only = sum(one.size for one in model.laws) == 1
-        held = Law(law.effects(moved), law.remembers, () if only else (path,))
-        there = refit(bench, projector, *last.with_law(which, held), 0 if only else _ROUNDS)
+        if law.size > 1:
+            held = Law(law.effects(moved), law.remembers, (path,))
+            there = refit(bench, projector, *last.with_law(which, held), _ROUNDS)
+        else:
+            there = refit_around(bench, projector, last, which, Law(law.effects(moved), law.remembers), _ROUNDS)
         found.append((there.cost, _coordinates(there, which, law)))
         away = max(there.cost - model.cost, 0.0) ** 0.5 / _FAR_Z
         if 1 / _FAR_WITHIN < away < _FAR_WITHIN:

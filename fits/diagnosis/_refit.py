@@ -221,6 +221,23 @@ def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -
     return model
 
 
+def refit_around(bench: Bench, projector: Projector, model: Refit, which: int, law: Law, rounds: int) -> Refit:
+    """Fit all other laws beside one that stays as it starts."""
+    laws, x = model.with_law(which, law)
+    if len(laws) == 1:
+        return refit(bench, projector, laws, x, 0)
+    order = [which, *(k for k in range(len(laws)) if k != which)]
+    nothing = np.zeros((len(projector.residual), 0))
+    found = _fit(bench, projector, [laws[k] for k in order], [x[k] for k in order], 1, nothing, rounds)
+    return _in_order(found, order)
+
+
+def _in_order(found: Refit, order: Sequence[int]) -> Refit:
+    """Laws and coordinates in the order from which they were taken."""
+    back = np.argsort(order)
+    return replace(found, laws=tuple(found.laws[k] for k in back), x=tuple(found.x[k] for k in back))
+
+
 def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: float, least_s: float) -> Refit:
     """Fit a law at another instant; all others stay, and follow along their tangent."""
     here = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
@@ -230,8 +247,7 @@ def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: floa
     owner = np.repeat(np.arange(len(laws)), [law.size for law in model.laws])
     basis = replace(model, tangent=model.tangent[:, owner != k]).basis()
     found = _fit(bench, projector, [laws[i] for i in order], [x[i] for i in order], len(laws) - 1, basis, 2)
-    back = np.argsort(order)
-    return replace(found, laws=tuple(found.laws[i] for i in back), x=tuple(found.x[i] for i in back))
+    return _in_order(found, order)
 
 
 def _fit(
