@@ -8,6 +8,7 @@ from scipy.interpolate import BSpline
 from fits import Record
 from fits.diagnosis._baseline import has_known_loop
 from fits.loop._past import past_columns
+from fits.loop._run import prepare_run
 
 LEVELS = 120
 
@@ -54,7 +55,10 @@ def test_relays_not_yet_swept_add_what_the_columns_span(rng, way):
     swept = np.where(voltage[0] >= on_V, 1.0, -1.0)
     known = (on_V <= voltage[0]) | (off_V >= voltage[0])
     # Whatever turns it went through before: states that vary smoothly over the half-plane.
-    before = np.clip(3 * np.sin(5 * on_V - 3 * off_V + rng.uniform(0, 6)), -1, 1)
+    phases = rng.uniform(0, 6) + np.linspace(0, 2 * np.pi, 6)
+    pasts = [np.clip(3 * np.sin(5 * on_V - 3 * off_V + phase), -1, 1) for phase in phases]
+    # That which differs most from none.
+    before = max(pasts, key=lambda past: weight[~known] @ (past[~known] + 1))
     past = relays(voltage, np.where(known, swept, before), weight, on_V, off_V)
     plain = relays(voltage, np.where(known, swept, -1.0), weight, on_V, off_V)
     columns = np.asarray(past_columns(jnp.asarray(voltage)))
@@ -89,3 +93,22 @@ def test_a_past_is_estimated_where_a_loop_is_left_beside_it():
     assert not known(np.r_[once, once, once], holdout=0.6)
     # A slow return within the range is no whole loop.
     assert not known(np.r_[once, 0.4 * once])
+
+
+def test_of_a_run_that_goes_farther_at_its_end_less_is_held_out(rng):
+    on_V, off_V, weight = half_plane(rng)
+    voltage = grown(600, 0.5)
+    # What is met for the first time is as two pasts left it, and no fit of what was before says how.
+    one, other = (relays(voltage, np.full(len(weight), state), weight, on_V, off_V) for state in (-1.0, 1.0))
+    record = Record(np.arange(600) * 0.01, voltage, one)
+
+    def spread_of(held_out):
+        left = (one - other)[held_out]
+        return np.max(np.abs(left - (one - other)[np.flatnonzero(~held_out)[-1]]))
+
+    stated, estimated = (
+        prepare_run(record, (0.0, 1.0), initial, 0.2, estimated=True) for initial in ("negative", "unknown")
+    )
+    assert stated.held_out.sum() == 120
+    assert 0 < estimated.held_out.sum() < 120
+    assert spread_of(estimated.held_out) < 0.25 * spread_of(stated.held_out)

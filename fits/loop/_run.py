@@ -25,6 +25,8 @@ _STAIRCASES = (64, 512, MOST_EXTREMES)
 _FEWEST = 50
 # Samples that a shorter run is padded to, so that runs of many lengths share what is compiled.
 _SHORTEST = 4096
+# Part of the range by which peaks of smooth commands miss their highest.
+_ALMOST = 1e-2
 # Told what is being done, a sentence at a time.
 Progress = Callable[[str], None]
 
@@ -214,8 +216,8 @@ def prepare_run(
 
     The memory before the first sample is `initial`, one of `INITIAL_STATES`; a fraction at the end is held out.
     `gain` is None for a stage without a hysteresis, which no past is unknown of. Samples that are not
-    `usable` are not known ones, shape `(n,)`; nor are those with an unknown past, unless that is `estimated`.
-    For the others see `Run`.
+    `usable` are not known ones, shape `(n,)`; nor are those with an unknown past, unless that is `estimated`: then
+    less is held out where the run goes farther at its end than before. For the others see `Run`.
     """
     n, (lower, upper) = len(record), range_V
     known = np.ones(n, dtype=bool) if gain is None else known_samples(record.voltage_V, lower, upper, initial)
@@ -226,7 +228,8 @@ def prepare_run(
     known = known if usable is None else known & usable
     fitted = known.copy()
     if holdout > 0:
-        fitted[n - round(holdout * n) :] = False
+        first = n - round(holdout * n)
+        fitted[max(first, _as_far_as_it_goes(record.voltage_V, upper - lower)) if has_past else first :] = False
     if holdout < 1 and fitted.sum() < _FEWEST:
         raise DataError(
             f"{record.source}: only {fitted.sum()} samples are left to fit, {_FEWEST} are needed: the others come "
@@ -237,6 +240,17 @@ def prepare_run(
     lower, upper = ahead * lower, ahead * upper
     start = initial_state(initial, lower, upper)
     return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown, has_past)
+
+
+def _as_far_as_it_goes(voltage_V: np.ndarray, width_V: float) -> int:
+    """Samples until a run has gone as far both ways as it will, but for a little of the range.
+
+    What relays that it sweeps for the first time went through before is learnt there, and predicted by nothing.
+    """
+    near_V = _ALMOST * width_V
+    there = np.maximum.accumulate(voltage_V) >= voltage_V.max() - near_V
+    there &= np.minimum.accumulate(voltage_V) <= voltage_V.min() + near_V
+    return int(np.argmax(there)) + 1
 
 
 def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
