@@ -131,8 +131,8 @@ class _Fit:
     def prefers(self, hold: Hold, thresholds: Thresholds) -> bool:
         """Whether there is evidence for another command between samples.
 
-        Curves must leave less than lines beyond chance, and beside the best effect, too. Steps must explain what a
-        delay behind lines does.
+        Curves must leave less than lines beyond chance. Steps must explain what a delay behind lines does. Either
+        must explain more with the best effect beside it than lines do.
         """
         least, off = thresholds.other_hold_z**2, thresholds.model_error
         late = self.delay_drop() if hold == "zero" else np.inf
@@ -140,9 +140,11 @@ class _Fit:
             return False
         left = self.left_under(hold)
         gained = float(self.left @ self.left - left @ left)
+        best, beside = self.largest_z() ** 2, gained + self.largest_z(left) ** 2
         if hold == "zero":
-            return gained > (1 - off) * late or gained - late + self.delay_drop(left) > off * late
-        return gained > least and gained + self.largest_z(left) ** 2 > self.largest_z() ** 2
+            explains = gained > (1 - off) * late or gained - late + self.delay_drop(left) > off * late
+            return explains and beside > (1 - off) * best
+        return gained > least and beside > best
 
     def largest_z(self, left: np.ndarray | None = None) -> float:
         """Evidence of the effect that has most, in what is `left`."""
