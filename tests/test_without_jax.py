@@ -24,7 +24,7 @@ from fits import DataError, Record, Uncertainty, predict, save_model
 from fits.io._model_text import read_model_text
 from fits.loop import _plain_file
 from fits.loop._design import Grid
-from fits.loop._plain import Path
+from fits.loop._path import Path
 from fits.loop._plain_file import plain_loop
 from fits.loop._prediction import MOST_EXTREMES, PIECE
 
@@ -33,6 +33,7 @@ EXACT = 1e-12
 SAMPLES = 300
 
 inverse = compiled(m.invert)
+respond = compiled(lambda model, voltage_V, start: model(voltage_V, start))
 
 
 def uncertainty_of(rng, model):
@@ -70,10 +71,18 @@ def test_predictions_are_those_of_jax(levels, rng, tmp_path):
         voltage_V = nested_voltages(rng, lower_V, upper_V, SAMPLES)
         voltage_V[[20, 40, 41, 60]] = lower_V, upper_V, upper_V, rng.choice(np.linspace(lower_V, upper_V, levels))
         record = Record(times_s(SAMPLES), voltage_V, None)
-        found, expected = loop.predict(record, state), predict(model, uncertainty, record, state)
         exact = {"rtol": 0, "atol": EXACT * stroke_um(model)}
-        np.testing.assert_allclose(found.displacement_um, expected.displacement_um, **exact)
-        np.testing.assert_allclose(found.displacement_sd_um, expected.displacement_sd_um, **exact)
+        start = starts(model)[state]
+        perturbed = np.stack(
+            [
+                respond(uncertainty.grid.model(columns, offset), voltage_V, start)
+                for columns, offset in zip(uncertainty.columns_um, uncertainty.offset_um, strict=True)
+            ]
+        )
+        sd_um = np.sqrt(np.sum(perturbed**2, axis=0) + float(uncertainty.discrepancy_um) ** 2)
+        for found in (loop.predict(record, state), predict(model, uncertainty, record, state)):
+            np.testing.assert_allclose(found.displacement_um, respond(model, voltage_V, start), **exact)
+            np.testing.assert_allclose(found.displacement_sd_um, sd_um, **exact)
 
 
 @pytest.mark.parametrize("state", STATES)
@@ -106,6 +115,11 @@ def test_branches_hang_from_the_extremes_of_the_definition(rng):
     found, (anchor, rising) = Path.of(path[:1], path[1:]), branches(path)
     np.testing.assert_array_equal(path[found.anchor], path[anchor])
     np.testing.assert_array_equal(found.rising, rising)
+    # The same piece by piece, with what each leaves carried on.
+    pieces = list(Path.pieces(path[:1], path[1:], 7))
+    anchors = np.concatenate([piece.values[piece.anchor[piece.lead :]] for piece in pieces])
+    np.testing.assert_array_equal(anchors, path[anchor][1:])
+    np.testing.assert_array_equal(np.concatenate([piece.rising[piece.lead :] for piece in pieces]), rising[1:])
 
 
 def test_a_voltage_that_nests_too_deeply_is_refused(file):

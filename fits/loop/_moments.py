@@ -17,13 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.loop._design import Grid, branch_table, design
+from fits.loop._design import Grid, branch_table, responses
 from fits.loop._past import past_columns
+from fits.loop._path import Path, branches
 from fits.loop._run import Run
-from microid import Staircase
 
 _SLOTS = 4
 _NEGLIGIBLE = 1e-14
+# Numbers in the rows that are regressed at a time: 16 MB.
+_VALUES = 2_000_000
 BLOCKS = 5
 # Short enough for each block to have seen all of a record: fifths of one that swings ever farther would not.
 PIECES = 40
@@ -49,7 +51,7 @@ class Compressed:
 def compress(run: Run, levels_V: np.ndarray, pieces: int) -> Compressed:
     """Group the samples of a run by their branches, see `Path`, and by evenly spaced levels; see `blocks_of`."""
     voltage_V, displacement_um, block = run.voltage_V, run.displacement_um, blocks_of(run, pieces)
-    anchor_V, rising = run.path.anchor_V, run.path.rising
+    anchor_V, rising = branches(run.path)
     share = np.ones(len(voltage_V)) if run.weight is None else run.weight
     step = levels_V[1] - levels_V[0]
     cell = np.clip(((voltage_V - levels_V[0]) / step).astype(np.int64), 0, len(levels_V) - 2)
@@ -126,7 +128,7 @@ def square_root(
     return root, target, np.maximum(energy - np.sum(target**2, axis=1), 0.0)
 
 
-def _zero_dimensional(value: Any) -> Any:
+def zero_dimensional(value: Any) -> Any:
     """Turn what NumPy's arithmetic makes of arrays without axes back into such."""
     return np.asarray(value) if isinstance(value, float | np.generic) else value
 
@@ -139,8 +141,8 @@ class Moments(eqx.Module):
 
     gram: Float[Array | np.ndarray, "D D"]
     cross_um: Float[Array | np.ndarray, " D"]
-    energy_um2: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
-    count: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
+    energy_um2: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
+    count: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
 
     @classmethod
     def empty(cls, size: int) -> "Moments":
@@ -214,7 +216,7 @@ def gather(grid: Grid, runs: Sequence[Run], pieces: int = PIECES) -> Data:
         if run.has_past:
             past = np.asarray(past_columns(jnp.asarray(groups.voltage_V.ravel())))
         past = past.reshape(*groups.voltage_V.shape, past.shape[1])
-        sums = _sums(grid, groups, run.path.pieces[0][1], past)
+        sums = _sums(grid, groups, run.extremes_V, past)
         total, mean = _without_nuisance(reduce(operator.add, sums), grid.columns)
         centred.append([total, *(_without_nuisance(part, grid.columns)[0] for part in sums)])
         means.append(mean)
@@ -222,23 +224,19 @@ def gather(grid: Grid, runs: Sequence[Run], pieces: int = PIECES) -> Data:
     return Data(grid, whole, tuple(blocks), tuple(means), pieces)
 
 
-def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) -> list[Moments]:
+def _sums(grid: Grid, groups: Compressed, before_V: np.ndarray, past: np.ndarray) -> list[Moments]:
     """Moments per block, with the nuisance parameters at the end: columns of a past, `(groups, 4, k)`, and ones."""
     size = grid.columns + past.shape[2] + 1
     sums = [Moments.empty(size) for _ in range(BLOCKS)]
-    table = jnp.asarray(branch_table(grid.levels))
-    # Groups that are regressed at a time: few, so that little is padded, or many where the many columns pay for it.
-    length = 512 if grid.levels > 32 else 256
-    for begin in range(0, len(groups.block), length):
+    table = branch_table(grid.levels)
+    length = max(_VALUES // (_SLOTS * size), 1)
+    paths = Path.pieces(before_V, groups.voltage_V.ravel(), _SLOTS * length)
+    for begin, path in zip(range(0, len(groups.block), length), paths, strict=True):
         piece = slice(begin, begin + length)
-        pad = (0, length - len(groups.block[piece]))
-        voltage = np.pad(groups.voltage_V[piece].ravel(), (0, 4 * pad[1]), mode="edge")
-        mix = np.pad(groups.mix[piece], (pad, (0, 0), (0, 0)))
-        mixed, start = _regress(grid, table, jnp.asarray(voltage), start, jnp.asarray(mix))
-        shape = 4 * len(past[piece]), past.shape[2]
-        beside = np.einsum("gij,gjk->gik", groups.mix[piece], past[piece]).reshape(shape)
-        rows = np.asarray(mixed)[: len(beside)]
-        rows = np.concatenate([rows[:, :-1], beside, rows[:, -1:]], axis=1)
+        mix = groups.mix[piece]
+        alone = np.concatenate([past[piece], np.ones((*past[piece].shape[:2], 1))], axis=2)
+        columns = responses(grid, table, path).reshape(len(mix), _SLOTS, -1)
+        rows = np.concatenate([mix @ columns, mix @ alone], axis=2).reshape(-1, size)
         for block in np.unique(groups.block[piece]):
             if block < 0:
                 continue
@@ -250,20 +248,6 @@ def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) ->
             count = np.asarray(groups.count[piece][which].sum(), dtype=float)
             sums[block] = sums[block] + Moments(part.T @ part, target @ part, energy, count)
     return sums
-
-
-@eqx.filter_jit
-def _regress(
-    grid: Grid,
-    table: Float[Array, "4 k D"],
-    voltage_V: Float[Array, " n"],
-    start: Staircase,
-    mix: Float[Array, "groups 4 4"],
-) -> tuple[Float[Array, "n E"], Staircase]:
-    response, end = design(grid, table, voltage_V, start)
-    response = jnp.concatenate([response, jnp.ones_like(response[:, :1])], axis=1)
-    mixed = jnp.einsum("gij,gjd->gid", mix, response.reshape(*mix.shape[:2], -1))
-    return mixed.reshape(response.shape), end
 
 
 def _without_nuisance(sums: Moments, size: int) -> tuple[Moments, RunMean]:

@@ -6,13 +6,13 @@ outputs counts operators that share a grid.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.loop._path import Path
 from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, refuse_outside, too_deep
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
@@ -21,46 +21,6 @@ _BATCH = 32
 _SWINGS = 31  # of a demagnetised state, as in `microid`
 _STEPS = 128  # of a root, as in `microid`
 _EPS = float(np.finfo(float).eps)
-
-
-@dataclass(frozen=True)
-class Path:
-    """Extremes of the memory to begin with, `lead` of them, and what follows; see `microid.Memory`.
-
-    A branch to each entry hangs from its anchor, and is rising or not. `depth` counts the anchors back to the first.
-    """
-
-    values: np.ndarray
-    anchor: np.ndarray
-    rising: np.ndarray
-    depth: np.ndarray
-    lead: int = 0
-
-    @classmethod
-    def of(cls, before: np.ndarray, then: Sequence[float] | np.ndarray = ()) -> Self:
-        """Find the extreme that each branch hangs from, in one pass with a stack (Madelung's rules)."""
-        values = np.append(before, then)
-        path = values.tolist()
-        anchor, rising, depth = [0], [True], [0]
-        stack, up, last = [0], True, path[0]
-        for t, x in enumerate(path[1:], 1):
-            # An entry that does not move belongs to the branch of the one before it.
-            if x != last and (x > last) != up:
-                up = not up
-                stack.append(t - 1)
-            while len(stack) > 2 and (path[stack[-2]] <= x if up else path[stack[-2]] >= x):
-                del stack[-2:]
-            anchor.append(stack[-1])
-            rising.append(up)
-            depth.append(depth[stack[-1]] + 1)
-            last = x
-        return cls(values, np.array(anchor), np.array(rising), np.array(depth), len(before))
-
-    @cached_property
-    def levels(self) -> list[np.ndarray]:
-        """Entries whose anchor is not the first, by their depth: each adds to one of the level before."""
-        order = np.argsort(self.depth, kind="stable")
-        return np.split(order, np.searchsorted(self.depth[order], np.arange(2, self.depth.max() + 1)))[1:]
 
 
 @dataclass(frozen=True)
@@ -81,10 +41,8 @@ class Surface:
         n = len(density)
         h, i = (upper_V - lower_V) / (n - 1), np.arange(n - 1)
         corner, side = density[np.arange(n), np.arange(n)], density[i + 1, i]
-        # The node below each diagonal triangle that makes the bilinear form linear on it.
-        ghost = corner[:-1] + corner[1:] - side
-        nodes = density.copy()
-        nodes[i, i + 1] += ghost
+        nodes = continued(density)
+        ghost = nodes[i, i + 1]
         window = h**2 * _running(_running(nodes).swapaxes(0, 1)).swapaxes(0, 1)
         # Along the diagonal: trapezoids of the rows up to it above, and of the columns of ghosts below it.
         rows = density.sum(axis=1) - (density[:, 0] + corner) / 2
@@ -109,6 +67,20 @@ class Surface:
         interval = np.minimum(x.astype(int), self.intervals - 1)
         return interval, x - interval
 
+    def over(self, voltage_V: np.ndarray) -> np.ndarray:
+        """Everett surfaces between all pairs of voltages, `(n, n, k)`, the higher first; see `microid.Everett`."""
+        i, s = self.place(voltage_V)
+        spline = np.zeros((len(i), len(self.window_um)))
+        for p, part in enumerate(_basis(s)):
+            spline[np.arange(len(i)), i + p] = part
+        rising, falling = (self._branch(i, s, up) for up in (True, False))
+        return rising[:, None] - np.einsum("ap,bq,pqk->abk", spline, spline, self.window_um, optimize=True) - falling
+
+    def _branch(self, interval: np.ndarray, s: np.ndarray, rising: np.ndarray | bool) -> np.ndarray:
+        c0, c1, c2, c3 = self.branch_um[:, np.where(rising, interval, interval + self.intervals)]
+        s = s[:, None]
+        return np.asarray(c0 + s * (c1 + s * (c2 + s * c3)))
+
     def respond(self, path: Path) -> np.ndarray:
         """Outputs along a path of voltages, zero at negative saturation (Eq. 11), in um, `(n, k)`."""
         i, s = self.place(path.values)
@@ -119,12 +91,7 @@ class Surface:
         total = np.zeros((len(i), self.window_um.shape[2]))
         for p, q in np.ndindex(3, 3):
             total += (sign * left[p] * right[q])[:, None] * self.window_um[a + p, b + q]
-        total[0] = 0.0
-        for rows in path.levels:
-            total[rows] += total[path.anchor[rows]]
-        c0, c1, c2, c3 = self.branch_um[:, np.where(up, i, i + self.intervals)]
-        s = s[:, None]
-        return np.asarray(total + (c0 + s * (c1 + s * (c2 + s * c3))))[path.lead :]
+        return np.asarray(path.add(total) + self._branch(i, s, up))[path.lead :]
 
 
 @dataclass(frozen=True)
@@ -140,14 +107,15 @@ class Perturbations:
     offset_um: np.ndarray
     discrepancy_um: float
 
-    def sd_um(self, path: Path) -> np.ndarray:
-        """Standard deviation of the displacement along a path of voltages, `(n,)`."""
-        square = np.full(len(path.values) - path.lead, self.discrepancy_um**2)
+    def sd_um(self, pieces: Sequence[Path]) -> np.ndarray:
+        """Standard deviation of the displacement along a path of voltages, in pieces, `(n,)`."""
+        square = [np.full(len(piece.values) - piece.lead, self.discrepancy_um**2) for piece in pieces]
         for k in range(0, len(self.offset_um), _BATCH):
             batch = slice(k, k + _BATCH)
             surface = Surface.of(self.density[..., batch], self.slope[:, batch], *self.range_V)
-            square += np.sum((surface.respond(path) + self.offset_um[batch]) ** 2, axis=1)
-        return np.sqrt(square)
+            for piece, sum_um2 in zip(pieces, square, strict=True):
+                sum_um2 += np.sum((surface.respond(piece) + self.offset_um[batch]) ** 2, axis=1)
+        return np.sqrt(np.concatenate(square))
 
 
 @dataclass(frozen=True)
@@ -175,18 +143,17 @@ class PlainLoop:
         refuse_outside(record, *self.range_V)
         path = self._path(record.voltage_V, initial)
         sd_um = np.full(len(record), np.nan) if self.uncertainty is None else self.uncertainty.sd_um(path)
-        return Prediction(self.offset_um + self.surface.respond(path)[:, 0], sd_um)
+        return Prediction(self._respond(path), sd_um)
 
     def respond(self, voltage_V: np.ndarray, initial: str) -> np.ndarray:
         """Displacement along a voltage, `(n,)`, in um; a `DataError` where it nests too deeply."""
-        return self.offset_um + self.surface.respond(self._path(voltage_V, initial))[:, 0]
+        return self._respond(self._path(voltage_V, initial))
 
-    def _path(self, voltage_V: np.ndarray, initial: str) -> Path:
-        path = Path.of(extremes_V(initial, *self.range_V), voltage_V)
-        depth = path.depth[path.lead :]
-        if max(depth[PIECE - 1 :: PIECE].max(initial=0), depth[-1]) >= MOST_EXTREMES:
-            raise too_deep()
-        return path
+    def _path(self, voltage_V: np.ndarray, initial: str) -> tuple[Path, ...]:
+        return path_of(extremes_V(initial, *self.range_V), voltage_V)
+
+    def _respond(self, path: tuple[Path, ...]) -> np.ndarray:
+        return self.offset_um + np.concatenate([self.surface.respond(piece)[:, 0] for piece in path])
 
     def invert(self, wanted_um: np.ndarray, initial: str) -> tuple[np.ndarray, float, float]:
         """Voltage whose displacement is the one wanted, `(n,)`, and the ends of what can be reached, in um."""
@@ -248,6 +215,14 @@ class PlainLoop:
         return np.array(voltage)
 
 
+def path_of(before_V: np.ndarray, voltage_V: np.ndarray) -> tuple[Path, ...]:
+    """A voltage followed by the memory, in pieces of one length; a `DataError` where it nests too deeply."""
+    pieces = tuple(Path.pieces(before_V, voltage_V, PIECE))
+    if max(piece.depth[-1] for piece in pieces) >= MOST_EXTREMES:
+        raise too_deep()
+    return pieces
+
+
 def extremes_V(initial: str, lower_V: float, upper_V: float) -> np.ndarray:
     """Extremes that a memory begins with, oldest first, by its name; see `microid.Staircase`.
 
@@ -266,6 +241,13 @@ def spread(packed: np.ndarray, levels: int) -> np.ndarray:
     """Values row by row over the half-plane, `(N (N + 1) / 2, k)` to `(N, N, k)`."""
     nodes = np.zeros((levels, levels, packed.shape[1]))
     nodes[np.tril_indices(levels)] = packed
+    return nodes
+
+
+def continued(density: np.ndarray) -> np.ndarray:
+    """Densities with the node below each diagonal triangle that makes the bilinear form linear on it, `(N, N, k)`."""
+    i, nodes = np.arange(len(density) - 1), density.copy()
+    nodes[i, i + 1] += density[i, i] + density[i + 1, i + 1] - density[i + 1, i]
     return nodes
 
 
