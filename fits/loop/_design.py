@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.loop._path import Path
-from fits.loop._plain import Surface, spread
+from fits.loop._surface import Surface, spread
 from microid import GridDensity, Preisach, Reversible, Staircase, forest_sum, node_areas, remember
 
 

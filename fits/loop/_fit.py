@@ -19,9 +19,9 @@ from fits.loop._left_over import suggestions
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._path import branches
-from fits.loop._plain import Surface
 from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import Progress, Run, command_range_V, prepare_run, simulate_run
+from fits.loop._surface import Surface
 from fits.loop._uncertainty import Uncertainty
 from fits.stats._metrics import WHITE
 from fits.stats._noise import LOSSES

@@ -7,9 +7,9 @@ import numpy as np
 
 from fits.loop._grid import EVIDENCE_LEVELS
 from fits.loop._moments import BLOCKS, PIECES, blocks_of, gather, grid_of
-from fits.loop._plain import Surface
 from fits.loop._prior import Hyper, Posterior, roughness
 from fits.loop._run import Run, simulate_run
+from fits.loop._surface import Surface
 
 # Time constants that stand for all of a relaxation, from so many samples to such a part of a run.
 _CONSTANTS, _SHORTEST, _LONGEST = 3, 20, 1 / 4

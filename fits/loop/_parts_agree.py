@@ -10,10 +10,10 @@ from fits.io._record import Record
 from fits.loop._grid import non_negative, solve_grid
 from fits.loop._misfit import Misfit, compare_gains, misfits, remarks_on, worst
 from fits.loop._moments import gather, grid_of
-from fits.loop._plain import Surface
 from fits.loop._prior import Hyper, Posterior, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, simulate_run
+from fits.loop._surface import Surface
 from fits.stats._metrics import WHITE
 from fits.stats._noise import correlation_samples
 

@@ -6,7 +6,7 @@ outputs counts operators that share a grid.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -14,84 +14,13 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._path import Path
 from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, refuse_outside, too_deep
+from fits.loop._surface import Surface, Visits, basis
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 # Perturbations at a time, which with a few thousand samples stay in a processor's cache.
-_BATCH = 32
 _SWINGS = 31  # of a demagnetised state, as in `microid`
 _STEPS = 128  # of a root, as in `microid`
 _EPS = float(np.finfo(float).eps)
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Everett surfaces of `k` densities; see `microid.Everett`.
-
-    The shape of `window_um` is `(N + 1, N + 1, k)`, that of `branch_um` `(4, 2 N - 2, k)`.
-    """
-
-    lower_V: float
-    upper_V: float
-    window_um: np.ndarray
-    branch_um: np.ndarray
-
-    @classmethod
-    def of(cls, density: np.ndarray, slope: np.ndarray, lower_V: float, upper_V: float) -> Self:
-        """Integrate densities at the nodes, in um/V^2, `(N, N, k)`, and slopes on the diagonal, in um/V, `(N, k)`."""
-        n = len(density)
-        h, i = (upper_V - lower_V) / (n - 1), np.arange(n - 1)
-        corner, side = density[np.arange(n), np.arange(n)], density[i + 1, i]
-        nodes = continued(density)
-        ghost = nodes[i, i + 1]
-        window = h**2 * _running(_running(nodes).swapaxes(0, 1)).swapaxes(0, 1)
-        # Along the diagonal: trapezoids of the rows up to it above, and of the columns of ghosts below it.
-        rows = density.sum(axis=1) - (density[:, 0] + corner) / 2
-        rising = _triangle(nodes, rows[:-1], rows[1:] - (corner[1:] + side) / 2)
-        here = np.concatenate([ghost[:1] / 2, ghost[1:-1]]) + corner[1:-1] / 2
-        none = np.zeros_like(ghost[:1])
-        next_ = np.concatenate([none, ghost[1:] / 2])
-        falling = _triangle(nodes.swapaxes(0, 1), np.concatenate([none, here]), next_)
-        reversible = h * _pieces(slope[:-1], np.diff(slope, axis=0) / 2, np.zeros_like(slope[1:]))
-        branch = np.concatenate([h**2 * rising + reversible, reversible - h**2 * falling], axis=1)
-        return cls(lower_V, upper_V, window, branch)
-
-    @property
-    def intervals(self) -> int:
-        """Number of intervals between levels, `N - 1`."""
-        return self.branch_um.shape[1] // 2
-
-    def place(self, voltage_V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Interval and fraction of it, at most those of the ends of the range."""
-        scale = self.intervals / (self.upper_V - self.lower_V)
-        x = (np.clip(voltage_V, self.lower_V, self.upper_V) - self.lower_V) * scale
-        interval = np.minimum(x.astype(int), self.intervals - 1)
-        return interval, x - interval
-
-    def over(self, voltage_V: np.ndarray) -> np.ndarray:
-        """Everett surfaces between all pairs of voltages, `(n, n, k)`, the higher first; see `microid.Everett`."""
-        i, s = self.place(voltage_V)
-        spline = np.zeros((len(i), len(self.window_um)))
-        for p, part in enumerate(_basis(s)):
-            spline[np.arange(len(i)), i + p] = part
-        rising, falling = (self._branch(i, s, up) for up in (True, False))
-        return rising[:, None] - np.einsum("ap,bq,pqk->abk", spline, spline, self.window_um, optimize=True) - falling
-
-    def _branch(self, interval: np.ndarray, s: np.ndarray, rising: np.ndarray | bool) -> np.ndarray:
-        c0, c1, c2, c3 = self.branch_um[:, np.where(rising, interval, interval + self.intervals)]
-        s = s[:, None]
-        return np.asarray(c0 + s * (c1 + s * (c2 + s * c3)))
-
-    def respond(self, path: Path) -> np.ndarray:
-        """Outputs along a path of voltages, zero at negative saturation (Eq. 11), in um, `(n, k)`."""
-        i, s = self.place(path.values)
-        up, i0, s0 = path.rising, i[path.anchor], s[path.anchor]
-        a, b = np.where(up, i, i0), np.where(up, i0, i)
-        left, right = _basis(np.where(up, s, s0)), _basis(np.where(up, s0, s))
-        sign = np.where(up, -1.0, 1.0)
-        total = np.zeros((len(i), self.window_um.shape[2]))
-        for p, q in np.ndindex(3, 3):
-            total += (sign * left[p] * right[q])[:, None] * self.window_um[a + p, b + q]
-        return np.asarray(path.add(total) + self._branch(i, s, up))[path.lead :]
 
 
 @dataclass(frozen=True)
@@ -109,13 +38,23 @@ class Perturbations:
 
     def sd_um(self, pieces: Sequence[Path]) -> np.ndarray:
         """Standard deviation of the displacement along a path of voltages, in pieces, `(n,)`."""
-        square = [np.full(len(piece.values) - piece.lead, self.discrepancy_um**2) for piece in pieces]
-        for k in range(0, len(self.offset_um), _BATCH):
-            batch = slice(k, k + _BATCH)
-            surface = Surface.of(self.density[..., batch], self.slope[:, batch], *self.range_V)
-            for piece, sum_um2 in zip(pieces, square, strict=True):
-                sum_um2 += np.sum((surface.respond(piece) + self.offset_um[batch]) ** 2, axis=1)
-        return np.sqrt(np.concatenate(square))
+        surface = Surface.of(self.density, self.slope, *self.range_V)
+        return np.concatenate([self._sd_um(surface, Visits.of(surface, piece)) for piece in pieces])
+
+    def _sd_um(self, surface: Surface, visits: Visits) -> np.ndarray:
+        """The square root of a polynomial of the sixth degree for each visit: the sum of squared cubics."""
+        square = np.zeros((len(visits.interval), 7))
+        square[:, 0] = self.discrepancy_um**2
+        for which, cubics in surface.cubics(visits):
+            cubics[:, 0] += self.offset_um
+            products = cubics @ np.moveaxis(cubics, 1, 2)
+            for power, other in np.ndindex(4, 4):
+                square[which, power + other] += products[:, power, other]
+        coefficients, s = square[visits.of_sample], visits.fraction
+        total = coefficients[:, 6]
+        for power in range(5, -1, -1):
+            total = total * s + coefficients[:, power]
+        return np.sqrt(np.maximum(total, 0.0))
 
 
 @dataclass(frozen=True)
@@ -183,7 +122,7 @@ class PlainLoop:
                 of, y = (a, up), (x0 - lower) * scale
                 i = min(int(y), n - 1)
                 s = y - i
-                w = np.array(_basis(s))
+                w = np.array(basis(s))
                 spline = (-(window[:, i : i + 3] @ w) if up else w @ window[i : i + 3]).tolist()
                 c0, c1, c2, c3 = branches[i if rising[a] else i + n]
                 begins = c0 + s * (c1 + s * (c2 + s * c3))
@@ -235,41 +174,3 @@ def extremes_V(initial: str, lower_V: float, upper_V: float) -> np.ndarray:
         rest, left = (lower_V + upper_V) / 2, 1 - np.arange(_SWINGS) / _SWINGS
         return np.append(rest + left[:, None] * (np.array([lower_V, upper_V]) - rest), rest)
     return np.array([lower_V, upper_V] if initial == "positive" else [lower_V])
-
-
-def spread(packed: np.ndarray, levels: int) -> np.ndarray:
-    """Values row by row over the half-plane, `(N (N + 1) / 2, k)` to `(N, N, k)`."""
-    nodes = np.zeros((levels, levels, packed.shape[1]))
-    nodes[np.tril_indices(levels)] = packed
-    return nodes
-
-
-def continued(density: np.ndarray) -> np.ndarray:
-    """Densities with the node below each diagonal triangle that makes the bilinear form linear on it, `(N, N, k)`."""
-    i, nodes = np.arange(len(density) - 1), density.copy()
-    nodes[i, i + 1] += density[i, i] + density[i + 1, i + 1] - density[i + 1, i]
-    return nodes
-
-
-def _sums(values: np.ndarray) -> np.ndarray:
-    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
-
-
-def _running(nodes: np.ndarray) -> np.ndarray:
-    """B-spline coefficients of the integral, from the first node on, of the hat functions along axis 0."""
-    return _sums(nodes) - nodes[:1] / 2
-
-
-def _pieces(c1: np.ndarray, c2: np.ndarray, c3: np.ndarray) -> np.ndarray:
-    return np.stack([_sums(c1 + c2 + c3)[:-1], c1, c2, c3])
-
-
-def _triangle(nodes: np.ndarray, here: np.ndarray, next_: np.ndarray) -> np.ndarray:
-    """Integrate over `0 <= y <= x` up to `x`: cubics on every interval, in units of the step squared."""
-    i = np.arange(len(nodes) - 1)
-    p, q, r = nodes[i, i], nodes[i + 1, i], nodes[i, i + 1]
-    return _pieces(here, (next_ - here + p) / 2, (q - p + (r - p) / 2) / 3)
-
-
-def _basis(s: Any) -> tuple[Any, Any, Any]:
-    return (1 - s) ** 2 / 2, 0.5 + s * (1 - s), s**2 / 2

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fits.loop._plain import Perturbations, PlainLoop, Surface, spread
+from fits.loop._plain import Perturbations, PlainLoop
+from fits.loop._surface import Surface, spread
 
 # Samples times perturbations, and times a hundred for the memory and the inverse, beyond which JAX is done first
 # although it takes seconds to start.

@@ -17,7 +17,8 @@ from fits.io.columns import columns_beside
 from fits.loop._design import Grid, columns_of
 from fits.loop._past import past_columns
 from fits.loop._path import Path
-from fits.loop._plain import Surface, extremes_V, path_of
+from fits.loop._plain import extremes_V, path_of
+from fits.loop._surface import Surface
 
 # Room for the extremes of a memory, and along the runs of a stage: filtered multisines nest deeply.
 _EXTREMES, _EXTREMES_OF_STAGE = 64, 512

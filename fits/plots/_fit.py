@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from fits.io._errors import AnyPath
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
-from fits.loop._plain import Surface, continued
 from fits.loop._result import FitResult, RunReport
 from fits.loop._run import Run, prepare_run, simulate_run
+from fits.loop._surface import Surface, continued
 from fits.plots import _style as style
 from fits.stats._metrics import TWO_SIDED_95
 from microid import Preisach
