@@ -123,7 +123,7 @@ class Surface:
         """What branches from places in intervals to others add, by powers of the fraction of the latter, `(n, k)`."""
         spline = []
         for p in range(3):
-            one = 0.0
+            one: Any = 0.0
             for q, part in enumerate(basis(s0)):
                 a, b = np.where(up, i + p, i0 + q), np.where(up, i0 + q, i + p)
                 one = one + np.where(up, -part, part)[:, None] * self.window_um[a, b]
