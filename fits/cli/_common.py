@@ -24,6 +24,8 @@ from fits.io._file_set import discard_all
 from fits.io._printable import printable
 
 NOTHING_LEFT = "no unfinished file was left"
+# Beyond this a command says what it does.
+_SILENCE_s = 2.0
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*([a-zµμ]+)\s*")
 
 
@@ -162,6 +164,19 @@ def progress_to_stderr(quiet: bool, stages: Sequence[StrEnum] = ()) -> Callable[
     return tell
 
 
+def now_and_then(tell: Callable[[str], None]) -> Callable[[str], None]:
+    """Pass a sentence on if some seconds have passed since the last: nothing of what is soon done."""
+    latest = time.monotonic()
+
+    def maybe(sentence: str) -> None:
+        nonlocal latest
+        if time.monotonic() - latest > _SILENCE_s:
+            latest = time.monotonic()
+            tell(sentence)
+
+    return maybe
+
+
 def print_result(given: Given, content: Any, lines: Iterable[str]) -> None:
     """Print a result: as JSON where that is asked for, else in lines."""
     click.echo(late.finite_json(content) if given.as_json else "\n".join(lines))
@@ -247,10 +262,10 @@ def stage_or_preisach(path: str, loaded: "late.ModelFile") -> "late.Preisach | l
     raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
 
 
-def opened(path: str, samples: int, plain: bool = True) -> "late.ModelFile | late.PlainLoop":
-    """Read a model for so many samples: without JAX where `plain_loop` can, and what is asked for is plain."""
+def opened(path: str, plain: bool = True) -> "late.ModelFile | late.PlainLoop":
+    """Read a model: without JAX where `plain_loop` can, and what is asked for is plain."""
     content = late.read_model_text(path)
-    loop = late.plain_loop(content, samples) if plain else None
+    loop = late.plain_loop(content) if plain else None
     if loop is not None:
         return loop
     late.start_jax()
@@ -258,11 +273,15 @@ def opened(path: str, samples: int, plain: bool = True) -> "late.ModelFile | lat
 
 
 def predicted_by(
-    path: str, loaded: "late.ModelFile | late.PlainLoop", program: "late.Record", initial: str
+    path: str,
+    loaded: "late.ModelFile | late.PlainLoop",
+    program: "late.Record",
+    initial: str,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> "late.Prediction":
     """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
     if isinstance(loaded, late.PlainLoop):
-        return loaded.predict(program, initial)
+        return loaded.predict(program, initial, progress)
     model = stage_or_preisach(path, loaded)
     if loaded.uncertainty is None and isinstance(model, late.Preisach):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")

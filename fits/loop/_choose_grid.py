@@ -43,7 +43,7 @@ def choose_grid(
 
     def trial(n: int, hyper: Hyper) -> GridTrial:
         progress(f"{n} levels")
-        return try_grid(gather(grid_of(runs, n), runs), runs, stroke, hyper, levels is None, alone)
+        return try_grid(gather(grid_of(runs, n), runs, progress=progress), runs, stroke, hyper, levels is None, alone)
 
     digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
     tried, trials = _resolve(trial, levels, finest, 1.2 * digit / 12**0.5)

@@ -4,7 +4,7 @@ The algorithm is that of `Everett`, `remember` and `invert` in `microid`. The la
 outputs counts operators that share a grid.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,10 +36,13 @@ class Perturbations:
     offset_um: np.ndarray
     discrepancy_um: float
 
-    def sd_um(self, pieces: Sequence[Path]) -> np.ndarray:
+    def sd_um(self, pieces: Sequence[Path], progress: Callable[[str], None] = lambda _: None) -> np.ndarray:
         """Standard deviation of the displacement along a path of voltages, in pieces, `(n,)`."""
-        surface = Surface.of(self.density, self.slope, *self.range_V)
-        return np.concatenate([self._sd_um(surface, Visits.of(surface, piece)) for piece in pieces])
+        surface, found = Surface.of(self.density, self.slope, *self.range_V), []
+        for k, piece in enumerate(pieces):
+            progress(f"predicting, {100 * k // len(pieces)} % done")
+            found.append(self._sd_um(surface, Visits.of(surface, piece)))
+        return np.concatenate(found)
 
     def _sd_um(self, surface: Surface, visits: Visits) -> np.ndarray:
         """The square root of a polynomial of the sixth degree for each visit: the sum of squared cubics."""
@@ -77,11 +80,13 @@ class PlainLoop:
         saturated = Path.of(*np.array(self.range_V)[:, None])
         return self.offset_um, self.offset_um + float(self.surface.respond(saturated)[0, 0])
 
-    def predict(self, record: Record, initial: str) -> Prediction:
+    def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
         refuse_outside(record, *self.range_V)
         path = self._path(record.voltage_V, initial)
-        sd_um = np.full(len(record), np.nan) if self.uncertainty is None else self.uncertainty.sd_um(path)
+        sd_um = np.full(len(record), np.nan)
+        if self.uncertainty is not None:
+            sd_um = self.uncertainty.sd_um(path, progress)
         return Prediction(self._respond(path), sd_um)
 
     def respond(self, voltage_V: np.ndarray, initial: str) -> np.ndarray:

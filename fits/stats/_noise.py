@@ -9,6 +9,8 @@ from scipy import fft
 # Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
 _HUBER = 1.345
 LOSSES = ("squares", "huber")
+# Samples of which it is seen whether a residual repeats itself.
+_COMPARED = 1_000_000
 
 
 def shared_square(residual: np.ndarray) -> float:
@@ -41,9 +43,13 @@ def repeated_square(place: np.ndarray, residual: np.ndarray, correlation: float)
     """Variance of what a residual repeats wherever it comes back to the same place; 0 where noise may do that, too.
 
     The products of pairs that are closest in place are compared, of samples so far apart in time that they share no
-    noise, if one in so many samples as `correlation` is independent.
+    noise, if one in so many samples as `correlation` is independent. Of a very long residual some samples are taken,
+    evenly chosen.
     """
-    order, centred = np.argsort(place, kind="stable"), residual - residual.mean()
+    centred, every = residual - residual.mean(), -(-len(place) // _COMPARED)
+    place, centred = place[::every], centred[::every]
+    correlation = max(correlation / every, 1.0)
+    order = np.argsort(place, kind="stable")
     one, other = (np.concatenate(part) for part in zip(*((order[k:], order[:-k]) for k in range(1, 9)), strict=True))
     apart = np.abs(one - other) > 5 * correlation
     one, other = one[apart], other[apart]
