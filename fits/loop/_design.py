@@ -116,14 +116,13 @@ def responses(grid: Grid, table: np.ndarray, path: Path) -> np.ndarray:
 
     x = x[path.lead :]
     cell = np.minimum(x.astype(np.int64), n - 2)
-    s = (x - cell)[:, None]
-    c0, c1, c2, c3 = table[:, np.where(path.rising[path.lead :], cell, cell + (n - 1))]
-    out = c3
-    for one in (c2, c1, c0):
-        out *= s
-        out += one
+    powers, branch = np.vander(x - cell, 4, increasing=True), np.where(path.rising[path.lead :], cell, cell + (n - 1))
+    out = np.empty((len(x), grid.columns))
+    for one in np.unique(branch):
+        here = branch == one
+        out[here] = powers[here] @ table[:, one]
     out[:, : grid.weights] += total
-    return np.asarray(out)
+    return out
 
 
 def _reach(x: Any, n: int, xp: Any) -> Any:
