@@ -163,7 +163,8 @@ def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
 
 
 def _with_offset(model: Preisach, offset_um: float) -> Preisach:
-    return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offset_um))
+    # By NumPy: of a Python number JAX remembers that its type is weak, and compiles all anew for that.
+    return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(np.asarray(offset_um)))
 
 
 def _report(found: Estimate, surface: Surface, offset_um: float, run: Run, **figures: Any) -> RunReport:
