@@ -18,7 +18,7 @@ class Visits:
 
     Of each visit there is the interval between levels, whether it is `rising`, and the place of its anchor among the
     `turns`: the path of those entries alone from which branches hang. Each sample has the `fraction` of the interval
-    where it is, and the number of its visit.
+    where it is, and the number of its visit. Visits that come back, with all that is remembered the same, are one.
     """
 
     interval: np.ndarray
@@ -39,8 +39,20 @@ class Visits:
         entries = np.unique(path.anchor)
         back = np.searchsorted(entries, path.anchor[entries])
         turns = Path(path.values[entries], back, path.rising[entries], path.depth[entries])
-        at = np.searchsorted(entries, anchor[first])
-        return cls(interval[first], rising[first], at, turns, fraction, np.cumsum(begins) - 1)
+        at = _alike(turns)[np.searchsorted(entries, anchor[first])]
+        key = (at * surface.intervals + interval[first]) * 2 + rising[first]
+        _, one, number = np.unique(key, return_index=True, return_inverse=True)
+        which = first[one]
+        return cls(interval[which], rising[which], at[one], turns, fraction, number[np.cumsum(begins) - 1])
+
+
+def _alike(turns: Path) -> np.ndarray:
+    """The first entry before which, and in which, all that is remembered is the same, for each entry, `(n,)`."""
+    first: dict[tuple[float, int], int] = {}
+    found: list[int] = []
+    for k, (value, anchor) in enumerate(zip(turns.values.tolist(), turns.anchor.tolist(), strict=True)):
+        found.append(first.setdefault((value, found[anchor] if anchor < k else -1), k))
+    return np.array(found)
 
 
 @dataclass(frozen=True)
