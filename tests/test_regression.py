@@ -4,16 +4,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import dblquad, quad
-from scipy.optimize import nnls
+from scipy.optimize import minimize, nnls, rosen, rosen_der
 from scipy.stats import multivariate_normal
 
 import fits
 from fits.loop._design import Grid, columns_of
 from fits.loop._moments import gather
-from fits.loop._prior import Hyper, Posterior, _negative_log, interpolation, maximise_evidence, roughness
+from fits.loop._prior import Evidence, Hyper, Posterior, interpolation, maximise_evidence, roughness
 from fits.loop._run import prepare_run, simulate_run
+from fits.stats._bfgs import minimise
 from fits.stats._noise import correlation_samples, shared_square
-from fits.stats._nonnegative import minimise_nonnegative
+from fits.stats._nonnegative import minimise_nonnegative, pivot_nonnegative
 
 LEVELS = 6
 
@@ -72,12 +73,12 @@ def test_evidence_is_the_density_of_the_data_under_the_prior(rng):
     data = gather(grid, [run])
     design, target = _dense(grid, [run]), run.displacement_um - run.displacement_um.mean()
     rough = roughness(4)
+    evidence = Evidence(data.total, rough)
 
     def cost(*smooth, variance):
-        hyper = Hyper(*(jnp.asarray(v) for v in (*smooth, variance)))
-        prior = np.asarray(rough.precision(hyper))
+        prior = rough.precision(Hyper.of(*smooth, variance))
         covariance = np.exp(variance) * np.eye(len(target)) + design @ np.linalg.solve(prior, design.T)
-        ours = float(_negative_log(hyper, (data.total, rough)))
+        ours = evidence.value(np.array([*smooth, variance]))
         weak = np.sum(((np.array(smooth) - [-12.0, np.log(1e-2), 2.0, np.log(1e-2)]) / 6.0) ** 2) / 2
         return ours - weak, -multivariate_normal(np.zeros(len(target)), covariance).logpdf(target)
 
@@ -88,13 +89,33 @@ def test_evidence_is_the_density_of_the_data_under_the_prior(rng):
     assert abs(pairs[0][1] - pairs[1][1]) > 1  # the points differ, so agreement means something
 
     found = maximise_evidence(data.total, rough, Hyper.start())
-    best = float(_negative_log(found, (data.total, rough)))
-    assert all(best <= float(ours) + 30 for ours, _ in pairs)
+    best = evidence.value(np.array([*found.weights, found.log_variance]))
+    exact = minimize(evidence.value, points[0], method="Nelder-Mead", options={"maxiter": 4000})
+    assert best <= exact.fun + 0.02
+
+
+def test_slope_of_the_evidence_is_that_of_its_values(problem):
+    _, _, data = problem
+    evidence, step = Evidence(data.total, roughness(LEVELS)), 1e-3
+    for logs in ((-3.0, -1.0, -4.0, -2.0, -1.0), (2.0, -2.0, 3.0, 1.0, -3.0)):
+        ahead, behind = ([evidence.value(logs + sign * step * unit) for unit in np.eye(5)] for sign in (1, -1))
+        slope = (np.array(ahead) - behind) / (2 * step)
+        np.testing.assert_allclose(evidence.slope(np.array(logs)), slope, rtol=1e-4, atol=1e-3)
+
+
+def test_quasi_newton_steps_find_the_bottom_of_a_valley_and_come_back_from_where_nothing_is_finite():
+    def value(x):
+        return rosen(x) if np.all(np.abs(x) < 3) else np.nan
+
+    found = minimise(value, rosen_der, np.array([-1.2, 1.0, 0.5]), 1e-9, 1e-9, 500)
+    np.testing.assert_allclose(found, 1.0, rtol=0, atol=1e-6)
+    few = minimise(value, rosen_der, np.array([-1.2, 1.0, 0.5]), 1e-9, 1e-9, 20)
+    assert rosen([-1.2, 1.0, 0.5]) > rosen(few) > 1e-3
 
 
 def test_posterior_is_that_of_dense_bayesian_regression(problem):
     grid, runs, data = problem
-    hyper = Hyper(*(jnp.asarray(v) for v in (-2.0, -1.0, -3.0, -1.0, -4.0)))
+    hyper = Hyper.of(-2.0, -1.0, -3.0, -1.0, -4.0)
     rough = roughness(LEVELS)
     posterior = Posterior.of(data.total, rough, hyper)
     design = _dense(grid, runs)
@@ -147,8 +168,13 @@ def test_interpolated_columns_respond_as_the_coarse_ones_where_the_grids_share_n
     np.testing.assert_allclose(one, other, rtol=0, atol=0.02 * np.ptp(one))
 
 
+def traced(hessian, linear, start, atol, most_steps):
+    return minimise_nonnegative(*map(jnp.asarray, (hessian, linear, start)), atol, most_steps)
+
+
+@pytest.mark.parametrize("solve", [traced, pivot_nonnegative])
 @pytest.mark.parametrize("condition", [1e1, 1e6, 1e10])
-def test_block_pivoting_finds_the_minimum_that_nnls_finds(rng, condition):
+def test_block_pivoting_finds_the_minimum_that_nnls_finds(rng, condition, solve):
     size = 40
     rotation = np.linalg.qr(rng.normal(size=(size, size)))[0]
     root = rotation * np.geomspace(1, condition**-0.5, size) @ rotation.T
@@ -159,8 +185,7 @@ def test_block_pivoting_finds_the_minimum_that_nnls_finds(rng, condition):
     def cost(y, _):
         return y @ (hessian @ y) / 2 - linear @ y
 
-    start = jnp.asarray(rng.normal(size=size))
-    found, success = minimise_nonnegative(jnp.asarray(hessian), -jnp.asarray(linear), start, 1e-8, 400)
+    found, success = solve(hessian, -linear, rng.normal(size=size), 1e-8, 400)
     assert success
     exact, _ = nnls(root, target, maxiter=10000)
     y = np.asarray(found)
@@ -172,11 +197,13 @@ def test_block_pivoting_finds_the_minimum_that_nnls_finds(rng, condition):
     assert np.all(np.abs(gradient[y > 0]) < 1e-6)
 
 
-def test_block_pivoting_says_when_it_ran_out_of_steps(rng):
+@pytest.mark.parametrize("solve", [traced, pivot_nonnegative])
+def test_block_pivoting_says_when_it_ran_out_of_steps_or_there_is_no_minimum(rng, solve):
     root = rng.normal(size=(30, 30))
-    hessian, linear = jnp.asarray(root.T @ root), -jnp.asarray(root.T @ rng.normal(size=30))
-    assert not minimise_nonnegative(hessian, linear, jnp.zeros(30), 1e-10, 1)[1]
-    assert minimise_nonnegative(hessian, linear, jnp.zeros(30), 1e-10, 400)[1]
+    hessian, linear = root.T @ root, -root.T @ rng.normal(size=30)
+    assert not solve(hessian, linear, np.zeros(30), 1e-10, 1)[1]
+    assert solve(hessian, linear, np.zeros(30), 1e-10, 400)[1]
+    assert not solve(-hessian, linear, np.ones(30), 1e-10, 400)[1]
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.6, 0.9])

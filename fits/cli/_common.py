@@ -24,6 +24,8 @@ from fits.io._file_set import discard_all
 from fits.io._printable import printable
 
 NOTHING_LEFT = "no unfinished file was left"
+# Beyond this a command says what it does.
+_SILENCE_s = 2.0
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*([a-zµμ]+)\s*")
 
 
@@ -132,6 +134,15 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
     return run
 
 
+def one_thread() -> None:
+    """Let linear algebra use one thread, unless the user says otherwise; to be called before NumPy is imported.
+
+    Matrices of a few hundred rows are factored no faster by more, and far more slowly where other processes run: the
+    threads wait for each other.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 def progress_to_stderr(quiet: bool, stages: Sequence[StrEnum] = ()) -> Callable[[str], None]:
     """Make what tells on stderr what is being done, and since when.
 
@@ -151,6 +162,19 @@ def progress_to_stderr(quiet: bool, stages: Sequence[StrEnum] = ()) -> Callable[
         click.echo(f"\r\033[K{line}" if stays else line, nl=not stays or at == len(stages), err=True)
 
     return tell
+
+
+def now_and_then(tell: Callable[[str], None]) -> Callable[[str], None]:
+    """Pass a sentence on if some seconds have passed since the last: nothing of what is soon done."""
+    latest = time.monotonic()
+
+    def maybe(sentence: str) -> None:
+        nonlocal latest
+        if time.monotonic() - latest > _SILENCE_s:
+            latest = time.monotonic()
+            tell(sentence)
+
+    return maybe
 
 
 def print_result(given: Given, content: Any, lines: Iterable[str]) -> None:
@@ -238,10 +262,10 @@ def stage_or_preisach(path: str, loaded: "late.ModelFile") -> "late.Preisach | l
     raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
 
 
-def opened(path: str, samples: int, plain: bool = True) -> "late.ModelFile | late.PlainLoop":
-    """Read a model for so many samples: without JAX where `plain_loop` can, and what is asked for is plain."""
+def opened(path: str, plain: bool = True) -> "late.ModelFile | late.PlainLoop":
+    """Read a model: without JAX where `plain_loop` can, and what is asked for is plain."""
     content = late.read_model_text(path)
-    loop = late.plain_loop(content, samples) if plain else None
+    loop = late.plain_loop(content) if plain else None
     if loop is not None:
         return loop
     late.start_jax()
@@ -249,11 +273,15 @@ def opened(path: str, samples: int, plain: bool = True) -> "late.ModelFile | lat
 
 
 def predicted_by(
-    path: str, loaded: "late.ModelFile | late.PlainLoop", program: "late.Record", initial: str
+    path: str,
+    loaded: "late.ModelFile | late.PlainLoop",
+    program: "late.Record",
+    initial: str,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> "late.Prediction":
     """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
     if isinstance(loaded, late.PlainLoop):
-        return loaded.predict(program, initial)
+        return loaded.predict(program, initial, progress)
     model = stage_or_preisach(path, loaded)
     if loaded.uncertainty is None and isinstance(model, late.Preisach):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")

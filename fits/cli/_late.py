@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fits.control._tune_problem import Goal, passed_limits
     from fits.diagnosis._diagnose import diagnose
     from fits.diagnosis._result import Diagnosis, Step
-    from fits.io._atomic import finite_json, refuse_nonfinite, write_csv
+    from fits.io._atomic import finite_json, refuse_nonfinite, write_csv, write_table
     from fits.io._inspect import inspect_table
     from fits.io._jax_setup import start_jax
     from fits.io._json import strict
@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from fits.paper._regenerate import paper_result
     from fits.plots._channels import plot_channels
     from fits.plots._control import plot_compensation, plot_control
-    from fits.plots._fit import plot_fit, plot_stage
+    from fits.plots._fit import plot_fit
+    from fits.plots._fit_stage import plot_stage
     from fits.plots._machining import plot_budget, plot_sensitivity
     from fits.plots._sweep import plot_sweep
     from fits.report._control import control_json, describe_control

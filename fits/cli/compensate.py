@@ -41,7 +41,7 @@ def compensate(given: common.Given) -> None:
     volts, stated = common.parse_rig_limits(given.limits, given.limit, given.margin)
     wanted = late.read_reference(given.reference, **common.reading(given))
     every = bool({"velocity", "acceleration", "current"} & set(stated))
-    loaded = common.opened(given.model, len(wanted), plain=given.way == "static" and not (every or given.plots))
+    loaded = common.opened(given.model, plain=given.way == "static" and not (every or given.plots))
     stage: Any = loaded if isinstance(loaded, late.PlainLoop) else common.stage_or_preisach(given.model, loaded)
     if given.way == "dynamic" and isinstance(stage, late.Preisach):
         raise DataError(

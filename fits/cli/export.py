@@ -22,7 +22,7 @@ def export(given: common.Given) -> None:
 
     The header and the source need no library and allocate nothing.
     """
-    loaded, limits_V = common.opened(given.model, 0), common.parse_limits_V(given.limits)
+    loaded, limits_V = common.opened(given.model), common.parse_limits_V(given.limits)
     law: Any = loaded
     remarks = list[str]()
     if not isinstance(loaded, late.PlainLoop):

@@ -14,23 +14,25 @@ from fits.cli import _options as options
 @options.initial("the program")
 @options.columns
 @options.json_output
+@options.quiet
 @common.in_sentences
 def simulate(given: common.Given) -> None:
     """Predict the displacement of a voltage program, with its standard deviation.
 
     PROGRAM.csv needs the columns time_s and voltage_V. The prediction has time_s, voltage_V, displacement_um and
-    displacement_sd_um; sensor noise is not in the last.
+    displacement_sd_um; sensor noise is not in the last. A name that ends in .npz or .parquet says that format.
     """
     import numpy as np
 
+    progress = common.now_and_then(common.progress_to_stderr(given.quiet))
     common.refuse_overwriting(given.out, [given.model, given.program])
     record = late.read_table(given.program, required=("time_s", "voltage_V"), **common.reading(given))
-    loaded = common.opened(given.model, len(record))
-    prediction = common.predicted_by(given.model, loaded, record, given.initial)
+    loaded = common.opened(given.model)
+    prediction = common.predicted_by(given.model, loaded, record, given.initial, progress)
     displacement_um, sd_um = prediction.displacement_um, prediction.displacement_sd_um
     known = loaded.uncertainty is not None
     table = {"time_s": record.time_s, "voltage_V": record.voltage_V, "displacement_um": displacement_um}
-    late.write_csv(given.out, table | ({"displacement_sd_um": sd_um} if known else {}))
+    late.write_table(given.out, table | ({"displacement_sd_um": sd_um} if known else {}))
     summary = {
         "out": given.out,
         "samples": len(record),

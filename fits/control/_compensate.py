@@ -12,7 +12,8 @@ from fits.control import _compensate_stage as whole
 from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, compensate_loop, follow, within_range
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
-from fits.loop._plain import PlainLoop, Surface
+from fits.loop._plain import PlainLoop
+from fits.loop._surface import Surface
 from microid import AbstractEffect, Preisach, Stage
 
 Way = Literal["static", "dynamic"]

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 import microid
 from fits.io._errors import DataError
@@ -45,7 +46,7 @@ def gains_of(stage: Stage) -> tuple[float, float, float]:
     for k, part in enumerate(stage.parts):
         if not isinstance(part, AbstractLinear):
             continue
-        gain = float(part.static_gain)
+        gain, own = map(float, _at_rest(part))
         if not (np.isfinite(gain) and gain > 0):
             raise DataError(
                 f"part {stage.names[k]!r} of the stage: expected a positive static gain, found {gain:g}; turn the "
@@ -55,8 +56,13 @@ def gains_of(stage: Stage) -> tuple[float, float, float]:
         if k < law:
             ahead *= gain
         else:
-            behind, offset = behind * gain, gain * offset + float(part.system().offset)
+            behind, offset = behind * gain, gain * offset + own
     return ahead, behind, offset
+
+
+@eqx.filter_jit
+def _at_rest(part: AbstractLinear) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    return part.static_gain, part.system().offset
 
 
 def static_equivalent(model: Preisach | Stage) -> Preisach:
@@ -67,7 +73,14 @@ def static_equivalent(model: Preisach | Stage) -> Preisach:
     if isinstance(model, Preisach):
         return model
     stage = plain_of(model)
-    law, (ahead, behind, offset_um) = hysteresis_of(stage), gains_of(stage)
+    return _folded(hysteresis_of(stage), *map(jnp.asarray, gains_of(stage)))
+
+
+# As one program: one operation after the other they would be compiled each by itself.
+@eqx.filter_jit
+def _folded(
+    law: Preisach, ahead: Float[Array, ""], behind: Float[Array, ""], offset_um: Float[Array, ""]
+) -> Preisach:
     lower, upper = law.density.lower_V / ahead, law.density.upper_V / ahead
     weights = law.weights_um[np.tril_indices(law.density.levels)]
     return Preisach(

@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 
 from fits.io._errors import AnyPath, DataError
 from fits.io._file_set import file_set
+from fits.io._late import need
+
+# Rows of a text that are made at a time.
+_ROWS = 65_536
 
 
 @contextmanager
@@ -58,13 +62,33 @@ def write_csv(path: AnyPath, columns: Mapping[str, NDArray[Any]], comments: Sequ
 
     A name that ends in `.gz` is compressed. A `DataError` refuses values that are not finite.
     """
-    for name, values in columns.items():
-        refuse_nonfinite(name, np.asarray(values))
-    lists = [np.asarray(values).tolist() for values in columns.values()]
+    arrays = [np.asarray(values) for values in columns.values()]
+    for name, values in zip(columns, arrays, strict=True):
+        refuse_nonfinite(name, values)
     with atomic_path(path) as temporary:
         opener: Any = gzip.open if temporary.suffix == ".gz" else open
         with opener(temporary, "wt", encoding="utf-8", newline="") as file:
             file.writelines(f"# {' '.join(comment.split())}\n" for comment in comments)
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(columns)
-            writer.writerows(zip(*lists, strict=True))  # csv writes floats by repr, which is exact
+            for first in range(0, len(arrays[0]), _ROWS):
+                lists = [values[first : first + _ROWS].tolist() for values in arrays]
+                writer.writerows(zip(*lists, strict=True))  # csv writes floats by repr, which is exact
+
+
+def write_table(path: AnyPath, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write columns, shape `(n,)` each, in the format of the name: `.npz`, `.parquet`, or else CSV.
+
+    A `DataError` refuses values that are not finite, and a format whose package is not installed.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".npz", ".parquet"):
+        write_csv(path, columns)
+        return
+    for name, values in columns.items():
+        refuse_nonfinite(name, np.asarray(values))
+    with atomic_path(path) as temporary:
+        if suffix == ".npz":
+            np.savez(temporary, allow_pickle=False, **columns)
+        else:
+            need("pyarrow.parquet", "io").write_table(need("pyarrow", "io").table(dict(columns)), temporary)

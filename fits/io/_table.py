@@ -167,7 +167,7 @@ def _columns(name: tuple[str, ...], values: Any) -> Iterable[tuple[tuple[str, ..
     elif array.ndim == 1 and array.size > 1 and array.dtype.kind in "mM" and not np.isnat(array).all():
         yield (*name[:-1], with_unit(name[-1], "s")), seconds(array)
     elif array.ndim == 1 and array.size > 1 and array.dtype.kind in "iuf":
-        yield name, array.astype(np.float64)
+        yield name, array.astype(np.float64, copy=False)
     elif array.ndim == 2 and array.dtype.kind in "iuf":
         rows = array if array.shape[0] >= array.shape[1] else array.T
         for k in range(min(rows.shape[1], MOST_COLUMNS + 1)):

@@ -43,7 +43,7 @@ def choose_grid(
 
     def trial(n: int, hyper: Hyper) -> GridTrial:
         progress(f"{n} levels")
-        return try_grid(gather(grid_of(runs, n), runs), runs, stroke, hyper, levels is None, alone)
+        return try_grid(gather(grid_of(runs, n), runs, progress=progress), runs, stroke, hyper, levels is None, alone)
 
     digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
     tried, trials = _resolve(trial, levels, finest, 1.2 * digit / 12**0.5)
@@ -82,7 +82,7 @@ def try_grid(
     grid = data.grid
     correlation = 1.0
     solution = solve_grid(data, stroke, hyper)
-    model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
+    model = grid.surface(solution.columns * stroke)
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
     off = [run.without_nuisance(run.displacement_um - simulate_run(model, run), run.fitted) for run in runs]
     left = [run.weighed(one)[run.fitted] for run, one in zip(runs, off, strict=True)]
@@ -172,7 +172,7 @@ def weigh_robustly(runs: Sequence[Run], progress: Progress) -> list[Run]:
     for _ in range(8):  # outliers have settled by then
         solution = solve_grid(gather(grid, runs), stroke, hyper)
         hyper = solution.hyper
-        model = grid.model(np.asarray(solution.columns) * stroke, np.zeros(()))
+        model = grid.surface(solution.columns * stroke)
         left = [run.displacement_um - simulate_run(model, run) for run in runs]
         runs = [replace(run, weight=huber_weight(one, run.fitted)) for run, one in zip(runs, left, strict=True)]
     return list(runs)

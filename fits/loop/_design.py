@@ -1,13 +1,15 @@
 """The Preisach operator as a linear regression: one column per weight and slope."""
 
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.loop._plain import Surface, spread
+from fits.loop._path import Path
+from fits.loop._surface import Surface, spread
 from microid import GridDensity, Preisach, Reversible, Staircase, forest_sum, node_areas, remember
 
 
@@ -42,6 +44,21 @@ class Grid(eqx.Module):
         zeros = jnp.zeros((self.levels, self.levels), packed.dtype)
         return zeros.at[np.tril_indices(self.levels)].set(packed)
 
+    @property
+    def ends_V(self) -> tuple[float, float]:
+        """Ends of the range."""
+        return float(self.lower_V), float(self.upper_V)
+
+    def densities(self, columns_um: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Densities and slopes of solutions in um, `(D, k)`, as `Surface.of` takes them."""
+        lower, upper = self.ends_V
+        nodes = spread(columns_um[: self.weights], self.levels) / (upper - lower) ** 2
+        return nodes, columns_um[self.weights :] / (upper - lower)
+
+    def surface(self, columns_um: np.ndarray) -> Surface:
+        """The Everett surface of a solution in um, `(D,)`."""
+        return Surface.of(*self.densities(columns_um[:, None]), *self.ends_V)
+
     @eqx.filter_jit
     def model(
         self, columns_um: Float[Array | np.ndarray, " D"], offset_um: Float[Array | np.ndarray, ""]
@@ -75,11 +92,11 @@ def design(
     memory = remember(voltage_V, start)
     x = jnp.clip((memory.path_V - grid.lower_V) / grid.range_V, 0, 1) * (n - 1)
     up, anchor = memory.rising[:, None], memory.anchor
-    reach = _reach(x, n)
+    reach = _reach(x, n, jnp)
     # A branch adds or takes off the rectangle between its anchor and the present voltage (see microid.Everett).
     high = jnp.where(up, -reach, reach[anchor])
     low = jnp.where(up, reach[anchor], reach)
-    total = forest_sum(_rectangles(high, low).at[0].set(0), anchor)[memory.lead :]
+    total = forest_sum(_rectangles(high, low, jnp).at[0].set(0), anchor)[memory.lead :]
 
     x, rising = x[memory.lead :], memory.rising[memory.lead :]
     cell = jnp.clip(x.astype(jnp.int32), 0, n - 2)
@@ -89,21 +106,42 @@ def design(
     return branch + jnp.pad(total, ((0, 0), (0, n))), memory.end()
 
 
-def _reach(x: Float[Array, " m"], n: int) -> Float[Array, "m N"]:
-    """Integral of each hat function up to `x` levels, in units of the range."""
-    z = jnp.clip(x[:, None] - jnp.arange(n, dtype=x.dtype)[None, :], -1, 1)
-    rise = jnp.where(z < 0, (z + 1) ** 2 / 2, 1 - (1 - z) ** 2 / 2)
-    return rise.at[:, 0].add(-0.5) / (n - 1)
+def responses(grid: Grid, table: np.ndarray, path: Path) -> np.ndarray:
+    """The same as `design` in NumPy, which compiles nothing, along a path: shape `(n, D)`."""
+    n, (lower, upper) = grid.levels, grid.ends_V
+    x = np.clip((path.values - lower) / (upper - lower), 0, 1) * (n - 1)
+    reach, up = _reach(x, n, np), path.rising[:, None]
+    before = reach[path.anchor]
+    total = path.add(_rectangles(np.where(up, -reach, before), np.where(up, before, reach), np))[path.lead :]
+
+    x = x[path.lead :]
+    cell = np.minimum(x.astype(np.int64), n - 2)
+    powers, branch = np.vander(x - cell, 4, increasing=True), np.where(path.rising[path.lead :], cell, cell + (n - 1))
+    out = np.empty((len(x), grid.columns))
+    for one in np.unique(branch):
+        here = branch == one
+        out[here] = powers[here] @ table[:, one]
+    out[:, : grid.weights] += total
+    return out
 
 
-def _rectangles(high: Float[Array, "m N"], low: Float[Array, "m N"]) -> Float[Array, "m p"]:
-    """Products of the two along all pairs `(i, j <= i)`, packed row by row.
+def _reach(x: Any, n: int, xp: Any) -> Any:
+    """Integral of each hat function up to `x` levels, `(m,)`, in units of the range, shape `(m, N)`; by `xp`."""
+    nodes = xp.arange(n, dtype=x.dtype)[None, :]
+    z = xp.clip(x[:, None] - nodes, -1, 1)
+    rise = xp.where(z < 0, (z + 1) ** 2 / 2, 1 - (1 - z) ** 2 / 2)
+    # Of the first there is only the half within the range.
+    return (rise - xp.where(nodes == 0, 0.5, 0.0)) / (n - 1)
+
+
+def _rectangles(high: Any, low: Any, xp: Any) -> Any:
+    """Products of the two, `(m, N)`, along all pairs `(i, j <= i)`, packed row by row, shape `(m, p)`; by `xp`.
 
     The nodes under the diagonal triangles continue the three corners linearly: what they would add goes to those.
     """
     n = high.shape[1]
     i, j = np.tril_indices(n)
-    ghost = jnp.pad(high[:, :-1] * low[:, 1:], ((0, 0), (1, 1)))
+    ghost = xp.pad(high[:, :-1] * low[:, 1:], ((0, 0), (1, 1)))
     # Column k + 1 holds ghost k; the first and last are zero.
     after = np.where(i == j, i + 1, 0)
     before = np.where(i == j, i, 0)

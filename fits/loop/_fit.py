@@ -1,4 +1,4 @@
-"""From records to a fitted Preisach operator, and to what a rig must have been through before its record."""
+"""From records to a fitted Preisach operator."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,8 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._given import AnyRuns, holdout_given, records_given
@@ -20,20 +18,17 @@ from fits.loop._grid import Estimate, grid_estimate
 from fits.loop._left_over import suggestions
 from fits.loop._moments import Data, gather, grid_of
 from fits.loop._parts_agree import check_loops
+from fits.loop._path import branches
 from fits.loop._result import FitResult, FitStatus, RunReport
-from fits.loop._run import Progress, Run, command_range_V, prepare_run, resized, simulate_run
-from fits.loop._shapes import solve_shape
+from fits.loop._run import Progress, Run, command_range_V, prepare_run, simulate_run
+from fits.loop._surface import Surface
 from fits.loop._uncertainty import Uncertainty
 from fits.stats._metrics import WHITE
 from fits.stats._noise import LOSSES
-from microid import FAMILIES, Preisach, Staircase
+from microid import FAMILIES, Preisach
 
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
-# Pairs of extremes that stand for the unknown history, and samples that are compared.
-_PAIRS = 6
-_SAMPLES = 1024
-_SIZE = 64
 
 
 def fit(
@@ -95,6 +90,8 @@ def fit(
     else:
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
             tried = try_grid(gather(grid_of(runs, _SHAPE_LEVELS), runs), runs, stroke, tried.solution.hyper, True)
+        from fits.loop._shapes import solve_shape  # its solver takes long to import
+
         smooth, key = tried.solution.hyper, jax.random.key(seed)
         found, agree = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
         if not agree:
@@ -103,21 +100,21 @@ def fit(
             )
     if found.correlation > WHITE:
         remarks.append(correlated(found.correlation, "creep, rate, drift or a density this family cannot follow"))
-    model = found.model
+    model, columns = found.model, np.asarray(columns_of(found.model))
+    surface = tried.data.grid.surface(columns)
     if found.correlation > WHITE:
         progress("looking for lags and relaxations")
-        remarks += suggestions(runs, model, stroke, tried.solution.hyper)
+        remarks += suggestions(runs, surface, stroke, tried.solution.hyper)
     progress("checking the records")
-    miss, told = check_loops(runs, prepare, model, stroke, tried.solution.hyper, loss == "huber")
-    columns = np.asarray(columns_of(model))
+    miss, told = check_loops(runs, prepare, surface, stroke, tried.solution.hyper, loss == "huber")
     offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]
     progress("comparing with the measurement")
     figures = {"noise_um": found.noise_um, "correlation_samples": found.correlation, "substeps": 1}
-    reports = [_report(model, offset, run, found, **figures) for offset, run in zip(offsets, runs, strict=True)]
+    reports = [_report(found, surface, offset, run, **figures) for offset, run in zip(offsets, runs, strict=True)]
     for record in aside:
         run = prepare_run(record, range_V, initial, holdout=1.0)
-        off = float(np.mean((run.displacement_um - simulate_run(model, run))[run.known]))
-        reports.append(_report(model, off, run, found))
+        off = float(np.mean((run.displacement_um - simulate_run(surface, run))[run.known]))
+        reports.append(_report(found, surface, off, run))
     return FitResult(
         model=_with_offset(model, offsets[0]),
         uncertainty=_uncertainty(tried.data, found),
@@ -157,21 +154,26 @@ def check_fit(
 def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
     """Perturbations by the columns of a factor of the covariance, and of the sensor offset alone."""
     mean, grid = data.means[0], data.grid
-    columns = jnp.concatenate([found.factor_um.T, jnp.zeros((1, grid.columns))])
+    columns = np.concatenate([found.factor_um.T, np.zeros((1, grid.columns))])
     # The mean displacement of a run fixes the offset: it makes up for what a perturbation does to that.
-    moved = -(jnp.asarray(mean.response) @ found.factor_um)
+    moved = -(mean.response @ found.factor_um)
     sd = found.noise_um * (found.correlation / mean.count) ** 0.5
-    return Uncertainty(columns, jnp.append(moved, sd), jnp.asarray(found.discrepancy_um), grid)
+    offset_um, discrepancy_um = jnp.asarray(np.append(moved, sd)), jnp.asarray(found.discrepancy_um)
+    return Uncertainty(jnp.asarray(columns), offset_um, discrepancy_um, grid)
 
 
 def _with_offset(model: Preisach, offset_um: float) -> Preisach:
-    return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(offset_um))
+    # By NumPy: of a Python number JAX remembers that its type is weak, and compiles all anew for that.
+    return eqx.tree_at(lambda m: m.offset_um, model, jnp.asarray(np.asarray(offset_um)))
 
 
-def _report(model: Preisach, offset_um: float, run: Run, found: Estimate, **figures: Any) -> RunReport:
-    model = _with_offset(model, offset_um)
-    start = run.start if run.known.all() else estimate_start(model, run, found.noise_um)
-    return RunReport.of(run, simulate_run(model, run), offset_um, start, **figures)
+def _report(found: Estimate, surface: Surface, offset_um: float, run: Run, **figures: Any) -> RunReport:
+    start = run.start
+    if not run.known.all():
+        from fits.loop._estimate_start import estimate_start  # its solver takes long to import
+
+        start = estimate_start(_with_offset(found.model, offset_um), run, found.noise_um)
+    return RunReport.of(run, offset_um + simulate_run(surface, run), offset_um, start, **figures)
 
 
 def _remarks(runs: list[Run]) -> list[str]:
@@ -186,7 +188,7 @@ def _remarks(runs: list[Run]) -> list[str]:
             )
     lower, upper = min(run.lower_V for run in runs), max(run.upper_V for run in runs)
     edge = 0.02 * (upper - lower)
-    anchors = np.concatenate([run.path.anchor_V[run.fitted] for run in runs])
+    anchors = np.concatenate([branches(run.path)[0][run.fitted] for run in runs])
     if np.mean((anchors > lower + edge) & (anchors < upper - edge)) < 0.01:
         remarks.append(
             "the fitted samples hold no loop smaller than the full range: what the model says about smaller loops "
@@ -201,50 +203,3 @@ def _remarks(runs: list[Run]) -> list[str]:
             "beyond them the model is extrapolated"
         )
     return remarks
-
-
-def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Array, ""]) -> Staircase:
-    """Extremes that close in on the first sample, by the shares of the way that the coordinates stand for."""
-    below, above = jax.nn.softmax(z[0]), jax.nn.softmax(z[1])
-    low, high = model.density.lower_V, model.density.upper_V
-    minima = low + (first_V - low) * jnp.cumsum(below)[:-1]
-    maxima = high - (high - first_V) * jnp.cumsum(above)[:-1]
-    inner = jnp.stack([maxima, minima], axis=1).ravel()
-    extremes = jnp.concatenate([low[None], inner, first_V[None]])
-    return resized(Staircase(extremes, jnp.asarray(len(extremes), dtype=jnp.int32)), _SIZE)
-
-
-def _residual(
-    z: Float[Array, "2 pairs_1"], args: tuple[Preisach, Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
-) -> Float[Array, " m"]:
-    model, voltage_V, displacement_um, weight = args
-    start = _staircase(z, model, voltage_V[0])
-    # A faint pull towards an even decay decides what the samples leave open.
-    return jnp.concatenate([weight * (model(voltage_V, start) - displacement_um), 1e-2 * z.ravel()])
-
-
-@eqx.filter_jit
-def _solve(args: tuple[Preisach, Array, Array, Array]) -> Staircase:
-    solver: Any = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
-    start = jnp.zeros((2, _PAIRS + 1))
-    solution: Any = optx.least_squares(_residual, solver, start, args=args, max_steps=100, throw=False)
-    return _staircase(solution.value, args[0], args[1][0])
-
-
-def estimate_start(model: Preisach, run: Run, noise_um: float) -> Staircase:
-    """Fit the memory before the first sample to the samples that depend on it; the model has this run's offset.
-
-    The output is differentiable in the remembered extremes as it is in any voltage, so the extremes themselves are
-    the unknowns (Levenberg-Marquardt on `2 x 7` shares of the way from the ends of the range to the first sample).
-    """
-    keep = np.arange(np.flatnonzero(~run.known)[-1] + 1)
-    # Thinned out evenly; the extremes of the path must stay, as they make the memory.
-    if len(keep) > _SAMPLES:
-        voltage = run.voltage_V[keep]
-        turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(voltage))) != 0)
-        even = np.linspace(0, len(keep) - 1, max(2, _SAMPLES - len(turns))).astype(np.int64)
-        keep = np.unique(np.concatenate([even, turns]))[: 2 * _SAMPLES]
-    pad = (0, 2 * _SAMPLES - len(keep))
-    voltage = np.pad(run.voltage_V[keep], pad, mode="edge")
-    displacement, weight = (np.pad(x, pad) for x in (run.displacement_um[keep], np.full(len(keep), 1 / noise_um)))
-    return _solve((model, jnp.asarray(voltage), jnp.asarray(displacement), jnp.asarray(weight)))

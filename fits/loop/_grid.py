@@ -5,19 +5,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
-from scipy.optimize import nnls
+from scipy.linalg import cho_solve
 
 from fits.loop._moments import Data, Moments, blocks_of
-from fits.loop._prior import Hyper, Posterior, effective, interpolation, maximise_evidence, renew_noise, roughness
+from fits.loop._prior import (
+    Hyper,
+    Posterior,
+    cholesky,
+    effective,
+    interpolation,
+    maximise_evidence,
+    renew_noise,
+    roughness,
+)
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
 from fits.stats._noise import shared_square
-from fits.stats._nonnegative import minimise_nonnegative
+from fits.stats._nonnegative import pivot_nonnegative
 from microid import Preisach
 
 # The smoothness is a property of the density, not of the grid: this many levels are enough to find it.
@@ -40,7 +46,7 @@ class Estimate:
     """
 
     model: Preisach
-    factor_um: Float[Array, "D k"]
+    factor_um: np.ndarray
     noise_um: float
     correlation: float
     discrepancy_um: float
@@ -50,7 +56,7 @@ class Estimate:
 class GridSolution:
     """Non-negative weights and slopes of a grid, in strokes, and the Gaussian posterior they are the mode of."""
 
-    columns: Float[Array, " D"]
+    columns: np.ndarray
     posterior: Posterior
     hyper: Hyper
 
@@ -80,8 +86,8 @@ def solve_grid(data: Data, stroke_um: float, start: Hyper, correlation: float = 
 
 
 def _bounded(posterior: Posterior, hyper: Hyper) -> GridSolution:
-    if np.all(np.asarray(posterior.mean) >= 0):
-        return GridSolution(posterior.mean, posterior, hyper)
+    if np.all(posterior.mean >= 0):
+        return GridSolution(np.asarray(posterior.mean), posterior, hyper)
     columns, found = non_negative(posterior)
     if not found:
         raise FitError(FitStatus.MAX_STEPS)
@@ -132,83 +138,67 @@ def relaxation_of(data: Data, stroke_um: float, white: Hyper) -> float:
     return best
 
 
-def non_negative(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
+def non_negative(posterior: Posterior) -> tuple[np.ndarray, bool]:
     """Find the mode of the posterior among non-negative columns; and whether it was found.
 
     Few columns ever touch zero. Only the lowest are treated as bounded, the others follow them linearly; if one of
     those ends up below zero, more are bounded. The answer is that of all bounds together.
     """
+    posterior = jax.tree.map(np.asarray, posterior)
     scale = np.sqrt(np.diagonal(posterior.precision))
-    lowest = np.asarray(posterior.mean) * scale
+    lowest = posterior.mean * scale
     if not np.all(np.isfinite(lowest)):  # rounding left no Cholesky factor
-        return jnp.zeros_like(posterior.mean), False
+        return np.zeros_like(posterior.mean), False
     size = len(lowest)
     bounded = 64
     while True:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
-        spread, precision, mean, unit = _marginal(posterior, jnp.asarray(order))
-        y, found = _pivot(precision, mean)
-        columns = _follow(posterior, jnp.asarray(order), spread, precision, mean, y, unit)
-        left = np.asarray(columns) * scale
+        spread, precision, mean, unit = _marginal(posterior, order)
+        y, found = pivot_nonnegative(precision, -(precision @ mean), np.maximum(mean, 0), _ATOL, 500)
         if not found:
             return _one_by_one(posterior)
+        # All columns move along with the chosen ones, from their mean; where a bound holds it holds exactly.
+        columns = posterior.mean + spread @ (unit * (precision @ (y - mean)))
+        columns[order] = y / unit
+        left = columns * scale
         if bounded == size or np.all(left >= -_ATOL):
-            return jnp.maximum(columns, 0), True
+            return np.maximum(columns, 0), True
         lowest = np.minimum(lowest, left)
         bounded *= 2
 
 
-def _one_by_one(posterior: Posterior) -> tuple[Float[Array, " D"], bool]:
+def _one_by_one(posterior: Posterior) -> tuple[np.ndarray, bool]:
     """The same, slow and sure, where block pivoting goes round in circles or rounding leaves no Cholesky factor."""
-    precision = np.asarray(posterior.precision)
+    from scipy.optimize import nnls  # slow to import, and hardly ever needed
+
+    precision = posterior.precision
     # More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
     if len(precision) > 1100:
-        return jnp.maximum(posterior.mean, 0), False
+        return np.maximum(posterior.mean, 0), False
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])
     root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
     try:
-        columns, _ = nnls(root, root @ (scale * np.asarray(posterior.mean)), maxiter=30 * len(scale))
+        columns, _ = nnls(root, root @ (scale * posterior.mean), maxiter=30 * len(scale))
     except RuntimeError:
-        return jnp.maximum(posterior.mean, 0), False
-    return jnp.asarray(columns / scale), True
+        return np.maximum(posterior.mean, 0), False
+    return np.asarray(columns / scale), True
 
 
-@eqx.filter_jit
-def _marginal(
-    posterior: Posterior, which: Int[Array, " k"]
-) -> tuple[Float[Array, "D k"], Float[Array, "k k"], Float[Array, " k"], Float[Array, " k"]]:
+def _marginal(posterior: Posterior, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Covariance of all columns with the chosen ones, which ascend, and the posterior of those alone, scaled."""
-    rows = jax.nn.one_hot(which, posterior.mean.shape[0], dtype=posterior.mean.dtype)
-    spread = jax.scipy.linalg.cho_solve((posterior.root, True), rows.T)
+    rows = np.zeros((len(posterior.mean), len(which)))
+    rows[which, np.arange(len(which))] = 1.0
+    spread = cho_solve((posterior.root, True), rows)
     # With the chosen ones last, the end of the Cholesky factor is that of their marginal precision. The inverse of
     # their covariance would be the same, but for rounding, which may leave it indefinite.
-    last = jnp.argsort(jnp.sum(rows, axis=0), stable=True)
-    root = jnp.linalg.cholesky(posterior.precision[last][:, last])[-which.shape[0] :, -which.shape[0] :]
+    last = np.argsort(rows.sum(axis=1), kind="stable")
+    root = cholesky(posterior.precision[np.ix_(last, last)])[-len(which) :, -len(which) :]
     precision = root @ root.T
     # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
-    scale = jnp.sqrt(jnp.diagonal(precision))
+    scale = np.sqrt(np.diagonal(precision))
     return spread, precision / (scale[:, None] * scale[None, :]), posterior.mean[which] * scale, scale
-
-
-@eqx.filter_jit
-def _pivot(precision: Float[Array, "k k"], mean: Float[Array, " k"]) -> tuple[Float[Array, " k"], Bool[Array, ""]]:
-    return minimise_nonnegative(precision, -(precision @ mean), jnp.maximum(mean, 0), _ATOL, 500)
-
-
-@eqx.filter_jit
-def _follow(
-    posterior: Posterior,
-    which: Int[Array, " k"],
-    spread: Float[Array, "D k"],
-    precision: Float[Array, "k k"],
-    mean: Float[Array, " k"],
-    y: Float[Array, " k"],
-    scale: Float[Array, " k"],
-) -> Float[Array, " D"]:
-    """Move all columns along with the chosen ones, from their mean to `y`; where a bound holds it holds exactly."""
-    return (posterior.mean + spread @ (scale * (precision @ (y - mean)))).at[which].set(y / scale)
 
 
 def grid_estimate(
@@ -219,11 +209,11 @@ def grid_estimate(
     if levels > BELIEF_LEVELS:
         basis = interpolation(BELIEF_LEVELS, levels)
         moments = data.total.scaled(1 / correlation, stroke_um).project(basis)
-        factor = jnp.asarray(basis) @ Posterior.of(moments, roughness(BELIEF_LEVELS), solution.hyper).factor()
+        factor = basis @ Posterior.of(moments, roughness(BELIEF_LEVELS), solution.hyper).factor()
     return Estimate(
-        model=data.grid.model(np.asarray(solution.columns) * stroke_um, np.zeros(())),
+        model=data.grid.model(solution.columns * stroke_um, np.zeros(())),
         factor_um=factor * stroke_um,
-        noise_um=float(jnp.exp(solution.hyper.log_variance / 2)) * stroke_um,
+        noise_um=float(np.exp(solution.hyper.log_variance / 2)) * stroke_um,
         correlation=correlation,
         discrepancy_um=discrepancy_um,
     )
@@ -248,9 +238,8 @@ def cross_validate(
         if not block.count > 0:
             continue
         posterior = Posterior.of((whole - block).scaled(1 / correlation, stroke_um), rough, hyper)
-        columns = np.asarray(non_negative(posterior)[0])
-        columns = columns if basis is None else basis @ columns
-        model = data.grid.model(columns * stroke_um, np.zeros(()))
+        columns = non_negative(posterior)[0]
+        model = data.grid.surface((columns if basis is None else basis @ columns) * stroke_um)
         # A short run may have no sample in a block.
         off = []
         for run, label in zip(runs, labels, strict=True):
@@ -259,13 +248,11 @@ def cross_validate(
                 off.append(run.weighed(left)[inside])
         squares += sum(float(np.sum(o**2)) for o in off)
         shared += sum(shared_square(o) * len(o) for o in off)
-        expected += float(_expected_square(posterior, block)) * stroke_um**2
+        expected += _expected_square(posterior, block) * stroke_um**2
         count += float(block.count)
     return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
 
 
-@eqx.filter_jit
-def _expected_square(posterior: Posterior, block: Moments) -> Float[Array, ""]:
+def _expected_square(posterior: Posterior, block: Moments) -> float:
     """Sum over a block of the variances that the posterior gives its predictions."""
-    half = jax.scipy.linalg.solve_triangular(posterior.root, block.gram, lower=True)
-    return jnp.trace(jax.scipy.linalg.solve_triangular(posterior.root, half.T, lower=True))
+    return float(np.trace(cho_solve((posterior.root, True), block.gram)))

@@ -9,7 +9,7 @@ from fits.loop._grid import EVIDENCE_LEVELS
 from fits.loop._moments import BLOCKS, PIECES, blocks_of, gather, grid_of
 from fits.loop._prior import Hyper, Posterior, roughness
 from fits.loop._run import Run, simulate_run
-from microid import Preisach
+from fits.loop._surface import Surface
 
 # Time constants that stand for all of a relaxation, from so many samples to such a part of a run.
 _CONSTANTS, _SHORTEST, _LONGEST = 3, 20, 1 / 4
@@ -17,7 +17,7 @@ _CONSTANTS, _SHORTEST, _LONGEST = 3, 20, 1 / 4
 _CLEARLY = 0.85
 
 
-def suggestions(runs: Sequence[Run], model: Preisach, stroke_um: float, hyper: Hyper) -> list[str]:
+def suggestions(runs: Sequence[Run], model: Surface, stroke_um: float, hyper: Hyper) -> list[str]:
     """Suggest the fit of a lag, or of relaxations, where they predict blocks of what a hysteresis leaves better.
 
     The smoothness and noise given, in strokes, say what a hysteresis takes in of them.
@@ -32,7 +32,7 @@ def suggestions(runs: Sequence[Run], model: Preisach, stroke_um: float, hyper: H
         played = [replace(r, record=replace(r.record, displacement_um=s)) for r, s in zip(runs, signals, strict=True)]
         data = gather(grid_of(runs, EVIDENCE_LEVELS), played)
         columns = Posterior.of(data.total.scaled(1.0, stroke_um), roughness(EVIDENCE_LEVELS), hyper).mean
-        fitted = data.grid.model(np.asarray(columns) * stroke_um, np.zeros(()))
+        fitted = data.grid.surface(np.asarray(columns) * stroke_um)
         return [run.without_nuisance(run.displacement_um - simulate_run(fitted, run), run.fitted) for run in played]
 
     lags, relaxations = [], []

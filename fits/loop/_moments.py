@@ -6,7 +6,7 @@ voltages and a 4 x 4 mixing matrix. What a fit costs then depends on the path, n
 """
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -17,13 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.loop._design import Grid, branch_table, design
+from fits.loop._design import Grid, branch_table, responses
 from fits.loop._past import past_columns
+from fits.loop._path import Path, branches
+from fits.loop._prediction import PIECE
 from fits.loop._run import Run
-from microid import Staircase
 
 _SLOTS = 4
 _NEGLIGIBLE = 1e-14
+# Pieces of a path whose samples are grouped at a time.
+_AT_ONCE = 16
+# How many such parts are gone through in silence: a million samples.
+_TOLD = 8
+# Numbers in the rows that are regressed at a time: 16 MB.
+_VALUES = 2_000_000
 BLOCKS = 5
 # Short enough for each block to have seen all of a record: fifths of one that swings ever farther would not.
 PIECES = 40
@@ -46,11 +53,18 @@ class Compressed:
     residue_um2: np.ndarray
 
 
-def compress(run: Run, levels_V: np.ndarray, pieces: int) -> Compressed:
-    """Group the samples of a run by their branches, see `Path`, and by evenly spaced levels; see `blocks_of`."""
-    voltage_V, displacement_um, block = run.voltage_V, run.displacement_um, blocks_of(run, pieces)
-    anchor_V, rising = run.path.anchor_V, run.path.rising
-    share = np.ones(len(voltage_V)) if run.weight is None else run.weight
+def compressed(run: Run, levels_V: np.ndarray, pieces: int) -> Iterator[Compressed]:
+    """Group the samples of a run, some pieces of its path at a time: a long one takes no more memory than that."""
+    block, many = blocks_of(run, pieces), len(run.path) if run.has_past else _AT_ONCE
+    for k in range(0, len(run.path), many):
+        yield _compress(run, run.path[k : k + many], slice(k * PIECE, (k + many) * PIECE), levels_V, block)
+
+
+def _compress(run: Run, path: Sequence[Path], samples: slice, levels_V: np.ndarray, block: np.ndarray) -> Compressed:
+    """Group samples by their branches, see `Path`, and by evenly spaced levels; see `blocks_of`."""
+    voltage_V, displacement_um, block = run.voltage_V[samples], run.displacement_um[samples], block[samples]
+    anchor_V, rising = branches(path)
+    share = np.ones(len(voltage_V)) if run.weight is None else run.weight[samples]
     step = levels_V[1] - levels_V[0]
     cell = np.clip(((voltage_V - levels_V[0]) / step).astype(np.int64), 0, len(levels_V) - 2)
     changed = (np.diff(anchor_V) != 0) | (np.diff(rising) != 0) | (np.diff(cell) != 0) | (np.diff(block) != 0)
@@ -126,7 +140,7 @@ def square_root(
     return root, target, np.maximum(energy - np.sum(target**2, axis=1), 0.0)
 
 
-def _zero_dimensional(value: Any) -> Any:
+def zero_dimensional(value: Any) -> Any:
     """Turn what NumPy's arithmetic makes of arrays without axes back into such."""
     return np.asarray(value) if isinstance(value, float | np.generic) else value
 
@@ -139,8 +153,8 @@ class Moments(eqx.Module):
 
     gram: Float[Array | np.ndarray, "D D"]
     cross_um: Float[Array | np.ndarray, " D"]
-    energy_um2: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
-    count: Float[Array | np.ndarray, ""] = eqx.field(converter=_zero_dimensional)
+    energy_um2: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
+    count: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
 
     @classmethod
     def empty(cls, size: int) -> "Moments":
@@ -203,18 +217,18 @@ def grid_of(runs: Sequence[Run], levels: int) -> Grid:
     return Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), levels)
 
 
-def gather(grid: Grid, runs: Sequence[Run], pieces: int = PIECES) -> Data:
-    """Pass runs with displacement through the regression once; blocks are made of so many pieces of each run."""
+def gather(
+    grid: Grid, runs: Sequence[Run], pieces: int = PIECES, progress: Callable[[str], None] = lambda _: None
+) -> Data:
+    """Pass runs with displacement through the regression once; blocks are made of so many pieces of each run.
+
+    Told is how far that is in long runs.
+    """
     centred: list[list[Moments]] = []
     means = []
     levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
     for run in runs:
-        groups = compress(run, levels_V, pieces)
-        past = np.zeros((groups.voltage_V.size, 0))
-        if run.has_past:
-            past = np.asarray(past_columns(jnp.asarray(groups.voltage_V.ravel())))
-        past = past.reshape(*groups.voltage_V.shape, past.shape[1])
-        sums = _sums(grid, groups, run.path.pieces[0][1], past)
+        sums = _sums(grid, run, _told(compressed(run, levels_V, pieces), run, progress))
         total, mean = _without_nuisance(reduce(operator.add, sums), grid.columns)
         centred.append([total, *(_without_nuisance(part, grid.columns)[0] for part in sums)])
         means.append(mean)
@@ -222,48 +236,49 @@ def gather(grid: Grid, runs: Sequence[Run], pieces: int = PIECES) -> Data:
     return Data(grid, whole, tuple(blocks), tuple(means), pieces)
 
 
-def _sums(grid: Grid, groups: Compressed, start: Staircase, past: np.ndarray) -> list[Moments]:
-    """Moments per block, with the nuisance parameters at the end: columns of a past, `(groups, 4, k)`, and ones."""
-    size = grid.columns + past.shape[2] + 1
-    sums = [Moments.empty(size) for _ in range(BLOCKS)]
-    table = jnp.asarray(branch_table(grid.levels))
-    # Groups that are regressed at a time: few, so that little is padded, or many where the many columns pay for it.
-    length = 512 if grid.levels > 32 else 256
-    for begin in range(0, len(groups.block), length):
-        piece = slice(begin, begin + length)
-        pad = (0, length - len(groups.block[piece]))
-        voltage = np.pad(groups.voltage_V[piece].ravel(), (0, 4 * pad[1]), mode="edge")
-        mix = np.pad(groups.mix[piece], (pad, (0, 0), (0, 0)))
-        mixed, start = _regress(grid, table, jnp.asarray(voltage), start, jnp.asarray(mix))
-        shape = 4 * len(past[piece]), past.shape[2]
-        beside = np.einsum("gij,gjk->gik", groups.mix[piece], past[piece]).reshape(shape)
-        rows = np.asarray(mixed)[: len(beside)]
-        rows = np.concatenate([rows[:, :-1], beside, rows[:, -1:]], axis=1)
-        for block in np.unique(groups.block[piece]):
-            if block < 0:
-                continue
-            which = groups.block[piece] == block
-            # NumPy hands `a.T @ a` to BLAS as a rank-k update.
-            part = rows[np.repeat(which, 4)]
-            target = groups.target_um[piece][which].ravel()
-            energy = target @ target + groups.residue_um2[piece][which].sum()
-            count = np.asarray(groups.count[piece][which].sum(), dtype=float)
-            sums[block] = sums[block] + Moments(part.T @ part, target @ part, energy, count)
+def _told(parts: Iterator[Compressed], run: Run, progress: Callable[[str], None]) -> Iterator[Compressed]:
+    """Tell from time to time how many samples are done."""
+    for k, part in enumerate(parts, 1):
+        yield part
+        if k % _TOLD == 0:
+            progress(f"  {k * _AT_ONCE * PIECE:,} of {len(run.record):,} samples")
+
+
+def _sums(grid: Grid, run: Run, parts: Iterable[Compressed]) -> list[Moments]:
+    """Moments per block, with the nuisance parameters at the end: those of a past that is estimated, and ones."""
+    sums: list[Moments] = []
+    table, before_V = branch_table(grid.levels), run.extremes_V
+    for groups in parts:
+        beside = _beside(run, groups)
+        size = grid.columns + beside.shape[2]
+        sums = sums or [Moments.empty(size) for _ in range(BLOCKS)]
+        length = max(_VALUES // (_SLOTS * size), 1)
+        for begin in range(0, len(groups.block), length):
+            piece = slice(begin, begin + length)
+            path, mix = Path.of(before_V, groups.voltage_V[piece].ravel()), groups.mix[piece]
+            before_V = path.end
+            columns = responses(grid, table, path).reshape(len(mix), _SLOTS, -1)
+            rows = np.concatenate([mix @ columns, mix @ beside[piece]], axis=2).reshape(-1, size)
+            for block in np.unique(groups.block[piece]):
+                if block < 0:
+                    continue
+                which = groups.block[piece] == block
+                # NumPy hands `a.T @ a` to BLAS as a rank-k update.
+                part = rows[np.repeat(which, 4)]
+                target = groups.target_um[piece][which].ravel()
+                energy = target @ target + groups.residue_um2[piece][which].sum()
+                count = np.asarray(groups.count[piece][which].sum(), dtype=float)
+                sums[block] = sums[block] + Moments(part.T @ part, target @ part, energy, count)
     return sums
 
 
-@eqx.filter_jit
-def _regress(
-    grid: Grid,
-    table: Float[Array, "4 k D"],
-    voltage_V: Float[Array, " n"],
-    start: Staircase,
-    mix: Float[Array, "groups 4 4"],
-) -> tuple[Float[Array, "n E"], Staircase]:
-    response, end = design(grid, table, voltage_V, start)
-    response = jnp.concatenate([response, jnp.ones_like(response[:, :1])], axis=1)
-    mixed = jnp.einsum("gij,gjd->gid", mix, response.reshape(*mix.shape[:2], -1))
-    return mixed.reshape(response.shape), end
+def _beside(run: Run, groups: Compressed) -> np.ndarray:
+    """Columns of the nuisance parameters, `(groups, 4, k)`."""
+    ones = np.ones((*groups.voltage_V.shape, 1))
+    if not run.has_past:
+        return ones
+    past = np.asarray(past_columns(jnp.asarray(groups.voltage_V.ravel())))
+    return np.concatenate([past.reshape(*groups.voltage_V.shape, -1), ones], axis=2)
 
 
 def _without_nuisance(sums: Moments, size: int) -> tuple[Moments, RunMean]:

@@ -13,9 +13,9 @@ from fits.loop._moments import gather, grid_of
 from fits.loop._prior import Hyper, Posterior, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, simulate_run
+from fits.loop._surface import Surface
 from fits.stats._metrics import WHITE
 from fits.stats._noise import correlation_samples
-from microid import Preisach
 
 # Levels on which parts are fitted alone: enough to see whether they agree.
 _LEVELS = 16
@@ -28,7 +28,7 @@ _FEWEST_SAMPLES = 200
 
 
 def check_loops(
-    runs: list[Run], prepare: Callable[[Record], Run], model: Preisach, stroke_um: float, hyper: Hyper, robust: bool
+    runs: list[Run], prepare: Callable[[Record], Run], model: Surface, stroke_um: float, hyper: Hyper, robust: bool
 ) -> tuple[Misfit, list[str]]:
     """Say how far from noise a fitted hysteresis is, and what is wrong with its runs; errors of `disagreements`.
 
@@ -58,21 +58,21 @@ class SeparateFits:
     stroke_um: float
     hyper: Hyper
 
-    def fit(self, runs: Sequence[Run]) -> Preisach:
+    def fit(self, runs: Sequence[Run]) -> Surface:
         """Fit a hysteresis to some runs; a `FitError` where that fails."""
         data = gather(grid_of(runs, _LEVELS), runs)
         solution = solve_grid(data, self.stroke_um, self.hyper)
-        return data.grid.model(np.asarray(solution.columns) * self.stroke_um, np.zeros(()))
+        return data.grid.surface(solution.columns * self.stroke_um)
 
     def left(self, run: Run) -> np.ndarray:
         """What a run leaves that is fitted alone as smoothly as all are, at its fitted samples, in um."""
         data = gather(grid_of([run], _LEVELS), [run])
         moments = data.total.scaled(1.0, self.stroke_um)
         columns, _ = non_negative(Posterior.of(moments, roughness(_LEVELS), self.hyper))
-        return left_of(data.grid.model(np.asarray(columns) * self.stroke_um, np.zeros(())), run)[run.fitted]
+        return left_of(data.grid.surface(columns * self.stroke_um), run)[run.fitted]
 
 
-def left_of(model: Preisach, run: Run) -> np.ndarray:
+def left_of(model: Surface, run: Run) -> np.ndarray:
     """Measurement less prediction, the offset taken off over the fitted samples, in um, shape `(n,)`."""
     return run.without_nuisance(run.displacement_um - simulate_run(model, run), run.fitted)
 
@@ -116,7 +116,7 @@ def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
     """Find the place from where on a run shows another hysteresis."""
     order = np.cumsum(run.fitted)
     total = int(order[-1])
-    best: tuple[float, int, Preisach, Preisach] | None = None
+    best: tuple[float, int, Surface, Surface] | None = None
 
     def parts(place: int) -> tuple[Run, Run]:
         before = np.arange(len(order)) < place

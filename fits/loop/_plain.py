@@ -4,127 +4,23 @@ The algorithm is that of `Everett`, `remember` and `invert` in `microid`. The la
 outputs counts operators that share a grid.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.loop._path import Path
 from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, refuse_outside, too_deep
+from fits.loop._surface import Surface, Visits, basis
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
 # Perturbations at a time, which with a few thousand samples stay in a processor's cache.
-_BATCH = 32
 _SWINGS = 31  # of a demagnetised state, as in `microid`
 _STEPS = 128  # of a root, as in `microid`
 _EPS = float(np.finfo(float).eps)
-
-
-@dataclass(frozen=True)
-class Path:
-    """Extremes of the memory to begin with, `lead` of them, and what follows; see `microid.Memory`.
-
-    A branch to each entry hangs from its anchor, and is rising or not. `depth` counts the anchors back to the first.
-    """
-
-    values: np.ndarray
-    anchor: np.ndarray
-    rising: np.ndarray
-    depth: np.ndarray
-    lead: int = 0
-
-    @classmethod
-    def of(cls, before: np.ndarray, then: Sequence[float] | np.ndarray = ()) -> Self:
-        """Find the extreme that each branch hangs from, in one pass with a stack (Madelung's rules)."""
-        values = np.append(before, then)
-        path = values.tolist()
-        anchor, rising, depth = [0], [True], [0]
-        stack, up, last = [0], True, path[0]
-        for t, x in enumerate(path[1:], 1):
-            # An entry that does not move belongs to the branch of the one before it.
-            if x != last and (x > last) != up:
-                up = not up
-                stack.append(t - 1)
-            while len(stack) > 2 and (path[stack[-2]] <= x if up else path[stack[-2]] >= x):
-                del stack[-2:]
-            anchor.append(stack[-1])
-            rising.append(up)
-            depth.append(depth[stack[-1]] + 1)
-            last = x
-        return cls(values, np.array(anchor), np.array(rising), np.array(depth), len(before))
-
-    @cached_property
-    def levels(self) -> list[np.ndarray]:
-        """Entries whose anchor is not the first, by their depth: each adds to one of the level before."""
-        order = np.argsort(self.depth, kind="stable")
-        return np.split(order, np.searchsorted(self.depth[order], np.arange(2, self.depth.max() + 1)))[1:]
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Everett surfaces of `k` densities; see `microid.Everett`.
-
-    The shape of `window_um` is `(N + 1, N + 1, k)`, that of `branch_um` `(4, 2 N - 2, k)`.
-    """
-
-    lower_V: float
-    upper_V: float
-    window_um: np.ndarray
-    branch_um: np.ndarray
-
-    @classmethod
-    def of(cls, density: np.ndarray, slope: np.ndarray, lower_V: float, upper_V: float) -> Self:
-        """Integrate densities at the nodes, in um/V^2, `(N, N, k)`, and slopes on the diagonal, in um/V, `(N, k)`."""
-        n = len(density)
-        h, i = (upper_V - lower_V) / (n - 1), np.arange(n - 1)
-        corner, side = density[np.arange(n), np.arange(n)], density[i + 1, i]
-        # The node below each diagonal triangle that makes the bilinear form linear on it.
-        ghost = corner[:-1] + corner[1:] - side
-        nodes = density.copy()
-        nodes[i, i + 1] += ghost
-        window = h**2 * _running(_running(nodes).swapaxes(0, 1)).swapaxes(0, 1)
-        # Along the diagonal: trapezoids of the rows up to it above, and of the columns of ghosts below it.
-        rows = density.sum(axis=1) - (density[:, 0] + corner) / 2
-        rising = _triangle(nodes, rows[:-1], rows[1:] - (corner[1:] + side) / 2)
-        here = np.concatenate([ghost[:1] / 2, ghost[1:-1]]) + corner[1:-1] / 2
-        none = np.zeros_like(ghost[:1])
-        next_ = np.concatenate([none, ghost[1:] / 2])
-        falling = _triangle(nodes.swapaxes(0, 1), np.concatenate([none, here]), next_)
-        reversible = h * _pieces(slope[:-1], np.diff(slope, axis=0) / 2, np.zeros_like(slope[1:]))
-        branch = np.concatenate([h**2 * rising + reversible, reversible - h**2 * falling], axis=1)
-        return cls(lower_V, upper_V, window, branch)
-
-    @property
-    def intervals(self) -> int:
-        """Number of intervals between levels, `N - 1`."""
-        return self.branch_um.shape[1] // 2
-
-    def place(self, voltage_V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Interval and fraction of it, at most those of the ends of the range."""
-        scale = self.intervals / (self.upper_V - self.lower_V)
-        x = (np.clip(voltage_V, self.lower_V, self.upper_V) - self.lower_V) * scale
-        interval = np.minimum(x.astype(int), self.intervals - 1)
-        return interval, x - interval
-
-    def respond(self, path: Path) -> np.ndarray:
-        """Outputs along a path of voltages, zero at negative saturation (Eq. 11), in um, `(n, k)`."""
-        i, s = self.place(path.values)
-        up, i0, s0 = path.rising, i[path.anchor], s[path.anchor]
-        a, b = np.where(up, i, i0), np.where(up, i0, i)
-        left, right = _basis(np.where(up, s, s0)), _basis(np.where(up, s0, s))
-        sign = np.where(up, -1.0, 1.0)
-        total = np.zeros((len(i), self.window_um.shape[2]))
-        for p, q in np.ndindex(3, 3):
-            total += (sign * left[p] * right[q])[:, None] * self.window_um[a + p, b + q]
-        total[0] = 0.0
-        for rows in path.levels:
-            total[rows] += total[path.anchor[rows]]
-        c0, c1, c2, c3 = self.branch_um[:, np.where(up, i, i + self.intervals)]
-        s = s[:, None]
-        return np.asarray(total + (c0 + s * (c1 + s * (c2 + s * c3))))[path.lead :]
 
 
 @dataclass(frozen=True)
@@ -140,14 +36,28 @@ class Perturbations:
     offset_um: np.ndarray
     discrepancy_um: float
 
-    def sd_um(self, path: Path) -> np.ndarray:
-        """Standard deviation of the displacement along a path of voltages, `(n,)`."""
-        square = np.full(len(path.values) - path.lead, self.discrepancy_um**2)
-        for k in range(0, len(self.offset_um), _BATCH):
-            batch = slice(k, k + _BATCH)
-            surface = Surface.of(self.density[..., batch], self.slope[:, batch], *self.range_V)
-            square += np.sum((surface.respond(path) + self.offset_um[batch]) ** 2, axis=1)
-        return np.sqrt(square)
+    def sd_um(self, pieces: Sequence[Path], progress: Callable[[str], None] = lambda _: None) -> np.ndarray:
+        """Standard deviation of the displacement along a path of voltages, in pieces, `(n,)`."""
+        surface, found = Surface.of(self.density, self.slope, *self.range_V), []
+        for k, piece in enumerate(pieces):
+            progress(f"predicting, {100 * k // len(pieces)} % done")
+            found.append(self._sd_um(surface, Visits.of(surface, piece)))
+        return np.concatenate(found)
+
+    def _sd_um(self, surface: Surface, visits: Visits) -> np.ndarray:
+        """The square root of a polynomial of the sixth degree for each visit: the sum of squared cubics."""
+        square = np.zeros((len(visits.interval), 7))
+        square[:, 0] = self.discrepancy_um**2
+        for which, cubics in surface.cubics(visits):
+            cubics[:, 0] += self.offset_um
+            products = cubics @ np.moveaxis(cubics, 1, 2)
+            for power, other in np.ndindex(4, 4):
+                square[which, power + other] += products[:, power, other]
+        coefficients, s = square[visits.of_sample], visits.fraction
+        total = coefficients[:, 6]
+        for power in range(5, -1, -1):
+            total = total * s + coefficients[:, power]
+        return np.sqrt(np.maximum(total, 0.0))
 
 
 @dataclass(frozen=True)
@@ -170,23 +80,24 @@ class PlainLoop:
         saturated = Path.of(*np.array(self.range_V)[:, None])
         return self.offset_um, self.offset_um + float(self.surface.respond(saturated)[0, 0])
 
-    def predict(self, record: Record, initial: str) -> Prediction:
+    def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
         refuse_outside(record, *self.range_V)
         path = self._path(record.voltage_V, initial)
-        sd_um = np.full(len(record), np.nan) if self.uncertainty is None else self.uncertainty.sd_um(path)
-        return Prediction(self.offset_um + self.surface.respond(path)[:, 0], sd_um)
+        sd_um = np.full(len(record), np.nan)
+        if self.uncertainty is not None:
+            sd_um = self.uncertainty.sd_um(path, progress)
+        return Prediction(self._respond(path), sd_um)
 
     def respond(self, voltage_V: np.ndarray, initial: str) -> np.ndarray:
         """Displacement along a voltage, `(n,)`, in um; a `DataError` where it nests too deeply."""
-        return self.offset_um + self.surface.respond(self._path(voltage_V, initial))[:, 0]
+        return self._respond(self._path(voltage_V, initial))
 
-    def _path(self, voltage_V: np.ndarray, initial: str) -> Path:
-        path = Path.of(extremes_V(initial, *self.range_V), voltage_V)
-        depth = path.depth[path.lead :]
-        if max(depth[PIECE - 1 :: PIECE].max(initial=0), depth[-1]) >= MOST_EXTREMES:
-            raise too_deep()
-        return path
+    def _path(self, voltage_V: np.ndarray, initial: str) -> tuple[Path, ...]:
+        return path_of(extremes_V(initial, *self.range_V), voltage_V)
+
+    def _respond(self, path: tuple[Path, ...]) -> np.ndarray:
+        return self.offset_um + np.concatenate([self.surface.respond(piece)[:, 0] for piece in path])
 
     def invert(self, wanted_um: np.ndarray, initial: str) -> tuple[np.ndarray, float, float]:
         """Voltage whose displacement is the one wanted, `(n,)`, and the ends of what can be reached, in um."""
@@ -216,7 +127,7 @@ class PlainLoop:
                 of, y = (a, up), (x0 - lower) * scale
                 i = min(int(y), n - 1)
                 s = y - i
-                w = np.array(_basis(s))
+                w = np.array(basis(s))
                 spline = (-(window[:, i : i + 3] @ w) if up else w @ window[i : i + 3]).tolist()
                 c0, c1, c2, c3 = branches[i if rising[a] else i + n]
                 begins = c0 + s * (c1 + s * (c2 + s * c3))
@@ -248,6 +159,14 @@ class PlainLoop:
         return np.array(voltage)
 
 
+def path_of(before_V: np.ndarray, voltage_V: np.ndarray) -> tuple[Path, ...]:
+    """A voltage followed by the memory, in pieces of one length; a `DataError` where it nests too deeply."""
+    pieces = tuple(Path.pieces(before_V, voltage_V, PIECE))
+    if max(piece.depth[-1] for piece in pieces) >= MOST_EXTREMES:
+        raise too_deep()
+    return pieces
+
+
 def extremes_V(initial: str, lower_V: float, upper_V: float) -> np.ndarray:
     """Extremes that a memory begins with, oldest first, by its name; see `microid.Staircase`.
 
@@ -260,34 +179,3 @@ def extremes_V(initial: str, lower_V: float, upper_V: float) -> np.ndarray:
         rest, left = (lower_V + upper_V) / 2, 1 - np.arange(_SWINGS) / _SWINGS
         return np.append(rest + left[:, None] * (np.array([lower_V, upper_V]) - rest), rest)
     return np.array([lower_V, upper_V] if initial == "positive" else [lower_V])
-
-
-def spread(packed: np.ndarray, levels: int) -> np.ndarray:
-    """Values row by row over the half-plane, `(N (N + 1) / 2, k)` to `(N, N, k)`."""
-    nodes = np.zeros((levels, levels, packed.shape[1]))
-    nodes[np.tril_indices(levels)] = packed
-    return nodes
-
-
-def _sums(values: np.ndarray) -> np.ndarray:
-    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
-
-
-def _running(nodes: np.ndarray) -> np.ndarray:
-    """B-spline coefficients of the integral, from the first node on, of the hat functions along axis 0."""
-    return _sums(nodes) - nodes[:1] / 2
-
-
-def _pieces(c1: np.ndarray, c2: np.ndarray, c3: np.ndarray) -> np.ndarray:
-    return np.stack([_sums(c1 + c2 + c3)[:-1], c1, c2, c3])
-
-
-def _triangle(nodes: np.ndarray, here: np.ndarray, next_: np.ndarray) -> np.ndarray:
-    """Integrate over `0 <= y <= x` up to `x`: cubics on every interval, in units of the step squared."""
-    i = np.arange(len(nodes) - 1)
-    p, q, r = nodes[i, i], nodes[i + 1, i], nodes[i, i + 1]
-    return _pieces(here, (next_ - here + p) / 2, (q - p + (r - p) / 2) / 3)
-
-
-def _basis(s: Any) -> tuple[Any, Any, Any]:
-    return (1 - s) ** 2 / 2, 0.5 + s * (1 - s), s**2 / 2

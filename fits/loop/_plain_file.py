@@ -6,20 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from fits.loop._plain import Perturbations, PlainLoop, Surface, spread
+from fits.loop._plain import Perturbations, PlainLoop
+from fits.loop._surface import Surface, spread
 
-# Samples times perturbations, and times a hundred for the memory and the inverse, beyond which JAX is done first
-# although it takes seconds to start.
-_MOST, _BESIDE = 60_000_000, 100
 # What is larger in size is refused where JAX reads it.
 _LARGEST, _FINEST = 1e30, 1000
 
 
-def plain_loop(content: Mapping[str, Any], samples: int) -> PlainLoop | None:
-    """The hysteresis of a model file, as `read_model_text` gives it, for so many samples.
+def plain_loop(content: Mapping[str, Any]) -> PlainLoop | None:
+    """The hysteresis of a model file, as `read_model_text` gives it.
 
     None where JAX is to take it, and to say what is wrong with it: where it is no Preisach operator on a grid with
-    its uncertainty, as `microid fit` writes it, where anything is odd, and where JAX is faster for so many samples.
+    its uncertainty, as `microid fit` writes it, and where anything is odd.
     """
     try:
         density, reversible, offset = _fields(content["model"], "Preisach", "density", "reversible", "offset_um")
@@ -40,7 +38,6 @@ def plain_loop(content: Mapping[str, Any], samples: int) -> PlainLoop | None:
             and len(offsets_um) == count > 0
             and 2 <= levels <= _FINEST
             and columns_um.shape[1] == size + levels
-            and (count + _BESIDE) * samples <= _MOST
         ):
             return None
     except (LookupError, TypeError, ValueError, AttributeError):

@@ -1,4 +1,8 @@
-"""How smooth and how noisy a density is believed to be: found by maximising the evidence, not set by hand."""
+"""How smooth and how noisy a density is believed to be: found by maximising the evidence, not set by hand.
+
+The algebra is that of NumPy and SciPy where the moments are NumPy's, so that nothing is compiled for one fit; in
+traced programs, such as many fits at once, it is JAX's.
+"""
 
 from functools import lru_cache
 from typing import Any
@@ -7,14 +11,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
+import scipy.linalg
 from jaxtyping import Array, Float
 
-from fits.loop._moments import Moments
+from fits.loop._moments import Moments, zero_dimensional
+from fits.stats._bfgs import minimise
 
 # Logarithms of the weights where the data say nothing: a density, of some strokes per squared range, whose slope is
 # ten, along the diagonal a third, and whose curvature is free, and a reversible slope whose curvature is ten.
 _MIDDLING = (-12.0, np.log(1e-2), 2.0, np.log(1e-2))
+# How far, in e-folds, they are believed to be from there.
+_WIDTH = 6.0
+# What rounding may take off a diagonal, relative to its largest entry.
+_ROUNDING = 1e-14
 
 
 class Hyper(eqx.Module):
@@ -26,55 +35,65 @@ class Hyper(eqx.Module):
     `log_reversible` the squared curvature of the reversible slope. `log_variance` is of noise, in squared strokes.
     """
 
-    log_density: Float[Array, ""]
-    log_slope: Float[Array, ""]
-    log_along: Float[Array, ""]
-    log_reversible: Float[Array, ""]
-    log_variance: Float[Array, ""]
+    log_density: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
+    log_slope: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
+    log_along: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
+    log_reversible: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
+    log_variance: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
 
     @classmethod
     def start(cls) -> "Hyper":
         """Weights that are believed beforehand, and noise of a thousandth of the stroke."""
-        _, slope, along, reversible = map(jnp.asarray, _MIDDLING)
         # Curvature is found from where it counts.
-        return cls(jnp.asarray(np.log(1e-2)), slope, along, reversible, jnp.asarray(np.log(1e-6)))
+        return cls.of(np.log(1e-2), *_MIDDLING[1:], np.log(1e-6))
+
+    @classmethod
+    def of(cls, *logs: Any) -> "Hyper":
+        """From numbers of any kind, in the order of the fields."""
+        return cls(*logs)
 
     def relaxed(self, efolds: float) -> "Hyper":
         """The same with all slopes and curvature counting less by so many e-folds."""
-        weights = jax.tree.map(lambda weight: weight - efolds, self)
-        return eqx.tree_at(lambda h: h.log_variance, weights, self.log_variance)
+        return Hyper.of(*(weight - efolds for weight in self.weights), self.log_variance)
+
+    @property
+    def weights(self) -> list[Any]:
+        """Logarithms of the weights of all kinds, in the order of `Roughness`."""
+        return [self.log_density, self.log_slope, self.log_along, self.log_reversible]
 
 
 class Roughness(eqx.Module):
     """Quadratic forms that measure the squared slopes and curvature that `Hyper` weighs, in columns of a `Grid`."""
 
-    density: Float[Array, "D D"]
-    slope: Float[Array, "D D"]
-    along: Float[Array, "D D"]
-    reversible: Float[Array, "D D"]
+    density: Float[Array | np.ndarray, "D D"]
+    slope: Float[Array | np.ndarray, "D D"]
+    along: Float[Array | np.ndarray, "D D"]
+    reversible: Float[Array | np.ndarray, "D D"]
 
-    @eqx.filter_jit
-    def precision(self, hyper: Hyper) -> Float[Array, "D D"]:
+    def precision(self, hyper: Hyper) -> Float[Array | np.ndarray, "D D"]:
         """Prior precision of the columns in strokes, shape `(D, D)`; positive definite."""
-        uneven = (
-            jnp.exp(hyper.log_density) * self.density
-            + jnp.exp(hyper.log_slope) * self.slope
-            + jnp.exp(hyper.log_along) * self.along
-            + jnp.exp(hyper.log_reversible) * self.reversible
-        )
+        xp, _ = _algebra(self.density, hyper.log_density)
+        forms = (self.density, self.slope, self.along, self.reversible)
+        uneven = sum(xp.exp(weight) * form for weight, form in zip(hyper.weights, forms, strict=True))
         # What is even costs nothing, but no density of 100 strokes is believed; and a great weight on the rest
         # must not make it negative by rounding.
-        floor = 1 / 100.0**2 + 1e-14 * jnp.max(jnp.diagonal(uneven))
-        return uneven + floor * jnp.eye(uneven.shape[0])
+        floor = 1 / 100.0**2 + _ROUNDING * xp.max(xp.diagonal(uneven))
+        return uneven + floor * xp.eye(uneven.shape[0])
 
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Roughness":
         """Keep only combinations of columns."""
-        return jax.tree.map(lambda form: jnp.asarray(basis.T @ form @ basis), self)
+        return jax.tree.map(lambda form: basis.T @ form @ basis, self)
 
 
 def roughness(levels: int) -> Roughness:
     """Build the forms for a grid of `levels`."""
-    return Roughness(*(jnp.asarray(form) for form in _matrices(levels)))
+    return Roughness(*_matrices(levels))
+
+
+def _algebra(*numbers: Any) -> tuple[Any, Any]:
+    """Modules of arrays and of their linear algebra, for numbers that are NumPy's or, any of them, JAX's."""
+    traced = any(isinstance(one, jax.Array) for one in numbers)
+    return (jnp, jax.scipy.linalg) if traced else (np, scipy.linalg)
 
 
 @lru_cache(maxsize=16)
@@ -139,67 +158,114 @@ def interpolation(coarse: int, fine: int) -> np.ndarray:
 
 
 class Posterior(eqx.Module):
-    """Gaussian posterior of the columns, in strokes, without bounds; `root` is the precision's Cholesky factor."""
+    """Gaussian posterior of the columns, in strokes, without bounds; `root` is the precision's Cholesky factor.
 
-    mean: Float[Array, " D"]
-    precision: Float[Array, "D D"]
-    root: Float[Array, "D D"]
+    Where rounding leaves no factor, mean and factor are NaN.
+    """
+
+    mean: Float[Array | np.ndarray, " D"]
+    precision: Float[Array | np.ndarray, "D D"]
+    root: Float[Array | np.ndarray, "D D"]
 
     @classmethod
-    @eqx.filter_jit
     def of(cls, moments: Moments, rough: Roughness, hyper: Hyper) -> "Posterior":
         """Condition the prior on the data."""
-        variance = jnp.exp(hyper.log_variance)
-        precision = jnp.asarray(moments.gram / variance + rough.precision(hyper))
+        xp, linalg = _algebra(moments.gram, rough.density, hyper.log_variance)
+        variance = xp.exp(hyper.log_variance)
+        precision = moments.gram / variance + rough.precision(hyper)
         # What rounding leaves of what a past has taken off may be negative.
-        precision += 1e-14 * jnp.max(jnp.diagonal(precision)) * jnp.eye(precision.shape[0])
-        root = jnp.linalg.cholesky(precision)
-        mean = jax.scipy.linalg.cho_solve((root, True), moments.cross_um / variance)
+        precision = precision + _ROUNDING * xp.max(xp.diagonal(precision)) * xp.eye(precision.shape[0])
+        root = cholesky(precision)
+        mean = linalg.cho_solve((root, True), moments.cross_um / variance, **_unchecked(xp))
         return cls(mean, precision, root)
 
-    @eqx.filter_jit
-    def factor(self) -> Float[Array, "D D"]:
+    def factor(self) -> np.ndarray:
         """Factor of the covariance: `factor @ factor.T` is the inverse of the precision."""
-        unit = jnp.eye(self.mean.shape[0])
-        return jax.scipy.linalg.solve_triangular(self.root, unit, lower=True).T
+        return np.asarray(scipy.linalg.solve_triangular(self.root, np.eye(len(self.mean)), lower=True).T)
 
 
-def _negative_log(hyper: Hyper, args: tuple[Moments, Roughness]) -> Float[Array, ""]:
-    """Negative logarithm of the evidence (MacKay 1992; Rasmussen & Williams 2006, ch. 2), but for a constant."""
-    moments, rough = args
-    prior = rough.precision(hyper)
-    variance = jnp.exp(hyper.log_variance)
-    root = jnp.linalg.cholesky(moments.gram / variance + prior)
-    half = jax.scipy.linalg.solve_triangular(root, moments.cross_um / variance, lower=True)
-    misfit = moments.energy_um2 / variance - half @ half
-    volume = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
-    prior_volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(prior))))
-    weights = jnp.stack([hyper.log_density, hyper.log_slope, hyper.log_along, hyper.log_reversible])
-    # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
-    unlikely = jnp.sum(((weights - jnp.asarray(_MIDDLING)) / 6.0) ** 2)
-    return jnp.asarray(moments.count * hyper.log_variance + misfit + volume - prior_volume + unlikely) / 2
+def cholesky(matrix: Any) -> Any:
+    """Lower Cholesky factor; NaN where there is none."""
+    xp, _ = _algebra(matrix)
+    try:
+        return xp.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
 
 
-@eqx.filter_jit
+def _unchecked(xp: Any) -> dict[str, Any]:
+    """Let SciPy pass NaN on, as JAX does."""
+    return {"check_finite": False} if xp is np else {}
+
+
+class Evidence:
+    """Negative logarithm of the evidence of moments, but for a constant (MacKay 1992; Rasmussen & Williams 2006).
+
+    Values and slopes are those at the logarithms of `Hyper`, in its order, shape `(5,)`.
+    """
+
+    def __init__(self, moments: Moments, rough: Roughness):
+        self._moments = jax.tree.map(np.asarray, moments)
+        self._rough = jax.tree.map(np.asarray, rough)
+
+    def value(self, logs: np.ndarray) -> float:
+        """The value; not a number where a matrix has no Cholesky factor."""
+        moments, variance = self._moments, np.exp(logs[4])
+        prior = self._rough.precision(Hyper.of(*logs))
+        root, prior_root = cholesky(moments.gram / variance + prior), cholesky(prior)
+        half = scipy.linalg.solve_triangular(root, moments.cross_um / variance, lower=True, check_finite=False)
+        misfit = moments.energy_um2 / variance - half @ half
+        volume, prior_volume = (2 * np.sum(np.log(np.diagonal(one))) for one in (root, prior_root))
+        # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
+        unlikely = np.sum(((logs[:4] - _MIDDLING) / _WIDTH) ** 2)
+        return float(moments.count * logs[4] + misfit + volume - prior_volume + unlikely) / 2
+
+    def slope(self, logs: np.ndarray) -> np.ndarray:
+        """The derivatives, shape `(5,)`."""
+        moments, variance = self._moments, np.exp(logs[4])
+        prior = self._rough.precision(Hyper.of(*logs))
+        forms = [np.exp(log) * form for log, form in zip(logs, jax.tree.leaves(self._rough), strict=False)]
+        # The floor of the precision follows its largest diagonal entry.
+        largest = int(np.argmax(sum(np.diagonal(form) for form in forms)))
+        covariance, alone = _inverse(moments.gram / variance + prior), _inverse(prior)
+        mean = covariance @ moments.cross_um / variance
+        out = np.empty(5)
+        for k, form in enumerate(forms):
+            floor = _ROUNDING * form[largest, largest]
+            wide = np.sum((covariance - alone) * form) + floor * np.trace(covariance - alone)
+            out[k] = mean @ form @ mean + floor * (mean @ mean) + wide + 2 * (logs[k] - _MIDDLING[k]) / _WIDTH**2
+        left = moments.energy_um2 - 2 * mean @ moments.cross_um + mean @ moments.gram @ mean
+        out[4] = moments.count - (left + np.sum(covariance * moments.gram)) / variance
+        return out / 2
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    return np.asarray(scipy.linalg.cho_solve((cholesky(matrix), True), np.eye(len(matrix)), check_finite=False))
+
+
 def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> Hyper:
     """Find the smoothness and the noise under which the data, in strokes, are most probable."""
-    solver: Any = optx.BFGS(rtol=1e-3, atol=1e-2)
-    solution: Any = optx.minimise(_negative_log, solver, start, args=(moments, rough), max_steps=256, throw=False)
-    # Out of steps on a flat evidence, the best place so far is as good as any; the regression itself must converge.
-    return solution.value
+    evidence = Evidence(moments, rough)
+    first = np.array([float(log) for log in jax.tree.leaves(start)])
+    # A step too far is not finite, and taken back. Out of steps on a flat evidence, the best place so far is as good
+    # as any; the regression itself must converge.
+    with np.errstate(all="ignore"):
+        return Hyper.of(*minimise(evidence.value, evidence.slope, first, rtol=1e-3, atol=1e-2, most_values=256))
 
 
-@eqx.filter_jit
-def effective(rough: Roughness, hyper: Hyper, posterior: Posterior) -> Float[Array, ""]:
+def effective(rough: Roughness, hyper: Hyper, posterior: Posterior) -> Float[Array | np.ndarray, ""]:
     """Count the columns that the data, not the prior, determine."""
-    prior = jnp.linalg.cholesky(rough.precision(hyper))
-    held = jax.scipy.linalg.solve_triangular(posterior.root, prior, lower=True)
-    return prior.shape[0] - jnp.sum(held**2)
+    prior = cholesky(rough.precision(hyper))
+    xp, linalg = _algebra(prior, posterior.root)
+    held = linalg.solve_triangular(posterior.root, prior, lower=True, **_unchecked(xp))
+    return zero_dimensional(prior.shape[0] - xp.sum(held**2))
 
 
-@eqx.filter_jit
-def renew_noise(moments: Moments, hyper: Hyper, posterior: Posterior, determined: Float[Array, ""]) -> Hyper:
+def renew_noise(
+    moments: Moments, hyper: Hyper, posterior: Posterior, determined: Float[Array | np.ndarray, ""]
+) -> Hyper:
     """Re-estimate the noise from what is left at the full resolution (MacKay's fixed point)."""
+    xp, _ = _algebra(moments.gram, posterior.mean)
     left = moments.energy_um2 - 2 * posterior.mean @ moments.cross_um + posterior.mean @ moments.gram @ posterior.mean
-    variance = jnp.maximum(left, 0) / jnp.maximum(moments.count - determined, 1)
-    return eqx.tree_at(lambda h: h.log_variance, hyper, jnp.log(jnp.maximum(variance, 1e-30)))
+    variance = xp.maximum(left, 0) / xp.maximum(moments.count - determined, 1)
+    return Hyper.of(*hyper.weights, xp.log(xp.maximum(variance, 1e-30)))

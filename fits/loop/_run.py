@@ -8,19 +8,22 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 import microid as m
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import columns_beside
+from fits.loop._design import Grid, columns_of
 from fits.loop._past import past_columns
-from fits.loop._plain import extremes_V
-from fits.loop._prediction import MOST_EXTREMES, PIECE, too_deep
+from fits.loop._path import Path
+from fits.loop._plain import extremes_V, path_of
+from fits.loop._surface import Surface
 
+# Room for the extremes of a memory, and along the runs of a stage: filtered multisines nest deeply.
+_EXTREMES, _EXTREMES_OF_STAGE = 64, 512
 # A hundred arrays of so many values are 8 GB.
 _MOST_STEPS = 10_000_000
-_STAIRCASES = (64, 512, MOST_EXTREMES)
 # Samples that a run must leave to fit.
 _FEWEST = 50
 # Samples that a shorter run is padded to, so that runs of many lengths share what is compiled.
@@ -51,10 +54,11 @@ class Samples(eqx.Module):
     beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
 
 
-def resized(start: m.Staircase, size: int) -> m.Staircase:
-    """Give a memory room for so many extremes at least."""
-    pad = jnp.full(max(0, size - start.extremes_V.shape[0]), start.extremes_V[0])
-    return m.Staircase(jnp.concatenate([start.extremes_V, pad]), start.count)
+def staircase(extremes_V: np.ndarray, size: int) -> m.Staircase:
+    """A memory of some extremes, shape `(used,)`, with room for so many at least."""
+    used = len(extremes_V)
+    extremes_V = np.pad(extremes_V, (0, max(0, size - used)), mode="edge")
+    return m.Staircase(jnp.asarray(extremes_V), jnp.asarray(np.int32(used)))
 
 
 @eqx.filter_jit
@@ -69,19 +73,6 @@ def refuse_many_steps(record: Record, stride: int) -> None:
             f"{record.source}: expected at most {_MOST_STEPS:,} steps, found {len(record):,} samples of {stride} "
             "substeps each; split the record, or use a model of fewer substeps"
         )
-
-
-@dataclass(frozen=True)
-class Path:
-    """A voltage followed by the memory of relays.
-
-    All `pieces` have one length, and each the memory that it begins with. Each sample lies on a branch that hangs
-    from the remembered extreme `anchor_V` and is `rising` or not, shape `(n,)`.
-    """
-
-    pieces: tuple[tuple[Float[Array, " k"], m.Staircase], ...]
-    anchor_V: np.ndarray
-    rising: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -136,25 +127,15 @@ class Run:
         """What each sample counts in the sum of squares, 0 where it is not fitted, shape `(n,)`."""
         return self.fitted.astype(float) if self.weight is None else self.weight * self.fitted
 
+    @property
+    def extremes_V(self) -> np.ndarray:
+        """Extremes of the memory before the first sample, oldest first."""
+        return np.asarray(self.start.extremes_V)[: int(self.start.count)]
+
     @cached_property
-    def path(self) -> Path:
-        """The voltage followed by the memory, as the fit of a hysteresis alone needs it."""
-        voltage = self.voltage_V
-        # The last piece is filled up with its final value, which changes no memory.
-        padded = np.pad(voltage, (0, -len(voltage) % PIECE), mode="edge")
-        for size in _STAIRCASES:
-            memory, anchors, risings, pieces = resized(self.start, size), [], [], []
-            for piece in map(jnp.asarray, padded.reshape(-1, PIECE)):
-                pieces.append((piece, memory))
-                anchor, rising, memory = _remember(piece, memory)
-                anchors.append(anchor)
-                risings.append(rising)
-                # Without room for all extremes.
-                if np.isnan(memory.extremes_V[0]):
-                    break
-            else:
-                return Path(tuple(pieces), *(np.concatenate(each)[: len(voltage)] for each in (anchors, risings)))
-        raise too_deep()
+    def path(self) -> tuple[Path, ...]:
+        """The voltage followed by the memory, as the fit of a hysteresis alone needs it, in pieces of one length."""
+        return path_of(self.extremes_V, self.voltage_V)
 
     @cached_property
     def samples(self) -> Samples:
@@ -179,7 +160,7 @@ class Run:
             voltage_V=_refined(voltage, stride, self.hold),
             displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
             weight=jnp.asarray(np.pad(self.fit_weight, pad)),
-            start=m.Start(memory=resized(self.start, 512)),  # filtered multisines nest deeply
+            start=m.Start(memory=staircase(self.extremes_V, _EXTREMES_OF_STAGE)),
             stride=stride,
             moving=self.moving,
             has_past=self.has_past,
@@ -261,8 +242,7 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
 
 def initial_state(name: str, lower_V: float, upper_V: float) -> m.Staircase:
     """Make the memory before a record from its name; see `extremes_V`."""
-    extremes = extremes_V(name, lower_V, upper_V)
-    return resized(m.Staircase(jnp.asarray(extremes), jnp.asarray(len(extremes), jnp.int32)), _STAIRCASES[0])
+    return staircase(extremes_V(name, lower_V, upper_V), _EXTREMES)
 
 
 def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:
@@ -287,21 +267,13 @@ def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: 
     return next(known for known in found if 2 * known.sum() >= found[-1].sum())
 
 
-@eqx.filter_jit
-def _remember(
-    voltage_V: Float[Array, " n"], start: m.Staircase
-) -> tuple[Float[Array, " n"], Bool[Array, " n"], m.Staircase]:
-    memory = m.remember(voltage_V, start)
-    anchor = memory.path_V[memory.anchor]
-    return anchor[memory.lead :], memory.rising[memory.lead :], memory.end()
+def simulate_run(model: m.Preisach | Surface, run: Run) -> np.ndarray:
+    """Predict the displacement of a run by a hysteresis alone, in um, shape `(n,)`; a surface has no offset."""
+    surface, offset_um = (model, 0.0) if isinstance(model, Surface) else (surface_of(model), float(model.offset_um))
+    return offset_um + np.concatenate([surface.respond(piece)[:, 0] for piece in run.path])
 
 
-@eqx.filter_jit
-def _respond(model: m.Preisach, voltage_V: Float[Array, " n"], start: m.Staircase) -> Float[Array, " n"]:
-    return model(voltage_V, start)
-
-
-def simulate_run(model: m.Preisach, run: Run) -> np.ndarray:
-    """Predict the displacement of a run by a hysteresis alone, in um, shape `(n,)`."""
-    out = [_respond(model, voltage, start) for voltage, start in run.path.pieces]
-    return np.concatenate(out)[: len(run.record)]
+def surface_of(model: m.Preisach) -> Surface:
+    """The Everett surface of a hysteresis of any family, without its offset."""
+    grid = Grid(model.density.lower_V, model.density.upper_V, model.density.levels)
+    return grid.surface(np.asarray(columns_of(model)))

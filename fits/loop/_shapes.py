@@ -96,7 +96,7 @@ def solve_shape(
     """
     grid = data.grid
     moments = data.total.scaled(1.0, stroke_um)
-    variance = float(jnp.exp(hyper.log_variance))
+    variance = float(np.exp(hyper.log_variance))
 
     def draw(key: PRNGKeyArray) -> Preisach:
         half = jnp.asarray(stroke_um / 2)
@@ -109,8 +109,8 @@ def solve_shape(
     gram, cross, energy = (np.asarray(x)[None] for x in (moments.gram, moments.cross_um, moments.energy_um2))
     root, target = (jnp.asarray(x[0]) for x in square_root(gram, cross, energy, negligible=1e-13)[:2])
     rough = roughness(grid.levels).reversible[grid.weights :, grid.weights :]
-    values, vectors = jnp.linalg.eigh(rough * jnp.exp(hyper.log_reversible))
-    slopes = jnp.sqrt(jnp.maximum(values, 0))[:, None] * vectors.T
+    values, vectors = np.linalg.eigh(rough * np.exp(hyper.log_reversible))
+    slopes = jnp.asarray(np.sqrt(np.maximum(values, 0))[:, None] * vectors.T)
     unit = jnp.asarray(1.0)
     # Starts race on a coarse scale: at the grid's own noise, most would crawl along narrow valleys.
     scale = jnp.asarray(1 / max(variance, 3e-3**2) ** 0.5)
@@ -153,7 +153,7 @@ def solve_shape(
     shared = sum(shared_square(o) * len(o) for o in off) / sum(len(o) for o in off)
     estimate = Estimate(
         model=coordinates(z),
-        factor_um=factor,
+        factor_um=np.asarray(factor),
         noise_um=variance**0.5 * stroke_um,
         correlation=correlation,
         discrepancy_um=max(0.0, shared) ** 0.5,

@@ -3,17 +3,16 @@
 from abc import abstractmethod
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid
+from fits.loop._plain import Perturbations
 from fits.loop._prediction import Prediction, refuse_outside
 from fits.loop._run import Run, prepare_run, simulate_run
-from microid import Preisach, Stage, Staircase, everett, remember
+from microid import Preisach, Stage
 
 
 class AbstractUncertainty(eqx.Module):
@@ -50,8 +49,8 @@ class Uncertainty(AbstractUncertainty):
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
         """Standard deviation of the predicted displacement of a run, shape `(n,)`; it is that of any such model."""
         del model
-        out = [_sd(self, voltage, start) for voltage, start in run.path.pieces]
-        return np.concatenate(out)[: len(run.record)]
+        densities, discrepancy_um = self.grid.densities(np.asarray(self.columns_um).T), float(self.discrepancy_um)
+        return Perturbations(*densities, self.grid.ends_V, np.asarray(self.offset_um), discrepancy_um).sd_um(run.path)
 
     def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
         if not isinstance(model, Preisach):
@@ -60,18 +59,3 @@ class Uncertainty(AbstractUncertainty):
         refuse_outside(record, *range_V)
         run = prepare_run(record, range_V, initial, holdout=1.0)
         return Prediction(simulate_run(model, run), self.sd_um(model, run))
-
-
-@eqx.filter_jit
-def _sd(uncertainty: Uncertainty, voltage_V: Float[Array, " n"], start: Staircase) -> Float[Array, " n"]:
-    memory, grid = remember(voltage_V, start), uncertainty.grid
-    n = grid.weights
-
-    def variance(perturbation: tuple[Float[Array, " D"], Float[Array, ""]]) -> Float[Array, " n"]:
-        columns, offset = perturbation
-        nodes, slopes = grid.nodes(columns[:n]) / grid.range_V**2, columns[n:] / grid.range_V
-        return (everett(nodes, slopes, grid.lower_V, grid.upper_V).respond(memory) + offset) ** 2
-
-    # In batches: all at once would take k times the memory of a simulation.
-    each = lax.map(variance, (uncertainty.columns_um, uncertainty.offset_um), batch_size=32)
-    return jnp.sqrt(jnp.sum(each, axis=0) + uncertainty.discrepancy_um**2)

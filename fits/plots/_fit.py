@@ -1,39 +1,30 @@
-"""Pictures of a fit, for print, readable in grey: of a hysteresis alone, of a stage, and of runs beside either."""
+"""Pictures of a fit, for print, readable in grey: of a hysteresis alone, and of runs beside it or a stage."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
 
 from fits.io._errors import AnyPath
 from fits.io._record import Record
+from fits.loop._design import Grid, columns_of
 from fits.loop._result import FitResult, RunReport
-from fits.loop._run import Run, command_range_V, prepare_run, simulate_run
+from fits.loop._run import Run, prepare_run, simulate_run
+from fits.loop._surface import Surface, continued
 from fits.plots import _style as style
-from fits.stage._checks import speed_Hz
-from fits.stage._run import gain_ahead, residual_of
-from fits.stage._start import MeasuredResponse, measure_response
-from fits.stage._steps import hysteresis_alone
 from fits.stats._metrics import TWO_SIDED_95
-from microid import AbstractLinear, Preisach, Reversible, Stage
+from microid import Preisach
 
-_surfaces = eqx.filter_jit(lambda model, alpha, beta: (model.density(alpha, beta), model.everett(alpha, beta)))
+# Voltages along either side of the surfaces.
+_MESH = 361
 _ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
-# How far beyond the measured frequencies the model's response is drawn.
-_BEYOND = 1.3
-# Coherence from which a line counts as measured.
-_COHERENT = 0.8
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class Drawn:
     """A run with its prediction and its standard deviation, as the report compares them, in um."""
 
     run: Run
@@ -48,7 +39,7 @@ class _Drawn:
         return np.where(self.run.known, self.run.displacement_um - self.predicted_um, np.nan)
 
 
-def _held_out(holdout: float | Sequence[Record], records: int, runs: int) -> tuple[float, Sequence[Record]]:
+def told_apart(holdout: float | Sequence[Record], records: int, runs: int) -> tuple[float, Sequence[Record]]:
     """Tell the fraction that was held out from records; a ValueError where both are not the runs of a result."""
     fraction, aside = (float(holdout), ()) if isinstance(holdout, int | float) else (0.0, holdout)
     if records + len(aside) != runs:
@@ -56,7 +47,7 @@ def _held_out(holdout: float | Sequence[Record], records: int, runs: int) -> tup
     return fraction, aside
 
 
-def _loops(runs: Sequence[_Drawn]) -> Figure:
+def loops_of(runs: Sequence[Drawn]) -> Figure:
     """Draw displacement and error against the voltage, with a column for each of the first runs."""
     picture, axes = _columns(runs, style.NARROW_in if len(runs) == 1 else style.WIDE_in)
     for each, (loop, error) in zip(runs, axes.T, strict=False):
@@ -72,7 +63,7 @@ def _loops(runs: Sequence[_Drawn]) -> Figure:
     return picture
 
 
-def _over_time(runs: Sequence[_Drawn], held_out_alone: bool = False) -> Figure:
+def over_time(runs: Sequence[Drawn], held_out_alone: bool = False) -> Figure:
     """Draw displacement and error against time, with their 95 % bands and a column for each of the first runs."""
     picture, axes = _columns(runs, style.WIDE_in)
     for each, (above, below) in zip(runs, axes.T, strict=False):
@@ -100,7 +91,7 @@ def _over_time(runs: Sequence[_Drawn], held_out_alone: bool = False) -> Figure:
     return picture
 
 
-def _columns(runs: Sequence[_Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
+def _columns(runs: Sequence[Drawn], width_in: float) -> tuple[Figure, np.ndarray]:
     """Two rows of axes, values above errors, with a column for each of the first runs."""
     many = min(len(runs), 3)
     picture, axes = style.panels(width_in, 3.6, 2, many, 0.04, squeeze=False, sharex="col", height_ratios=(2, 1))
@@ -130,39 +121,44 @@ def plot_fit(
     the result. `loops`, `density`, `everett` and `heldout` are written into an existing folder, in the form `png`
     (200 dots per inch), `svg` or `pdf`; a `DataError` says if they cannot be.
     """
-    fraction, aside = _held_out(holdout, len(records), len(result.runs))
+    fraction, aside = told_apart(holdout, len(records), len(result.runs))
     range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
     runs = [prepare_run(record, range_V, initial, fraction) for record in records]
     runs += [prepare_run(record, range_V, initial, holdout=1.0) for record in aside]
-    drawn = [_simulated(result, run, report) for run, report in zip(runs, result.runs, strict=True)]
+    law = result.model
+    grid, columns_um = Grid(law.density.lower_V, law.density.upper_V, law.density.levels), np.asarray(columns_of(law))
+    surface = grid.surface(columns_um)
+    drawn = [_simulated(result, surface, run, report) for run, report in zip(runs, result.runs, strict=True)]
 
-    voltage, (density, everett) = _over_half_plane(result.model)
+    voltage, (density, everett) = _over_half_plane(grid, columns_um)
     pictures = {
-        "loops": _loops(drawn[: len(records)]),
-        "density": _density(voltage, density, result.model.reversible),
+        "loops": loops_of(drawn[: len(records)]),
+        "density": _density(voltage, density, np.asarray(law.reversible.slope_um_per_V)),
         "everett": _everett(voltage, everett),
     }
     if predicted := [each for each in drawn if each.run.held_out.any()]:
-        pictures["heldout"] = _over_time(predicted, held_out_alone=True)
+        pictures["heldout"] = over_time(predicted, held_out_alone=True)
     return style.save_all(pictures, folder, form)
 
 
-def _simulated(result: FitResult[Preisach], run: Run, report: RunReport) -> _Drawn:
-    model = eqx.tree_at(lambda m: m.offset_um, result.model, jnp.asarray(report.offset_um))
-    predicted = simulate_run(model, run)
+def _simulated(result: FitResult[Preisach], surface: Surface, run: Run, report: RunReport) -> Drawn:
+    predicted = report.offset_um + simulate_run(surface, run)
     if not run.known.all():
         # The reported errors are those of the known samples; the start was estimated from the others.
-        predicted = np.where(run.known, predicted, simulate_run(model, replace(run, start=report.start)))
+        before = report.offset_um + simulate_run(surface, replace(run, start=report.start))
+        predicted = np.where(run.known, predicted, before)
     sd_um = result.uncertainty.sd_um(result.model, run) if run.held_out.any() else np.zeros(len(predicted))
-    return _Drawn(run, report, predicted, sd_um, result.noise_um)
+    return Drawn(run, report, predicted, sd_um, result.noise_um)
 
 
-def _over_half_plane(model: Preisach) -> tuple[np.ndarray, list[np.ma.MaskedArray]]:
+def _over_half_plane(grid: Grid, columns_um: np.ndarray) -> tuple[np.ndarray, list[np.ma.MaskedArray]]:
     """Evaluate the density and the Everett surface on a mesh of voltages; beta runs along the last axis."""
-    voltage = np.linspace(float(model.density.lower_V), float(model.density.upper_V), 361)
-    alpha, beta = np.meshgrid(voltage, voltage, indexing="ij")
-    surfaces = _surfaces(model, jnp.asarray(alpha), jnp.asarray(beta))
-    return voltage, [np.ma.masked_where(alpha < beta, np.asarray(surface)) for surface in surfaces]
+    voltage, levels = np.linspace(*grid.ends_V, _MESH), np.linspace(*grid.ends_V, grid.levels)
+    hats = np.stack([np.interp(voltage, levels, unit) for unit in np.eye(grid.levels)], axis=1)
+    nodes = continued(grid.densities(columns_um[:, None])[0])[..., 0]
+    surfaces = hats @ nodes @ hats.T, grid.surface(columns_um).over(voltage)[..., 0]
+    below = voltage[:, None] < voltage
+    return voltage, [np.ma.masked_where(below, surface) for surface in surfaces]
 
 
 def _half_plane(axes: Axes, voltage: np.ndarray) -> None:
@@ -170,7 +166,7 @@ def _half_plane(axes: Axes, voltage: np.ndarray) -> None:
     axes.set_aspect("equal")
 
 
-def _density(voltage: np.ndarray, values: np.ma.MaskedArray, reversible: Reversible) -> Figure:
+def _density(voltage: np.ndarray, values: np.ma.MaskedArray, slope_um_per_V: np.ndarray) -> Figure:
     picture, (plane, slope) = style.panels(style.WIDE_in, 2.9, 1, 2, width_ratios=(1.25, 1), gap=0.08)
     # One sharp peak at the diagonal would otherwise leave the rest white.
     top = float(np.quantile(values.compressed(), 0.995)) or None
@@ -178,7 +174,7 @@ def _density(voltage: np.ndarray, values: np.ma.MaskedArray, reversible: Reversi
     _half_plane(plane, voltage)
     style.label(plane, "switching down at β (V)", f"switching up at {_ALPHA} (V)")
     picture.colorbar(mesh, ax=plane, extend="max").set_label("density (µm/V²)")
-    slope.plot(np.linspace(voltage[0], voltage[-1], reversible.levels), reversible.slope_um_per_V, color=style.DARK)
+    slope.plot(np.linspace(voltage[0], voltage[-1], len(slope_um_per_V)), slope_um_per_V, color=style.DARK)
     slope.set_ylim(bottom=0)
     style.label(slope, "voltage (V)", "reversible slope (µm/V)")
     return picture
@@ -191,104 +187,4 @@ def _everett(voltage: np.ndarray, values: np.ma.MaskedArray) -> Figure:
     _half_plane(axes, voltage)
     style.label(axes, "fall to β (V)", f"fall from {_ALPHA} (V)")
     picture.colorbar(filled, ax=axes).set_label("Everett surface (µm)")
-    return picture
-
-
-def plot_stage(
-    result: FitResult[Stage],
-    records: Sequence[Record],
-    folder: AnyPath,
-    *,
-    holdout: float | Sequence[Record] = 0.2,
-    initial: str | Sequence[str] = "unknown",
-    form: str = "png",
-) -> list[Path]:
-    """Draw the fit of a stage: frequency response, runs with their residuals, and the loop of the slowest run.
-
-    Records, holdout and initial memory are those that `fit_stage` was given; a ValueError says that they are not
-    those of the result. `response` (where a run shows one), `runs`, `heldout` (where records were held out) and
-    `loop` are written into an existing folder, in the form `png` (200 dots per inch), `svg` or `pdf`; a `DataError`
-    if they cannot be.
-    """
-    fraction, aside = _held_out(holdout, len(records), len(result.runs))
-    states = [initial] * len(records) if isinstance(initial, str) else list(initial)
-    known = result.fitted_runs
-    if len(records) != len(known):
-        raise ValueError(f"the result is of {len(known)} fitted runs, and {len(records)} were given")
-    # The runs are refined already.
-    stage, gain = result.model.with_substeps(1), gain_ahead(result.model)
-    range_V = command_range_V([*records, *aside])
-    runs = [
-        prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold)
-        for record, state, report in zip(records, states, known, strict=True)
-    ]
-    before_aside = initial if isinstance(initial, str) else "unknown"
-    for record in aside:
-        run = prepare_run(record, range_V, before_aside, 1.0, known[-1].substeps or 1, gain, stage.hold)
-        runs.append(replace(run, fitted=run.known))
-    noises = [report.noise_um or 0.0 for report in known]
-    noises += [max(noises)] * len(aside)
-    drawn = [
-        _Drawn(
-            run, report, run.displacement_um - residual_of(stage, run), result.uncertainty.sd_um(stage, run), noise
-        )
-        for run, report, noise in zip(runs, result.runs, noises, strict=True)
-    ]
-    fitted, predicted = drawn[: len(records)], drawn[len(records) :]
-    pictures: dict[str, Figure] = {}
-    behind = float(stage.static_gain) / (gain or 1.0)
-    static_um = [behind * one for one in hysteresis_alone(stage, runs[: len(records)])]
-    found = [(run.record.source, measure_response(run, drive)) for run, drive in zip(runs, static_um, strict=False)]
-    if seen := [each for each in found if len(each[1].frequency_Hz)]:
-        # Of the run that shows the highest frequencies.
-        pictures["response"] = _response(stage, *max(seen, key=lambda each: _highest_Hz(each[1])))
-    pictures["runs"] = _over_time(fitted)
-    if predicted:
-        pictures["heldout"] = _over_time(predicted)
-    pictures["loop"] = _loops([min(fitted, key=lambda each: speed_Hz(each.run.record))])
-    return style.save_all(pictures, folder, form)
-
-
-def _highest_Hz(measured: MeasuredResponse) -> float:
-    """The highest frequency that a run surely shows; that of its last line if it shows none surely."""
-    sure = measured.frequency_Hz[measured.coherence > _COHERENT]
-    return float((sure if len(sure) else measured.frequency_Hz).max())
-
-
-def linear_gain(stage: Stage, frequency_Hz: np.ndarray) -> np.ndarray:
-    """Frequency response of all linear parts over their static gain, complex, shape `(f,)`."""
-    out = np.ones(len(frequency_Hz), dtype=complex)
-    for part in stage.parts:
-        if isinstance(part, AbstractLinear):
-            out = out * np.asarray(part.frequency_response(jnp.asarray(frequency_Hz))) / float(part.static_gain)
-    return out
-
-
-def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
-    # Beyond what was excited there are only lines that noise put there.
-    low, high = float(measured.frequency_Hz.min()), _BEYOND * _highest_Hz(measured)
-    shown = measured.frequency_Hz <= high
-    measured = MeasuredResponse(measured.frequency_Hz[shown], measured.response[shown], measured.coherence[shown])
-    frequency = np.geomspace(low / _BEYOND, high, 600)
-    model = linear_gain(stage, frequency)
-    phase = np.unwrap(np.angle(model))
-    at_lines = linear_gain(stage, measured.frequency_Hz)
-    # The measured phase is drawn on the branch of the model's.
-    near = np.interp(measured.frequency_Hz, frequency, phase) + np.angle(measured.response / at_lines)
-
-    picture, (size, turn) = style.panels(style.WIDE_in, 3.9, 2, 1, sharex=True, height_ratios=(1.4, 1))
-    # The less coherent a line, the lighter.
-    shade = 0.85 * np.minimum(1.0, (1 - measured.coherence) / (1 - _COHERENT) / 2)
-    grey: dict[str, Any] = {"c": shade, "cmap": "gray", "vmin": 0.0, "vmax": 1.0, "s": 5.0, "linewidths": 0.0}
-    grey["zorder"], name = 3, "measured (Welch: peaks are rounded)"
-    size.scatter(measured.frequency_Hz, np.abs(measured.response), label=name, **grey)
-    size.loglog(frequency, np.abs(model), label="driver and mechanics", color="0.5", linewidth=1.2)
-    turn.scatter(measured.frequency_Hz, np.degrees(near), **grey)
-    turn.semilogx(frequency, np.degrees(phase), color="0.5", linewidth=1.2)
-    turn.xaxis.set_major_formatter(LogFormatter())
-    turn.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
-    title = f"{style.verbatim(source)}\nover the displacement that the hysteresis alone would give"
-    style.label(size, "", "magnitude", title)
-    style.label(turn, "frequency (Hz)", "phase (°)")
-    style.legend(picture, (size,))
     return picture

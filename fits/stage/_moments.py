@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
@@ -103,16 +104,18 @@ def _rows(
     interval_s: Float[Array, " k"],
     voltage_V: Float[Array, " k"],
     memory: Staircase,
-    carried: tuple[Float[Array, "s D"], Float[Array, " D"]] | None,
+    begins: Bool[Array, ""],
+    carried: tuple[Float[Array, "s D"], Float[Array, " D"]],
 ) -> tuple[Float[Array, "k D"], Staircase, tuple[Float[Array, "s D"], Float[Array, " D"]]]:
-    """Response to every column alone, passed on through what follows the hysteresis."""
+    """Response to every column alone, passed on through what follows the hysteresis.
+
+    Where a run `begins` it is at rest before the first sample.
+    """
     response, memory = design(grid, table, voltage_V, memory)
-    if system is None:
-        return response, memory, (jnp.zeros((0, grid.columns)), response[-1])
-    if carried is None:
-        # At rest before the first sample.
-        carried = jnp.zeros((system.order, grid.columns)), response[0]
     state, last = carried
+    if system is None:
+        return response, memory, (state, response[-1])
+    last = jnp.where(begins, response[0], last)
     step, taken = system.advance(interval_s, "first")
     change = jnp.diff(response, axis=0, prepend=last[None])
 
@@ -183,7 +186,18 @@ def along(
     Without columns the run is linearised at those that the stage has, whose grid may then differ from the chain's. Of
     the changes of each piece, shape `(samples, k)`, only what `reduce` makes of them is kept.
     """
-    _, slope, _ = linearise(chain, z, columns_um, run)
+    return moved_along(chain, z, linearise(chain, z, columns_um, run)[1], run, directions, reduce)
+
+
+def moved_along(
+    chain: Chain,
+    z: Float[Array, " p"],
+    slope: np.ndarray,
+    run: Run,
+    directions: Sequence[np.ndarray],
+    reduce: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """The same where the slopes along the coordinates are known, shape `(n, p)`."""
     moved = [
         reduce(columns @ directions[0] + slope[first : first + len(columns)] @ directions[1])
         for first, columns in pieces(chain, z, run, True)
@@ -202,7 +216,8 @@ def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterato
         return
     voltage, system = _before_and_after(chain.coordinates, chain.place, z, samples)
     table = jnp.asarray(branch_table(grid.levels))
-    memory, carried = samples.start.memory, None
+    memory = samples.start.memory
+    carried: tuple[Any, Any] = np.zeros((0 if system is None else system.order, grid.columns)), np.zeros(grid.columns)
     interval = np.diff(run.record.time_s, prepend=2 * run.record.time_s[0] - run.record.time_s[1])
     path = np.asarray(voltage)[:n]
     for first in range(0, n, _PIECE):
@@ -215,6 +230,7 @@ def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterato
             jnp.asarray(np.pad(interval[piece], pad, mode="edge")),
             jnp.asarray(np.pad(path[piece], pad, mode="edge")),
             memory,
+            jnp.asarray(first == 0),
             carried,
         )
         yield first, np.asarray(rows)[: _PIECE - pad[1]]

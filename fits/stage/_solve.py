@@ -268,7 +268,7 @@ def _step(
         solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, hyper)
         columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
         step = step - follow @ columns
-        variance = float(jnp.exp(hyper.log_variance)) * stroke_um**2
+        variance = float(np.exp(hyper.log_variance)) * stroke_um**2
         if not variance > 1e-20 * stroke_um**2:  # all is rounding below
             # The search for the noise went astray.
             raise FitError(FitStatus.NONFINITE)

@@ -5,7 +5,6 @@ from functools import cached_property
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import fft
 
 from fits.io._errors import DataError
 from fits.io._record import Record
@@ -15,11 +14,11 @@ from fits.loop._prior import interpolation
 from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
-from fits.stage._moments import Chain, along, offsets_out
+from fits.stage._moments import Chain, along, linearise, moved_along, offsets_out
 from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._metrics import TWO_SIDED_95, WHITE
-from fits.stats._noise import correlation_samples, shared_square
+from fits.stats._noise import correlation_samples, fast_length, shared_square
 from microid import Preisach, Stage
 
 # Levels on which predictions are perturbed; finer ones move no displacement.
@@ -44,16 +43,18 @@ class StageUncertainty(AbstractUncertainty):
     grid: Grid | None
 
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
-        stage = _stage(model)
+        return self._predicted(_stage(model), run).displacement_sd_um
+
+    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
+        return self._predicted(*prepare_program(_stage(model), record, initial))
+
+    def _predicted(self, stage: Stage, run: Run) -> Prediction:
         chain, mean = Chain.of(stage, self.grid), np.asarray(self.mean_um)
         directions = np.asarray(self.columns_um).T, np.asarray(self.coordinates).T
         z = chain.coordinates.of(stage)
-        square = along(chain, z, None, run, directions, lambda moved: np.sum((moved - mean) ** 2, axis=1))
-        return np.sqrt(square + float(self.discrepancy_um) ** 2)
-
-    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
-        stage, run = prepare_program(_stage(model), record, initial)
-        return Prediction(simulate_stage(stage, run), self.sd_um(stage, run))
+        out, slope, _ = linearise(chain, z, None, run)
+        square = moved_along(chain, z, slope, run, directions, lambda moved: np.sum((moved - mean) ** 2, axis=1))
+        return Prediction(out[: len(run.record)], np.sqrt(square + float(self.discrepancy_um) ** 2))
 
 
 def _stage(model: Preisach | Stage) -> Stage:
@@ -161,8 +162,8 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
     left = np.where(fitted, residual_um, 0.0)
     correlation = correlation_samples([residual_um[fitted]])
     lags = 0 if correlation <= WHITE else min(len(left) - 1, int(np.ceil(6.0 * correlation)))
-    size = fft.next_fast_len(2 * len(left))
-    auto = fft.irfft(np.abs(fft.rfft(left, size)) ** 2, size)[: lags + 1] / fitted.sum()
+    size = fast_length(2 * len(left))
+    auto = np.fft.irfft(np.abs(np.fft.rfft(left, size)) ** 2, size)[: lags + 1] / fitted.sum()
     # Bartlett's window keeps the covariance positive.
     kernel = auto * (1 - np.arange(lags + 1) / (lags + 1))
     moved = fftconvolve(influence, np.concatenate([kernel[:0:-1], kernel])[None], mode="same", axes=1)

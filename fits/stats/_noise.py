@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
 
 # Huber's bound, in standard deviations: 95 % efficient on clean Gaussian noise.
 _HUBER = 1.345
 LOSSES = ("squares", "huber")
+# Samples of which it is seen whether a residual repeats itself.
+_COMPARED = 1_000_000
 
 
 def shared_square(residual: np.ndarray) -> float:
@@ -28,8 +29,9 @@ def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     total = np.zeros(max(len(r) for r in residuals))
     for residual in residuals:
         n = len(residual)
-        spectrum = np.abs(fft.rfft(residual - residual.mean(), fft.next_fast_len(2 * n))) ** 2
-        total[:n] += fft.irfft(spectrum)[:n]
+        size = fast_length(2 * n)
+        spectrum = np.abs(np.fft.rfft(residual - residual.mean(), size)) ** 2
+        total[:n] += np.fft.irfft(spectrum, size)[:n]
     if total[0] <= 0:
         return 1.0
     time = 1 + 2 * np.cumsum(total[1:] / total[0])
@@ -37,13 +39,22 @@ def correlation_samples(residuals: Sequence[np.ndarray]) -> float:
     return float(max(1.0, time[inside[0]] if len(inside) else time.max(initial=1.0)))
 
 
+def fast_length(least: int) -> int:
+    """A length whose Fourier transform is quick, a quarter longer at most: one that is even and has small primes."""
+    return min(part << max((-(-least // part) - 1).bit_length(), 1) for part in (4, 5, 6, 7))
+
+
 def repeated_square(place: np.ndarray, residual: np.ndarray, correlation: float) -> float:
     """Variance of what a residual repeats wherever it comes back to the same place; 0 where noise may do that, too.
 
     The products of pairs that are closest in place are compared, of samples so far apart in time that they share no
-    noise, if one in so many samples as `correlation` is independent.
+    noise, if one in so many samples as `correlation` is independent. Of a very long residual some samples are taken,
+    evenly chosen.
     """
-    order, centred = np.argsort(place, kind="stable"), residual - residual.mean()
+    centred, every = residual - residual.mean(), -(-len(place) // _COMPARED)
+    place, centred = place[::every], centred[::every]
+    correlation = max(correlation / every, 1.0)
+    order = np.argsort(place, kind="stable")
     one, other = (np.concatenate(part) for part in zip(*((order[k:], order[:-k]) for k in range(1, 9)), strict=True))
     apart = np.abs(one - other) > 5 * correlation
     one, other = one[apart], other[apart]

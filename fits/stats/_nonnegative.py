@@ -2,8 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
+from scipy.linalg import cho_factor, cho_solve
 
 # Exchanges that may fail to reduce the number of violations before they are made one at a time.
 _PATIENCE = 3
@@ -45,3 +47,28 @@ def minimise_nonnegative(
     first: tuple[Array, ...] = start, start > 0, jnp.zeros_like(start, dtype=bool), *counts, far, jnp.asarray(0)
     y, *_, left, _ = lax.while_loop(goes_on, step, first)
     return y, (left <= atol) & jnp.all(jnp.isfinite(y))
+
+
+def pivot_nonnegative(
+    hessian: np.ndarray, linear: np.ndarray, start: np.ndarray, atol: float, most_steps: int
+) -> tuple[np.ndarray, bool]:
+    """The same for one quadratic in NumPy, which compiles nothing."""
+    free, wrong, fewest, patience = start > 0, np.zeros(len(start), dtype=bool), len(start) + 1, _PATIENCE
+    y, left = start, np.inf
+    for _ in range(most_steps):
+        free = free ^ wrong
+        y = np.zeros_like(start)
+        try:
+            y[free] = cho_solve(cho_factor(hessian[np.ix_(free, free)]), -linear[free])
+        except (np.linalg.LinAlgError, ValueError):
+            return np.full_like(start, np.nan), False
+        violation = np.where(free, -y, -(hessian @ y + linear))
+        wrong, left, y = violation > atol, float(violation.max()), np.maximum(y, 0)
+        if left <= atol:
+            break
+        count = int(wrong.sum())
+        patience = _PATIENCE if count < fewest else max(patience - 1, -1)
+        fewest = min(count, fewest)
+        if patience < 0:
+            wrong[: np.flatnonzero(wrong)[-1]] = False
+    return y, left <= atol

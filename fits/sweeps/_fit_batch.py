@@ -54,7 +54,7 @@ def fit_batch(
         hyper = lax.fori_loop(0, 4, renew, hyper)
         posterior = Posterior.of(moments, rough, hyper)
         scale = jnp.sqrt(jnp.diagonal(posterior.precision))
-        precision, mode = posterior.precision / (scale[:, None] * scale[None, :]), posterior.mean * scale
+        precision, mode = jnp.asarray(posterior.precision) / (scale[:, None] * scale[None, :]), posterior.mean * scale
         solution, success = minimise_nonnegative(precision, -(precision @ mode), jnp.maximum(mode, 0), 1e-6, 500)
         found = solution / scale * stroke
         offset = mean - mean_column @ found

@@ -7,7 +7,6 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from microid._param import static
@@ -272,6 +271,8 @@ def _solved(
     def residual(scaled: Array, given: tuple[list[Array], Array, Constants, Array]) -> Array:
         values, piezo_um, constants, unit = given
         return function(scaled * unit, *values, piezo_um, constants=constants)
+
+    import optimistix as optx  # slow to import
 
     found: optx.Solution = optx.root_find(
         residual,

@@ -9,7 +9,6 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
-import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -145,6 +144,8 @@ def _flattened_um(
     shape = jnp.stack(jnp.broadcast_arrays(length_mm, thickness_mm, leg_mm, inclination_rad, spring))
     wanted = jnp.asarray(piezo_um / 1000, dtype=shape.dtype)
     start = wanted * _load_per_elongation(shape)
+    import optimistix as optx  # slow to import
+
     found: optx.Solution = optx.root_find(
         _excess, optx.Newton(rtol=1e-9, atol=1e-12), start, args=(shape, wanted), max_steps=64
     )

@@ -1,0 +1,66 @@
+"""What a rig must have been through before its record, from the samples that depend on it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from fits.loop._run import Run
+from microid import Preisach, Staircase
+
+# Pairs of extremes that stand for the unknown history, and samples that are compared.
+_PAIRS = 6
+_SAMPLES = 1024
+_SIZE = 64
+
+
+def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Array, ""]) -> Staircase:
+    """Extremes that close in on the first sample, by the shares of the way that the coordinates stand for."""
+    below, above = jax.nn.softmax(z[0]), jax.nn.softmax(z[1])
+    low, high = model.density.lower_V, model.density.upper_V
+    minima = low + (first_V - low) * jnp.cumsum(below)[:-1]
+    maxima = high - (high - first_V) * jnp.cumsum(above)[:-1]
+    inner = jnp.stack([maxima, minima], axis=1).ravel()
+    extremes = jnp.concatenate([low[None], inner, first_V[None]])
+    used = extremes.shape[0]
+    return Staircase(jnp.pad(extremes, (0, _SIZE - used), mode="edge"), jnp.asarray(used, dtype=jnp.int32))
+
+
+def _residual(
+    z: Float[Array, "2 pairs_1"], args: tuple[Preisach, Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
+) -> Float[Array, " m"]:
+    model, voltage_V, displacement_um, weight = args
+    start = _staircase(z, model, voltage_V[0])
+    # A faint pull towards an even decay decides what the samples leave open.
+    return jnp.concatenate([weight * (model(voltage_V, start) - displacement_um), 1e-2 * z.ravel()])
+
+
+@eqx.filter_jit
+def _solve(args: tuple[Preisach, Array, Array, Array]) -> Staircase:
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+    start = jnp.zeros((2, _PAIRS + 1))
+    solution: Any = optx.least_squares(_residual, solver, start, args=args, max_steps=100, throw=False)
+    return _staircase(solution.value, args[0], args[1][0])
+
+
+def estimate_start(model: Preisach, run: Run, noise_um: float) -> Staircase:
+    """Fit the memory before the first sample to the samples that depend on it; the model has this run's offset.
+
+    The output is differentiable in the remembered extremes as it is in any voltage, so the extremes themselves are
+    the unknowns (Levenberg-Marquardt on `2 x 7` shares of the way from the ends of the range to the first sample).
+    """
+    keep = np.arange(np.flatnonzero(~run.known)[-1] + 1)
+    # Thinned out evenly; the extremes of the path must stay, as they make the memory.
+    if len(keep) > _SAMPLES:
+        voltage = run.voltage_V[keep]
+        turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(voltage))) != 0)
+        even = np.linspace(0, len(keep) - 1, max(2, _SAMPLES - len(turns))).astype(np.int64)
+        keep = np.unique(np.concatenate([even, turns]))[: 2 * _SAMPLES]
+    pad = (0, 2 * _SAMPLES - len(keep))
+    voltage = np.pad(run.voltage_V[keep], pad, mode="edge")
+    displacement, weight = (np.pad(x, pad) for x in (run.displacement_um[keep], np.full(len(keep), 1 / noise_um)))
+    return _solve((model, jnp.asarray(voltage), jnp.asarray(displacement), jnp.asarray(weight)))
