@@ -250,7 +250,7 @@ def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> Hyper
     # A step too far is not finite, and taken back. Out of steps on a flat evidence, the best place so far is as good
     # as any; the regression itself must converge.
     with np.errstate(all="ignore"):
-        return Hyper.of(*minimise(evidence.value, evidence.slope, first, rtol=1e-3, atol=1e-2, most_values=256))
+        return Hyper.of(*minimise(evidence.value, evidence.slope, first, rtol=1e-3, atol=1e-2, most_steps=128))
 
 
 def effective(rough: Roughness, hyper: Hyper, posterior: Posterior) -> Float[Array | np.ndarray, ""]:

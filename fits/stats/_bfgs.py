@@ -1,11 +1,9 @@
-"""Smooth functions of a few variables: the quasi-Newton method of Broyden, Fletcher, Goldfarb and Shanno."""
+"""Smooth functions of a few variables: SciPy's quasi-Newton method, ended as Optimistix ends its own."""
 
 from collections.abc import Callable
 
 import numpy as np
-
-# A step is halved until it gains such a part of what the slope at its start promises (Armijo's condition).
-_GAIN = 0.1
+from scipy.optimize import OptimizeResult, minimize
 
 
 def minimise(
@@ -14,30 +12,27 @@ def minimise(
     start: np.ndarray,
     rtol: float,
     atol: float,
-    most_values: int,
+    most_steps: int,
 ) -> np.ndarray:
-    """Go down from a start, shape `(k,)`, to where steps and gains are small, or as far as so many values lead.
+    """Go down from a start, shape `(k,)`, to where steps and gains are small, or as far as so many steps lead.
 
     A step counts as small where each variable, and the value, change by less than `atol` and `rtol` of their size.
-    The rule is that of Nocedal & Wright, Numerical Optimization (2006), Eq. 6.17. Where the function is not finite
-    steps are halved, too. SciPy's method goes on until the slope is small, which rounding may keep it from.
+    By itself SciPy goes on until the slope is small, which rounding may keep it from. What is not finite is too far.
     """
-    x, unit, step = start, np.eye(len(start)), 1.0
-    now, downhill, inverse = value(x), slope(x), unit
-    for _ in range(most_values - 1):
-        move = -step * (inverse @ downhill)
-        there, promised = value(x + move), float(downhill @ move)
-        if not (promised <= 0 and there - now <= _GAIN * promised):
-            step /= 2
-            continue
-        x, gained, step, before = x + move, there - now, 1.0, downhill
-        now, downhill = there, slope(x)
-        bend = downhill - before
-        along = float(bend @ move)
-        if along > np.finfo(float).eps:
-            off = unit - np.outer(move, bend) / along
-            inverse = off @ inverse @ off.T + np.outer(move, move) / along
-        small = np.all(np.abs(move) < atol + rtol * np.abs(x)) and abs(gained) < atol + rtol * abs(now)
-        if small:
-            break
-    return x
+    before, now = start, value(start)
+
+    def end(intermediate_result: OptimizeResult) -> None:
+        nonlocal before, now
+        x, reached = np.array(intermediate_result.x), float(intermediate_result.fun)
+        moved, gained = np.abs(x - before), abs(reached - now)
+        before, now = x, reached
+        if np.all(moved < atol + rtol * np.abs(x)) and gained < atol + rtol * abs(reached):
+            raise StopIteration
+
+    def finite(x: np.ndarray) -> float:
+        found = value(x)
+        return found if np.isfinite(found) else np.inf
+
+    options = {"maxiter": most_steps, "gtol": 0.0}
+    found = minimize(finite, start, jac=slope, method="BFGS", callback=end, options=options)
+    return np.asarray(found.x)
