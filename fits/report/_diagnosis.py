@@ -141,7 +141,7 @@ def _bars(diagnosis: Diagnosis) -> list[tuple[str, str, float, float]]:
 
 
 def _span(low: float, high: float, unit: str) -> str:
-    return f"{number(low)} to {number(high)} {unit}"
+    return f"{number(low)} to {number(high)} {shown_unit(unit)}"
 
 
 def _facts(ahead: Experiment) -> list[tuple[str, Any]]:
