@@ -42,7 +42,7 @@ def test_the_command_writes_everything(bench, rng):
     assert (bench.asked["duration_s"], bench.asked["false_alarm"], bench.asked["holdout"]) == (30.0, 0.05, 0.2)
     assert bench.asked["budget_s"] == 60.0
     assert [record.source for record in bench.asked["records"]] == ["run.csv"]
-    for words in ("creep", "thermal_drift", "gain_per_decade", "0.0471", "0.0123", "It decides.", "report.html"):
+    for words in ("creep", "thermal_drift", "gain_per_decade", "47.1 nm", "12.3 nm", "It decides.", "report.html"):
         assert words in done.stdout
     assert "asking" in done.stderr
     # Announced out of turn, a step counts those before it.

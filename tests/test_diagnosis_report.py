@@ -1,8 +1,6 @@
 import html.parser
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html import unescape
 
@@ -239,90 +237,3 @@ def test_numbers_have_sensible_digits():
     ]
     assert named == ["onset", "a"]
     assert [shown_unit(u) for u in ("1", "um", "um/K", "1/K", "um/V^2")] == ["", "µm", "µm/K", "1/K", "µm/V²"]
-
-
-def browser():
-    names = ("chromium", "chromium-browser", "google-chrome")
-    return next(filter(None, map(shutil.which, names)), None)
-
-
-def opened(text, width_px, folder, act="null"):
-    """What a browser says of a page in a frame of a width; a window cannot be as narrow as a phone.
-
-    `act` is what is done there before, with the window `w` and the document `d`, and comes back as `acted`.
-    """
-    watch = (
-        "<script>window.problems = []; addEventListener('error', e => problems.push(String(e.message)), true);"
-        "console.error = (...words) => problems.push(words.join(' '));</script>"
-    )
-    page = json.dumps(text.replace("<head>", f"<head>{watch}", 1)).replace("</", "<\\/")
-    outer = folder / f"outer{width_px}.html"
-    outer.write_text(
-        f"<!DOCTYPE html><body><iframe id='frame' width='{width_px}' height='800' style='border:0'></iframe>"
-        "<pre id='seen'></pre><script>const frame = document.getElementById('frame');"
-        "frame.addEventListener('load', () => { const w = frame.contentWindow, d = w.document;"
-        f"const acted = {act};"
-        "document.getElementById('seen').textContent = JSON.stringify({acted, width: w.innerWidth,"
-        "needed: d.documentElement.scrollWidth, problems: w.problems,"
-        "lefts: [...d.querySelectorAll('article')].map(one => one.getBoundingClientRect().left),"
-        "pictures: [...d.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().width),"
-        "broken: [...d.images].filter(i => !i.complete || !i.naturalWidth).length}); });"
-        f"frame.srcdoc = {page};</script></body>",
-        encoding="utf-8",
-    )
-    options = (
-        "--headless=new",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--virtual-time-budget=5000",
-        "--window-size=1400,900",
-    )
-    command = [browser(), *options, f"--user-data-dir={folder / 'profile'}", "--dump-dom", outer.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
-    return json.loads(unescape(re.search(r'<pre id="seen">(.*?)</pre>', done.stdout, re.DOTALL)[1]))
-
-
-@pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the report with")
-@pytest.mark.parametrize("width_px", [360, pytest.param(1200, marks=pytest.mark.study)])
-def test_a_browser_shows_the_report_without_scrolling_sideways(rng, tmp_path, width_px):
-    page = report_html(diagnosis(rng, "unexplained"))
-    seen = opened(page, width_px, tmp_path)
-    assert seen["width"] == width_px
-    assert seen["needed"] <= width_px
-    assert seen["problems"] == []
-    assert seen["broken"] == 0
-    visible = [width for width in seen["pictures"] if width > 0]
-    assert len(visible) == len(seen["pictures"]) / 2
-    assert all(250 < width <= width_px for width in visible)
-    wide = page.replace("<main>", '<main><div style="width: 3000px">x</div>', 1)
-    assert opened(wide, width_px, tmp_path)["needed"] > width_px
-
-
-# Drags over the first panel from 40 to 60 % of its width, and says where its curve, ticks and hint are then.
-DRAG = """(() => {
-    const svg = d.querySelector(".wide svg[data-spans]"), pad = svg.querySelector("rect.zoom");
-    const box = pad.getBoundingClientRect(), curve = svg.querySelector("[id$=zoom0-0]");
-    const at = share => ({clientX: box.left + share * box.width, clientY: box.top + 5, bubbles: true});
-    const send = (name, share) => pad.dispatchEvent(new w.MouseEvent(name, at(share)));
-    const told = () => ({width: curve.getBoundingClientRect().width / box.width, texts:
-        [...svg.querySelectorAll("[id$=ticks0] > g")].filter(g => g.style.display !== "none")
-        .filter(g => g.querySelector("use")).map(g => g.querySelector("text").textContent)});
-    const before = told();
-    send("pointerdown", 0.4); send("pointermove", 0.6); send("pointerup", 0.6);
-    const zoomed = told();
-    send("dblclick", 0.5);
-    return {before, zoomed, after: told(), hint: !svg.closest("figure").querySelector(".hint").hidden};
-})()"""
-
-
-@pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the report with")
-def test_a_stretch_of_a_trace_is_enlarged_where_it_is_dragged_over(rng, tmp_path):
-    seen = opened(report_html(diagnosis(rng, n=2000, count=1)), 1200, tmp_path, DRAG)
-    acted, (before, zoomed) = seen["acted"], (seen["acted"][name]["texts"] for name in ("before", "zoomed"))
-    assert seen["problems"] == []
-    assert acted["hint"]
-    assert acted["after"] == acted["before"]
-    assert acted["zoomed"]["width"] == pytest.approx(5 * acted["before"]["width"], rel=0.01)
-    # The run takes 19.99 s, so that these are those from 8 s to just short of 12 s.
-    assert (float(before[0]), float(before[-1])) == (0.0, 17.5)
-    assert sorted(map(float, zoomed)) == [8.0, 9.0, 10.0, 11.0]

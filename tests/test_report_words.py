@@ -6,20 +6,28 @@ from itertools import product
 
 import numpy as np
 import pytest
-from _diagnosis import KINDS, diagnosis
+from _diagnosis import KINDS, cause, diagnosis
 
 from fits.diagnosis._result import Gain
-from fits.report._diagnosis import _gained
+from fits.report._diagnosis import _gained, report_html
+from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, runs_read, stage_parameters
-from fits.report._words import Lengths, number, verdict_sentence
+from fits.report._words import NONE, length, number, plain, spread, verdict_sentence
+from microid import EFFECTS
 
 SIZES_um = (0.0471, 0.0123, 0.04709, 0.0470999, 0.9, np.nan)
 
 
 def compared(text):
-    """How sentences say that an error changes: the words, and both of its sizes as they are printed."""
-    found = re.findall(r"(falls|goes) from ([\d.]+) (\S+) to ([\d.]+) (\S+?),", text)
-    return [(word, float(before), float(after), unit == other) for word, before, unit, after, other in found]
+    """How sentences say that an error changes: the words, and both of its sizes in um."""
+    found = re.findall(r"(falls|goes) from (\S+ \S+) to (\S+ \S+?),", text)
+    return [(word, size_um(before), size_um(after)) for word, before, after in found]
+
+
+def size_um(text):
+    """A length as it is printed."""
+    number, unit = text.split()
+    return float(number) * {"pm": 1e-6, "nm": 1e-3, "µm": 1.0}[unit]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -29,14 +37,13 @@ def test_no_sentence_contradicts_a_number(rng, kind):
         if np.isnan(before) != np.isnan(after):
             continue
         found = replace(made, gain=Gain(before, after, sd, noise_um=made.noise_um))
-        length, words = Lengths(found), verdict_sentence(found)
-        for word, first, second, same_unit in compared(words):
-            assert same_unit
+        words = verdict_sentence(found)
+        for word, first, second in compared(words):
             assert (word == "falls") == (second < first)
             assert first != second
         if kind == "effect_found" and np.isfinite(after):
-            assert ("falls" in words) == (float(length.bare(after)) < float(length.bare(before)))
-            said = _gained(found, length)
+            assert ("falls" in words) == (size_um(length(after)) < size_um(length(before)))
+            said = _gained(found)
             assert ("may be chance" in said) == (after != before and abs(before - after) < 2 * sd)
             assert "rises" not in said or after > before
             assert "falls" not in said or after < before
@@ -45,6 +52,52 @@ def test_no_sentence_contradicts_a_number(rng, kind):
         assert ("extended.json" in command) == better
         assert ("extended" in step) == better
         assert ("Hold a run out" in step) == (better and bool(np.isnan(after)))
+
+
+SIZE = r"([\d.]+ [pnµ]m)"
+TILES = ("Residual of the plain stage in the fit", "Noise floor", "Unexplained, beyond the noise")
+
+
+def test_sentence_tile_step_and_json_give_one_residual_by_one_name(rng):
+    made = diagnosis(rng, "unexplained")
+    # What comes before a run has forgotten its past is off by far more than all that counts.
+    runs = tuple(replace(run, before_um=run.before_um + np.where(run.fitted, 0.0, 50.0)) for run in made.runs)
+    left_um = np.concatenate([run.before_um[run.fitted] for run in runs])
+    residual_um = np.sqrt(np.mean(left_um**2))
+    for gain in (Gain(noise_um=made.noise_um), made.gain):
+        found = replace(made, causes=(), runs=runs, gain=gain, unexplained_rms_um=0.00167)
+        page = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", report_html(found)))
+        tiles = [size_um(re.search(rf"{name}, rms {SIZE}", page)[1]) for name in TILES]
+        words = rf"leaves a residual of {SIZE}.* noise floor of {SIZE} .* reproducible error of {SIZE}"
+        said = [size_um(one) for one in re.search(words, verdict_sentence(found)).groups()]
+        content = diagnosis_json(found)
+        listed = [content[name] for name in ("residual_rms_before_um", "noise_um", "unexplained_rms_um")]
+        for one in (tiles, said, listed):
+            np.testing.assert_allclose(one, [residual_um, made.noise_um, 0.00167], rtol=0.006)
+        expected = size_um(re.search(rf"Expect errors of {SIZE}", next_steps(found)[0][0])[1])
+        known = np.isfinite(gain.heldout_rms_before_um)
+        assert expected == pytest.approx(gain.heldout_rms_before_um if known else 0.00167, rel=0.006)
+        assert ("not used" in next_steps(found)[0][0]) == known
+
+
+def test_no_verb_follows_a_name_as_some_are_plural(rng):
+    made = diagnosis(rng)
+    verbs = "is|are|was|were|has|have|explains?|shows?|does|do"
+    for name in {effect.name for effect in EFFECTS}:
+        found = replace(made, causes=(replace(cause(name), fingerprint=""),), runs=(), next_experiment=None)
+        page = re.sub(r"<[^>]+>", " ", report_html(found))
+        text = " ".join([verdict_sentence(found), next_steps(found)[0][0], found.summary(), page])
+        assert plain(name) in text
+        assert not re.search(rf"{plain(name)} ({verbs})\b", text, re.IGNORECASE)
+
+
+def test_lengths_are_in_the_unit_that_they_ask_for():
+    sizes_um = (123.4, 1.0, 0.9996, 0.99949, 0.00115, 0.001, 0.0009994, 1.15e-9, 2e-14, 0.0, -0.0471, np.nan)
+    shown = "123 µm, 1.00 µm, 1.00 µm, 999 nm, 1.15 nm, 1.00 nm, 999 pm, 0.00115 pm, < 0.001 pm, 0 µm, -47.1 nm, "
+    assert ", ".join(map(length, sizes_um)) == shown + NONE
+    assert spread(0.0348, 0.0008) == "34.8 ± 0.80 nm"
+    assert spread(0.0002, 0.0013) == "0.200 ± 1.3 nm"
+    assert spread(0.0348, np.nan) == "34.8 nm"
 
 
 def test_what_is_left_is_called_noise_only_where_it_is(rng):

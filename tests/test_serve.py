@@ -10,10 +10,11 @@ from http.server import ThreadingHTTPServer
 
 import numpy as np
 import pytest
+from _browser import browser, opened
 from _command import refused, run
 from _diagnosis import diagnosis
 from _seed import seed_of
-from test_diagnosis_report import Page, browser, opened
+from test_diagnosis_report import Page
 
 from fits import default_stage, save_model
 from fits.cli.serve import _Pages

@@ -10,6 +10,7 @@ from fits.cli import _late as late
 from fits.cli import _options as options
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
+from fits.io._length import length
 
 
 @click.command()
@@ -86,15 +87,17 @@ def compensate(given: common.Given) -> None:
     }
     lines = [
         f"{len(wanted)} samples, {summary['voltage_min_V']:.6g} to {summary['voltage_max_V']:.6g} V",
-        f"by the model   within {summary['error_max_within_reach_um']:.3g} um of the reference where it is in reach",
+        f"by the model   within {length(summary['error_max_within_reach_um'])} of the reference where it is in reach",
     ]
     if sd_um is not None:
-        lines.append(f"expected       standard deviation {np.median(sd_um):.3g} um in the median")
+        lines.append(f"expected       standard deviation {length(float(np.median(sd_um)))} in the median")
     lines.append(
         f"offset         the reference is a sensor's reading, {summary['offset_um']:.6g} um at negative saturation"
     )
     if summary["clipped"]:
-        lines.append(f"clipped        at {summary['clipped']} of the samples, off by at most {off.max():.3g} um")
+        lines.append(
+            f"clipped        at {summary['clipped']} of the samples, off by at most {length(float(off.max()))}"
+        )
     lines += [f"Note: {remark}" for remark in remarks]
     lines += [f"voltage        {given.out}", *(f"plot           {place}" for place in places)]
     common.print_result(given, summary, lines)

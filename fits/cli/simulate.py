@@ -5,6 +5,7 @@ import click
 from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
+from fits.io._length import length
 
 
 @click.command()
@@ -43,7 +44,7 @@ def simulate(given: common.Given) -> None:
     }
     spread = "of unknown standard deviation, as the model has none"
     if known:
-        spread = f"standard deviation {summary['displacement_sd_median_um']:.3g} um in the median"
+        spread = f"standard deviation {length(summary['displacement_sd_median_um'])} in the median"
     lines = [
         f"{len(record)} samples, {summary['displacement_min_um']:.6g} to {summary['displacement_max_um']:.6g} um, "
         f"{spread}",

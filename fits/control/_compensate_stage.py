@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 import microid
 from fits.io._errors import DataError
+from fits.io._length import length
 from fits.io._record import Record
 from fits.loop._run import initial_state, prepare_run, simulate_run
 from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Reversible, Stage, Start, innermost
@@ -115,10 +116,10 @@ def demand_remarks(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: fl
     start_um, little_um = abs(float(needed_um[0] - reference_um[0])), _WORTH_SAYING * float(np.ptp(reference_um))
     turning = (
         "the reference turns within a sample, so that the displacement its acceleration asks for is uncertain by "
-        f"{doubt_um:.3g} um; smooth it, sample it more finely, or use --static."
+        f"{length(doubt_um)}; smooth it, sample it more finely, or use --static."
     )
     moving = (
-        f"the reference begins in motion and the stage at rest, {start_um:.3g} um away from what it would need; "
+        f"the reference begins in motion and the stage at rest, {length(start_um)} away from what it would need; "
         "begin with a rest and a smooth start."
     )
     return [turning] if doubt_um > little_um else [], [moving] if start_um > max(little_um, doubt_um) else []

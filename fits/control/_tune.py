@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from fits.control._tune_problem import REACH, Figures, Goal, Problem, Tuning, descend, judge, reports
 from fits.control._tune_start import steepest_slope
 from fits.io._errors import DataError
+from fits.io._length import length
 from fits.loop._result import FitError, FitStatus
 from microid import AbstractController, Coordinates, ParameterInfo, Stage, Start, parameter_table
 
@@ -88,12 +89,12 @@ def tune_controller(
         which = np.flatnonzero(~np.asarray(figures.stable)) + 1
         detail = f"at the start, with plant {', '.join(map(str, which))} of {len(stages)}"
         raise FitError(FitStatus.UNSTABLE, detail, "tuning")
-    progress(f"start: cost {float(cost):.4g} um, {_excess_in_words(over)}")
+    progress(f"start: cost {length(float(cost), 4)}, {_excess_in_words(over)}")
     first = _worst(over)
     rng, ends = np.random.default_rng(seed), []
     for number in range(starts):
         end = _search(problem, origin if number == 0 else _stable_place(problem, rng))
-        progress(f"search {number + 1} of {starts}: cost {end.cost_um:.4g} um, {_excess_in_words(end.over)}")
+        progress(f"search {number + 1} of {starts}: cost {length(end.cost_um, 4)}, {_excess_in_words(end.over)}")
         ends.append(end)
     kept = [end for end in ends if end.kept]
     if not kept:

@@ -35,6 +35,7 @@ from fits.diagnosis._residual_tests import (
 from fits.diagnosis._result import Diagnosis, Gain, RunView, Step, Test
 from fits.diagnosis._select import Selection
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
+from fits.io._length import length
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from fits.loop._run import known_samples
@@ -130,9 +131,9 @@ def conclude(
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
     if kept and (misfit.share < thresholds.explained_share or predicts_worse(seen, thresholds.worse_z)):
         suspects = ", ".join(cause.name for cause in kept)
-        why = "predicts what was held out worse"
+        why = "what was held out is predicted worse with that"
         if misfit.share < thresholds.explained_share:
-            why = f"explains only {misfit.share:.0%} of what is left"
+            why = f"that explains only {misfit.share:.0%} of it"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak)
@@ -150,7 +151,7 @@ def conclude(
     )
     if cyclic:
         remarks.append(
-            f"what is left repeats itself every {repeated.period_um:.3g} um of the position, as the error of an "
+            f"what is left repeats itself every {length(repeated.period_um)} of the position, as the error of an "
             "interferometer or an encoder does"
         )
     faults = _standing(ready.faults, beside, extension.compared, thresholds.spike_z) if kept else ready.faults

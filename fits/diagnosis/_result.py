@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
+from fits.io._length import length
 from fits.io._limits import Extreme
 from fits.io._summary import AbstractSummary
 from fits.loop._result import ParameterEstimate
@@ -189,13 +190,13 @@ class Diagnosis(AbstractSummary):
 
     def summary(self) -> str:
         """Say the verdict, the causes with their parameters in units, and the gain, in a few lines."""
-        lines = [f"{KINDS[self.verdict]}; noise {self.noise_um:.3g} um, {self.noise_source}"]
+        lines = [f"{KINDS[self.verdict]}; noise {length(self.noise_um)}, {self.noise_source}"]
         for cause in self.causes:
             also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
             chance = f"{cause.p_family:.1g}" if cause.p_family >= SMALLEST_P else f"below {SMALLEST_P:.0e}"
             lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {chance}")
             if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
-                lines.append(f"    {cause.rms_um:.3g} um, {100 * cause.share_of_misfit:.0f} % of the misfit")
+                lines.append(f"    {length(cause.rms_um)}, {100 * cause.share_of_misfit:.0f} % of the misfit")
             for each in cause.parameters:
                 unit = "" if each.unit == "1" else f" {each.unit}"
                 below, above = each.value - each.lower, each.upper - each.value
@@ -205,12 +206,12 @@ class Diagnosis(AbstractSummary):
                     spread = f"(95 %: {each.lower:.3g} to {each.upper:.3g}){unit}"
                 lines.append(f"    {each.name:24} {each.value:.4g} {spread}")
         if self.unexplained_rms_um > 0:
-            lines.append(f"  unexplained: {self.unexplained_rms_um:.3g} um")
+            lines.append(f"  unexplained: {length(self.unexplained_rms_um)} beyond the noise")
         gain = self.gain
         if math.isfinite(gain.heldout_rms_before_um):
-            line = f"error on held-out data: {gain.heldout_rms_before_um:.3g} um"
+            line = f"error on held-out data: {length(gain.heldout_rms_before_um)}"
             if self.causes and math.isfinite(gain.heldout_rms_after_um):
-                line += f" without, {gain.heldout_rms_after_um:.3g} um with what was found"
+                line += f" without, {length(gain.heldout_rms_after_um)} with what was found"
             lines.append(line)
         if self.next_experiment is not None:
             lines.append(f"next experiment: {self.next_experiment.purpose}")

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import signal
 
 from fits.io._errors import DataError
+from fits.io._length import length
 from fits.io._quantity import FloatArray
 from fits.io._read_csv import KnownColumns
 from fits.io._record import Reference
@@ -192,10 +193,10 @@ def _find_fault(time_s: FloatArray, displacement_um: FloatArray) -> tuple[str, i
 
 def _correlation_samples(residual_um: FloatArray) -> float:
     """Samples that are worth one independent one; means of batches show slow noise that hides below white noise."""
-    length = len(residual_um) // 32
-    means = residual_um[: 32 * length].reshape(32, length).mean(axis=1)
+    each = len(residual_um) // 32
+    means = residual_um[: 32 * each].reshape(32, each).mean(axis=1)
     square = float(residual_um @ residual_um) / len(residual_um)
-    batch = length * float(means @ means) / 30 / square if square > 0 else 1.0
+    batch = each * float(means @ means) / 30 / square if square > 0 else 1.0
     return max(correlation_samples([residual_um]), batch)
 
 
@@ -215,12 +216,12 @@ def _quantum(readings_um: FloatArray) -> float | None:
 def _remarks(noise: IdleNoise) -> Iterator[str]:
     yield (
         f"The mean of {noise.mean_um:.4g} um is an offset that zeroing the sensor removes; what enters Eq. 1 as the "
-        f"measuring error is {noise.error_um():.3g} um, twice the random part. The paper takes the average, "
+        f"measuring error is {length(noise.error_um())}, twice the random part. The paper takes the average, "
         "0.103 um, instead."
     )
     yield (
-        f"The standard deviation is {noise.sd_um:.3g} um and no percentage: the paper's 3.18 % has no reference, and "
-        "0.0318 um would fit its band of 0.05 to 0.15 um."
+        f"The standard deviation is {length(noise.sd_um)} and no percentage: the paper's 3.18 % has no reference, "
+        "and 0.0318 um would fit its band of 0.05 to 0.15 um."
     )
     if abs(noise.drift_um_per_s) > 3 * noise.drift_sd_um_per_s:
         yield (
@@ -236,7 +237,7 @@ def _remarks(noise: IdleNoise) -> Iterator[str]:
         )
     if noise.resolution_um is not None and noise.sd_um < noise.resolution_um / 2:
         yield (
-            f"The readings scatter by less than half their quantum of {noise.resolution_um:.3g} um, so their "
+            f"The readings scatter by less than half their quantum of {length(noise.resolution_um)}, so their "
             "standard deviation is not that of the noise; no less is counted than an even spread over the quantum."
         )
     if noise.bias_instability_s == noise.averaging_s[-1]:
@@ -250,6 +251,6 @@ def _remarks(noise: IdleNoise) -> Iterator[str]:
             "longer does not help, and the mean of another record may differ by more than its error says."
         )
     if noise.lines:
-        named = ", ".join(f"{line.amplitude_um:.2g} um at {line.frequency_Hz:.4g} Hz" for line in noise.lines[:3])
+        named = ", ".join(f"{length(line.amplitude_um, 2)} at {line.frequency_Hz:.4g} Hz" for line in noise.lines[:3])
         more = f" and {len(noise.lines) - 3} more" if len(noise.lines) > 3 else ""
         yield f"Narrow lines stand above the floor: {named}{more}; they do not average out as noise does."

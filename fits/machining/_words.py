@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from fits.io._json import columns
+from fits.io._length import length
 from fits.io._printable import plain
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def describe_budget(found: "Budget") -> str:
     lines = [
         f"piezo   {driving.stroke_um:.4g} um by {source}; {driving.slope_um_per_V:.4g} um/V leaves "
         f"{driving.lowest_um:+.3g} to {driving.highest_um:+.3g} um of hysteresis",
-        f"sensor  {found.noise_um:.3g} um, twice its random part"
+        f"sensor  {length(found.noise_um)}, twice its random part"
         + (", zeroed at rest" if found.zeroed else " and its offset")
         + (f", at {found.arm_mm:g} mm from the axes of rotation" if found.arm_mm else ""),
         "",

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from fits.diagnosis._result import Diagnosis, Experiment, RunView
+from fits.io._length import length_unit
 from fits.plots._residual_views import VIEWS
 from fits.plots._style import label, panels, thinned, verbatim
 from fits.stats._noise import stretches
@@ -80,17 +81,15 @@ def shown_runs(runs: Sequence[RunView]) -> list[RunView]:
     return [runs[k] for k in keep]
 
 
-def residuals(diagnosis: Diagnosis, per_um: float, unit: str) -> Picture | None:
-    """Residual of the plain and the extended stage over time, in a unit; None where there are no runs."""
+def residuals(diagnosis: Diagnosis) -> Picture | None:
+    """Residual of the plain and the extended stage over time; None where there are no runs."""
     words = "Residual over time before and after the extension, with the band of the noise"
     if not shown_runs(diagnosis.runs):
         return None
-    return _drawn("residuals", words, lambda width_in: residual_figure(diagnosis, width_in, per_um, unit), True)
+    return _drawn("residuals", words, lambda width_in: residual_figure(diagnosis, width_in), True)
 
 
-def residual_figure(
-    diagnosis: Diagnosis, width_in: float = _WIDE_in, per_um: float = 1.0, unit: str = "µm"
-) -> Figure:
+def residual_figure(diagnosis: Diagnosis, width_in: float = _WIDE_in) -> Figure:
     """The same as a figure of a width; the band is that of two standard deviations of the noise."""
     runs = shown_runs(diagnosis.runs)
     # Where there is room, as many as show when a stretch is enlarged.
@@ -99,6 +98,7 @@ def residual_figure(
     shown = [(run.before_um, run.after_um)[side][np.argmax(run.fitted) :] for run in runs for side in (0, 1)]
     highest_um = max((float(np.nanmax(np.abs(one))) for one in shown if np.isfinite(one).any()), default=0.0)
     highest_um = max(highest_um, 2.2 * diagnosis.noise_um if np.isfinite(diagnosis.noise_um) else 0.0)
+    per_um, unit = _scale(highest_um)
     height_in = 0.55 + 1.35 * len(runs) + (0.5 if len(runs) == 1 else 0)
     picture, grid = panels(width_in, height_in, len(runs), sharey=True, squeeze=False)
     for axes, run in zip(grid[:, 0], runs, strict=True):
@@ -126,19 +126,37 @@ def residual_figure(
     return picture
 
 
-def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, unit: str) -> tuple[Picture, str] | None:
+def _scale(highest_um: float) -> tuple[float, str]:
+    """How many of the unit of an axis are in 1 µm, and the unit as it is drawn."""
+    per_um, unit = length_unit(highest_um)
+    return per_um, unit.replace("u", "µ")
+
+
+def _in_fit(run: RunView) -> RunView:
+    """A run from its first to its last fitted sample, without residuals where others are between."""
+    at = np.flatnonzero(run.fitted)
+    part = slice(at[0], at[-1] + 1)
+    before_um, after_um = (np.where(run.fitted, each, np.nan)[part] for each in (run.before_um, run.after_um))
+    driven = run.time_s[part], run.voltage_V[part], run.measured_um[part]
+    return RunView(run.source, *driven, before_um, after_um, run.fitted[part])
+
+
+def fingerprint(diagnosis: Diagnosis, name: str, number: int) -> tuple[Picture, str] | None:
     """The residual against the variable that shows an effect, and what is drawn in words; None where runs do not."""
-    sides: list[tuple[str, Callable[[RunView], np.ndarray]]] = [(BEFORE, lambda run: per_um * run.before_um)]
+    runs = [_in_fit(run) for run in diagnosis.runs if run.fitted.any()]
+    sides: list[tuple[str, Callable[[RunView], np.ndarray]]] = [(BEFORE, lambda run: run.before_um)]
     if diagnosis.causes:
-        sides.append((AFTER, lambda run: per_um * run.after_um))
+        sides.append((AFTER, lambda run: run.after_um))
     for view in (VIEWS[card_of(name).view if name else "voltage"], VIEWS["voltage"]):
         try:
-            seen = [(colour, curve) for colour, of in sides for curve in view.look(diagnosis.runs, of)]
+            seen = [(colour, curve) for colour, of in sides for curve in view.look(runs, of)]
             break
         except ValueError:
             continue
     else:
         return None
+
+    per_um, unit = _scale(max(float(np.abs(curve.y).max()) for _, curve in seen))
 
     def draw(width_in: float) -> Figure:
         picture, axes = panels(width_in, 2.7 if width_in == _WIDE_in else 2.5)
@@ -146,8 +164,10 @@ def fingerprint(diagnosis: Diagnosis, name: str, number: int, per_um: float, uni
             axes.axhline(0.0, color=INK, linewidth=0.5)
         for colour, curve in seen:
             if curve.low is not None and curve.high is not None:
-                axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.14, linewidth=0)
-            axes.plot(curve.x, curve.y, "--" if curve.downwards else "-", color=colour, linewidth=1.3)
+                axes.fill_between(
+                    curve.x, per_um * curve.low, per_um * curve.high, color=colour, alpha=0.14, linewidth=0
+                )
+            axes.plot(curve.x, per_um * curve.y, "--" if curve.downwards else "-", color=colour, linewidth=1.3)
         if view.logarithmic:
             axes.set_xscale("log")
         if view.spectrum:

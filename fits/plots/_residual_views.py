@@ -78,8 +78,11 @@ def _over(x: _Of, even: bool = True) -> Callable[[Sequence[RunView], _Of], list[
 def _over_voltage(runs: Sequence[RunView], of: _Of) -> list[Curve]:
     x, y = _together(runs, attrgetter("voltage_V")), _together(runs, of)
     up = _together(runs, lambda run: _last_move(run)[0]) >= 0
-    down = [_binned(x[~up], y[~up], downwards=True)] if np.count_nonzero(~up) > _BINS else []
-    return [_binned(x[up], y[up]), *down]
+    # What was fitted may go one way only.
+    ways = [(part, downwards) for part, downwards in ((up, False), (~up, True)) if np.count_nonzero(part) > _BINS]
+    if not ways:
+        raise ValueError("too few samples")
+    return [_binned(x[part], y[part], downwards) for part, downwards in ways]
 
 
 def _last_move(run: RunView) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from fits.control._gains import printed_gains
 from fits.control._make import Loop, Made
 from fits.control._tune_problem import Tuning
 from fits.io._json import strict
+from fits.io._length import length
 from microid import ControlledRun, StepMetrics, step_metrics, tracking_errors
 
 # Feedback that takes off less than this share is hardly worth its trouble.
@@ -31,10 +32,10 @@ def control_json(
     rms = _rms(np.asarray(run.error_um)[kept])
     sensor = {"noise": loop.noise_um, "resolution": loop.resolution_um or 0.0}
     said = list(remarks)
-    below = [f"{name}, {size:.3g} um" for name, size in sensor.items() if 0 < rms < size]
+    below = [f"{name}, {length(size)}" for name, size in sensor.items() if 0 < rms < size]
     if below:
         said.append(
-            f"the error, {rms:.3g} um rms, is that of the model's own displacement and below the sensor's "
+            f"the error, {length(rms)} rms, is that of the model's own displacement and below the sensor's "
             f"{' and its '.join(below)}: a bench cannot show it in single readings"
         )
     every, without = loop.margins(made.controller), _without(loop, kept)
@@ -120,7 +121,7 @@ def describe_control(summary: Mapping[str, Any]) -> str:
     if (tuning := summary["tuning"]) is not None:
         how = "converged" if tuning["converged"] else "not converged"
         lines.append(
-            f"tuning      cost {_said(tuning['cost_before_um'])} to {_said(tuning['cost_after_um'])} um over "
+            f"tuning      cost {_long(tuning['cost_before_um'])} to {_long(tuning['cost_after_um'])} over "
             f"{tuning['plants']} plants, {how}"
         )
     lines.append(
@@ -146,15 +147,19 @@ def describe_control(summary: Mapping[str, Any]) -> str:
 def _tracked(found: Mapping[str, Any]) -> str:
     # A reference that stands still has no range to count in.
     shares = ["" if found[name] is None else f" ({found[name]:.4g} %)" for name in ("e_rms_pct", "e_max_pct")]
-    return f"rms {_said(found['error_rms_um'])} um{shares[0]}, at most {_said(found['error_max_um'])} um{shares[1]}"
+    return f"rms {_long(found['error_rms_um'])}{shares[0]}, at most {_long(found['error_max_um'])}{shares[1]}"
 
 
 def _said_of_worth(worth: Mapping[str, Any]) -> str:
     """Say whether the feedback pays."""
-    share, after, before = worth["share"] or 0.0, _said(worth["error_rms_um"]), _said(worth["without_um"])
+    share, after, before = worth["share"] or 0.0, _long(worth["error_rms_um"]), _long(worth["without_um"])
     part = f"{100 * share:.3g} %" if share > 0 else "nothing"
-    does = f"takes {part} off the error of the feedforward alone, {before} to {after} um over all plants"
+    does = f"takes {part} off the error of the feedforward alone, {before} to {after} over all plants"
     return does if share >= _PAYS else f"{does}; {_ALONE.format('as well' if share >= 0 else 'better')}"
+
+
+def _long(size_um: float | None) -> str:
+    return "unlimited" if size_um is None else length(size_um, 5)
 
 
 def _said(value: float | None) -> str:

@@ -12,9 +12,9 @@ from fits.report._next_steps import next_steps, runs_read, stage_parameters
 from fits.report._page import environment
 from fits.report._words import (
     SIGMA,
-    Lengths,
     chance,
     estimate,
+    length,
     listed,
     number,
     parameter_name,
@@ -22,6 +22,7 @@ from fits.report._words import (
     plain,
     shown_unit,
     sigmas,
+    spread,
 )
 
 
@@ -30,13 +31,13 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
 
     It says `when` the runs were read, where that is given.
     """
-    length, causes, ahead = Lengths(diagnosis), diagnosis.causes, diagnosis.next_experiment
+    causes, ahead = diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]
     asked = [one for one in diagnosis.upper_bounds if not one.reason]
     asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
     gain = diagnosis.gain
     bounds = [
-        (plain(one.name).capitalize(), sigmas(one.z), percent(one.absorbed_fraction), length.bare(one.bound_um))
+        (plain(one.name).capitalize(), sigmas(one.z), percent(one.absorbed_fraction), length(one.bound_um))
         for one in asked
     ]
     tests = [
@@ -47,25 +48,24 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
         (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
         for one in (ahead.extremes if ahead else ())
     ]
-    further = _arrow("Largest error", gain.heldout_max_before_um, gain.heldout_max_after_um, length)
+    further = _arrow("Largest error", gain.heldout_max_before_um, gain.heldout_max_after_um)
     driven = gain.feedforward_before_um, gain.feedforward_after_um
-    further += _arrow("Error under feedforward, rms", *driven, length)
+    further += _arrow("Error under feedforward, rms", *driven)
     template = _with_words().get_template("diagnosis.html")
     return template.render(
         diagnosis=diagnosis,
-        length=length,
         ahead=ahead,
         kind=KINDS[diagnosis.verdict],
         when=when,
         steps=next_steps(diagnosis),
         runs=runs_read(diagnosis.runs),
         parameters=stage_parameters(diagnosis),
-        tiles=_tiles(diagnosis, length),
-        residuals=residuals(diagnosis, length.per_um, length.unit),
+        tiles=_tiles(diagnosis),
+        residuals=residuals(diagnosis),
         some_aside=any((~run.fitted).any() for run in diagnosis.runs),
         left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
-        views=[fingerprint(diagnosis, name, k, length.per_um, length.unit) for k, name in enumerate(named)],
-        gained=_gained(diagnosis, length),
+        views=[fingerprint(diagnosis, name, k) for k, name in enumerate(named)],
+        gained=_gained(diagnosis),
         bars=_bars(diagnosis),
         further=further,
         bounds=bounds,
@@ -82,6 +82,7 @@ def _with_words() -> Environment:
     made = environment()
     for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number"):
         made.filters[name] = getattr(_words, name)
+    made.filters["length_of"] = length
     made.filters["without_dot"] = lambda text: text.rstrip(".")
     made.filters["parameter_row"] = lambda one: (parameter_name(one), *estimate(one), shown_unit(one.unit) or "1")
     made.tests["finite"] = math.isfinite
@@ -89,42 +90,42 @@ def _with_words() -> Environment:
     return made
 
 
-def _tiles(diagnosis: Diagnosis, length: Lengths) -> list[tuple[str, str]]:
+def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Key figures at the top of the page, by name."""
     gain, tiles = diagnosis.gain, []
     for first in diagnosis.causes[:1]:
         tiles += [
             (f"Evidence for {plain(first.name)}", f"{sigmas(first.z)} {SIGMA}"),
             ("Share of the misfit it explains", percent(first.share_of_misfit)),
-            *_arrow("Error on unused data", gain.heldout_rms_before_um, gain.heldout_rms_after_um, length),
+            *_arrow("Error on unused data", gain.heldout_rms_before_um, gain.heldout_rms_after_um),
         ]
     if not diagnosis.causes:
-        tiles.append(("Residual of the plain stage, rms", length(_words.rms_um(diagnosis.runs, "before_um"))))
+        tiles.append(
+            ("Residual of the plain stage in the fit, rms", length(_words.rms_um(diagnosis.runs, "before_um")))
+        )
     if diagnosis.verdict == "unexplained":
-        tiles.append(("Unexplained, rms", length(diagnosis.unexplained_rms_um)))
+        tiles.append(("Unexplained, beyond the noise, rms", length(diagnosis.unexplained_rms_um)))
     return [*tiles, ("Noise floor, rms", length(diagnosis.noise_um))]
 
 
-def _arrow(name: str, before_um: float, after_um: float, length: Lengths) -> list[tuple[str, str]]:
+def _arrow(name: str, before_um: float, after_um: float) -> list[tuple[str, str]]:
     """How a size changes; nothing where one of the two is not known."""
     if not (math.isfinite(before_um) and math.isfinite(after_um)):
         return []
-    return [(f"{name}, before → after", f"{length.bare(before_um)} → {length.bare(after_um)} {length.unit}")]
+    return [(f"{name}, before → after", f"{length(before_um)} → {length(after_um)}")]
 
 
-def _gained(diagnosis: Diagnosis, length: Lengths) -> str:
+def _gained(diagnosis: Diagnosis) -> str:
     """What the extension is worth on data that were not used."""
     gain = diagnosis.gain
     before = gain.heldout_rms_before_um
     if not diagnosis.causes or gain.heldout_rms_after_um == before:
         return f"On data that were not used, the plain stage errs by {length(before)}, root mean square."
     difference, sd = before - gain.heldout_rms_after_um, gain.sd_of_difference_um
-    size = length.bare(abs(difference))
-    if math.isfinite(sd):
-        size += f" ± {number(length.per_um * sd, 2)}"
+    size = spread(abs(difference), sd)
     way, part = ("falls", f": by {percent(difference / before)}") if difference > 0 else ("rises", "")
     doubt = ", which may be chance" if abs(difference) < 2 * sd else ""
-    return f"On data that were not used, the error {way} by {size} {length.unit}, root mean square{part}{doubt}."
+    return f"On data that were not used, the error {way} by {size}, root mean square{part}{doubt}."
 
 
 def _bars(diagnosis: Diagnosis) -> list[tuple[str, str, float, float]]:
@@ -140,7 +141,7 @@ def _bars(diagnosis: Diagnosis) -> list[tuple[str, str, float, float]]:
 
 
 def _span(low: float, high: float, unit: str) -> str:
-    return f"{number(low)} to {number(high)} {unit}"
+    return f"{number(low)} to {number(high)} {shown_unit(unit)}"
 
 
 def _facts(ahead: Experiment) -> list[tuple[str, Any]]:

@@ -37,6 +37,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "causes": [vars(cause) | {"parameters": _by_name(cause.parameters)} for cause in diagnosis.causes],
         "baseline_parameters": _by_name(diagnosis.baseline_parameters),
         "extended_parameters": _by_name(diagnosis.extended_parameters),
+        "residual_rms_before_um": rms_um(diagnosis.runs, "before_um"),
+        "residual_rms_after_um": rms_um(diagnosis.runs, "after_um"),
         **{name: getattr(diagnosis, name) for name in kept},
         "next_experiment": None if ahead is None else _experiment(ahead),
         "remarks": diagnosis.remarks,
@@ -69,6 +71,6 @@ def _run(run: RunView) -> dict[str, Any]:
         "samples": int(run.time_s.size),
         "fitted_samples": int(np.count_nonzero(run.fitted)),
         "duration_s": np.ptp(run.time_s) if run.time_s.size else None,
-        "rms_before_um": rms_um([run], "before_um", fitted=True),
-        "rms_after_um": rms_um([run], "after_um", fitted=True),
+        "rms_before_um": rms_um([run], "before_um"),
+        "rms_after_um": rms_um([run], "after_um"),
     }

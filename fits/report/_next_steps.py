@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from fits.diagnosis._result import Diagnosis, RunView
-from fits.report._words import NONE, Lengths, estimate, listed, number, parameter_name, percent, plain, shown_unit
+from fits.report._words import NONE, estimate, length, listed, number, parameter_name, percent, plain, shown_unit
 from microid.effects import card_of
 
 
@@ -34,7 +34,7 @@ def _use(diagnosis: Diagnosis) -> tuple[str, str]:
     """Which stage to go on with, and why."""
     gain, modelled = diagnosis.gain, [one.name for one in diagnosis.causes if not card_of(one.name).statistic]
     before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
-    name, length = "baseline.json", Lengths(diagnosis)
+    name = "baseline.json"
     if modelled and not (after >= before):
         name, words = "extended.json", f"Compensate with the extended stage, which has {listed(modelled)}"
         if not math.isfinite(after):
@@ -42,11 +42,13 @@ def _use(diagnosis: Diagnosis) -> tuple[str, str]:
     elif modelled:
         words = f"Keep to the plain stage: with {listed(modelled)} it predicts data that were not used no better"
     elif diagnosis.verdict == "unexplained":
-        left = length(diagnosis.unexplained_rms_um)
-        words = f"Expect errors of {left}, root mean square, where the plain stage is used"
+        size_um, where = diagnosis.unexplained_rms_um, "left beyond the noise in the fit"
+        if math.isfinite(before):
+            size_um, where = before, "erred, noise included, on data that were not used"
+        words = f"Expect errors of {length(size_um)}, root mean square, from the plain stage: by so much it {where}"
     elif diagnosis.causes:
         named = listed([one.name for one in diagnosis.causes])
-        words = f"Mend {named} where it arises: it is in the readings, and no model of the stage takes it away"
+        words = f"Mend this where it arises: {named}. It is in the readings, and no model of the stage takes it away"
     else:
         words = "Use the plain stage: these records need no more"
     return f"{words}.", f"microid compensate {name} reference.csv --dynamic --out voltage.csv"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fits.diagnosis._result import SMALLEST_P, Diagnosis, RunView
+from fits.io import _length
 from fits.loop._result import ParameterEstimate
 from microid.effects import card_of
 
@@ -96,25 +97,25 @@ def chance(p: float) -> str:
     return number(p, 2 if p >= 1e-3 else 1)
 
 
-class Lengths:
-    """Writes sizes of a residual, all in one unit: nm where they are small, um elsewhere."""
-
-    def __init__(self, diagnosis: Diagnosis):
-        known = list(filter(math.isfinite, (rms_um(diagnosis.runs, "before_um"), diagnosis.noise_um)))
-        self.per_um, self.unit = (1e3, "nm") if known and max(known) < 0.5 else (1.0, "µm")
-
-    def bare(self, size_um: float) -> str:
-        """Without its unit, for tables whose heading has it."""
-        return number(self.per_um * size_um)
-
-    def __call__(self, size_um: float) -> str:
-        """With its unit."""
-        return f"{self.bare(size_um)} {self.unit}" if math.isfinite(size_um) else NONE
+def length(size_um: float) -> str:
+    """Write a length with the unit that it asks for, and an en dash where it is not known."""
+    return _length.length(size_um).replace("um", _UNITS["um"]) if math.isfinite(size_um) else NONE
 
 
-def rms_um(runs: Sequence[RunView], name: str, fitted: bool = False) -> float:
-    """Root mean square of a residual, `before_um` or `after_um`, over all samples or those `fitted`; NaN for none."""
-    parts = [getattr(run, name)[run.fitted] if fitted else np.ravel(getattr(run, name)) for run in runs]
+def spread(size_um: float, sd_um: float) -> str:
+    """Write a length and its standard deviation, where that is known, in the unit of the larger."""
+    if not math.isfinite(sd_um):
+        return length(size_um)
+    per_um, unit = _length.length_unit(max(abs(size_um), sd_um))
+    return f"{number(per_um * size_um)} ± {number(per_um * sd_um, 2)} {shown_unit(unit)}"
+
+
+def rms_um(runs: Sequence[RunView], name: str) -> float:
+    """Root mean square of a residual, `before_um` or `after_um`, over the samples of the fit; NaN for none.
+
+    Others were held out, or come before the stage forgot what it went through earlier: that is no error of a model.
+    """
+    parts = [getattr(run, name)[run.fitted] for run in runs]
     values = np.concatenate(parts or [np.empty(0)])
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
@@ -136,26 +137,26 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """Say in plain sentences what is wrong, why, how sure that is, and how much better the extension predicts."""
-    length = Lengths(diagnosis)
     apart = [
         f"These records cannot tell {plain(cause.name)} from {listed(cause.also_consistent, 'or')}."
         for cause in diagnosis.causes
         if cause.also_consistent
     ]
-    return " ".join([_found(diagnosis, length), *apart, *_gained(diagnosis, length)])
+    return " ".join([_found(diagnosis), *apart, *_gained(diagnosis)])
 
 
-def _found(diagnosis: Diagnosis, length: Lengths) -> str:
+def _found(diagnosis: Diagnosis) -> str:
     noise, left = length(diagnosis.noise_um), length(diagnosis.unexplained_rms_um)
+    over_um = rms_um(diagnosis.runs, "before_um")
     if not diagnosis.causes and diagnosis.verdict == "unexplained":
         return (
-            f"The plain stage leaves a reproducible error of {left}, root mean square, over a noise floor of "
-            f"{noise}, and no effect of the library explains it."
+            f"In the fit the plain stage leaves a residual of {length(over_um)}, root mean square. Beyond a noise "
+            f"floor of {noise} that is a reproducible error of {left}, and no effect of the library explains it."
         )
     if not diagnosis.causes:
-        over, described = rms_um(diagnosis.runs, "before_um", fitted=True), "describes these records down to"
-        if over > _NOISY * diagnosis.noise_um:
-            described = f"leaves {length(over)}, root mean square, in which no effect shows, over"
+        described = "describes these records down to"
+        if over_um > _NOISY * diagnosis.noise_um:
+            described = f"leaves {length(over_um)}, root mean square, in which no effect shows, over"
         return (
             f"The plain stage {described} a noise floor of {noise}. Of records that hold no effect, "
             f"{percent(diagnosis.false_alarm)} are given a cause by chance."
@@ -164,15 +165,18 @@ def _found(diagnosis: Diagnosis, length: Lengths) -> str:
     for cause in diagnosis.causes:
         what = "noise" if card_of(cause.name).statistic else "reproducible misfit of the plain stage"
         sentences.append(
-            f"{plain(cause.name).capitalize()} explains {percent(cause.share_of_misfit)} of the {what} "
+            # No verb follows a name, as some are plural.
+            f"{percent(cause.share_of_misfit)} of the {what} is explained by {plain(cause.name)} "
             f"({sigmas(cause.z)} standard deviations; probability by chance {chance(cause.p_family)})."
         )
     if diagnosis.unexplained_rms_um > 0:
-        sentences.append(f"A reproducible error of {left}, root mean square, is left without an explanation.")
+        sentences.append(
+            f"Beyond the noise, a reproducible error of {left}, root mean square, is left without an explanation."
+        )
     return " ".join(sentences)
 
 
-def _gained(diagnosis: Diagnosis, length: Lengths) -> list[str]:
+def _gained(diagnosis: Diagnosis) -> list[str]:
     before, after = diagnosis.gain.heldout_rms_before_um, diagnosis.gain.heldout_rms_after_um
     modelled = [cause.name for cause in diagnosis.causes if not card_of(cause.name).statistic]
     if not modelled:

@@ -21,6 +21,8 @@ _OCTAVES = 2
 _NARROW = 3.0
 # A Hann window makes a line so many bins wide.
 _LINE = 4
+# Bins of less than this part of the strongest one's power hold nothing but rounding.
+_ROUNDING = float(np.finfo(float).eps) ** 2
 # A level is looked for within so many e-folds.
 _REACH = 30.0
 # Qualities, and heights above the floor, from which the likelihood climbs.
@@ -73,8 +75,12 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
     lowest_Hz, highest_Hz = max(_LOWEST_Hz, _CYCLES * bin_Hz), min(_HIGHEST_Hz, 0.45 / interval_s)
     if highest_Hz - lowest_Hz < _FEWEST * bin_Hz:  # sampled too slowly, or too short
         return none
+    # In parts of its largest value, so that no power of it is out of the range of numbers.
+    if not (scale_um := float(np.abs(residual_um).max())) > 0:
+        return none
+    residual = residual_um / scale_um
     # An octave beyond both ends tells a peak there from a slope.
-    spectrum = _Spectrum.of(_power(residual_um), bin_Hz, lowest_Hz / 2, 2 * highest_Hz)
+    spectrum = _Spectrum.of(_power(residual), bin_Hz, lowest_Hz / 2, 2 * highest_Hz)
     inside = (spectrum.frequency_Hz > lowest_Hz) & (spectrum.frequency_Hz < highest_Hz)
     if inside.sum() < _FEWEST or not spectrum.power.min() > 0:
         return none
@@ -88,14 +94,14 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
     if not lowest_Hz < middle_Hz < highest_Hz or (bins <= _LINE and _played(_power(command_V), best)):
         return none
     # It goes on throughout: no block has nearly all of it.
-    swing = np.exp(-2j * np.pi * middle_Hz * interval_s * np.arange(n)) * (residual_um - residual_um.mean())
+    swing = np.exp(-2j * np.pi * middle_Hz * interval_s * np.arange(n)) * (residual - residual.mean())
     blocks = np.array([np.abs(block.sum()) ** 2 for block in np.array_split(swing, 8)])
     if np.sort(blocks)[-2:].sum() > 0.85 * blocks.sum():
         return none
-    if not _steady(residual_um, best / n, 2 * width_Hz * interval_s):
+    if not _steady(residual, best / n, 2 * width_Hz * interval_s):
         return none
     # The area of the peak, whose bins stand for two each.
-    size_um = float(np.exp(height) * np.pi / 2 * width_Hz / bin_Hz * 2 / n) ** 0.5
+    size_um = scale_um * float(np.exp(height) * np.pi / 2 * width_Hz / bin_Hz * 2 / n) ** 0.5
     # Noise of this width has so many independent values.
     sd_um = size_um / (2 * max(width_Hz * n * interval_s, 1.0) ** 0.5)
     z = max(2 * (found - nothing - np.log(inside.sum())), 0.0) ** 0.5
@@ -131,6 +137,7 @@ class _Spectrum:
         octaves = np.log2(frequency_Hz)
         knots = np.linspace(octaves[0], octaves[-1], max(round((octaves[-1] - octaves[0]) / _OCTAVES), 1) + 1)
         hats = np.stack([np.interp(octaves, knots, one) for one in np.eye(len(knots))], axis=1)
+        mean = np.maximum(mean, _ROUNDING * mean.max())
         return cls(frequency_Hz, mean, np.asarray(_INDEPENDENT * bins), hats)
 
     def floor(self) -> FloatArray:
@@ -158,7 +165,9 @@ class _Spectrum:
 
         start = floor if peak is None else np.concatenate([floor, peak])
         least, most = np.log(self.frequency_Hz[[0, -1]])
-        shapes = [(None, None), (least, most), (0.0, np.log(_QUALITIES[-1]))]
+        # So near the powers there are, the smallest of which are rounding, that no exponential overflows.
+        heights = floor.min() - _REACH, max(floor.max(), np.log(self.power.max())) + _REACH
+        shapes = [heights, (least, most), (0.0, np.log(_QUALITIES[-1]))]
         bounds = [*zip(floor - _REACH, floor + _REACH, strict=True), *([] if peak is None else shapes)]
         found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 300})
         return found.x, -float(found.fun)

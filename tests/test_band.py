@@ -1,0 +1,45 @@
+"""A narrow band of a residual, whatever its size and shape."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from fits.stats._band import band_of
+
+# Residuals over a time, some with white noise of standard deviation one.
+ODD = {
+    "line": lambda t, white: np.sin(2 * np.pi * 37.3 * t),
+    "lines": lambda t, white: sum(10.0 ** (-2 * k) * np.sin(2 * np.pi * f * t) for k, f in enumerate((3, 11, 83))),
+    "spike": lambda t, white: np.where(t == t[2000], 1e12, white),
+    "step": lambda t, white: np.where(t > 2, 1e9, 0.0) + 1e-9 * white,
+    "burst": lambda t, white: np.where((t > 1) & (t < 1.1), 1e8, 1e-8) * white,
+    "steep": lambda t, white: np.cumsum(np.cumsum(np.cumsum(white))),
+    "faint": lambda t, white: 1e-160 * white,
+    "loud": lambda t, white: 1e160 * white,
+    "constant": lambda t, white: 0 * t + 1e200,
+}
+
+
+@pytest.mark.parametrize("unit", [1e-160, 1e-30, 1.0, 1e150])
+def test_a_band_is_the_same_in_any_unit_and_nothing_overflows(rng, unit):
+    n, rate_Hz = 20_000, 500.0
+    # Noise through a resonance at 30 Hz of quality 20.
+    radius = np.exp(-np.pi * 30 / 20 / rate_Hz)
+    past = [1.0, -2 * radius * np.cos(2 * np.pi * 30 / rate_Hz), radius**2]
+    wave = lfilter([1.0], past, rng.standard_normal(n + 5000))[5000:]
+    residual = 0.05 * rng.standard_normal(n) + 0.1 * wave / np.std(wave)
+    command_V = np.linspace(0.0, 1.0, n)
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        found = band_of(unit * residual, 1 / rate_Hz, command_V)
+    assert found.z > 8
+    assert found.frequency_Hz == pytest.approx(30, rel=0.1)
+    assert found.size_um / unit == pytest.approx(0.1, rel=0.35)
+
+
+@pytest.mark.parametrize("of", ODD)
+def test_nothing_overflows_on_residuals_that_are_far_from_noise(rng, of):
+    time_s = 1e-3 * np.arange(4000)
+    residual_um = ODD[of](time_s, rng.standard_normal(time_s.size))
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        found = band_of(residual_um, 1e-3, time_s)
+    assert np.isfinite([found.frequency_Hz, found.size_um, found.sd_um, found.quality, found.z]).all()

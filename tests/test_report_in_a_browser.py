@@ -1,0 +1,93 @@
+"""The report of a diagnosis as a browser shows and prints it."""
+
+import math
+import re
+
+import pytest
+from _browser import browser, opened, printed
+from _diagnosis import KINDS, diagnosis
+
+from fits.report._diagnosis import report_html
+
+pytestmark = pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the report with")
+# A sheet of A4 less its margins, in CSS pixels of 1/96 in.
+MARGIN_mm, A4_mm = 16, (210, 297)
+SHEET_px = [math.floor((side - 2 * MARGIN_mm) / 25.4 * 96) for side in A4_mm]
+
+
+@pytest.mark.parametrize("width_px", [360, pytest.param(1200, marks=pytest.mark.study)])
+def test_a_browser_shows_the_report_without_scrolling_sideways(rng, tmp_path, width_px):
+    page = report_html(diagnosis(rng, "unexplained"))
+    seen = opened(page, width_px, tmp_path)
+    assert seen["width"] == width_px
+    assert seen["needed"] <= width_px
+    assert seen["problems"] == []
+    assert seen["broken"] == 0
+    visible = [width for width in seen["pictures"] if width > 0]
+    assert len(visible) == len(seen["pictures"]) / 2
+    assert all(250 < width <= width_px for width in visible)
+    wide = page.replace("<main>", '<main><div style="width: 3000px">x</div>', 1)
+    assert opened(wide, width_px, tmp_path)["needed"] > width_px
+
+
+# Drags over the first panel from 40 to 60 % of its width, and says where its curve, ticks and hint are then.
+DRAG = """(() => {
+    const svg = d.querySelector(".wide svg[data-spans]"), pad = svg.querySelector("rect.zoom");
+    const box = pad.getBoundingClientRect(), curve = svg.querySelector("[id$=zoom0-0]");
+    const at = share => ({clientX: box.left + share * box.width, clientY: box.top + 5, bubbles: true});
+    const send = (name, share) => pad.dispatchEvent(new w.MouseEvent(name, at(share)));
+    const told = () => ({width: curve.getBoundingClientRect().width / box.width, texts:
+        [...svg.querySelectorAll("[id$=ticks0] > g")].filter(g => g.style.display !== "none")
+        .filter(g => g.querySelector("use")).map(g => g.querySelector("text").textContent)});
+    const before = told();
+    send("pointerdown", 0.4); send("pointermove", 0.6); send("pointerup", 0.6);
+    const zoomed = told();
+    send("dblclick", 0.5);
+    return {before, zoomed, after: told(), hint: !svg.closest("figure").querySelector(".hint").hidden};
+})()"""
+
+
+def test_a_stretch_of_a_trace_is_enlarged_where_it_is_dragged_over(rng, tmp_path):
+    seen = opened(report_html(diagnosis(rng, n=2000, count=1)), 1200, tmp_path, DRAG)
+    acted, (before, zoomed) = seen["acted"], (seen["acted"][name]["texts"] for name in ("before", "zoomed"))
+    assert seen["problems"] == []
+    assert acted["hint"]
+    assert acted["after"] == acted["before"]
+    assert acted["zoomed"]["width"] == pytest.approx(5 * acted["before"]["width"], rel=0.01)
+    # The run takes 19.99 s, so that these are those from 8 s to just short of 12 s.
+    assert (float(before[0]), float(before[-1])) == (0.0, 17.5)
+    assert sorted(map(float, zoomed)) == [8.0, 9.0, 10.0, 11.0]
+
+
+# Height of the page; ends of what holds text beyond its right edge; and texts that are there and are not drawn.
+LAID_OUT = """(() => {
+    const right = d.documentElement.clientWidth, all = [...d.querySelectorAll("main *")];
+    const box = one => one.getBoundingClientRect();
+    const hidden = one => one.closest(".narrow, .hint, script, style, svg") !== null
+        || w.getComputedStyle(one).display === "contents";
+    return {height: d.documentElement.scrollHeight,
+        beyond: all.filter(one => !one.closest("svg") && box(one).right > right + 0.5).map(one => one.outerHTML),
+        unseen: all.filter(one => one.textContent.trim() && !hidden(one) && !(box(one).width * box(one).height > 0))
+            .map(one => one.outerHTML)};
+})()"""
+
+
+@pytest.mark.parametrize("kind", [*(pytest.param(kind, marks=pytest.mark.study) for kind in KINDS[:2]), KINDS[2]])
+def test_the_report_prints_on_a4_and_nothing_is_cut(rng, tmp_path, kind):
+    page = report_html(diagnosis(rng, kind))
+    # What is only for paper, in a frame as wide as the sheet.
+    assert page.count("@media print") == 2
+    seen = opened(page.replace("@media print", "@media all"), SHEET_px[0], tmp_path, LAID_OUT)
+    assert seen["needed"] <= SHEET_px[0]
+    assert seen["acted"]["beyond"] == seen["acted"]["unseen"] == []
+    pdf = printed(page, tmp_path)
+    boxes = [list(map(float, box.split())) for box in re.findall(rb"/MediaBox \[([^]]*)\]", pdf)]
+    sheets = len(re.findall(rb"/Type /Page\b", pdf))
+    assert len(boxes) == sheets
+    for box in boxes:
+        assert box == pytest.approx([0, 0, *(side / 25.4 * 72 for side in A4_mm)], abs=1)
+    # Not scaled down to fit, and little room is left before what must not be cut in two.
+    sheets_needed = seen["acted"]["height"] / SHEET_px[1]
+    assert sheets_needed <= sheets <= 1 + 1.3 * sheets_needed
+    wide = page.replace("<main>", '<main><div style="width: 3000px">x</div>', 1).replace("@media print", "@media all")
+    assert opened(wide, SHEET_px[0], tmp_path, LAID_OUT)["acted"]["beyond"]
