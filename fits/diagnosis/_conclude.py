@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from fits.diagnosis._certainty import stage_estimates
+from fits.diagnosis._certainty import Certainty
 from fits.diagnosis._experiment import Request, suggest
 from fits.diagnosis._extension import (
     Compared,
@@ -199,13 +199,13 @@ def conclude(
             f"{', '.join(silent)}: of what differs from run to run the extended stage has only what all have in "
             "common, so that it may explain these runs and not the next"
         )
-    before = after = stage_estimates(found.first, found.plain, found.bench, baseline)
+    sure = Certainty(found.first, found.plain, found.bench, baseline)
+    before = after = sure.parameters()
+    band = extended_band = sure.predictions(plain_stage(ready), [one.before_um for one in extension.compared])
     if extension.effects:
-        modelled = [cause for cause in causes if not card_of(cause.name).statistic]
-        after = (
-            *stage_estimates(found.projector, model, found.bench, extension.baseline),
-            *(replace(one, name=f"{cause.name}.{one.name}") for cause in modelled for one in cause.parameters),
-        )
+        sure = Certainty(found.projector, model, found.bench, extension.baseline)
+        after = sure.parameters(causes)
+        extended_band = sure.predictions(extension.stage, [one.after_um for one in extension.compared])
     likely = {cause.name for cause in causes} | {rival.name for cause in kept for rival in cause.rivals}
     return Diagnosis(
         verdict="unexplained" if unexplained else "effect_found" if causes else "no_effect",
@@ -225,6 +225,8 @@ def conclude(
         false_alarm=false_alarm,
         baseline_parameters=before,
         extended_parameters=after,
+        baseline_uncertainty=band,
+        extended_uncertainty=extended_band,
         details={
             "selection": found,
             "ready": ready,
