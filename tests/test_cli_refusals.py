@@ -1,8 +1,12 @@
+import shlex
+
 import numpy as np
 import pytest
 from _command import files, refused, run, without_jax
+from test_foreign_files import rows, signals
 
-from fits import FitError, FitStatus
+from fits import FitError, FitStatus, read_table
+from fits.io._units import parse_columns
 from microid import FAMILIES
 
 
@@ -116,3 +120,13 @@ def test_what_was_typed_is_not_quoted_at_any_length(typed):
     assert result.exit_code == 2
     assert "qqq" in result.stderr
     assert len(result.stderr) < 1300
+
+
+def test_the_option_that_a_refusal_suggests_can_be_pasted(tmp_path):
+    path = tmp_path / "weg.csv"
+    path.write_text("time_s;Spannung [V];Weg [nm]\n" + rows(*signals(), separator=";"))
+    told = run("fit", path, "--out", tmp_path / "m.json").stderr
+    option, columns = shlex.split(told[told.index("--columns") :].rstrip(".\n"))
+    found = read_table(path, columns=parse_columns(columns))
+    assert option == "--columns"
+    np.testing.assert_allclose(found.displacement_um, signals()[2] / 1000)

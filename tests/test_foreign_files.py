@@ -333,3 +333,13 @@ def test_inspect_says_what_is_there_in_words(tmp_path):
     assert drive.split() == ["2", "Drive[V]", "V", "0", "99.9957", "(voltage_V)"]
     assert gauge.split()[:3] == ["3", "Gauge[um]", "um"]
     assert command.startswith("microid fit ")
+
+
+def test_inspect_refuses_what_holds_no_numbers_and_says_nothing_of_a_rate_without_a_command(tmp_path):
+    (tmp_path / "letter.csv").write_text("Dear Sir,\nthis is no data\n")
+    refused(run("inspect", tmp_path / "letter.csv"), "letter.csv", "expected columns of numbers")
+    (tmp_path / "air.csv").write_text("air_degC,name\n2,a\n1,b\n2,c\n")
+    told = run("inspect", tmp_path / "air.csv")
+    assert told.exit_code == 0
+    assert "no columns of voltage and displacement were found" in told.stdout
+    assert "HZ" not in told.stdout

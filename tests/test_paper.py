@@ -2,6 +2,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -159,14 +160,14 @@ def short(tmp_path_factory):
         patch.setattr(paper, "PAPER", SHORT)
         patch.setattr(paper.data_synth, "PAPER_AXES", {"x": ds.PAPER_AXES["x"]})
         patch.setattr(paper, "AXIS_TITLES", {"x": "X"})
-        patch.setattr(paper, "_draw_errors", lambda rng, folder: [])
+        patch.setattr(paper, "_draw_errors", lambda rng, folder, form: [])
         # As far off as fits of the response are, which takes long to compile and is tested elsewhere.
         patch.setattr(
             paper, "identify_modes", lambda *given: [PaperMode(34.6, 0.131, 1.82), PaperMode(34.8, 0.13, 1.81)]
         )
         patch.setattr(runs, "TRAINING_RUNS", 0)
         patch.setattr(runs, "_STEP_s", 1.5)
-        result = run("paper", "--out", out, "--seeds", 2, "--seed", seed)
+        result = run("paper", "--out", out, "--seeds", 2, "--seed", seed, "--format", "svg")
     print(result.stderr)
     assert result.exit_code == 0, result.stderr
     return out, result, json.loads((out / "paper.json").read_text())
@@ -207,9 +208,9 @@ def test_the_file_has_the_schema(short):
     assert all(set(figure) == {"paper", "ours", "spread", "below_sensor"} for figure in figures)
     assert content["seeds"] == 2
     names = files(out)
-    assert {"paper.md", "paper.json", "fig6.png", "fig9.png", "fig10.png", "fig11.png", "fig12.png"} == set(names)
+    assert {"paper.md", "paper.json", "fig6.svg", "fig9.svg", "fig10.svg", "fig11.svg", "fig12.svg"} == set(names)
     page = (out / "paper.md").read_text()
-    assert set(re.findall(r"\]\((.*?)\)", page)) == {name for name in names if name.endswith(".png")}
+    assert set(re.findall(r"\]\((.*?)\)", page)) == {name for name in names if name.endswith(".svg")}
     assert "tracking along x, HC+CMAC-PID" in result.stderr
 
 
@@ -277,7 +278,7 @@ def test_a_place_that_is_no_folder_is_refused_in_a_sentence(tmp_path):
 
 
 def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
-    def interrupt(seeds, seed, folder, tell):
+    def interrupt(seeds, seed, folder, tell, form):
         (folder / "paper.md").write_text("half")
         raise KeyboardInterrupt
 
@@ -314,3 +315,18 @@ def test_all_of_it_is_no_worse_than_the_paper_but_where_it_is_known_to_be(tmp_pa
     assert content["table3"]["HC+BP-PID"]["e_rms_pct"]["ours"] < 0.62
     # What the table has learnt in the runs before is what the other controllers lack.
     assert content["table3"]["HC+CMAC-PID"]["e_rms_pct"]["ours"] < content["table3"]["HC+PID"]["e_rms_pct"]["ours"]
+
+
+@pytest.mark.parametrize(("form", "begins"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_pictures_are_in_the_format_that_is_asked_for(tmp_path, monkeypatch, form, begins):
+    steps = {"OPEN": SimpleNamespace(reference_um=np.ones(9), displacement_um=np.ones((1, 9)))}
+
+    def draw(seeds, seed, folder, tell, form):
+        paper._draw_steps(steps, folder / f"fig10.{form}")
+        return PaperResult(seed, seeds)
+
+    monkeypatch.setattr(paper, "paper_result", draw)
+    result = run("paper", "--out", tmp_path / "out", "--format", form, "--quiet")
+    assert result.exit_code == 0, result.stderr
+    assert files(tmp_path / "out") == [f"fig10.{form}"]
+    assert (tmp_path / "out" / f"fig10.{form}").read_bytes().startswith(begins)

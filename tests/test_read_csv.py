@@ -304,7 +304,7 @@ BAD_MAPPINGS = [
     ({"voltage_V": "u1_V", "displacement_um": "height[ft]"}, "out of um, nm, mm, m, pm .*found unit 'ft'"),
     ({"voltage_V": "t_ms"}, "out of V, mV, uV, kV .*found unit 'ms'"),
     ({"volts": "u1_V"}, "'volts' is not a column of a record; name one of time_s, voltage_V"),
-    ({"time_s": "t_ms"}, r"column 'voltage_V'.*--columns voltage_V=u1_V,displacement_um=height\[um\]"),
+    ({"time_s": "t_ms"}, r"column 'voltage_V'.*--columns 'voltage_V=u1_V,displacement_um=height\[um\]"),
 ]
 
 

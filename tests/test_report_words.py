@@ -92,8 +92,8 @@ def test_no_verb_follows_a_name_as_some_are_plural(rng):
 
 
 def test_lengths_are_in_the_unit_that_they_ask_for():
-    sizes_um = (123.4, 1.0, 0.9996, 0.99949, 0.00115, 0.001, 0.0009994, 1.15e-9, 0.0, -0.0471, np.nan)
-    shown = "123 µm, 1.00 µm, 1.00 µm, 999 nm, 1.15 nm, 1.00 nm, 999 pm, 0.00115 pm, 0 µm, -47.1 nm, "
+    sizes_um = (123.4, 1.0, 0.9996, 0.99949, 0.00115, 0.001, 0.0009994, 1.15e-9, 2e-14, 0.0, -0.0471, np.nan)
+    shown = "123 µm, 1.00 µm, 1.00 µm, 999 nm, 1.15 nm, 1.00 nm, 999 pm, 0.00115 pm, < 0.001 pm, 0 µm, -47.1 nm, "
     assert ", ".join(map(length, sizes_um)) == shown + NONE
     assert spread(0.0348, 0.0008) == "34.8 ± 0.80 nm"
     assert spread(0.0002, 0.0013) == "0.200 ± 1.3 nm"

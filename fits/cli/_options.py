@@ -70,9 +70,13 @@ def out_csv(metavar: str) -> Callable[[Any], Any]:
 def plots(what: str) -> Callable[[Any], Any]:
     """Declare the options of pictures: where, and in what format."""
     folder = click.option("--plots", metavar="DIR", help=f"Folder for {what}; it is made if need be.")
-    forms = click.Choice(["png", "svg", "pdf"])
-    form = click.option("--format", "form", type=forms, default="png", show_default=True, help="Of --plots.")
+    form = picture_format("--plots")
     return lambda command: folder(form(command))
+
+
+def picture_format(of: str) -> Callable[[Any], Any]:
+    forms = click.Choice(["png", "svg", "pdf"])
+    return click.option("--format", "form", type=forms, default="png", show_default=True, help=f"Of {of}.")
 
 
 def json_file(instead: str) -> Callable[[Any], Any]:

@@ -14,6 +14,7 @@ from fits.io._file_set import file_set
     "--seeds", type=click.IntRange(1, 100), default=10, show_default=True, help="How many noises to go through."
 )
 @click.option("--seed", type=options.SEEDS, default=0, show_default=True, help="Where all randomness starts.")
+@options.picture_format("the pictures")
 @options.quiet
 @common.in_sentences
 def paper(given: common.Given) -> None:
@@ -25,6 +26,6 @@ def paper(given: common.Given) -> None:
     late.start_jax()
     progress = common.progress_to_stderr(given.quiet)
     with file_set() as files:
-        result = late.paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), progress)
+        result = late.paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), progress, given.form)
     page, figures = common.paths_in(given.out, ("paper.md", "paper.json"))
     click.echo(f"page   {page}\njson   {figures}\nworse than the paper: {'; '.join(result.worse()) or 'no row'}")

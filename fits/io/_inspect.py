@@ -69,6 +69,8 @@ def inspect_table(path: AnyPath) -> Inspection:
         if kept.mean() > 0.5:
             found |= {name: left.read(())[0].get(name, np.zeros(0))}
     found = {name: found[name] for name in table.names if len(found.get(name, ()))}
+    if not found:
+        raise DataError(f"{os.fspath(path)}: expected columns of numbers, found none; name another file.")
     known = {spoken[0].column: Source(name, spoken[1]) for name in found if (spoken := recognise(name))}
     sources = known | _guessed(table, found, known)
     interval_s, even = table.interval_s, table.interval_s is not None
@@ -91,7 +93,7 @@ def inspect_table(path: AnyPath) -> Inspection:
         options += ["--sample-rate", "HZ"]
     still = "voltage_V" in sources and not np.ptp(found[sources["voltage_V"].column])
     command, remarks = _command(os.fspath(path), {*sources}, options, still), [table.remark]
-    if interval_s is None:
+    if interval_s is None and command:
         remarks.append("no column is a time: write the rate of the samples in place of HZ")
     elif command and not still:
         remarks += _remarks(path, ",".join(pairs), options, {*sources})

@@ -99,7 +99,8 @@ def parse_toml(text: str, place: str) -> dict[str, Any]:
     try:
         found = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{place}: expected TOML, found a mistake: {_why(error)}; correct it.") from None
+        what = f"expected TOML, found a mistake: {_why(error)}; correct it, or name another file."
+        raise DataError(f"{place}: {what}") from None
     _check(found, place, finite=False)
     return found
 

@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
@@ -169,7 +170,7 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
         found = f"found unit '{unit}'" if unit else "found no unit"
         raise DataError(
             f"{place}, column '{text}': expected a unit out of {', '.join(quantity.powers)} for {column}, {found}; "
-            f"state the unit with --columns {column}={text}[{quantity.unit}]."
+            f"state the unit with --columns {shlex.quote(f'{column}={text}[{quantity.unit}]')}."
         )
     return Source(text, str(unit), sign, scale)
 
@@ -191,7 +192,7 @@ def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str,
         guesses.append(f"{quantity.column}={Source(near, str(unit) if known else quantity.unit).spec()}")
         if unit and not known and stem.lower() == quantity.stem:
             message += f"'{near}' has the unknown unit '{unit}' instead of one out of {', '.join(quantity.powers)}; "
-    message += f"name what is missing, for instance --columns {','.join(guesses)}"
+    message += f"name what is missing, for instance --columns {shlex.quote(','.join(guesses))}"
     if not any(recognise(name) for name in names):
         message += ", or put # before this line if it is not the header"
     return f"{message}."

@@ -37,8 +37,10 @@ from microid.control import step_metrics, tracking_errors
 _IDLE_SAMPLES, _IDLE_RATE_Hz = 20_000, 1000.0
 
 
-def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], None]) -> PaperResult:
-    """Run everything, and write the page, the JSON file and the pictures into an existing folder."""
+def paper_result(
+    seeds: int, seed: int, folder: Path, progress: Callable[[str], None], form: str = "png"
+) -> PaperResult:
+    """Run everything, and write the page, the JSON file and the pictures of a form into an existing folder."""
     result = PaperResult(seed, seeds, assumed=_assumed())
     piezo = data_synth.PaperPiezo()
     # A generator each, so that one more run changes nothing elsewhere.
@@ -74,15 +76,15 @@ def paper_result(seeds: int, seed: int, folder: Path, progress: Callable[[str], 
         "fig6": _of_loops("fig6", [(run.loop_measured_pct, run.in_sample) for run in fits]),
         "fig9": _of_loops("fig9", [(loop_width_pct(um, end), errors(um, end)) for um, _, end in loops_um]),
     }
-    loop, inverse = _draw_loops(identified[0], piezo, folder)
+    loop, inverse = _draw_loops(identified[0], piezo, folder, form)
     other_axes = {title: tracks[name] for name, title in AXIS_TITLES.items()}
     pictures = [
         ("Fig. 6: the hysteresis and its model", loop),
-        *_draw_errors(idle, folder),
+        *_draw_errors(idle, folder, form),
         ("Fig. 9: the inverse model", inverse),
-        ("Fig. 10: a step by scheme", _draw_steps(steps, folder)),
-        ("Fig. 11: tracking along X, Y", _draw_tracks({"X, Y": tracks["x"]}, folder / "fig11.png")),
-        ("Fig. 12: tracking along and about the other axes", _draw_tracks(other_axes, folder / "fig12.png")),
+        ("Fig. 10: a step by scheme", _draw_steps(steps, folder / f"fig10.{form}")),
+        ("Fig. 11: tracking along X, Y", _draw_tracks({"X, Y": tracks["x"]}, folder / f"fig11.{form}")),
+        ("Fig. 12: tracking along and about the other axes", _draw_tracks(other_axes, folder / f"fig12.{form}")),
     ]
     (folder / "paper.json").write_text(f"{finite_json(paper_json(result))}\n", encoding="utf-8")
     page = paper_page(result, [(caption, path.name) for caption, path in pictures])
@@ -141,23 +143,24 @@ def _of_loops(figure: str, found: list[tuple[float | None, Any]]) -> dict[str, M
     return {name: Measured(paper, values) for (name, paper), values in zip(said, np.array(rows).T, strict=True)}
 
 
-def _draw_loops(one: Identified, piezo: data_synth.PaperPiezo, folder: Path) -> tuple[Path, Path]:
+def _draw_loops(one: Identified, piezo: data_synth.PaperPiezo, folder: Path, form: str) -> tuple[Path, Path]:
     voltage_V, measured_um = one.record.voltage_V, one.record.displacement_um
     assert measured_um is not None
     fitted_um = simulate_model(one.fit.model, one.record, "negative")
-    fitted = plot_loop(voltage_V, measured_um, fitted_um, folder / "fig6.png")
+    fitted = plot_loop(voltage_V, measured_um, fitted_um, folder / f"fig6.{form}")
     # Up to the end of the second full loop.
     end = 1 + int(np.flatnonzero(voltage_V == voltage_V.min())[2])
-    return fitted, plot_inverse(voltage_V[:end], measured_um[:end], *compensated(one, piezo), folder / "fig9.png")
+    return fitted, plot_inverse(voltage_V[:end], measured_um[:end], *compensated(one, piezo), folder / f"fig9.{form}")
 
 
-def _draw_errors(rng: np.random.Generator, folder: Path) -> list[tuple[str, Path]]:
+def _draw_errors(rng: np.random.Generator, folder: Path, form: str) -> list[tuple[str, Path]]:
     design = paper_design()
-    tornado, machining = plot_sensitivity(design, sensitivities(design, ("x", "z", "alpha", "gamma")), folder)
+    found = sensitivities(design, ("x", "z", "alpha", "gamma"))
+    tornado, machining = plot_sensitivity(design, found, folder, form=form)
     sensor = data_synth.PaperSensor()
     readings_um = sensor.read(np.zeros((_IDLE_SAMPLES, round(sensor.rate_Hz / _IDLE_RATE_Hz))), rng)
     record = Reference(np.arange(_IDLE_SAMPLES) / _IDLE_RATE_Hz, readings_um, source="the bench's sensor at rest")
-    (noise,) = plot_idle(record, idle_noise(record), folder)
+    (noise,) = plot_idle(record, idle_noise(record), folder, form=form)
     return [
         ("Fig. 7: machining errors", machining),
         ("Fig. 7 in figures: machining errors ranked", tornado),
@@ -165,11 +168,11 @@ def _draw_errors(rng: np.random.Generator, folder: Path) -> list[tuple[str, Path
     ]
 
 
-def _draw_steps(steps: dict[str, PaperRun], folder: Path) -> Path:
+def _draw_steps(steps: dict[str, PaperRun], path: Path) -> Path:
     shown = {scheme: run.displacement_um[0] for scheme, run in steps.items()}
     run = next(iter(steps.values()))
     time_s = INTERVAL_s * np.arange(len(run.reference_um))
-    return plot_steps(time_s, float(run.reference_um[-1]), shown, folder / "fig10.png")
+    return plot_steps(time_s, float(run.reference_um[-1]), shown, path)
 
 
 def _draw_tracks(tracks: dict[str, dict[str, PaperRun]], path: Path) -> Path:
