@@ -9,10 +9,10 @@ from scipy import stats
 
 import fits
 from fits import Record
-from fits.diagnosis import _conclude, _diagnose
-from fits.diagnosis._conclude import Misfit
+from fits.diagnosis import _conclude, _diagnose, _misfit
 from fits.diagnosis._effects import Law
 from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
+from fits.diagnosis._misfit import Misfit
 from fits.diagnosis._prepare import Prepared, _covered
 from fits.diagnosis._result import Gain
 from fits.diagnosis._select import Cause, Selection
@@ -73,12 +73,12 @@ def named_beside(monkeypatch, parts, rest):
     def misfit_of(_, found, __):
         return misfit(cost(()) - found.model.cost, rest), None
 
-    monkeypatch.setattr(_conclude, "_refit_of", fewer)
-    monkeypatch.setattr(_conclude, "_in_noise", lambda found, _: found)
-    monkeypatch.setattr(_conclude, "_misfit", misfit_of)
+    monkeypatch.setattr(_misfit, "_refit_of", fewer)
+    monkeypatch.setattr(_misfit, "_in_noise", lambda found, _: found)
+    monkeypatch.setattr(_misfit, "_misfit", misfit_of)
     causes = tuple(Cause(name, 9.0, 0.0, (), part) for name, part in parts.items())
     found = Selection(causes, model([*parts]), *(None,) * 7)
-    kept, _, last, _, said = _conclude._worth_naming(None, found, (), False)
+    kept, _, last, _, said = _misfit.worth_naming(None, found, (), False)
     names = [cause.name for cause in kept.causes]
     assert last.explained == pytest.approx(sum(parts[name] for name in names))
     assert [words.split(" would")[0] for words in said] == sorted({*parts} - {*names}, key=parts.__getitem__)

@@ -10,7 +10,7 @@ from scipy.signal import lsim
 
 from fits import Record
 from fits.diagnosis._baseline import Baseline, simulate, with_effects
-from fits.diagnosis._certainty import stage_estimates
+from fits.diagnosis._certainty import Certainty
 from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._joint_fit import fit_jointly
 from fits.diagnosis._predict import Hypothesis, Predictor
@@ -80,7 +80,7 @@ def test_the_intervals_of_a_stage_are_those_of_dense_least_squares(rng):
     projector = Projector(replace(regression, finer=()), [Noise(noise_um, np.zeros(0))] * 2)
     model = refit(bench, projector, [law := Law([lag, lag])], [law.start], 0)
     model = replace(model, residual=rng.standard_normal(len(model.residual)))
-    found = stage_estimates(projector, model, bench, baseline)
+    found = Certainty(projector, model, bench, baseline).parameters()
 
     def response(moved):
         z, columns_um, x = np.split(moved, [len(baseline.z), len(baseline.z) + len(baseline.columns_um)])

@@ -93,7 +93,7 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
             runs = [{"offset_um": 0.0, "reached": one} for one in reached]
             known = late.strict(getattr(diagnosis, f"{which}_parameters"))
             about = {"part_of": "diagnosis", "stage": which, "parameters": known, "runs": runs}
-            return late.model_text(stage, None, about)
+            return late.model_text(stage, getattr(diagnosis, f"{which}_uncertainty"), about)
         except DataError as error:
             raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error
 

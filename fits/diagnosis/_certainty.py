@@ -1,30 +1,119 @@
-"""How sure the parameters of driver and mechanics are, beside what causes and density may have taken up of them."""
+"""How sure stages are, beside what causes and density may have taken up: of their parameters, and of predictions."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
+import jax.numpy as jnp
 import numpy as np
 
-from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._baseline import Baseline, with_effects
 from fits.diagnosis._effects import Bench
+from fits.diagnosis._extension import shared_effects
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, changes_along
+from fits.diagnosis._result import FoundCause
+from fits.loop._design import Grid
+from fits.loop._prior import interpolation
 from fits.loop._result import ParameterEstimate
-from fits.stage._uncertainty import estimates
+from fits.stage._moments import Chain
+from fits.stage._run import place_of_hysteresis
+from fits.stage._solve import scale_free
+from fits.stage._uncertainty import NO_PRECISION, StageUncertainty, estimates
+from fits.stats._noise import shared_square
+from microid import Preisach, Stage
+from microid.effects import card_of
+
+# Levels on which predictions are perturbed, as those of a fit are.
+_LEVELS = 16
+# Of central differences along coordinates.
+_STEP = 1e-4
 
 
-def stage_estimates(
-    projector: Projector, model: Refit, bench: Bench, baseline: Baseline
-) -> tuple[ParameterEstimate, ...]:
-    """Parameters at a baseline with their intervals, effects of a model fitted beside them.
+class Certainty:
+    """What runs say of a plain stage with the effects of a model beside it; all is linearised where the projector is.
 
-    Density, roughness and what each run has of its own are marginalised. All is linearised where the projector is.
+    Unknowns are columns of the density, coordinates of the stage, and those of the effects, in this order.
     """
-    regression, size = projector.regression, projector.regression.baseline.chain.size
-    if regression.size == size:
-        return ()
-    rows = tuple(one[:, :size] for one in regression.rows)
-    density = Projector(replace(regression, rows=rows), projector.noise, projector.roughness, projector.held)
-    both = zip(regression.rows, changes_along(bench, model), strict=True)
-    tangent = density.off(density.join([np.concatenate([one[:, size:], more], axis=1) for one, more in both]))
-    sd = np.sqrt(np.diagonal(replace(model, tangent=tangent).covariance()))
-    return estimates(baseline.chain, baseline.z, sd[: regression.size - size])
+
+    def __init__(self, projector: Projector, model: Refit, bench: Bench, baseline: Baseline):
+        self.projector, self.model, self.baseline = projector, model, baseline
+        both = zip(projector.regression.rows, changes_along(bench, model), strict=True)
+        self.rows = [np.concatenate(pair, axis=1) for pair in both]
+
+    def parameters(self, causes: Sequence[FoundCause] = ()) -> tuple[ParameterEstimate, ...]:
+        """Parameters of the stage with their intervals, and behind them those of causes that a model can hold."""
+        own = self.projector.regression.size - self.baseline.chain.size
+        fitted = estimates(self.baseline.chain, self.baseline.z, self._sd[:own]) if own else ()
+        modelled = [cause for cause in causes if not card_of(cause.name).statistic]
+        beside = (replace(one, name=f"{cause.name}.{one.name}") for cause in modelled for one in cause.parameters)
+        return (*fitted, *beside)
+
+    @cached_property
+    def _sd(self) -> np.ndarray:
+        """Standard deviations of coordinates of the stage and of the effects, density and roughness marginalised."""
+        projector, size = self.projector, self.baseline.chain.size
+        rows = tuple(one[:, :size] for one in projector.regression.rows)
+        density = Projector(
+            replace(projector.regression, rows=rows), projector.noise, projector.roughness, projector.held
+        )
+        tangent = density.off(density.join([one[:, size:] for one in self.rows]))
+        return np.sqrt(np.diagonal(replace(self.model, tangent=tangent).covariance()))
+
+    def predictions(self, stage: Stage, residuals_um: Sequence[np.ndarray]) -> StageUncertainty | None:
+        """Perturbations of a stage that the model's effects were put into, for the band of its predictions.
+
+        What neighbouring samples share of its residuals in the runs is the model's own error. There are none where an
+        effect is around the hysteresis, through which columns do not pass in proportion, or without any coordinate.
+        """
+        baseline = self.baseline
+        place, grid = place_of_hysteresis(stage), baseline.chain.grid
+        assert grid is not None
+        if (
+            place is None
+            or not isinstance(stage.parts[place], Preisach)
+            or not self.rows[0].shape[1] > baseline.chain.size
+        ):
+            return None
+        size, others = baseline.chain.size, self.rows[0].shape[1] - baseline.chain.size
+        basis, coarse = np.eye(size), grid
+        if grid.levels > _LEVELS:
+            coarse, basis = Grid(grid.lower_V, grid.upper_V, _LEVELS), interpolation(_LEVELS, grid.levels)
+        whole = np.zeros((size + others, basis.shape[1] + others))
+        whole[:size, : basis.shape[1]], whole[size:, basis.shape[1] :] = basis, np.eye(others)
+        joined = self.projector.bare.join([one @ whole for one in self.rows])
+        nuisance = np.linalg.qr(self.projector.bare.nuisance_rows)[0]
+        joined = joined - nuisance @ (nuisance.T @ joined)
+        prior = np.zeros_like(whole, shape=(len(whole), len(whole)))
+        prior[:size, :size] = scale_free(baseline.prior, baseline.columns_um)
+        precision = joined.T @ joined + whole.T @ prior @ whole + NO_PRECISION * np.eye(whole.shape[1])
+        factor = np.linalg.inv(np.linalg.cholesky(precision))
+        # As much wider as those of the parameters, where what is left stays alike for a while.
+        columns_um, moves = factor[:, : basis.shape[1]], factor[:, basis.shape[1] :]
+        moves = moves * np.maximum(self._sd / np.maximum(np.linalg.norm(moves, axis=0), 1e-300), 1.0)
+        mean = self.rows[0][baseline.runs[0].fitted].mean(axis=0) @ whole
+        left = [one[run.fitted] for one, run in zip(residuals_um, baseline.runs, strict=False)]
+        return StageUncertainty(
+            jnp.asarray(moves @ self._into(stage).T),
+            jnp.asarray(columns_um),
+            jnp.asarray(np.concatenate([columns_um, moves], axis=1) @ mean),
+            jnp.asarray(max(0.0, float(np.mean([shared_square(one) for one in left]))) ** 0.5),
+            coarse,
+        )
+
+    def _into(self, stage: Stage) -> np.ndarray:
+        """Derivatives of an extended stage's coordinates along those of plain stage and effects, shape `(p, k)`."""
+        baseline, model = self.baseline, self.model
+        stops = np.cumsum([len(baseline.z), *(law.size for law in model.laws)])
+        runs = len(baseline.runs)
+        chain = Chain.of(stage, baseline.chain.grid)
+
+        def coordinates(moved: np.ndarray) -> np.ndarray:
+            dz, *dx = np.split(moved, stops[:-1])
+            there = replace(model, x=tuple(x + d for x, d in zip(model.x, dx, strict=True)))
+            moved_stage = with_effects(baseline.moved(dz, 0.0).stage, shared_effects(there, runs))
+            return np.asarray(chain.coordinates.of(moved_stage.with_substeps(stage.substeps)))
+
+        out = [(coordinates(step) - coordinates(-step)) / (2 * _STEP) for step in _STEP * np.eye(int(stops[-1]))]
+        # A strength at its bound stays there.
+        return np.nan_to_num(np.stack(out, axis=1), nan=0.0, posinf=0.0, neginf=0.0)

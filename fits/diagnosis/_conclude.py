@@ -1,12 +1,11 @@
 """From what the selection found to a diagnosis: verdict, extension, gain and what else is to be said."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
-from fits.diagnosis._certainty import stage_estimates
+from fits.diagnosis._certainty import Certainty
 from fits.diagnosis._effects import drop_programs
 from fits.diagnosis._experiment import Request, suggest
 from fits.diagnosis._extension import (
@@ -20,80 +19,26 @@ from fits.diagnosis._extension import (
     without_effects,
 )
 from fits.diagnosis._findings import bounds, causes_of, with_held_gain
+from fits.diagnosis._misfit import worth_naming
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
-from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._residual_tests import (
-    Cycles,
-    cycles,
     explain,
-    explain_together,
     further_regressors,
     irregular,
     run_regressors,
 )
 from fits.diagnosis._result import Diagnosis, Gain, RunView, Step, Test
 from fits.diagnosis._select import Selection
-from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._length import length
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
 from fits.loop._run import known_samples
 from fits.stats._held import held_gain
-from fits.stats._noise import Noise
 from microid.effects import card_of
 
 # Part of the stroke below which a change of the feedforward is rounding.
 _MET = 1e-9
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """What causes explain of a residual and what structure is left, as sums of squares in noise variances.
-
-    `freedom` is what chance gives the rest, and `count` the number of samples.
-    """
-
-    explained: float
-    rest: float
-    freedom: int
-    count: int
-    thresholds: Thresholds = THRESHOLDS
-
-    @property
-    def total(self) -> float:
-        """What there is to be explained: the rest as far as it is beyond chance."""
-        beyond = self.rest - self.freedom - self.thresholds.chance_z * (2 * self.freedom) ** 0.5
-        return max(self.explained + max(beyond, 0.0), 1e-300)
-
-    @property
-    def share(self) -> float:
-        """Part of it that the causes explain."""
-        return self.explained / self.total
-
-    @property
-    def excess(self) -> float:
-        """The rest without what chance gives it."""
-        return max(self.rest - self.freedom, 0.0)
-
-    @property
-    def rest_noise(self) -> float:
-        """Root mean square of the rest, in noise."""
-        return (self.excess / self.count) ** 0.5
-
-    @property
-    def is_left_over(self) -> bool:
-        """Whether the rest is of a size that matters, and no chance."""
-        improbable = bool(stats.chi2.sf(self.rest, self.freedom) < self.thresholds.rest_chance)
-        return improbable and self.rest_noise > self.thresholds.rest_noise
-
-    def unnamed(self, weak: bool) -> tuple[float, bool]:
-        """Root mean square of what is left in noise, and whether that counts, where none of the causes is named.
-
-        What is beyond chance counts, however small it is, unless nearly all of the rest is of another kind.
-        """
-        rest = (max(self.explained + self.excess, 0.0) / self.count) ** 0.5
-        return rest, rest > self.thresholds.rest_noise or not (weak or self.share < self.thresholds.minor_share)
 
 
 def conclude(
@@ -120,7 +65,7 @@ def conclude(
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
     rounding_um = ready.faults.quantum_um / 12**0.5
     rounded = rounding_um**2 > thresholds.minor_share * noise_um**2
-    found, told, misfit, repeated, minor = _worth_naming(ready, found, beside.noise, rounded)
+    found, told, misfit, repeated, minor = worth_naming(ready, found, beside.noise, rounded)
     rest_noise, left_over = misfit.rest_noise, misfit.is_left_over
     progress(Step.EXTENSION)
     extension = extend_stage(ready, found, found.model if found.causes else None)
@@ -201,13 +146,13 @@ def conclude(
             f"{', '.join(silent)}: of what differs from run to run the extended stage has only what all have in "
             "common, so that it may explain these runs and not the next"
         )
-    before = after = stage_estimates(found.first, found.plain, found.bench, baseline)
+    sure = Certainty(found.first, found.plain, found.bench, baseline)
+    before = after = sure.parameters()
+    band = extended_band = sure.predictions(plain_stage(ready), [one.before_um for one in extension.compared])
     if extension.effects:
-        modelled = [cause for cause in causes if not card_of(cause.name).statistic]
-        after = (
-            *stage_estimates(found.projector, model, found.bench, extension.baseline),
-            *(replace(one, name=f"{cause.name}.{one.name}") for cause in modelled for one in cause.parameters),
-        )
+        sure = Certainty(found.projector, model, found.bench, extension.baseline)
+        after = sure.parameters(causes)
+        extended_band = sure.predictions(extension.stage, [one.after_um for one in extension.compared])
     likely = {cause.name for cause in causes} | {rival.name for cause in kept for rival in cause.rivals}
     return Diagnosis(
         verdict="unexplained" if unexplained else "effect_found" if causes else "no_effect",
@@ -227,6 +172,8 @@ def conclude(
         false_alarm=false_alarm,
         baseline_parameters=before,
         extended_parameters=after,
+        baseline_uncertainty=band,
+        extended_uncertainty=extended_band,
         details={
             "selection": found,
             "ready": ready,
@@ -236,59 +183,6 @@ def conclude(
             ],
         },
     )
-
-
-def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
-    """What was found, in units of other noise."""
-    first, now = (one.beside(noise) for one in (found.first, found.projector))
-    plain = nothing(found.bench, first)
-    model = refit(found.bench, now, found.model.laws, found.model.x, 2) if found.causes else plain
-    explained = max(plain.cost - model.cost, 0.0)
-    return replace(found, first=first, projector=now, plain=plain, model=model, explained=explained)
-
-
-def _worth_naming(
-    ready: Prepared, found: Selection, noise: tuple[Noise, ...], rounded: bool
-) -> tuple[Selection, Selection, Misfit, Cycles, list[str]]:
-    """Leave out causes that explain a minor share of what the others leave: what explains the rest may explain that.
-
-    Returns what was found, the same in the given noise, and what is said of causes that were left out.
-    """
-    said: list[str] = []
-    while True:
-        told = _in_noise(found, noise)
-        misfit, repeated = _misfit(ready, told, rounded)
-        names = [cause.name for cause in found.causes]
-        parts = {}
-        for name in {*names} if len({*names}) > 1 else ():
-            kept = [k for k, other in enumerate(names) if other != name]
-            fewer = _refit_of(told, kept, 2)
-            part = replace(misfit, explained=fewer.cost - told.model.cost).share
-            if not card_of(name).independent and part < misfit.thresholds.minor_share:
-                parts[name] = part, kept
-        if not parts:
-            return found, told, misfit, repeated, said
-        name, (part, kept) = min(parts.items(), key=lambda item: item[1][0])
-        said.append(
-            f"{name} would explain {part:.0%} of what the other causes leave: what makes the rest may make that, "
-            "too, so that it is not named"
-        )
-        found = replace(found, causes=tuple(found.causes[k] for k in kept), model=_refit_of(found, kept, 3))
-
-
-def _refit_of(found: Selection, kept: Sequence[int], rounds: int) -> Refit:
-    """Some of the laws fitted anew."""
-    laws, x = zip(*((found.model.laws[k], found.model.x[k]) for k in kept), strict=True)
-    return refit(found.bench, found.projector, laws, x, rounds)
-
-
-def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, Cycles]:
-    """What there is to be explained, and what repeats itself with the position, which counts unless `rounded`."""
-    regressors = run_regressors(ready.baseline.runs, ready.bench.plain)
-    rest, freedom = explain_together(found.projector, found.model.basis(), found.model.residual, regressors)
-    repeated = cycles(found.projector, found.model.residual, ready.bench.plain)
-    rest = max(rest, 0.0 if rounded else repeated.drop)
-    return Misfit(found.explained, rest, freedom, found.first.count, ready.reading.thresholds), repeated
 
 
 def _tests(ready: Prepared, found: Selection) -> tuple[Test, ...]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,9 +14,10 @@ from fits.diagnosis._baseline import Baseline, simulate, with_effects
 from fits.loop._design import Grid
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
+from fits.stage._follow import propagated
 from fits.stage._moments import Chain, linearise, pieces
-from fits.stage._run import joined, place_of_hysteresis
-from microid import PLACES, AbstractEffect, Coordinates, Signal, Stage
+from fits.stage._run import place_of_hysteresis
+from microid import PLACES, AbstractEffect, Coordinates, Stage
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
 _FINE, _EXAMPLES = 64, 120
@@ -27,8 +27,6 @@ _STEP = 1e-4
 _DEAD = 1e-3
 # By kind, per run.
 Kinds: TypeAlias = tuple[tuple[np.ndarray, ...], ...]
-# Directions that are passed on at a time.
-_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ def regress(
         for first, columns in pieces(here, z, run, True):
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         around = both[:, : chain.size] @ baseline.columns_um
-        both[:, : chain.size] = propagated(here, baseline.z, run, around, both[:, : chain.size])
+        both[:, : chain.size] = propagated(here.coordinates, here.place, z, run, around, both[:, : chain.size])
         rows.append(both)
         plain = simulate(stage, many)
         speed = np.gradient(plain, run.record.time_s)
@@ -100,7 +98,9 @@ def regress(
         if roughness is not None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
             moved = np.concatenate([columns @ roughness for _, columns in pieces(fine, z, run, True)])[:n]
-            structure.append(np.split(propagated(fine, baseline.z, run, around, moved), [_FINE], axis=1))
+            structure.append(
+                np.split(propagated(fine.coordinates, fine.place, z, run, around, moved), [_FINE], axis=1)
+            )
     kinds = tuple(zip(*structure, strict=True)) if finer is None else finer
     data = tuple(rows), tuple(nuisance), kinds, tuple(residuals)
     return Regression(baseline, tuple(run.fitted for run in runs), *data, root_of(baseline.prior), levelling)
@@ -174,46 +174,3 @@ def with_effects_in(chain: Chain, z: np.ndarray, effects: tuple[AbstractEffect, 
         return chain
     coordinates: Any = eqx.Partial(_extended, chain.coordinates, effects)
     return Chain(coordinates, place_of_hysteresis(coordinates(jnp.asarray(z))), chain.grid)
-
-
-def propagated(chain: Chain, z: np.ndarray, run: Run, around_um: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
-    """Pass changes of what comes out of the hysteresis, shape `(n, k)`, on through what follows it, to first order.
-
-    They are `around_um`, shape `(n,)`. Where all that follows is linear, they have been passed on already.
-    """
-    assert chain.place is not None
-    after = chain.coordinates(jnp.asarray(z)).parts[chain.place + 1 :]
-    if not after or joined(after) is not None:
-        return moved_um
-    n, samples = len(run.record), run.samples
-    pad = len(samples.weight) - n
-    time_s = samples.time_s * samples.stride if samples.time_s.ndim == 0 else samples.time_s[:: samples.stride]
-    signal = jnp.asarray(np.pad(around_um, (0, pad), mode="edge"))
-    out = np.empty_like(moved_um)
-    for first in range(0, moved_um.shape[1], _AT_ONCE):
-        part = moved_um[:, first : first + _AT_ONCE].T
-        full = np.pad(part, ((0, _AT_ONCE - len(part)), (0, pad)))
-        answer = _propagated(chain.coordinates, chain.place, jnp.asarray(z), time_s, signal, jnp.asarray(full))
-        out[:, first : first + _AT_ONCE] = np.asarray(answer)[: len(part), :n].T
-    return out
-
-
-@eqx.filter_jit
-def _propagated(
-    coordinates: Coordinates[Stage],
-    place: int,
-    z: Float[Array, " p"],
-    time_s: Float[Array, " n"] | Float[Array, ""],
-    around_um: Float[Array, " n"],
-    moved_um: Float[Array, "k n"],
-) -> Float[Array, "k n"]:
-    stage = coordinates(z)
-
-    def follow(values: Float[Array, " n"]) -> Float[Array, " n"]:
-        signal = Signal(values, values[0], "first")
-        for part in stage.parts[place + 1 :]:
-            signal = part.run(time_s, signal)
-        return signal.values
-
-    _, push = jax.linearize(follow, around_um)
-    return jax.vmap(push)(moved_um)

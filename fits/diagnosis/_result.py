@@ -12,6 +12,7 @@ from fits.io._length import length
 from fits.io._limits import Extreme
 from fits.io._summary import AbstractSummary
 from fits.loop._result import ParameterEstimate
+from fits.stage._uncertainty import StageUncertainty
 from microid import Stage
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]
@@ -166,7 +167,8 @@ class Diagnosis(AbstractSummary):
     held-out data. `next_experiment` is None where nothing would help. `baseline` is the plain stage and `extended`
     the one with the causes, the same where there are none; of the `runs` those that were held out come last.
     `false_alarm` is the probability of naming a cause where there is none. The parameters that were fitted of the
-    plain and of the extended stage, which has those of its causes, too, are beside what the other may do.
+    plain and of the extended stage, which has those of its causes, too, are beside what the other may do. For the
+    bands of their predictions there are uncertainties, as `predict` takes them, None where they cannot be told.
     """
 
     verdict: Verdict
@@ -186,6 +188,8 @@ class Diagnosis(AbstractSummary):
     false_alarm: float
     baseline_parameters: tuple[ParameterEstimate, ...] = ()
     extended_parameters: tuple[ParameterEstimate, ...] = ()
+    baseline_uncertainty: StageUncertainty | None = None
+    extended_uncertainty: StageUncertainty | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def summary(self) -> str:

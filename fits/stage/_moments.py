@@ -1,6 +1,6 @@
 """A whole stage as a regression: linear in the columns of its hysteresis, linearised in its other parameters."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,8 @@ from jaxtyping import Array, Bool, Float
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
 from fits.loop._run import Run, Samples
+from fits.stage._follow import passes_linearly, propagated
+from fits.stage._motion import prepare, signals
 from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
 from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
 
@@ -186,23 +188,33 @@ def along(
     Without columns the run is linearised at those that the stage has, whose grid may then differ from the chain's. Of
     the changes of each piece, shape `(samples, k)`, only what `reduce` makes of them is kept.
     """
-    return moved_along(chain, z, linearise(chain, z, columns_um, run)[1], run, directions, reduce)
+    slope = linearise(chain, z, columns_um, run)[1]
+    return moved_along(chain, z, columns_um, slope, run, directions, reduce)
 
 
 def moved_along(
     chain: Chain,
     z: Float[Array, " p"],
+    columns_um: Float[Array, " D"] | None,
     slope: np.ndarray,
     run: Run,
     directions: Sequence[np.ndarray],
     reduce: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
     """The same where the slopes along the coordinates are known, shape `(n, p)`."""
-    moved = [
-        reduce(columns @ directions[0] + slope[first : first + len(columns)] @ directions[1])
-        for first, columns in pieces(chain, z, run, True)
-    ]
-    return np.concatenate(moved)
+    moved_um: Iterable[np.ndarray] = (columns @ directions[0] for _, columns in pieces(chain, z, run, True))
+    if chain.place is not None and not passes_linearly(stage := chain.stage(z, columns_um), chain.place):
+        # What is not linear needs all of a record at a time.
+        around_um = np.asarray(signals(stage, prepare(stage, run))[chain.place + 1].values)
+        around_um = around_um[:: run.samples.stride][: len(run.record)]
+        whole_um = np.concatenate([*moved_um])
+        whole_um = propagated(chain.coordinates, chain.place, z, run, around_um, whole_um)
+        moved_um = (whole_um[first : first + _PIECE] for first in range(0, len(whole_um), _PIECE))
+    found, first = [], 0
+    for each in moved_um:
+        found.append(reduce(each + slope[first : first + len(each)] @ directions[1]))
+        first += len(each)
+    return np.concatenate(found)
 
 
 def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterator[tuple[int, np.ndarray]]:

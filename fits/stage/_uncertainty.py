@@ -53,7 +53,9 @@ class StageUncertainty(AbstractUncertainty):
         directions = np.asarray(self.columns_um).T, np.asarray(self.coordinates).T
         z = chain.coordinates.of(stage)
         out, slope, _ = linearise(chain, z, None, run)
-        square = moved_along(chain, z, slope, run, directions, lambda moved: np.sum((moved - mean) ** 2, axis=1))
+        square = moved_along(
+            chain, z, None, slope, run, directions, lambda moved: np.sum((moved - mean) ** 2, axis=1)
+        )
         return Prediction(out[: len(run.record)], np.sqrt(square + float(self.discrepancy_um) ** 2))
 
 
