@@ -1,5 +1,6 @@
 """What decides in a diagnosis, by itself: on constructed residuals and answers, against closed forms and SciPy."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from scipy import stats
 
 import fits
 from fits import Record
-from fits.diagnosis import _conclude, _diagnose, _misfit
+from fits.diagnosis import _diagnose, _misfit
 from fits.diagnosis._effects import Law
 from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
 from fits.diagnosis._misfit import Misfit
@@ -200,6 +201,15 @@ def test_stretches_at_rest_are_whole():
     assert (begin, end) == (pytest.approx(1117, abs=2), len(place))
 
 
+@dataclass(frozen=True)
+class Answer:
+    verdict: str
+    causes: list
+    gain: Gain
+    of: dict
+    remarks: tuple
+
+
 @pytest.fixture
 def asked(monkeypatch):
     """How records were read, in order; the answers are made by hand."""
@@ -217,7 +227,7 @@ def asked(monkeypatch):
         after_um = answer.get("error", 1.0)
         gain = Gain(answer.get("plain", after_um), after_um, noise_um=1.0)
         causes = [SimpleNamespace(z=z) for z in answer.get("z", ())]
-        return SimpleNamespace(causes=causes, gain=gain, of=answer, remarks=ready.baseline.remarks)
+        return Answer("effect_found" if causes else "no_effect", causes, gain, answer, ready.baseline.remarks)
 
     monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
     monkeypatch.setattr(_diagnose, "select", lambda *_: None)
@@ -255,3 +265,16 @@ def test_what_was_held_out_is_used_where_only_it_shows_a_cause(asked, z):
     asked({"error": 3.0, "plain": 6.0, "z": (9.0,)})
     aside = Record(np.arange(6.0), np.arange(6.0), np.zeros(6))
     assert asked({"error": 3.0}, holdout=[aside])[2][0].fraction == 0.12
+
+
+def test_of_runs_held_out_that_are_off_by_more_than_noise_it_is_said(asked):
+    aside = Record(np.arange(6.0), np.arange(6.0), np.zeros(6))
+
+    def said(**answer):
+        return [
+            words for words in asked(answer, holdout=[aside])[0].remarks if "held out are off by 2 times" in words
+        ]
+
+    assert said(error=2.0)
+    assert not said(error=1.1)
+    assert not said(error=2.0, z=(9.0,))

@@ -27,6 +27,10 @@ _ALL = (
     "what was held out is predicted far worse than noise allows, and the causes show only there: it was used to find "
     "them, so that the gain is not measured on new data"
 )
+_UNKNOWN = (
+    "what was fitted is at the noise, and the runs held out are off by {:.2g} times it: where they go the hysteresis "
+    "is not known, or something shows only there; to ask for it, diagnose them with the others"
+)
 
 
 def diagnose(
@@ -131,4 +135,7 @@ def diagnose(
         whole = answer(replace(reading, fraction=0.0), _ALL)
         if max((cause.z for cause in whole.causes), default=0.0) > thresholds.strong_z:
             return whole
+    if aside and diagnosis.verdict == "no_effect" and gain.heldout_rms_before_um**2 > _UNLIKE * gain.noise_um**2:
+        said = _UNKNOWN.format(gain.heldout_rms_before_um / gain.noise_um)
+        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, said))
     return diagnosis
