@@ -289,7 +289,7 @@ def test_evidence_beside_a_misfit_is_worth_less(rng):
         assert (found.robust_z > 0.6 * found.z) == trusted
 
 
-def test_programs_make_room_where_records_are_long_and_those_of_the_host_stay(monkeypatch):
+def test_programs_make_room_where_records_are_long(monkeypatch):
     monkeypatch.setattr(_effects, "_MANY", 10**6)
     hosts = []
 
@@ -317,7 +317,10 @@ def test_programs_make_room_where_records_are_long_and_those_of_the_host_stay(mo
 
     assert traces_after(1000) == (1, 1)
     assert traces_after(1000) == (1, 1)
-    assert traces_after(10_000) == (2, 1)
+    assert traces_after(10_000) == (2, 2)
+    # Where programs are many, those of the host stay.
+    monkeypatch.setattr(_effects, "_MANY", 0)
+    assert traces_after(1000) == (3, 2)
 
 
 def test_a_signal_without_columns_is_whitened(rng):

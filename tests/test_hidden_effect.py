@@ -108,11 +108,14 @@ def test_the_extended_model_simulates_new_runs_better(case):
             out = case.folder / f"{which}_{csv.name}"
             done = run("simulate", model, csv, "--out", out, "--json")
             assert done.exit_code == 0, f"{case.seed}: {done.output}"
-            # A diagnosis tells the intervals of parameters, not how they go together, and no more is made up.
-            assert json.loads(done.stdout)["displacement_sd_median_um"] is None
-            measured = np.genfromtxt(csv, delimiter=",", names=True)
-            off_um = measured["displacement_um"] - np.genfromtxt(out, delimiter=",", names=True)["displacement_um"]
+            measured, said = (np.genfromtxt(file, delimiter=",", names=True) for file in (csv, out))
+            off_um = measured["displacement_um"] - said["displacement_um"]
             squares[which] += np.sum((off_um - off_um.mean()) ** 2)
+            sd_um = json.loads(done.stdout)["displacement_sd_median_um"]
+            assert sd_um == pytest.approx(float(np.median(said["displacement_sd_um"])), rel=1e-9)
+            if which == "extended":
+                # Of normal errors as large together as the band and the noise say, three in a million are so large.
+                assert np.std(off_um) < np.hypot(1.1 * case.found["noise_um"], 4.5 * sd_um), case.seed
     assert squares["extended"] <= squares["baseline"], case.seed
 
 

@@ -313,7 +313,7 @@ def test_the_card_of_an_effect_reaches_the_report(copy):
     said = python(copy, "-c", REPORT).splitlines()
     assert said == ["The residual is proportional to the displacement.", "gauge_um: a second sensor."]
     page = (copy / "report.html").read_text(encoding="utf-8")
-    assert "Wrong gain explains" in page
+    assert "explained by wrong gain" in page
     assert said[0] in page
     assert "Residual against measured displacement" in page
     assert "Source: a test." in page
