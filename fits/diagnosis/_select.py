@@ -25,6 +25,8 @@ from microid.effects import card_of
 # Laws at most, as some causes come several times, sets of causes that are followed at a time, and rounds in which
 # others are fitted where none of the leaders holds.
 _MOST_LAWS, _BEAM, _TRIES = 8, 2, 3
+# The farthest that a standard deviation in coordinates is taken at its word.
+_FARTHEST = 3.0
 _ONCE = {form.name for form in EFFECTS if not form.repeats}
 
 
@@ -114,6 +116,14 @@ class Explanation:
         """Bayesian information criterion: the smaller, the better."""
         return self.model.criterion(self.projector.count)
 
+    @property
+    def near_bound(self) -> bool:
+        """Whether a cause may, within a standard deviation, be as large as such an effect can be."""
+        sd = np.minimum(np.sqrt(np.diagonal(self.model.covariance(robust=False))), _FARTHEST)
+        each = np.split(sd, np.cumsum([law.size for law in self.model.laws])[:-1])
+        moved = zip(self.model.laws, self.model.x, each, strict=True)
+        return any(law.at_bound(x + way * own) for law, x, own in moved for way in (-1, 0, 1))
+
 
 def select(
     bench: Bench,
@@ -137,16 +147,17 @@ def select(
     start = Explanation.of((), (bench, projector, plain), search)
     beam, ends = [start], []
     while beam:
-        grown: dict[frozenset[str], Explanation] = {}
+        grown: dict[frozenset[str], tuple[int, Explanation]] = {}
         for one in beam:
-            more = _grown(one, search)
+            more = sorted(_grown(one, search), key=lambda one: one.criterion)
             if not more:
                 ends.append(one)
-            for other in more:
+            for place, other in enumerate(more):
                 key = frozenset(other.names)
-                if key not in grown or other.criterion < grown[key].criterion:
-                    grown[key] = other
-        order = sorted(grown.values(), key=lambda one: one.criterion)
+                if key not in grown or other.criterion < grown[key][1].criterion:
+                    grown[key] = place, other
+        ranked = sorted(grown.values(), key=lambda one: one[1].criterion)
+        order = [one for _, one in ranked]
         if order and again and not beam[0].causes:
             afresh = relearn_noise(projector, order[0].projector, order[0].model, search.candidates, thresholds)
             if afresh is not None:
@@ -156,9 +167,18 @@ def select(
                 if found.causes and is_smoothness_confirmed(found.projector, found.model):
                     return found
         reach = confusable_z(plain.cost - order[0].model.cost, thresholds) ** 2 if order else 0.0
-        beam = [one for one in order if one.criterion < order[0].criterion + reach][:_BEAM]
-    best = min(ends, key=lambda one: one.criterion)
+        near = [one for one in ranked if one[1].criterion < order[0].criterion + reach]
+        # The best of each set before the second best of any: effects of one class would take all places.
+        beam = [one for _, one in sorted(near, key=lambda one: one[0])[:_BEAM]]
+    best = _best(ends, plain, thresholds)
     return _refined(_without_outdone(best, ends, thresholds, plain), start, search)
+
+
+def _best(ends: Sequence[Explanation], plain: Refit, thresholds: Thresholds) -> Explanation:
+    """The explanation of the smallest criterion; of those that are not told apart, one with no cause near a bound."""
+    first = min(ends, key=lambda one: one.criterion)
+    reach = confusable_z(plain.cost - first.model.cost, thresholds) ** 2
+    return min(ends, key=lambda one: (one.criterion > first.criterion + reach, one.near_bound, one.criterion))
 
 
 def _grown(one: Explanation, search: Search) -> list[Explanation]:
