@@ -15,6 +15,8 @@ from data_synth._bouc_wen import BoucWenOscillator as BoucWenOscillator
 from data_synth._bouc_wen import boucwen_multisine as boucwen_multisine
 from data_synth._bouc_wen import boucwen_response as boucwen_response
 from data_synth._bouc_wen import boucwen_sweep as boucwen_sweep
+from data_synth._bouc_wen_files import BOUCWEN as BOUCWEN
+from data_synth._bouc_wen_files import boucwen_files as boucwen_files
 from data_synth._environment import OtherAxisSettings as OtherAxisSettings
 from data_synth._environment import TemperatureSettings as TemperatureSettings
 from data_synth._errors import ScenarioError as ScenarioError
@@ -71,6 +73,7 @@ from data_synth.effects import EFFECTS as EFFECTS
 from data_synth.effects import OUTSIDE as OUTSIDE
 
 __all__ = [
+    "BOUCWEN",
     "BOUCWEN_RATE_HZ",
     "EFFECTS",
     "OUTSIDE",
@@ -106,6 +109,7 @@ __all__ = [
     "Segment",
     "Sensor",
     "TemperatureSettings",
+    "boucwen_files",
     "boucwen_multisine",
     "boucwen_response",
     "boucwen_sweep",

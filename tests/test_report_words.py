@@ -9,6 +9,7 @@ import pytest
 from _diagnosis import KINDS, cause, diagnosis
 
 from fits.diagnosis._result import Gain
+from fits.loop._report_words import _row
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, runs_read, stage_parameters
@@ -128,3 +129,11 @@ def test_parameters_stand_beside_each_other(rng):
     assert row == frequency
     # Without a cause both are the same.
     assert stage_parameters(diagnosis(rng, "no_effect"))[1] == (*frequency[:3], "Hz")
+
+
+def test_errors_of_a_fit_are_in_the_unit_that_they_ask_for():
+    errors = {"samples": 100, "e_rms_pct": 0.07, "rms_um": 0.01217, "e_max_pct": 9.0, "max_um": 1.5}
+    row = _row("in-sample", errors)
+    assert "12.17 nm" in row
+    assert "1.5" in row.split("9 %")[1]
+    assert row.endswith(" um")

@@ -229,8 +229,8 @@ def gather(
     levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
     for run in runs:
         sums = _sums(grid, run, _told(compressed(run, levels_V, pieces), run, progress))
-        total, mean = _without_nuisance(reduce(operator.add, sums), grid.columns)
-        centred.append([total, *(_without_nuisance(part, grid.columns)[0] for part in sums)])
+        total, mean = without_nuisance(reduce(operator.add, sums), grid.columns)
+        centred.append([total, *(without_nuisance(part, grid.columns)[0] for part in sums)])
         means.append(mean)
     whole, *blocks = (reduce(operator.add, parts) for parts in zip(*centred, strict=True))
     return Data(grid, whole, tuple(blocks), tuple(means), pieces)
@@ -281,7 +281,7 @@ def _beside(run: Run, groups: Compressed) -> np.ndarray:
     return np.concatenate([past.reshape(*groups.voltage_V.shape, -1), ones], axis=2)
 
 
-def _without_nuisance(sums: Moments, size: int) -> tuple[Moments, RunMean]:
+def without_nuisance(sums: Moments, size: int) -> tuple[Moments, RunMean]:
     """Eliminate a run's nuisance parameters, all unknowns but the first `size`; the last of them is its offset."""
     gram, cross = np.asarray(sums.gram), np.asarray(sums.cross_um)
     scale = np.sqrt(np.maximum(np.diagonal(gram)[size:], 1e-300))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.io._errors import DataError
+from fits.io._length import length
 from fits.io._record import Record
 from fits.loop._grid import non_negative, solve_grid
 from fits.loop._misfit import Misfit, compare_gains, misfits, remarks_on, worst
@@ -189,7 +190,7 @@ def delays(
         where = "AFTER the voltage" if samples > 0 else "BEFORE the voltage that causes it"
         remarks.append(
             f"{run.record.source}: the displacement comes {size} {where}: taken out, the residual falls from "
-            f"{before:.3g} to {after:.3g} um; check columns and time stamps, or the lag of amplifier and sensor"
+            f"{length(before)} to {length(after)}; check columns and time stamps, or the lag of amplifier and sensor"
         )
     return remarks
 

@@ -6,6 +6,7 @@ from math import floor, log10
 from typing import Any
 
 from fits.io._json import columns
+from fits.io._length import length, length_unit
 from fits.stats._metrics import WHITE
 
 # Held-out errors up to this many times the fitted ones count as equal.
@@ -44,10 +45,11 @@ def _said_of_misfit(misfit: Mapping[str, Any] | None) -> list[str]:
     """Say first how far a residual is from noise; nothing of models that were written before it was looked at."""
     if misfit is None:
         return []
+    residual, noise = length(misfit["residual_um"], 4), length(misfit["noise_um"])
     figures = (
-        "{residual_um:.4g} um rms in {source}, {share_pct:.3g} % of its stroke and {times_noise:.3g} times the "
-        "sensor's noise ({noise_um:.3g} um, by {noise_shown_by})"
-    ).format(**misfit)
+        "{residual} rms in {source}, {share_pct:.3g} % of its stroke and {times_noise:.3g} times the "
+        "sensor's noise ({noise}, by {noise_shown_by})"
+    ).format(residual=residual, noise=noise, **misfit)
     if not misfit["far"]:
         return [f"left over      {figures}", ""]
     return [f"FAR FROM NOISE {figures}: the model misses something, and all below is no better than that", ""]
@@ -55,10 +57,11 @@ def _said_of_misfit(misfit: Mapping[str, Any] | None) -> list[str]:
 
 def _resolution(report: Mapping[str, Any]) -> list[str]:
     levels = ", ".join(f"{trial['levels']:d}" for trial in report["trials"])
-    errors = ", ".join(f"{trial['error_um']:.4g}" for trial in report["trials"])
+    per_um, unit = length_unit(min(trial["error_um"] for trial in report["trials"]))
+    errors = ", ".join(f"{trial['error_um'] * per_um:.4g}" for trial in report["trials"])
     return [
         f"levels tried   {levels}",
-        f"  their error  {errors} um, on blocks predicted from the others",
+        f"  their error  {errors} {unit}, on blocks predicted from the others",
         f"residual       {_residual(report)}",
     ]
 
@@ -66,15 +69,15 @@ def _resolution(report: Mapping[str, Any]) -> list[str]:
 def _residual(report: Mapping[str, Any]) -> str:
     correlation = report["correlation_samples"]
     colour = "white" if correlation <= WHITE else f"neighbours alike over {correlation:.0f} samples"
-    return f"{report['noise_um']:.4g} um standard deviation, {colour}"
+    return f"{length(report['noise_um'], 4)} standard deviation, {colour}"
 
 
 def _row(name: str, errors: Mapping[str, Any] | None) -> str:
     if errors is None:
         return f"{name:14} {'none':>8}"
     return (
-        f"{name:14} {errors['samples']:8d} {errors['e_rms_pct']:8.4g} % {errors['rms_um']:9.4g} um "
-        f"{errors['e_max_pct']:8.4g} % {errors['max_um']:9.4g} um"
+        f"{name:14} {errors['samples']:8d} {errors['e_rms_pct']:8.4g} % {length(errors['rms_um'], 4):>12} "
+        f"{errors['e_max_pct']:8.4g} % {length(errors['max_um'], 4):>12}"
     )
 
 
