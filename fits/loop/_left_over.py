@@ -33,13 +33,14 @@ def suggestions(runs: Sequence[Run], model: Surface, stroke_um: float, hyper: Hy
     noise given are in strokes.
     """
     grid = grid_of(runs, EVIDENCE_LEVELS)
+    alone = [gather(grid, [run]).blocks for run in runs]
     predicted_um = [simulate_run(model, run) for run in runs]
     lag_s = _LAG * min(float(np.median(np.diff(run.record.time_s))) for run in runs)
 
     # A lag is not linear in its time constant: its signal is made anew where a fit of the density and it finds it.
     for _ in range(_ROUNDS):
         lags = [_lag(run, moved, lag_s) for run, moved in zip(runs, predicted_um, strict=True)]
-        *columns, times = _solve(reduce(operator.add, _gather(grid, runs, lags, stroke_um)), hyper)
+        *columns, times = _solve(reduce(operator.add, _gather(grid, runs, alone, lags, stroke_um)), hyper)
         if times == 0:
             break
         lag_s *= times
@@ -49,7 +50,7 @@ def suggestions(runs: Sequence[Run], model: Surface, stroke_um: float, hyper: Hy
         np.c_[_lag(run, moved, lag_s), _relaxations(run, moved)]
         for run, moved in zip(runs, predicted_um, strict=True)
     ]
-    blocks = _gather(grid, runs, signals, stroke_um)
+    blocks = _gather(grid, runs, alone, signals, stroke_um)
 
     def error(what: tuple[str, ...]) -> float:
         return _error([_kept(block, grid.columns, what) for block in blocks], hyper)
@@ -96,15 +97,22 @@ def _behind(run: Run, moved_um: np.ndarray, constant_s: float) -> np.ndarray:
     return np.interp(time_s, even_s, lfilter([1 - left], [1, -left], moved, zi=left * moved[:1])[0])
 
 
-def _gather(grid: Grid, runs: Sequence[Run], signals_um: Sequence[np.ndarray], stroke_um: float) -> list[Moments]:
-    """Moments of blocks, in strokes, of the density's columns and then of the signals of each run, `(n, k)`."""
+def _gather(
+    grid: Grid,
+    runs: Sequence[Run],
+    alone: Sequence[tuple[Moments, ...]],
+    signals_um: Sequence[np.ndarray],
+    stroke_um: float,
+) -> list[Moments]:
+    """Moments of blocks, in strokes, of the density's columns and then of the signals of each run, `(n, k)`.
+
+    Those of the density `alone` are given for each run.
+    """
     found = [Moments.empty(grid.columns + signals_um[0].shape[1])] * BLOCKS
-    for run, signals in zip(runs, signals_um, strict=True):
+    for run, blocks, signals in zip(runs, alone, signals_um, strict=True):
         # How the density's columns respond is added up for one signal at a time, as for a measured displacement.
-        of = [
-            gather(grid, [replace(run, record=replace(run.record, displacement_um=one))]).blocks
-            for one in (run.displacement_um, *signals.T)
-        ]
+        played = [replace(run, record=replace(run.record, displacement_um=one)) for one in signals.T]
+        of = [blocks, *(gather(grid, [one]).blocks for one in played)]
         label, every = blocks_of(run, PIECES), np.c_[run.displacement_um, signals]
         for number in range(BLOCKS):
             weight = (label == number) * (1.0 if run.weight is None else run.weight)
