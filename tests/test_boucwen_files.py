@@ -3,12 +3,14 @@
 import json
 
 import numpy as np
+import pytest
 from _command import refused, run
 from scipy.integrate import solve_ivp
 
 SAMPLES, RATE_Hz = 300, 750.0
 
 
+@pytest.mark.study
 def test_the_benchmark_is_written_as_files(tmp_path):
     done = run("synth", "boucwen", "--out", tmp_path, "--samples", SAMPLES, "--seed", 4)
     assert done.exit_code == 0

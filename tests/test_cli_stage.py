@@ -111,7 +111,7 @@ def test_the_words_name_every_parameter_with_its_interval(bench):
         assert np.allclose([low, high], [each["lower"], each["upper"]], rtol=0, atol=each["sd"] / 10)
         assert line.endswith(each["unit"].replace("1", ""))
     text = "\n".join(lines)
-    for word in ("slow.csv", "fast.csv", "in-sample", "held-out", "levels from 0 to 120 V", "um standard deviation"):
+    for word in ("slow.csv", "fast.csv", "in-sample", "held-out", "levels from 0 to 120 V", "m standard deviation"):
         assert word in text
 
 
