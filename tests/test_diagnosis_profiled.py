@@ -13,8 +13,10 @@ from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._findings import _parameters, profile_likelihood
 from fits.diagnosis._joint_fit import leave_bounds
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import refit
+from fits.diagnosis._refit import nothing, refit
 from fits.diagnosis._regression import regress
+from fits.diagnosis._select import Explanation, _best
+from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._noise import Noise
 from microid import EFFECTS, Driver
 
@@ -173,3 +175,16 @@ def test_a_parameter_alone_in_its_effect_is_followed_with_the_other_effects_fitt
     assert len(along) > 2
     np.testing.assert_allclose([away for away, _ in along], np.maximum(np.sqrt(costs), 3), atol=0.02)
     assert np.any(costs > 9)
+
+
+def test_of_explanations_that_are_not_told_apart_one_with_nothing_near_its_bound_is_taken():
+    bench, projector, stuck = at_slope(0.9 - 1e-9, 0.9)
+    inside = at_slope(0.2, 0.2)[-1]
+    plain = nothing(bench, projector)
+    bound, free, none = (Explanation((), bench, projector, one, (), None) for one in (stuck, inside, plain))
+    # Where there is no effect, there is no bound.
+    assert [one.near_bound for one in (bound, free, none)] == [True, False, False]
+    projector.count = 50
+    assert _best([none], plain, THRESHOLDS) is none
+    assert _best([bound, free], plain, THRESHOLDS) is free
+    assert _best([bound, none], plain, THRESHOLDS) is bound

@@ -120,7 +120,7 @@ class Explanation:
     def near_bound(self) -> bool:
         """Whether a cause may, within a standard deviation, be as large as such an effect can be."""
         sd = np.minimum(np.sqrt(np.diagonal(self.model.covariance(robust=False))), _FARTHEST)
-        each = np.split(sd, np.cumsum([law.size for law in self.model.laws])[:-1])
+        each = np.split(sd, np.cumsum([law.size for law in self.model.laws], dtype=int))[:-1]
         moved = zip(self.model.laws, self.model.x, each, strict=True)
         return any(law.at_bound(x + way * own) for law, x, own in moved for way in (-1, 0, 1))
 
