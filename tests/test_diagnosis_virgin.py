@@ -43,8 +43,7 @@ def record(rng, start_V):
     return Record(np.arange(3000) / 50, voltage_V, reading_um, source="plays.csv")
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("start_V", [0.0, None])
+@pytest.mark.parametrize("start_V", [0.0, pytest.param(None, marks=pytest.mark.study)])
 def test_a_first_way_of_its_own_is_no_effect(rng, start_V):
     run = record(rng, start_V)
     found = diagnose([run])

@@ -17,7 +17,6 @@ from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, refuse_outsi
 from fits.loop._surface import Surface, Visits, basis
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
-# Perturbations at a time, which with a few thousand samples stay in a processor's cache.
 _SWINGS = 31  # of a demagnetised state, as in `microid`
 _STEPS = 128  # of a root, as in `microid`
 _EPS = float(np.finfo(float).eps)
