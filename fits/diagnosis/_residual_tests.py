@@ -14,6 +14,7 @@ from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import Run
 from fits.stats._noise import learn_noise
+from fits.stats._score_test import standard_deviations
 
 _WAVES, _PERIODS = 12, 1920
 # Bands of the command, from two periods in a run to half the sampling rate, and the part of its energy that counts.
@@ -157,9 +158,7 @@ def explain(
         keep = size > 1e-6 * size[0]
         along = left[:, keep].T @ residual
         drop, freedom = float(along @ along), int(keep.sum())
-        p = float(stats.chi2.sf(drop, freedom))
-        # Fisher's root of a chi-square variable is nearly normal.
-        z = float(max((2 * drop) ** 0.5 - (2 * freedom - 1) ** 0.5, 0.0))
+        p, z = float(stats.chi2.sf(drop, freedom)), float(standard_deviations(drop, freedom))
         found.append(Explained(regressors, drop, freedom, z, p))
     return found
 

@@ -19,6 +19,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._score import Family, Probe, Scored, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
+from fits.stats._score_test import standard_deviations
 from microid import EFFECTS
 from microid.effects import card_of
 
@@ -218,7 +219,7 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
             if not end[-1].determined(thresholds.determined_z, False, alone):
                 continue
             # What it explains is lost where all is fitted together, or it explains less than its score promised.
-            z = max(drop, 0.0) ** 0.5
+            z = float(standard_deviations(drop, end[-1].freedom - model.freedom))
             if model.cost - end[-1].cost < thresholds.minor_share * drop or z <= bars[rival.form]:
                 continue
             if one.family.p(z / sigma) >= false_alarm:

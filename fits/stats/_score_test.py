@@ -1,14 +1,33 @@
 """Score tests: the evidence for signatures in what a fit leaves, whose multiples may have a sign."""
 
 import numpy as np
+from scipy import special
 
 # Samples that are taken to err alike.
 BLOCK = 25
+# A decrease beyond which the probability of as much by chance is that of the tail's first term: less than rounding.
+_FAR = 1000.0
 
 
 def squares(columns: np.ndarray) -> np.ndarray:
     """Sum of squares of every column, shape `(k,)`."""
     return np.einsum("ij,ij->j", columns, columns)
+
+
+def standard_deviations(drop: np.ndarray | float, freedom: np.ndarray | float) -> np.ndarray:
+    """Standard deviations of a normal variable that chance exceeds as seldom as `drop` by so many squares of them.
+
+    `freedom` is the number of coefficients that the decrease took, which broadcasts against `drop`.
+    """
+    half, x = np.asarray(freedom) / 2, np.maximum(drop, 0.0) / 2
+    shape = np.maximum(half, 0.5)
+    with np.errstate(divide="ignore"):
+        log_p = np.where(
+            2 * x < _FAR,
+            np.log(special.gammaincc(shape, np.minimum(x, _FAR / 2))),
+            (shape - 1) * np.log(np.maximum(x, 1.0)) - x - special.gammaln(shape),
+        )
+    return np.where(half > 0, np.maximum(-special.ndtri_exp(log_p - np.log(2.0)), 0.0), 0.0)
 
 
 def robust_z(along: np.ndarray, residual: np.ndarray) -> float:
@@ -47,7 +66,6 @@ def best_multiples(gram: np.ndarray, cross: np.ndarray, positive: bool, most: np
 
 
 def evidence_of(gram: np.ndarray, cross: np.ndarray, multiples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations and decreases: chance gives one of it to each signature in use but one."""
+    """Standard deviations and decreases: chance takes a square of them for each signature in use."""
     drop = np.einsum("ij,ij->j", multiples, 2 * cross - gram @ multiples)
-    chance = np.maximum(np.count_nonzero(multiples, axis=0) - 1, 0)
-    return np.sqrt(np.maximum(drop - chance, 0.0)), drop
+    return standard_deviations(drop, np.count_nonzero(multiples, axis=0)), drop
