@@ -364,7 +364,7 @@ def test_what_has_many_coefficients_is_found_by_chance_no_more_often(rng):
     each = tuple(Scored(probe([(np.zeros(1),)] * k), 1.0, 0.0, 0.0, np.zeros(k), 0.0, 1.0) for k in sizes)
     family = Family(Scores(each, np.eye(sum(sizes))), rng)
     # Decreases that nothing but chance makes, each as evidence.
-    drops = rng.chisquare(np.asarray(sizes)[:, None], (len(sizes), 100_000))
+    drops = rng.chisquare(np.asarray(sizes)[:, None], (len(sizes), 20_000))
     largest = np.max(standard_deviations(drops, np.asarray(sizes)[:, None]), axis=0)
     for chance in (0.05, 1e-3):
         # The family is a table of 2000 draws, and what lies beyond goes on from the largest twenty.

@@ -99,7 +99,8 @@ def conclude(
             f"what is left repeats itself every {length(repeated.period_um)} of the position, as the error of an "
             "interferometer or an encoder does"
         )
-    faults = _standing(ready.faults, beside, extension.compared, thresholds.spike_z) if kept else ready.faults
+    rest_um = rest_noise * noise_um if left_over else 0.0
+    faults = _standing(ready.faults, beside if kept else ready.faults, extension.compared, rest_um, thresholds.spike_z)
     named = name_faults(faults, cyclic, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * noise_um**2
     causes = causes_of(kept, model, found, removed, named, ready.faults)
@@ -219,10 +220,12 @@ def _gain(
     return gain, sorted({effect.name for effect in extension.effects if effect.per_run and len(baseline.runs) > 1})
 
 
-def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared], spike_z: float) -> Faults:
-    """Faults of samples and noise beside the causes, which may explain what looked like a bad sample."""
+def _standing(
+    faults: Faults, beside: Faults, compared: Sequence[Compared], rest_um: float, spike_z: float
+) -> Faults:
+    """Faults of samples and noise beside the causes and a rest, which may make what looked like a bad sample."""
     spikes = tuple(
-        bad & (np.abs(one.after_um + height_um) > spike_z * noise.total_um)
+        bad & (np.abs(one.after_um + height_um) > spike_z * float(np.hypot(noise.total_um, rest_um)))
         for bad, height_um, one, noise in zip(faults.spikes, faults.heights_um, compared, beside.noise, strict=False)
     )
     return replace(beside, spikes=spikes, heights_um=faults.heights_um)

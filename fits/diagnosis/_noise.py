@@ -148,7 +148,8 @@ def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLD
         found.append(Fault("jitter", faults.jitter_z, (jitter,), faults.jitter_um**2))
     band = faults.band
     narrow = band.z > thresholds.strong_z and band.narrow and not (band.mains or cyclic)
-    if narrow and band.size_um**2 > thresholds.minor_share / 3 * total:
+    # Up to its own size rounding makes lines, too, where a motion is even.
+    if narrow and band.size_um**2 > max(thresholds.minor_share / 3 * total, step**2 / 12):
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"
         size_of_band = "amplitude_um", band.size_um, band.sd_um, "um"
         found.append(Fault("band", band.z, (size_of_band, middle), band.size_um**2))

@@ -219,14 +219,14 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
             if not end[-1].determined(thresholds.determined_z, False, alone):
                 continue
             # What it explains is lost where all is fitted together, or it explains less than its score promised.
-            z = float(standard_deviations(drop, end[-1].freedom - model.freedom))
+            new = end[-1].laws[len(one.causes) :]
+            z = float(standard_deviations(drop, sum(law.size for law in new)))
             if model.cost - end[-1].cost < thresholds.minor_share * drop or z <= bars[rival.form]:
                 continue
             if one.family.p(z / sigma) >= false_alarm:
                 continue
             rivals = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
-            new = len(end[-1].laws) - len(one.causes)
-            causes = [Cause(rival.name, z, one.family.p(z), rivals, drop / new)] * new
+            causes = [Cause(rival.name, z, one.family.p(z), rivals, drop / len(new))] * len(new)
             found.append(Explanation.of((*one.causes, *causes), end, search))
         if found:
             return _that_every_rig_has(found, bench)
