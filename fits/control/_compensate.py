@@ -55,6 +55,9 @@ def compensate(
     if (plain := whole.plain_of(model)) is not model:
         without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
         return _beside_effects(model, plain, reference, initial, without)
+    stage = whole.plain_stage_of(model)
+    if way == "static" and stage is not None:
+        return compensate_plain(stage, reference, initial, clip, limits_V)
     law = plain_loop_of(whole.static_equivalent(model))
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":

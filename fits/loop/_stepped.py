@@ -28,19 +28,28 @@ def even_interval_s(time_s: np.ndarray) -> float | None:
     return step if off <= 1e-3 * step else None
 
 
-def stepped(record: Record, steps: int, hold: str) -> tuple[np.ndarray, np.ndarray]:
-    """Divide the intervals of a record, and one more in which its command stays: intervals and command.
+def intervals(time_s: np.ndarray) -> np.ndarray:
+    """Intervals between times, `(n - 1,)`, or `(1,)` where they differ by rounding of the largest time alone."""
+    each = np.diff(time_s)
+    mean = float(time_s[-1] - time_s[0]) / max(len(each), 1) or 1.0
+    rounding = 4 * np.finfo(float).eps * max(abs(time_s[0]), abs(time_s[-1]))
+    return np.array([mean]) if np.all(np.abs(each - mean) <= rounding) else each
 
-    The command is `(n steps + 1,)` and runs in lines, `first`, or stays until the next sample, `zero`; intervals are
-    `(n steps,)`, or `(1,)` where they are even. What bends at the last sample is known by what comes after it.
+
+def stepped(record: Record, steps: int, hold: str, as_run: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Divide the intervals of a record: these in s, `(m,)`, or `(1,)` where they are even, and the command in V.
+
+    The latter, `(m + 1,)`, runs in lines, `first`, or stays until the next sample, `zero`. `as_run`, as a fit takes a
+    record, a clock that is even but for rounding is even, and the command stays for one more interval: then it is
+    known what bends at the last sample.
     """
-    command_V, step_s = np.append(record.voltage_V, record.voltage_V[-1:]), even_interval_s(record.time_s)
-    if hold == "zero":
-        finer = np.append(np.repeat(command_V[:-1], steps), command_V[-1:])
-    else:
-        share = np.arange(steps) / steps
-        finer = np.append((command_V[:-1, None] + np.diff(command_V)[:, None] * share).ravel(), command_V[-1:])
-    if step_s is not None:
-        return np.array([step_s / steps]), finer
-    each = np.diff(record.time_s)
-    return np.repeat(np.append(each, each.mean()) / steps, steps), finer
+    refuse_many_steps(record, steps)
+    step_s = even_interval_s(record.time_s) if as_run else None
+    each_s = intervals(record.time_s) if step_s is None else np.array([step_s])
+    command_V = record.voltage_V
+    if as_run:
+        command_V = np.append(command_V, command_V[-1:])
+        each_s = each_s if len(each_s) == 1 else np.append(each_s, each_s.mean())
+    share = np.arange(steps) / steps if hold == "first" else np.zeros(steps)
+    finer = (command_V[:-1, None] + np.diff(command_V)[:, None] * share).ravel()
+    return (each_s if len(each_s) == 1 else np.repeat(each_s, steps)) / steps, np.append(finer, command_V[-1:])

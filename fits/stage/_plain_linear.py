@@ -67,6 +67,8 @@ class Linear:
 
         Intervals are `(t,)` or `(1,)`; states are `(n, k)`.
         """
+        if len(self.rest) == 0:
+            return np.zeros_like(change), start
         step, taken = self._advance(interval_s, hold)
         push = -taken[:, :, None] * change[:, None]
         states = recur(step, push, start)
@@ -113,17 +115,6 @@ def recur(step: np.ndarray, push: np.ndarray, start: np.ndarray) -> np.ndarray:
         inside[b] += over[min(b, len(over) - 1)] @ start
         start = inside[b, -1]
     return inside.reshape(-1, n, k)[:count]
-
-
-def intervals(time_s: np.ndarray) -> np.ndarray:
-    """Intervals before each of some times, `(t,)`, the first like the second; or `(1,)` where they are even.
-
-    They are where rounding of the largest time explains what they differ by.
-    """
-    each = np.diff(time_s)
-    mean = float(time_s[-1] - time_s[0]) / max(len(each), 1) or 1.0
-    rounding = 4 * _EPS * max(abs(time_s[0]), abs(time_s[-1]))
-    return np.array([mean]) if np.all(np.abs(each - mean) <= rounding) else np.append(each[:1], each)
 
 
 def _bend(interval_s: np.ndarray, signal: np.ndarray) -> np.ndarray:

@@ -16,9 +16,9 @@ from fits.io._record import Record
 from fits.loop._path import Path
 from fits.loop._plain import PlainLoop, PlainModel, extremes_V
 from fits.loop._prediction import Prediction, refuse_outside
-from fits.loop._stepped import refuse_many_steps, stepped
+from fits.loop._stepped import intervals, stepped
 from fits.loop._surface import Surface
-from fits.stage._plain_linear import Linear, intervals
+from fits.stage._plain_linear import Linear
 from fits.stage._plain_parts import PlainPart
 
 # The imaginary part of a parameter along which derivatives are taken, in units of its coordinate: its square is lost.
@@ -80,12 +80,12 @@ class PlainStage(PlainModel):
         sd_um = np.full(len(record), np.nan)
         if self.uncertainty is not None:
             sd_um = self._sd_um(self.uncertainty, record, initial, progress)
-        return Prediction(self.play(record, initial), sd_um)
+        return Prediction(self._respond(self.parts, record, initial, self.substeps)[:: self.substeps], sd_um)
 
     @np.errstate(all="ignore")
     def play(self, record: Record, initial: str) -> np.ndarray:
         """See `PlainModel`."""
-        return self._respond(self.parts, record, initial, self.substeps)[:: self.substeps]
+        return self._respond(self.parts, record, initial, self.substeps, as_run=False)[:: self.substeps]
 
     @np.errstate(all="ignore")
     def ranges(self, program: Record, displacement_um: np.ndarray, initial: str) -> Ranges:
@@ -100,11 +100,12 @@ class PlainStage(PlainModel):
         between = self._respond(self.parts, program, initial, steps)
         return joined([found, {"displacement": (float(between.min()), float(between.max()))}])
 
-    def _respond(self, parts: Sequence[PlainPart], record: Record, initial: str, steps: int) -> np.ndarray:
+    def _respond(
+        self, parts: Sequence[PlainPart], record: Record, initial: str, steps: int, as_run: bool = True
+    ) -> np.ndarray:
         """Displacement at so many steps between samples, `((n - 1) steps + 1,)`, complex where a parameter is."""
-        refuse_many_steps(record, steps)
         ahead, behind = _around(parts)
-        interval_s, command_V = stepped(record, steps, self.hold)
+        interval_s, command_V = stepped(record, steps, self.hold, as_run)
         voltage, before, hold = _through(ahead, interval_s, command_V, command_V[0], self.hold)
         displacement = self.law.respond(np.append(before, voltage), initial)
         found, _, _ = _through(behind, interval_s, displacement[1:], displacement[0], hold)
@@ -135,11 +136,13 @@ class PlainStage(PlainModel):
     def _columns_um(self, known: Directions, record: Record, initial: str) -> Iterator[np.ndarray]:
         """What perturbations of the hysteresis do to the displacement, some samples at a time, `(samples, k)`."""
         ahead, behind = _around(self.parts)
-        interval_s, command_V = stepped(record, self.substeps, self.hold)
+        interval_s, command_V = stepped(record, self.substeps, self.hold, as_run=True)
         voltage_V, _, _ = _through(ahead, interval_s, command_V, command_V[0], self.hold)
         surface = Surface.of(known.density, known.slope, *known.range_V)
-        # The state before the first sample is one of rest, which no interval changes.
         between_s = intervals(record.time_s)
+        if len(between_s) > 1:
+            # The state before the first sample is one of rest, which no interval changes.
+            between_s = np.append(between_s[:1], between_s)
         states, last, first = np.zeros((len(behind.rest), len(known.mean_um))), None, 0
         for piece in Path.pieces(
             extremes_V(initial, *self.law.range_V), voltage_V[:: self.substeps][: len(record)], _PIECE
