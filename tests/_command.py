@@ -1,5 +1,6 @@
 """Running the `microid` command in tests, and looking at what it writes."""
 
+import json
 import os
 import re
 import subprocess
@@ -7,10 +8,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from click.testing import CliRunner
 from matplotlib.image import imread
 
 from fits.cli._main import cli
+from fits.stage import _plain_file
 
 OFF = {"MICROID_CACHE": "off"}
 
@@ -32,6 +35,25 @@ def without_jax(*arguments, and_without=()):
     )
     assert done.stdout.endswith("set()\n"), done.stderr + done.stdout
     return done
+
+
+def says_the_same_with_jax(monkeypatch, arguments, here):
+    """Run a command that writes a table `here`, and again with JAX: both agree, and so does what they say."""
+    plain = run(*arguments, "--out", here, "--json")
+    rows = columns_of(here) if plain.exit_code == 0 else {}
+    with monkeypatch.context() as patched:
+        patched.setattr(_plain_file, "plain_model", lambda content: None)
+        slow = run(*arguments, "--out", here, "--json")
+    assert (plain.exit_code, plain.stderr) == (slow.exit_code, slow.stderr)
+    if slow.exit_code:
+        return
+    assert rows.keys() == columns_of(here).keys()
+    for name, values in columns_of(here).items():
+        np.testing.assert_allclose(rows[name], values, rtol=0, atol=1e-11 * max(1.0, np.ptp(values)))
+    said, expected = json.loads(plain.stdout), json.loads(slow.stdout)
+    assert said.keys() == expected.keys()
+    for key, value in expected.items():
+        assert said[key] == (pytest.approx(value, rel=1e-9, abs=1e-9) if isinstance(value, float) else value)
 
 
 def files(folder):

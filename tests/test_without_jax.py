@@ -1,11 +1,9 @@
 """`simulate` and static `compensate` of a hysteresis in NumPy: against JAX, against relays, and never with JAX."""
 
-import json
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _command import columns_of, run, without_jax
+from _command import says_the_same_with_jax, without_jax
 from _models import (
     LEVELS,
     compiled,
@@ -22,7 +20,6 @@ from _reference import branches, play_relays, relay_weights_um
 import microid as m
 from fits import DataError, Record, Uncertainty, predict, save_model
 from fits.io._model_text import read_model_text
-from fits.loop import _plain_file
 from fits.loop._design import Grid
 from fits.loop._path import Path
 from fits.loop._plain_file import plain_loop
@@ -178,21 +175,7 @@ def test_the_commands_say_the_same_without_jax(rng, file, tmp_path, monkeypatch)
     ]
     here = tmp_path / "y.csv"
     for arguments in asked:
-        plain = run(*arguments, "--out", here, "--json")
-        rows = columns_of(here) if plain.exit_code == 0 else {}
-        with monkeypatch.context() as patched:
-            patched.setattr(_plain_file, "plain_loop", lambda content: None)
-            slow = run(*arguments, "--out", here, "--json")
-        assert (plain.exit_code, plain.stderr) == (slow.exit_code, slow.stderr)
-        if slow.exit_code:
-            continue
-        assert rows.keys() == columns_of(here).keys()
-        for name, values in columns_of(here).items():
-            np.testing.assert_allclose(rows[name], values, rtol=0, atol=1e-11 * max(1.0, np.ptp(values)))
-        said, expected = json.loads(plain.stdout), json.loads(slow.stdout)
-        assert said.keys() == expected.keys()
-        for key, value in expected.items():
-            assert said[key] == (pytest.approx(value, rel=1e-9, abs=1e-9) if isinstance(value, float) else value)
+        says_the_same_with_jax(monkeypatch, arguments, here)
 
 
 def test_jax_and_pandas_are_not_imported(file, tmp_path):

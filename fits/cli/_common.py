@@ -262,25 +262,25 @@ def stage_or_preisach(path: str, loaded: "late.ModelFile") -> "late.Preisach | l
     raise DataError(f"{path}: expected a Preisach model, found a {type(loaded.model).__name__}; fit one first.")
 
 
-def opened(path: str, plain: bool = True) -> "late.ModelFile | late.PlainLoop":
-    """Read a model: without JAX where `plain_loop` can, and what is asked for is plain."""
+def opened(path: str, plain: bool = True) -> "late.ModelFile | late.PlainModel":
+    """Read a model: without JAX where `plain_model` can, and what is asked for is plain."""
     content = late.read_model_text(path)
-    loop = late.plain_loop(content) if plain else None
-    if loop is not None:
-        return loop
+    found = late.plain_model(content) if plain else None
+    if found is not None:
+        return found
     late.start_jax()
     return late.load_model(path)
 
 
 def predicted_by(
     path: str,
-    loaded: "late.ModelFile | late.PlainLoop",
+    loaded: "late.ModelFile | late.PlainModel",
     program: "late.Record",
     initial: str,
     progress: Callable[[str], None] = lambda _: None,
 ) -> "late.Prediction":
     """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""
-    if isinstance(loaded, late.PlainLoop):
+    if isinstance(loaded, late.PlainModel):
         return loaded.predict(program, initial, progress)
     model = stage_or_preisach(path, loaded)
     if loaded.uncertainty is None and isinstance(model, late.Preisach):

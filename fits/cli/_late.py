@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from fits.control._compensate import compensate
     from fits.control._compensate_stage import static_equivalent
     from fits.control._export_c import export_c
-    from fits.control._follow import compensate_loop
+    from fits.control._follow import compensate_plain
     from fits.control._gains import read_gains
     from fits.control._make import Loop, Maker
     from fits.control._setup import setup
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fits.io._inspect import inspect_table
     from fits.io._jax_setup import start_jax
     from fits.io._json import strict
-    from fits.io._limits import allowed, check_command, joined, measured_ranges, parse_limits, ranges_json, reached_in
+    from fits.io._limits import allowed, check_command, joined, parse_limits, ranges_json, reached_in
     from fits.io._model_text import read_model_text
     from fits.io._quantity import Quantity
     from fits.io._read_csv import read_reference, read_runs, read_table
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from fits.io._record import Record
     from fits.io._units import parse_columns
     from fits.loop._fit import fit
-    from fits.loop._plain import PlainLoop
-    from fits.loop._plain_file import plain_loop
+    from fits.loop._plain import PlainModel
     from fits.loop._prediction import Prediction
     from fits.loop._report import fit_report
     from fits.loop._report_words import describe
@@ -58,6 +57,7 @@ if TYPE_CHECKING:
     from fits.stage._fit_slow import fit_slow
     from fits.stage._model_file import ModelFile, load_model, model_text
     from fits.stage._motion import predicted_ranges
+    from fits.stage._plain_file import plain_model
     from fits.stage._uncertainty import draw_plants, predict
     from fits.sweeps._run import run_sweep
     from fits.sweeps._show import describe_sweep, summarise

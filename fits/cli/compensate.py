@@ -1,6 +1,5 @@
 """The command `microid compensate`: its options, and the work."""
 
-from dataclasses import replace
 from typing import Any
 
 import click
@@ -43,7 +42,7 @@ def compensate(given: common.Given) -> None:
     wanted = late.read_reference(given.reference, **common.reading(given))
     every = bool({"velocity", "acceleration", "current"} & set(stated))
     loaded = common.opened(given.model, plain=given.way == "static" and not (every or given.plots))
-    stage: Any = loaded if isinstance(loaded, late.PlainLoop) else common.stage_or_preisach(given.model, loaded)
+    stage: Any = loaded if isinstance(loaded, late.PlainModel) else common.stage_or_preisach(given.model, loaded)
     if given.way == "dynamic" and isinstance(stage, late.Preisach):
         raise DataError(
             f"{given.model}: expected a model with mechanics for --dynamic, found a Preisach model, which has none; "
@@ -52,11 +51,11 @@ def compensate(given: common.Given) -> None:
     with file_set() as made:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         asked = stage, wanted, given.initial, given.clip, volts
-        plain = isinstance(stage, late.PlainLoop)
-        found = late.compensate_loop(*asked) if plain else late.compensate(*asked, given.way)
+        plain = isinstance(stage, late.PlainModel)
+        found = late.compensate_plain(*asked) if plain else late.compensate(*asked, given.way)
         program = late.Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
         if plain:
-            predicted = late.measured_ranges(replace(program, displacement_um=found.displacement_um))
+            predicted = stage.ranges(program, found.displacement_um, given.initial)
         else:
             predicted = late.predicted_ranges(stage, program, found.displacement_um, given.initial, every)
         said = late.check_command(wanted.source, predicted, late.reached_in(loaded.report), stated, given.margin)
@@ -79,7 +78,7 @@ def compensate(given: common.Given) -> None:
         "clipped": int(found.clipped.sum()),
         "voltage_min_V": float(found.voltage_V.min()),
         "voltage_max_V": float(found.voltage_V.max()),
-        "offset_um": float((stage if plain else late.static_equivalent(stage)).offset_um),
+        "offset_um": float((stage.static if plain else late.static_equivalent(stage)).offset_um),
         "error_max_um": float(off.max()),
         "error_max_within_reach_um": float(off[~found.clipped].max(initial=0.0)),
         "displacement_sd_median_um": None if sd_um is None else float(np.median(sd_um)),

@@ -23,16 +23,16 @@ def export(given: common.Given) -> None:
     The header and the source need no library and allocate nothing.
     """
     loaded, limits_V = common.opened(given.model), common.parse_limits_V(given.limits)
-    law: Any = loaded
+    if isinstance(loaded, late.PlainModel):
+        model: Any = loaded
+        law: Any = loaded.static
+    else:
+        model = common.stage_or_preisach(given.model, loaded)
+        law = late.static_equivalent(model)
     remarks = list[str]()
-    if not isinstance(loaded, late.PlainLoop):
-        stage = common.stage_or_preisach(given.model, loaded)
-        law = late.static_equivalent(stage)
-        if isinstance(stage, late.Stage):
-            # The inverse of mechanics needs the samples to come, which a controller does not have.
-            remarks = [
-                "the files hold the hysteresis with the static gains of the stage; what moves in it is left out."
-            ]
+    if law is not model:
+        # The inverse of mechanics needs the samples to come, which a controller does not have.
+        remarks = ["the files hold the hysteresis with the static gains of the stage; what moves in it is left out."]
     made = late.export_c(law, given.out, given.name, size=given.memory, limits_V=limits_V)
     files = [str(file) for file in made]
     lines = [*(f"Note: {remark}" for remark in remarks), *files]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.control import _compensate_stage as whole
-from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, compensate_loop, follow, within_range
+from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, compensate_plain, follow, within_range
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
 from fits.loop._plain import PlainLoop
@@ -51,10 +51,13 @@ def compensate(
     if isinstance(model, Preisach):
         if way == "dynamic":
             raise DataError("expected a stage for --dynamic, found a Preisach model, which has no mechanics.")
-        return compensate_loop(plain_loop_of(model), reference, initial, clip, limits_V)
+        return compensate_plain(plain_loop_of(model), reference, initial, clip, limits_V)
     if (plain := whole.plain_of(model)) is not model:
         without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
         return _beside_effects(model, plain, reference, initial, without)
+    stage = whole.plain_stage_of(model)
+    if way == "static" and stage is not None:
+        return compensate_plain(stage, reference, initial, clip, limits_V)
     law = plain_loop_of(whole.static_equivalent(model))
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":

@@ -9,7 +9,10 @@ import microid
 from fits.io._errors import DataError
 from fits.io._length import length
 from fits.io._record import Record
+from fits.loop._plain import PlainModel
 from fits.loop._run import initial_state, prepare_run, simulate_run
+from fits.stage._encode import encode
+from fits.stage._plain_file import plain_model
 from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Reversible, Stage, Start, innermost
 
 # Doubt about the displacement needed, or a start in motion, that is worth a remark: a fraction of the span.
@@ -64,6 +67,14 @@ def gains_of(stage: Stage) -> tuple[float, float, float]:
 @eqx.filter_jit
 def _at_rest(part: AbstractLinear) -> tuple[Float[Array, ""], Float[Array, ""]]:
     return part.static_gain, part.system().offset
+
+
+def plain_stage_of(stage: Stage) -> PlainModel | None:
+    """The same stage in NumPy, without its uncertainty; None where that has no form for one of its parts."""
+    try:
+        return plain_model({"model": encode(stage), "uncertainty": None, "fit": {}})
+    except DataError:
+        return None
 
 
 def static_equivalent(model: Preisach | Stage) -> Preisach:
@@ -136,6 +147,8 @@ def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.
     lower, upper = float(law.density.lower_V), float(law.density.upper_V)
     if isinstance(model, Preisach):
         return simulate_run(model, prepare_run(record, (lower, upper), initial, 1.0))
+    if (plain := plain_stage_of(model)) is not None:
+        return plain.play(record, initial)
     n = len(record)
     step_s = record.duration_s / max(n - 1, 1) or 1.0
     # Even times are given as the one interval between them: that takes half as long to compile.

@@ -6,7 +6,7 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
-from fits.loop._plain import PlainLoop, extremes_V
+from fits.loop._plain import PlainLoop, PlainModel, extremes_V
 
 # Short of an end of its range by this fraction of it, a reference is still within reach: files round.
 _SLACK = 1e-9
@@ -84,13 +84,14 @@ def binding(law: PlainLoop, limits: tuple[float, float]) -> str:
     return f"the voltage is limited to {low:g} to {high:g} V"
 
 
-def compensate_loop(
-    law: PlainLoop, reference: Reference | Record, initial: str, clip: bool, limits_V: tuple[float, float] | None
+def compensate_plain(
+    model: PlainModel, reference: Reference | Record, initial: str, clip: bool, limits_V: tuple[float, float] | None
 ) -> Compensation:
-    """Find the voltage whose displacement under a hysteresis alone is the reference; see `compensate`."""
-    wanted = np.asarray(reference.displacement_um)
+    """Find the voltage whose displacement by the hysteresis of a model is the reference; see `compensate`."""
+    law, wanted = model.static, np.asarray(reference.displacement_um)
     voltage, clipped = follow(law, reference, wanted, initial, clip, within_range(law.range_V, limits_V))
-    return Compensation(voltage, law.respond(voltage, initial), wanted, clipped)
+    program = Record(reference.time_s, voltage, None, source=reference.source)
+    return Compensation(voltage, model.play(program, initial), wanted, clipped)
 
 
 def within_range(range_V: tuple[float, float], limits_V: tuple[float, float] | None) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from functools import reduce
 
 import jax
 import numpy as np
-from scipy.linalg import cho_solve
+import scipy
 
 from fits.loop._moments import Data, Moments, blocks_of
 from fits.loop._prior import (
@@ -190,7 +190,7 @@ def _marginal(posterior: Posterior, which: np.ndarray) -> tuple[np.ndarray, np.n
     """Covariance of all columns with the chosen ones, which ascend, and the posterior of those alone, scaled."""
     rows = np.zeros((len(posterior.mean), len(which)))
     rows[which, np.arange(len(which))] = 1.0
-    spread = cho_solve((posterior.root, True), rows)
+    spread = scipy.linalg.cho_solve((posterior.root, True), rows)
     # With the chosen ones last, the end of the Cholesky factor is that of their marginal precision. The inverse of
     # their covariance would be the same, but for rounding, which may leave it indefinite.
     last = np.argsort(rows.sum(axis=1), kind="stable")
@@ -255,4 +255,4 @@ def cross_validate(
 
 def _expected_square(posterior: Posterior, block: Moments) -> float:
     """Sum over a block of the variances that the posterior gives its predictions."""
-    return float(np.trace(cho_solve((posterior.root, True), block.gram)))
+    return float(np.trace(scipy.linalg.cho_solve((posterior.root, True), block.gram)))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from fits.io._record import Record
 from fits.loop._run import Run
@@ -154,7 +154,7 @@ def outlying(residual_um: np.ndarray, fitted: np.ndarray) -> np.ndarray:
 
 
 def _height(residual_um: np.ndarray) -> np.ndarray:
-    return np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
+    return np.abs(residual_um - scipy.ndimage.median_filter(residual_um, 7, mode="nearest"))
 
 
 def impulses(run: Run, residual_um: np.ndarray, robust: bool) -> list[str]:
@@ -183,18 +183,18 @@ def without_impulses(record: Record) -> Record:
     bad = impulsive(reading, quantum_um(reading))
     if bad.sum() < _FEW:
         return record
-    mended = np.where(bad, median_filter(reading, 7, mode="nearest"), reading)
+    mended = np.where(bad, scipy.ndimage.median_filter(reading, 7, mode="nearest"), reading)
     return replace(record, displacement_um=mended)
 
 
 def impulsive(residual_um: np.ndarray, digit_um: float = 0.0) -> np.ndarray:
     """Mark readings that are far off their neighbours, in last digits, too, shape `(n,)`."""
     off = _height(residual_um)
-    spread = np.maximum(median_filter(off, 101, mode="nearest"), max(float(np.median(off)), digit_um))
+    spread = np.maximum(scipy.ndimage.median_filter(off, 101, mode="nearest"), max(float(np.median(off)), digit_um))
     far = off > 8.0 * 1.4826 * spread + 1e-300  # eight standard deviations
     # What rings, or turns back, goes on as fast as it came: its neighbours move about as far from sample to sample.
     steps = np.abs(np.diff(residual_um, append=residual_um[-1]))
-    far &= off > 4.0 * median_filter(steps, 33, mode="nearest")
+    far &= off > 4.0 * scipy.ndimage.median_filter(steps, 33, mode="nearest")
     for first, stop in stretches(far):
         if stop - first > 3:  # more do not jump back
             far[first:stop] = False

@@ -16,6 +16,7 @@ class Path:
     """Extremes of the memory to begin with, `lead` of them, and what follows; see `microid.Memory`.
 
     A branch to each entry hangs from its anchor, and is rising or not. `depth` counts the anchors back to the first.
+    Values may be complex: what is remembered is decided by their real parts.
     """
 
     values: np.ndarray
@@ -28,8 +29,8 @@ class Path:
     def of(cls, before: np.ndarray, then: Sequence[float] | np.ndarray = ()) -> Self:
         """Find the extreme that each branch hangs from, with a stack (Madelung's rules), from turn to turn."""
         values = np.append(before, then)
-        count, path = len(values), values.tolist()
-        moves = np.append(0.0, np.sign(np.diff(values)))
+        count, path = len(values), values.real.tolist()
+        moves = np.append(0.0, np.sign(np.diff(values.real)))
         # An entry that does not move belongs to the branch of the one before it; the first is a rising one.
         latest = np.maximum.accumulate(np.where(moves != 0, np.arange(count), 0))
         rising = moves[latest] >= 0

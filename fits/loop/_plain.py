@@ -4,13 +4,15 @@ The algorithm is that of `Everett`, `remember` and `invert` in `microid`. The la
 outputs counts operators that share a grid.
 """
 
+import abc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from fits.io._errors import DataError
+from fits.io._limits import Ranges, measured_ranges
 from fits.io._record import Record
 from fits.loop._path import Path
 from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, refuse_outside, too_deep
@@ -59,14 +61,43 @@ class Perturbations:
         return np.sqrt(np.maximum(total, 0.0))
 
 
+class PlainModel(abc.ABC):
+    """A model that does without JAX; its `uncertainty` may be None, and `report` is that of its file."""
+
+    uncertainty: Any
+    report: Mapping[str, Any]
+
+    @property
+    @abc.abstractmethod
+    def static(self) -> "PlainLoop":
+        """The hysteresis between command and sensor, as slow commands see it."""
+
+    @abc.abstractmethod
+    def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
+        """Predict the displacement of a voltage program; see `fits.predict`."""
+
+    @abc.abstractmethod
+    def play(self, record: Record, initial: str) -> np.ndarray:
+        """Displacement under the voltage of a record, `(n,)`, in um; a `DataError` where it nests too deeply."""
+
+    @abc.abstractmethod
+    def ranges(self, program: Record, displacement_um: np.ndarray, initial: str) -> Ranges:
+        """What a command is, and makes the model do, whose displacement at the samples, `(n,)`, is known."""
+
+
 @dataclass(frozen=True)
-class PlainLoop:
+class PlainLoop(PlainModel):
     """A hysteresis, and what its model file says beside; see `microid.Preisach` and `fits.ModelFile`."""
 
     surface: Surface
     offset_um: float
     uncertainty: Perturbations | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def static(self) -> "PlainLoop":
+        """The hysteresis itself."""
+        return self
 
     @property
     def range_V(self) -> tuple[float, float]:
@@ -80,13 +111,21 @@ class PlainLoop:
         return self.offset_um, self.offset_um + float(self.surface.respond(saturated)[0, 0])
 
     def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
-        """Predict the displacement of a voltage program; see `fits.predict`."""
+        """See `PlainModel`."""
         refuse_outside(record, *self.range_V)
         path = self._path(record.voltage_V, initial)
         sd_um = np.full(len(record), np.nan)
         if self.uncertainty is not None:
             sd_um = self.uncertainty.sd_um(path, progress)
         return Prediction(self._respond(path), sd_um)
+
+    def play(self, record: Record, initial: str) -> np.ndarray:
+        """See `PlainModel`."""
+        return self.respond(record.voltage_V, initial)
+
+    def ranges(self, program: Record, displacement_um: np.ndarray, initial: str) -> Ranges:
+        """See `PlainModel`: a hysteresis does nothing between the samples."""
+        return measured_ranges(replace(program, displacement_um=displacement_um))
 
     def respond(self, voltage_V: np.ndarray, initial: str) -> np.ndarray:
         """Displacement along a voltage, `(n,)`, in um; a `DataError` where it nests too deeply."""

@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from fits.loop._surface import Surface, spread
 
 # What is larger in size is refused where JAX reads it.
 _LARGEST, _FINEST = 1e30, 1000
+# What is raised by anything that is not as `microid fit` writes it.
+ODD = (LookupError, TypeError, ValueError, AttributeError)
 
 
 def plain_loop(content: Mapping[str, Any]) -> PlainLoop | None:
@@ -20,56 +23,75 @@ def plain_loop(content: Mapping[str, Any]) -> PlainLoop | None:
     its uncertainty, as `microid fit` writes it, and where anything is odd.
     """
     try:
-        density, reversible, offset = _fields(content["model"], "Preisach", "density", "reversible", "offset_um")
-        packed, *ends = _fields(density, "GridDensity", "packed_um", "lower_V", "upper_V")
-        slope, *others = _fields(reversible, "Reversible", "slope_um_per_V", "lower_V", "upper_V")
+        law = read_law(content["model"])
         known = content["uncertainty"], "Uncertainty", "columns_um", "offset_um", "discrepancy_um", "grid"
-        columns, offsets, discrepancy, grid = _fields(*known)
-        *grid_ends, levels = _fields(grid, "Grid", "lower_V", "upper_V", "levels")
-        weights_um, slope_um_per_V = _array(packed, 1, "um", 0.0), _array(slope, 1, "um/V", 0.0)
-        lower_V, upper_V, *_ = (float(_array(end, 0)) for end in (*ends, *others))
-        grid_V = float(_array(grid_ends[0], 0)), float(_array(grid_ends[1], 0))
-        offset_um, columns_um, offsets_um = float(_array(offset, 0, "um")), _array(columns, 2), _array(offsets, 1)
-        discrepancy_um, count = float(_array(discrepancy, 0)), len(columns_um)
-        own, size = np.tril_indices(len(slope_um_per_V)), levels * (levels + 1) // 2
-        if not (
-            len(slope_um_per_V) == 1 + own[0][-1]
-            and len(weights_um) == len(own[0])
-            and len(offsets_um) == count > 0
-            and 2 <= levels <= _FINEST
-            and columns_um.shape[1] == size + levels
-        ):
+        columns, offsets, discrepancy, grid = fields_of(*known)
+        columns_um, offsets_um = array_of(columns, 2, packed=True), array_of(offsets, 1)
+        moved = read_directions(columns_um, grid)
+        if not len(offsets_um) == len(columns_um) > 0:
             return None
-    except (LookupError, TypeError, ValueError, AttributeError):
+        uncertainty = Perturbations(*moved, offsets_um, float(array_of(discrepancy, 0)))
+    except ODD:
         return None
+    return replace(law, uncertainty=uncertainty, report=content["fit"])
+
+
+def read_law(item: Mapping[str, Any]) -> PlainLoop:
+    """A Preisach operator on a grid, without an uncertainty; one of the exceptions `ODD` where it is another part."""
+    density, reversible, offset = fields_of(item, "Preisach", "density", "reversible", "offset_um")
+    packed, *ends = fields_of(density, "GridDensity", "packed_um", "lower_V", "upper_V")
+    slope, *others = fields_of(reversible, "Reversible", "slope_um_per_V", "lower_V", "upper_V")
+    weights_um, slope_um_per_V = array_of(packed, 1, "um", 0.0), array_of(slope, 1, "um/V", 0.0)
+    lower_V, upper_V, *_ = (float(array_of(end, 0)) for end in (*ends, *others))
+    levels = len(slope_um_per_V)
+    if not (levels >= 2 and len(weights_um) == levels * (levels + 1) // 2 and lower_V < upper_V):
+        raise ValueError("no grid")
     with np.errstate(all="ignore"):
-        weights = (weights_um / _node_areas(len(slope_um_per_V))[own])[:, None]
-        nodes = spread(weights, len(slope_um_per_V)) / (upper_V - lower_V) ** 2
+        weights = (weights_um / _node_areas(levels)[np.tril_indices(levels)])[:, None]
+        nodes = spread(weights, levels) / (upper_V - lower_V) ** 2
         surface = Surface.of(nodes, slope_um_per_V[:, None], lower_V, upper_V)
-        range_V = grid_V[1] - grid_V[0]
-        moved = spread(columns_um[:, :size].T, levels) / range_V**2, columns_um[:, size:].T / range_V
-    sound = all(np.isfinite(one).all() for one in (surface.window_um, surface.branch_um, *moved))
-    if not (lower_V < upper_V and range_V > 0 and sound):
-        return None
-    uncertainty = Perturbations(*moved, grid_V, offsets_um, discrepancy_um)
-    return PlainLoop(surface, offset_um, uncertainty, content["fit"])
+    if not (np.isfinite(surface.window_um).all() and np.isfinite(surface.branch_um).all()):
+        raise ValueError("too large")
+    return PlainLoop(surface, float(array_of(offset, 0, "um")))
 
 
-def _fields(item: Mapping[str, Any], kind: str, *names: str) -> list[Any]:
+def read_directions(
+    columns_um: np.ndarray, grid: Mapping[str, Any]
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Densities and slopes of perturbations, `(k, D)`, as `Surface.of` takes them, and the range of their grid."""
+    *ends, levels = fields_of(grid, "Grid", "lower_V", "upper_V", "levels")
+    lower_V, upper_V = (float(array_of(end, 0)) for end in ends)
+    size = levels * (levels + 1) // 2
+    if not (2 <= levels <= _FINEST and columns_um.shape[1] == size + levels and lower_V < upper_V):
+        raise ValueError("another grid")
+    range_V = upper_V - lower_V
+    with np.errstate(all="ignore"):
+        density, slope = spread(columns_um[:, :size].T, levels) / range_V**2, columns_um[:, size:].T / range_V
+    if not (np.isfinite(density).all() and np.isfinite(slope).all()):
+        raise ValueError("too large")
+    return density, slope, (lower_V, upper_V)
+
+
+def fields_of(item: Mapping[str, Any], kind: str, *names: str) -> list[Any]:
     """Fields of a part of a kind; a `ValueError` where it is another, or has others."""
     if item["type"] != kind or set(item) != {"type", *names}:
         raise ValueError(kind)
     return [item[name] for name in names]
 
 
-def _array(item: Mapping[str, Any], axes: int, unit: str | None = None, least: float = -_LARGEST) -> np.ndarray:
-    """Numbers of a field in float64; a `ValueError` where they are not as `microid fit` writes them."""
-    if set(item) == {"unit", "shape", "float64_base64"}:
+def array_of(
+    item: Mapping[str, Any], axes: int, unit: str | None = None, least: float = -_LARGEST, packed: bool = False
+) -> np.ndarray:
+    """Numbers of a field in float64; a `ValueError` where they are not as `microid fit` writes them.
+
+    Only what may be `packed` may be in base64.
+    """
+    if packed and set(item) == {"unit", "shape", "float64_base64"}:
         data = base64.b64decode(item["float64_base64"], validate=True)
         array = np.frombuffer(data, "<f8").reshape(item["shape"])
     else:
         array = np.asarray(item["value"])
-    plain = set(item) == {"unit", "value"} or axes == 2
+    plain = packed or set(item) == {"unit", "value"}
     sized = array.dtype.kind in "if" and array.ndim == axes and np.all((array >= least) & (array <= _LARGEST))
     if not (plain and sized and unit in (None, item["unit"])):
         raise ValueError("another form")

@@ -18,12 +18,11 @@ from fits.loop._design import Grid, columns_of
 from fits.loop._past import past_columns
 from fits.loop._path import Path
 from fits.loop._plain import extremes_V, path_of
+from fits.loop._stepped import even_interval_s, refuse_many_steps
 from fits.loop._surface import Surface
 
 # Room for the extremes of a memory, and along the runs of a stage: filtered multisines nest deeply.
 _EXTREMES, _EXTREMES_OF_STAGE = 64, 512
-# A hundred arrays of so many values are 8 GB.
-_MOST_STEPS = 10_000_000
 # Samples that a run must leave to fit.
 _FEWEST = 50
 # Samples that a shorter run is padded to, so that runs of many lengths share what is compiled.
@@ -64,15 +63,6 @@ def staircase(extremes_V: np.ndarray, size: int) -> m.Staircase:
 @eqx.filter_jit
 def _refined(voltage_V: Float[Array, " n"], stride: int, hold: m.Hold) -> Float[Array, " m"]:
     return m.refined(jnp.ones(()), voltage_V, stride, hold)[1]
-
-
-def refuse_many_steps(record: Record, stride: int) -> None:
-    """Refuse, in a `DataError`, what would not fit into the memory."""
-    if stride * len(record) > _MOST_STEPS:
-        raise DataError(
-            f"{record.source}: expected at most {_MOST_STEPS:,} steps, found {len(record):,} samples of {stride} "
-            "substeps each; split the record, or use a model of fewer substeps"
-        )
 
 
 @dataclass(frozen=True)
@@ -144,14 +134,14 @@ class Run:
         refuse_many_steps(record, stride)
         n, time_s = len(record), record.time_s
         pad = (0, max(_SHORTEST, 1 << (n - 1).bit_length()) - n)
-        step = (time_s[-1] - time_s[0]) / (n - 1)
+        step = even_interval_s(time_s)
         share = np.arange((n + pad[1] - 1) * stride + 1) / stride
         voltage = jnp.asarray(np.pad(record.voltage_V, pad, mode="edge"))
-        # So near to those of an even clock, instants were taken by one: the time was rounded when it was written.
-        if np.max(np.abs(time_s - time_s[0] - step * np.arange(n))) <= 1e-3 * step:
+        if step is not None:
             time: Any = np.asarray(step / stride)
         else:
-            longer = np.concatenate([time_s, time_s[-1] + step * np.arange(1, pad[1] + 1)])
+            more_s = np.diff(time_s).mean() * np.arange(1, pad[1] + 1)
+            longer = np.concatenate([time_s, time_s[-1] + more_s])
             time = np.interp(share, np.arange(n + pad[1]), longer)
         measured = np.zeros(n) if record.displacement_um is None else record.displacement_um
         beside = {name: np.interp(share, np.arange(n), v) for name, v in columns_beside(record).items()}

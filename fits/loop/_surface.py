@@ -93,10 +93,10 @@ class Surface:
         return self.branch_um.shape[1] // 2
 
     def place(self, voltage_V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Interval and fraction of it, at most those of the ends of the range."""
+        """Interval and fraction of it, at most those of the ends of the range; complex voltages have one, too."""
         scale = self.intervals / (self.upper_V - self.lower_V)
         x = (np.clip(voltage_V, self.lower_V, self.upper_V) - self.lower_V) * scale
-        interval = np.minimum(x.astype(int), self.intervals - 1)
+        interval = np.minimum(x.real.astype(int), self.intervals - 1)
         return interval, x - interval
 
     def over(self, voltage_V: np.ndarray) -> np.ndarray:
@@ -125,7 +125,7 @@ class Surface:
         for first in range(0, len(visits.interval), length := max(_VALUES // columns, 1)):
             which = slice(first, first + length)
             interval, up, anchor = visits.interval[which], visits.rising[which], visits.anchor[which]
-            out = self.branch_um[:, np.where(up, interval, interval + self.intervals)]
+            out = self.branch_um[:, np.where(up, interval, interval + self.intervals)].astype(s.dtype, copy=False)
             for power, one in enumerate(self._squares(interval, up, i[anchor], s[anchor])):
                 out[power] += one
             out[0] += total[anchor]

@@ -16,7 +16,8 @@ from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
 from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, RunReport
-from fits.loop._run import Progress, Run, prepare_run, refuse_many_steps
+from fits.loop._run import Progress, Run, prepare_run
+from fits.loop._stepped import refuse_many_steps
 from fits.stage._checks import check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import (

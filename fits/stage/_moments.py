@@ -15,7 +15,6 @@ from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
 from fits.loop._run import Run, Samples
 from fits.stage._follow import passes_linearly, propagated
-from fits.stage._motion import prepare, signals
 from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
 from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
 
@@ -205,8 +204,7 @@ def moved_along(
     moved_um: Iterable[np.ndarray] = (columns @ directions[0] for _, columns in pieces(chain, z, run, True))
     if chain.place is not None and not passes_linearly(stage := chain.stage(z, columns_um), chain.place):
         # What is not linear needs all of a record at a time.
-        around_um = np.asarray(signals(stage, prepare(stage, run))[chain.place + 1].values)
-        around_um = around_um[:: run.samples.stride][: len(run.record)]
+        around_um = np.asarray(ahead(stage, chain.place + 1, run.samples))[:: run.samples.stride][: len(run.record)]
         whole_um = np.concatenate([*moved_um])
         whole_um = propagated(chain.coordinates, chain.place, z, run, around_um, whole_um)
         moved_um = (whole_um[first : first + _PIECE] for first in range(0, len(whole_um), _PIECE))

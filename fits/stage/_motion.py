@@ -1,6 +1,5 @@
 """What a command makes a stage do, between its samples as well: voltage at the piezo, displacement, derivatives."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -12,7 +11,8 @@ import numpy as np
 from fits.io._limits import Ranges, joined, measured_ranges
 from fits.io._record import Record
 from fits.loop._run import Run, prepare_run
-from fits.stage._run import as_stage, place_of_hysteresis, range_of
+from fits.stage._plain_stage import fine_steps
+from fits.stage._run import as_stage, gain_ahead, place_of_hysteresis, range_of
 from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
 
 
@@ -46,16 +46,6 @@ def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
     return found
 
 
-def fine_steps(stage: Stage, interval_s: float, count: int) -> int:
-    """Steps between samples that show how a stage rings."""
-    resonances = [float(p.natural_frequency_Hz) for p in map(innermost, stage.parts) if isinstance(p, Mechanics)]
-    # Of 16 steps in a period a sampled sine misses less than 2 % of its peak.
-    wanted = max((interval_s * 16 * f for f in resonances), default=1.0)
-    # In powers of two, so that few programs are compiled; what rings between samples that are so far apart that the
-    # run has more steps in all has died away.
-    return int(2 ** math.ceil(math.log2(min(max(wanted, 1.0), max((1 << 18) / count, 1.0)))))
-
-
 def motion(
     stage: Stage, record: Record, range_V: tuple[float, float], initial: str = "unknown"
 ) -> tuple[Ranges, np.ndarray]:
@@ -65,9 +55,9 @@ def motion(
     the switching voltages, as commands.
     """
     n = len(record)
-    stride = fine_steps(stage, float(np.median(np.diff(record.time_s))), n)
+    stride = _steps(stage, record)
     # Held out as a whole, so that short commands are no error: nothing is fitted.
-    run = prepare_run(record, range_V, initial, 1.0, stride, hold=stage.hold)
+    run = prepare_run(record, range_V, initial, 1.0, stride, gain_ahead(stage), stage.hold)
     found = signals(stage.with_substeps(1), prepare(stage, run))
     last = (n - 1) * stride + 1
     time_s = np.asarray(run.samples.time_s)
@@ -102,10 +92,16 @@ def predicted_ranges(
     if not np.isfinite(range_V[0]):
         # No hysteresis remembers anything of it.
         range_V = _range(program.voltage_V)
-    if not every and fine_steps(stage, float(np.median(np.diff(program.time_s))), len(program)) == 1:
+    if not every and _steps(stage, program) == 1:
         return ranges
     between, _ = motion(stage, program, range_V, initial)
     return joined([between, ranges]) if every else joined([ranges, {"displacement": between["displacement"]}])
+
+
+def _steps(stage: Stage, record: Record) -> int:
+    """Steps between samples that show how a stage rings."""
+    mechanics = (part for part in map(innermost, stage.parts) if isinstance(part, Mechanics))
+    return fine_steps([float(part.natural_frequency_Hz) for part in mechanics], record)
 
 
 def _driven(stage: Stage) -> int:

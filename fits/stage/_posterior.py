@@ -7,8 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.stats import chi2
 
 from fits.io._errors import DataError
 from fits.io._record import Record
@@ -150,7 +150,7 @@ def profile_stage(
     found = np.array([deviance(float(value)) for value in values])
     # Its square root is nearly straight.
     root = np.sign(values - at.value) * np.sqrt(np.maximum(found, 0.0))
-    bound = float(chi2.ppf(0.95, 1)) ** 0.5
+    bound = float(scipy.stats.chi2.ppf(0.95, 1)) ** 0.5
     lower, upper = (float(np.interp(sign * bound, root, values)) for sign in (-1, 1))
     return Profile(name, at.unit, values, found, lower, upper)
 

@@ -148,10 +148,11 @@ def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
 
 @eqx.filter_jit
 def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""] | None = None) -> Float[Array, " m"]:
-    """Voltage at a part after a rest at the first command, or at another, at the refined times, in V, `(m,)`."""
+    """What goes into a part after a rest at the first command, or at another, at the refined times, `(m,)`."""
     signal = m.Signal(samples.voltage_V, samples.voltage_V[0] if rest_V is None else rest_V, stage.hold)
+    scene = m.Scene(signal, samples.beside, samples.start.memory)
     for part in stage.parts[:place]:
-        signal = part.run(samples.time_s, signal)
+        signal = part.run(samples.time_s, signal, scene)
     return signal.values
 
 

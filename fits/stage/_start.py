@@ -7,8 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import signal
-from scipy.optimize import least_squares
+import scipy
 
 from fits.loop._run import Run
 from fits.stage._run import named_parts
@@ -37,8 +36,8 @@ def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
     x, y = (np.interp(even, time, values[piece]) for values in (drive, run.displacement_um))
     rate, length = (len(time) - 1) / (time[-1] - time[0]), max(64, 2 * len(time) // 9)  # eight segments
     settings: dict[str, Any] = {"fs": rate, "nperseg": min(length, len(time)), "detrend": "linear"}
-    frequency, cross = signal.csd(x, y, **settings)
-    power, out = signal.welch(x, **settings)[1], signal.welch(y, **settings)[1]
+    frequency, cross = scipy.signal.csd(x, y, **settings)
+    power, out = scipy.signal.welch(x, **settings)[1], scipy.signal.welch(y, **settings)[1]
     with np.errstate(invalid="ignore", divide="ignore"):
         response, coherence = cross / power, np.abs(cross) ** 2 / (power * out)
     # The lines next to zero hold what the trend leaves.
@@ -77,7 +76,9 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
     # Candidates may be too alike, in the logarithms of their poles, to refine both, or to keep both.
     for x in _distinct(problem.ranked()[1][:200], 0.5)[:4]:
         low, high = problem.bounds()
-        end: Any = least_squares(problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200)
+        end: Any = scipy.optimize.least_squares(
+            problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200
+        )
         found.append((float(end.cost), end.x))
     found.sort(key=lambda item: item[0])
     ends = _distinct([x for _, x in found], 0.05)[:3]

@@ -1,9 +1,10 @@
 """Smooth functions of a few variables: SciPy's quasi-Newton method, ended as Optimistix ends its own."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from scipy.optimize import OptimizeResult, minimize
+import scipy
 
 
 def minimise(
@@ -21,7 +22,7 @@ def minimise(
     """
     before, now = start, value(start)
 
-    def end(intermediate_result: OptimizeResult) -> None:
+    def end(intermediate_result: Any) -> None:
         nonlocal before, now
         x, reached = np.array(intermediate_result.x), float(intermediate_result.fun)
         moved, gained = np.abs(x - before), abs(reached - now)
@@ -34,5 +35,5 @@ def minimise(
         return found if np.isfinite(found) else np.inf
 
     options = {"maxiter": most_steps, "gtol": 0.0}
-    found = minimize(finite, start, jac=slope, method="BFGS", callback=end, options=options)
+    found = scipy.optimize.minimize(finite, start, jac=slope, method="BFGS", callback=end, options=options)
     return np.asarray(found.x)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from fits.io._record import Record
 
@@ -96,6 +96,6 @@ def _regressed(along: np.ndarray, values: np.ndarray) -> tuple[float, float, flo
     edges = np.linspace(along[0], along[-1], _BLOCKS + 1)
     block = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, _BLOCKS - 1)
     x, y = np.array([(along[block == k].mean(), values[block == k].mean()) for k in np.unique(block)]).T
-    line = stats.linregress(x, y)
+    line = scipy.stats.linregress(x, y)
     # Neighbouring blocks err alike: only every other is taken to be of its own.
     return float(line.slope), float(2**0.5 * line.stderr), float(line.rvalue**2)

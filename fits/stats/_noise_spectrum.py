@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, signal
+import scipy
 
 from fits.io._quantity import FloatArray
 
@@ -54,9 +54,9 @@ def find_lines(residual_um: FloatArray, rate_Hz: float, false_alarm: float = 0.0
     each other are one, and one that completes fewer than 20 cycles in the record is not looked for.
     """
     n = len(residual_um)
-    window = signal.windows.blackmanharris(n, sym=False)
+    window = scipy.signal.windows.blackmanharris(n, sym=False)
     # Mean squares of the sines that make up the record, so that a line's bins add up to half its amplitude squared.
-    power = 2 * np.abs(fft.rfft(window * residual_um)) ** 2 / (n * np.sum(window**2))
+    power = 2 * np.abs(scipy.fft.rfft(window * residual_um)) ** 2 / (n * np.sum(window**2))
     chance, floor = _compare(power)
     lines = []
     for i in np.flatnonzero(chance < false_alarm):

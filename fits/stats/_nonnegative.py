@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import lax
 from jaxtyping import Array, Bool, Float
-from scipy.linalg import cho_factor, cho_solve
 
 # Exchanges that may fail to reduce the number of violations before they are made one at a time.
 _PATIENCE = 3
@@ -59,7 +59,7 @@ def pivot_nonnegative(
         free = free ^ wrong
         y = np.zeros_like(start)
         try:
-            y[free] = cho_solve(cho_factor(hessian[np.ix_(free, free)]), -linear[free])
+            y[free] = scipy.linalg.cho_solve(scipy.linalg.cho_factor(hessian[np.ix_(free, free)]), -linear[free])
         except (np.linalg.LinAlgError, ValueError):
             return np.full_like(start, np.nan), False
         violation = np.where(free, -y, -(hessian @ y + linear))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter, rank_filter
+import scipy
 
 from fits.stats._noise import Noise, idle_stretches, learn_noise, rough_noise_um, stretches
 from fits.stats._noise_spectrum import DRIFT, MAINS_Hz
@@ -115,13 +115,15 @@ def spikes(voltage_V: np.ndarray, residual_um: np.ndarray, least_um: float, spik
 
     They are off by `least_um` and `spike_z` standard deviations at least.
     """
-    size = np.abs(residual_um - median_filter(residual_um, 7, mode="nearest"))
-    spread = np.maximum(1.4826 * median_filter(size, 101, mode="nearest"), 1.4826 * float(np.median(size)))
+    size = np.abs(residual_um - scipy.ndimage.median_filter(residual_um, 7, mode="nearest"))
+    spread = np.maximum(
+        1.4826 * scipy.ndimage.median_filter(size, 101, mode="nearest"), 1.4826 * float(np.median(size))
+    )
     far = size > np.maximum(spike_z * spread, least_um + 1e-300)
     # What rings has neighbours as large; what is alone has none, or one of its kind by chance.
     # In two dimensions: in one, SciPy 1.17 takes a footprint with a gap for one without.
     beside = np.abs(np.arange(-_COMPARED_SAMPLES, _COMPARED_SAMPLES + 1))[None] > _MOST_TOGETHER
-    far &= size > 3 * rank_filter(size[None], -2, footprint=beside, mode="nearest")[0]
+    far &= size > 3 * scipy.ndimage.rank_filter(size[None], -2, footprint=beside, mode="nearest")[0]
     change = np.diff(voltage_V, prepend=voltage_V[0])
     turned = np.abs(np.diff(change, append=change[-1])) > _TURNED_SHARE * float(np.ptp(voltage_V))
     moved = (np.abs(change) > _MOVED_SHARE * float(np.ptp(voltage_V))) | turned
