@@ -14,7 +14,7 @@ import microid as m
 from fits import Record
 from fits.loop._misfit import Misfit
 from fits.loop._run import prepare_run
-from fits.stage._checks import refuse_undersampled
+from fits.stage._checks import refuse_slopes, refuse_undersampled
 
 SCENARIO = """
 name = "small"
@@ -251,6 +251,19 @@ def test_a_run_sampled_too_slowly_for_its_mode_is_refused(rig, rng):
     # What so few samples make of the ringing may look like another rig.
     with pytest.raises(fits.DataError, match=r"thinned.csv: sampled at .* Hz|thinned.csv: .* not of one rig"):
         fits.fit_stage([rig.records["slow"], thinned], levels=8, initial="negative", holdout=0.0)
+
+
+def test_a_first_way_from_elsewhere_is_no_other_rig():
+    # The same loops, once after a start from far below: only what follows the first full swing is compared.
+    time_s = np.arange(600) / 100.0
+    voltage_V = 50 - 50 * np.cos(2 * np.pi * time_s)
+    settled_um = 0.2 * voltage_V
+    first_um = np.where(time_s < 0.45, settled_um - 5 * (1 - time_s / 0.45), settled_um)
+    runs = [Record(time_s, voltage_V, um, source=f"{k}.csv") for k, um in enumerate((first_um, settled_um))]
+    refuse_slopes(runs)
+    larger = Record(time_s, voltage_V, 1.2 * settled_um, source="larger.csv")
+    with pytest.raises(fits.DataError, match=r"larger.csv and 0.csv: .* times as far"):
+        refuse_slopes([runs[0], larger])
 
 
 @pytest.mark.study

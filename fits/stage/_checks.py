@@ -17,6 +17,8 @@ from microid import Driver, Mechanics, Stage
 
 # Gains that differ by more than this are not those of one rig.
 _REFUSED = 0.1
+# Part of a range of voltage that counts as all of it.
+_WHOLE = 0.95
 # A resonance above this fraction of the sampling rate is hardly told from its mirror image.
 _HIGHEST_RESONANCE = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
@@ -31,13 +33,21 @@ _FASTER, _OR_ALONE = "sample at 5 times the resonance or more", "or fit the hyst
 def refuse_slopes(records: Sequence[Record]) -> None:
     """Refuse, in a `DataError`, slow runs over one range of voltage that move differently far."""
     spans = [float(np.ptp(record.voltage_V)) for record in records]
-    moved = [float(np.ptp(record.displacement_um)) for record in records if record.displacement_um is not None]
-    found = zip(records, spans, moved, map(speed_Hz, records), strict=True)
-    full = [(um / span, speed, one.source) for one, span, um, speed in found if span > 0.95 * max(spans)]
+    found = zip(records, spans, map(_moved_um, records), map(speed_Hz, records), strict=True)
+    full = [(um / span, speed, one.source) for one, span, um, speed in found if span > _WHOLE * max(spans)]
     for (high, fast, one), (low, slow, other) in permutations(full, 2):
         # What is faster may move less far because of the dynamics, which are not known yet.
         if high > (1 + _REFUSED) * low and max(fast, slow) < 1.5 * min(fast, slow):
             raise DataError(_not_one_rig(one, other, high / low))
+
+
+def _moved_um(record: Record) -> float:
+    """Range of the displacement once the voltage has been at both ends: a first way may begin from elsewhere."""
+    voltage_V, displacement_um = record.voltage_V, np.asarray(record.displacement_um)
+    share = (voltage_V - voltage_V.min()) / max(float(np.ptp(voltage_V)), 1e-300)
+    first = max(int(np.argmax(share <= 1 - _WHOLE)), int(np.argmax(share >= _WHOLE)))
+    again = first if np.ptp(share[first:]) > _WHOLE else 0
+    return float(np.ptp(displacement_um[again:]))
 
 
 def speed_Hz(record: Record) -> float:
