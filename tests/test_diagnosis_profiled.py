@@ -181,10 +181,15 @@ def test_of_explanations_that_are_not_told_apart_one_with_nothing_near_its_bound
     bench, projector, stuck = at_slope(0.9 - 1e-9, 0.9)
     inside = at_slope(0.2, 0.2)[-1]
     plain = nothing(bench, projector)
-    bound, free, none = (Explanation((), bench, projector, one, (), None) for one in (stuck, inside, plain))
+    projector.count = 50
+
+    def explained_by(one):
+        criterion = one.criterion(projector.count)
+        return Explanation((), bench, projector, one, (), None, criterion, criterion)
+
+    bound, free, none = map(explained_by, (stuck, inside, plain))
     # Where there is no effect, there is no bound.
     assert [one.near_bound for one in (bound, free, none)] == [True, False, False]
-    projector.count = 50
     assert _best([none], plain, THRESHOLDS) is none
     assert _best([bound, free], plain, THRESHOLDS) is free
     assert _best([bound, none], plain, THRESHOLDS) is bound

@@ -29,7 +29,9 @@ def diagnosed(folder, effects, *options):
     (runs / "truth.json").rename(truth / "truth.json")
     slow, fast, *aside = (runs / f"{record.name}.csv" for record in bench.records)
     holdout = [word for path in aside for word in ("--holdout", path)]
-    done = run("diagnose", slow, fast, *holdout, *options, "--out", folder / "diagnosis", "--quiet")
+    # However slow the machine is.
+    patient = "--budget", "3600"
+    done = run("diagnose", slow, fast, *holdout, *patient, *options, "--out", folder / "diagnosis", "--quiet")
     assert done.exit_code == 0, f"seed {seed}: {done.output}"
     found = json.loads((folder / "diagnosis" / "diagnosis.json").read_text())
     return SimpleNamespace(

@@ -212,7 +212,7 @@ def test_the_suggested_run_tells_what_the_first_does_not(seed, monkeypatch):
     creep, drift = fitted(made, "creep"), fitted(made, "thermal_drift")
     plain = select(made.bench, made.projector, made.probes, 0.01, np.random.default_rng(seed), lambda _: None)
     count = made.projector.count
-    rival = Rival("thermal_drift", drift, drift.criterion(count), drift.cost)
+    rival = Rival("thermal_drift", drift, drift.criterion(count), drift.cost, np.zeros(0))
     ambiguous = replace(plain, causes=(Cause("creep", 9.0, 1e-9, (rival,), 81.0),), model=creep)
     told = []
     experiment = suggest(made, ambiguous, (found_cause("creep", "thermal_drift"),), Request(), told.append)

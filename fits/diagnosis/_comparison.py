@@ -9,7 +9,7 @@ from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State, fit_jointly
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
-from fits.diagnosis._score import Scored, best_of, score
+from fits.diagnosis._score import Probe, Scored, best_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.stats._compare import improvement_z
 from microid import EFFECTS, AbstractEffect
@@ -24,13 +24,29 @@ _WORTH, _PROMISING, _NEAR = 0.4, 0.5, 0.1
 
 @dataclass(frozen=True)
 class Rival:
-    """An effect fitted in place of a cause; `end` is where baseline and effect have followed each other, if tried."""
+    """An effect fitted in place of a cause; `end` is where baseline and effect have followed each other, if tried.
+
+    What was held out counts in `criterion` and `cost`, and `held_out` are the errors in it, in noise, shape `(n,)`.
+    """
 
     name: str
     refit: Refit
     criterion: float
     cost: float
+    held_out: np.ndarray
     end: State | None = None
+
+    @classmethod
+    def of(cls, projector: Projector, found: Refit) -> "Rival":
+        """The last effect that was fitted."""
+        unseen, errors = projector.surprise(found.change_um), projector.held_out(found.change_um)
+        criterion = found.criterion(projector.count) + unseen
+        return cls(found.laws[-1].form.name, found, criterion, found.cost + unseen, errors)
+
+    @property
+    def fitted_cost(self) -> float:
+        """Sum of squares that it leaves of what was fitted."""
+        return (self.refit if self.end is None else self.end[-1]).cost
 
     @property
     def form(self) -> type[AbstractEffect]:
@@ -77,8 +93,14 @@ def compare_rivals(
         found = _add_occurrences(bench, projector, found, scored, most, thresholds)
         if one.form not in fitted or found.criterion(projector.count) < fitted[one.form].criterion(projector.count):
             fitted[one.form] = found
-    rivals = [Rival(form.name, one, one.criterion(projector.count), one.cost) for form, one in fitted.items()]
-    return _ranked(bench, projector, rivals, model.cost, before, thresholds)
+    rivals = [Rival.of(projector, one) for one in fitted.values()]
+    without = model.cost + projector.surprise(model.change_um)
+    return _ranked(bench, projector, rivals, without, before, [one.probe for one in scores], thresholds)
+
+
+def criterion(projector: Projector, model: Refit) -> float:
+    """Information criterion of what was fitted, and how improbable that makes what was held out: small is good."""
+    return model.criterion(projector.count) + projector.surprise(model.change_um)
 
 
 def _predicts_worse(before: np.ndarray, after: np.ndarray, thresholds: Thresholds) -> bool:
@@ -143,32 +165,43 @@ def _ranked(
     fitted: list[Rival],
     cost: float,
     held_out: np.ndarray,
+    asked: Sequence[Probe],
     thresholds: Thresholds,
 ) -> list[Rival]:
     """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
 
     Without them there is a `cost`, and there are errors in what is `held_out`.
     About as good are also those that are behind the best by no more than twice what it gains by that, as they may
-    gain more, until one ends behind it.
+    gain more, until one ends behind it; and those that leave as little with the best further effect of those `asked`.
     """
     order = sorted(fitted, key=lambda one: one.criterion)
     out = list[Rival]()
     usual = max(thresholds.apart_z**2, _NEAR * (cost - order[0].cost)) if order else 0.0
     near = least = np.inf
+    ahead: float | None = None
+
+    def left_ahead(one: Rival) -> float:
+        left = score(projector, asked, one.refit.residual, one.refit.basis()).each
+        return one.cost - gain_ahead(left, {one.name}, cost - one.cost, thresholds)
+
     for place, one in enumerate(order):
-        if place >= _NEAREST or one.cost - order[0].cost > near:
+        far = one.cost - order[0].cost > near
+        if far and place < _NEAREST and not order[0].refit.is_noise(projector, thresholds.chance_z):
+            ahead = left_ahead(order[0]) if ahead is None else ahead
+            far = left_ahead(one) - ahead > near
+        if place >= _NEAREST or far:
             out.append(one)
             continue
         end = fit_jointly(bench, projector, one.refit)
-        worse = _predicts_worse(held_out, end[1].held_out(end[-1].change_um), thresholds)
-        if worse or not end[-1].possible(bench):
+        found = Rival.of(*end[1:])
+        if _predicts_worse(held_out, found.held_out, thresholds) or not end[-1].possible(bench):
             continue
         if least == np.inf:
-            near = max(usual, 2 * (one.cost - end[-1].cost))
-        elif end[-1].cost > least + thresholds.apart_z**2:
+            near = max(usual, 2 * (one.cost - found.cost))
+        elif found.cost > least + thresholds.apart_z**2:
             near = usual
-        least = min(least, end[-1].cost)
-        out.append(replace(one, cost=end[-1].cost, criterion=end[-1].criterion(projector.count), end=end))
+        least = min(least, found.cost)
+        out.append(replace(found, refit=one.refit, end=end))
     # Of an effect the best form counts, which may be another once the baseline has followed.
     best: dict[str, Rival] = {}
     for one in sorted(out, key=lambda one: one.criterion):
@@ -196,11 +229,16 @@ def indistinguishable(
     """
     # What the cause explains beyond the other: no more than models of effects are off by.
     apart_z = thresholds.apart_z if exact else confusable_z(drop, thresholds)
+
+    def is_as_good(other: Rival) -> bool:
+        # Errors of what else is not simulated yet are alike for long: noise would make less of a difference.
+        worse = improvement_z(other.held_out, first.held_out) > thresholds.chance_z
+        return other.fitted_cost - first.fitted_cost < apart_z**2 and not worse
+
     return tuple(
         other
         for other in fitted
-        if other is not first
-        and (other.criterion - first.criterion < thresholds.tie or other.cost - first.cost < apart_z**2)
+        if other is not first and (other.criterion - first.criterion < thresholds.tie or is_as_good(other))
     )
 
 
@@ -209,8 +247,21 @@ def confusable_z(drop: float, thresholds: Thresholds) -> float:
     return max(thresholds.apart_z, 2 * thresholds.model_error * max(drop, 0.0) ** 0.5)
 
 
-def model_error(one: Scored, causes: Collection[str], thresholds: Thresholds) -> float:
+def gain_ahead(left: Sequence[Scored], causes: Collection[str], explained: float, thresholds: Thresholds) -> float:
+    """Decrease of the sum of squares by the best further effect that is no error of the models of these causes.
+
+    `explained` is the decrease by the causes, and `left` are scores beside them.
+    """
+    bar = max(explained, 0.0) ** 0.5
+    further = [
+        one for one in left if one.name not in causes and one.z > bar * model_error(one.name, causes, thresholds)
+    ]
+    return max((one.drop for one in further), default=0.0)
+
+
+def model_error(name: str, causes: Collection[str], thresholds: Thresholds) -> float:
     """Part of what some causes explain that an effect beside them must exceed, by what it is mistaken for."""
-    if any(f.name in causes and (one.name in f.confusions or f.name in one.form.confusions) for f in EFFECTS):
+    own = {other for form in EFFECTS if form.name == name for other in form.confusions}
+    if any(f.name in causes and (name in f.confusions or f.name in own) for f in EFFECTS):
         return thresholds.confused_error
     return thresholds.model_error

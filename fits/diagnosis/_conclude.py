@@ -100,7 +100,9 @@ def conclude(
             "interferometer or an encoder does"
         )
     rest_um = rest_noise * noise_um if left_over else 0.0
-    faults = _standing(ready.faults, beside if kept else ready.faults, extension.compared, rest_um, thresholds.spike_z)
+    faults = _standing(
+        ready.faults, beside if kept else ready.faults, extension.compared, rest_um, thresholds.spike_z
+    )
     named = name_faults(faults, cyclic, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * noise_um**2
     causes = causes_of(kept, model, found, removed, named, ready.faults)
@@ -220,9 +222,7 @@ def _gain(
     return gain, sorted({effect.name for effect in extension.effects if effect.per_run and len(baseline.runs) > 1})
 
 
-def _standing(
-    faults: Faults, beside: Faults, compared: Sequence[Compared], rest_um: float, spike_z: float
-) -> Faults:
+def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared], rest_um: float, spike_z: float) -> Faults:
     """Faults of samples and noise beside the causes and a rest, which may make what looked like a bad sample."""
     spikes = tuple(
         bad & (np.abs(one.after_um + height_um) > spike_z * float(np.hypot(noise.total_um, rest_um)))

@@ -9,6 +9,8 @@ from fits.diagnosis._comparison import (
     Rival,
     compare_rivals,
     confusable_z,
+    criterion,
+    gain_ahead,
     indistinguishable,
     leaders,
     model_error,
@@ -91,7 +93,11 @@ class Search:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A set of causes, and baseline and causes fitted to each other; `left` are the scores beside them."""
+    """A set of causes, and baseline and causes fitted to each other.
+
+    `left` are the scores beside them. The smaller the `criterion`, the better; `promise` is what the best further
+    cause would leave of it.
+    """
 
     causes: tuple[Cause, ...]
     bench: Bench
@@ -99,23 +105,23 @@ class Explanation:
     model: Refit
     left: tuple[Scored, ...]
     family: Family
+    criterion: float
+    promise: float
 
     @classmethod
     def of(cls, causes: Sequence[Cause], state: State, search: Search) -> "Explanation":
         """Ask for all effects beside these causes."""
         bench, projector, model = state
         scores = score(projector, search.probes, model.residual, model.basis())
-        return cls(tuple(causes), bench, projector, model, scores.each, Family(scores, search.rng))
+        names, explained = {cause.name for cause in causes}, search.plain.cost - model.cost
+        ahead = gain_ahead(scores.each, names, explained, search.thresholds)
+        family, left = Family(scores, search.rng), criterion(projector, model)
+        return cls(tuple(causes), bench, projector, model, scores.each, family, left, left - ahead)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of the causes, in the order in which they were found, each once."""
         return tuple(dict.fromkeys(cause.name for cause in self.causes))
-
-    @property
-    def criterion(self) -> float:
-        """Bayesian information criterion: the smaller, the better."""
-        return self.model.criterion(self.projector.count)
 
     @property
     def near_bound(self) -> bool:
@@ -168,7 +174,9 @@ def select(
                 if found.causes and is_smoothness_confirmed(found.projector, found.model):
                     return found
         reach = confusable_z(plain.cost - order[0].model.cost, thresholds) ** 2 if order else 0.0
-        near = [one for one in ranked if one[1].criterion < order[0].criterion + reach]
+        # The same that is near is worth following where it is with the best further cause, which another may hide.
+        most = min((one.promise for one in order), default=0.0) + reach
+        near = [one for one in ranked if one[1].criterion < order[0].criterion + reach or one[1].promise < most]
         # The best of each set before the second best of any: effects of one class would take all places.
         beam = [one for _, one in sorted(near, key=lambda one: one[0])[:_BEAM]]
     best = _best(ends, plain, thresholds)
@@ -192,7 +200,8 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
     independent = sum(cause.drop for cause in one.causes if card_of(cause.name).independent)
     explained = max(whole - independent, 0.0) ** 0.5
     bars = {
-        scored.form: (whole**0.5 if scored.form.independent else explained) * model_error(scored, taken, thresholds)
+        scored.form: (whole**0.5 if scored.form.independent else explained)
+        * model_error(scored.name, taken, thresholds)
         for scored in one.left
     }
     # Noise that was read too low makes chance look like evidence: what is left says how low at most.
@@ -284,9 +293,9 @@ def _backward(
         for k in range(len(causes)):
             laws = [law for i, law in enumerate(model.laws) if i != k]
             without = refit(bench, projector, laws, [x for i, x in enumerate(model.x) if i != k], 3)
-            trials.append((without.criterion(projector.count), k, without))
-        criterion, k, without = min(trials, key=lambda t: t[0])
-        if criterion > model.criterion(projector.count) + tie:
+            trials.append((criterion(projector, without), k, without))
+        least, k, without = min(trials, key=lambda t: t[0])
+        if least > criterion(projector, model) + tie:
             break
         causes = [cause for i, cause in enumerate(causes) if i != k]
         model = without
