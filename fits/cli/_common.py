@@ -134,15 +134,6 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
     return run
 
 
-def one_thread() -> None:
-    """Let linear algebra use one thread, unless the user says otherwise; to be called before NumPy is imported.
-
-    Matrices of a few hundred rows are factored no faster by more, and far more slowly where other processes run: the
-    threads wait for each other.
-    """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-
 def progress_to_stderr(quiet: bool, stages: Sequence[StrEnum] = ()) -> Callable[[str], None]:
     """Make what tells on stderr what is being done, and since when.
 

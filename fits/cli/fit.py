@@ -72,7 +72,6 @@ def fit(given: common.Given) -> None:
     The files are runs of one rig, with the columns time_s, voltage_V and displacement_um. A stage needs a slow run
     over the whole range, and one with steps, a chirp or a multisine beyond the resonance.
     """
-    common.one_thread()
     given.model = "stage" if given.start else given.model
     slow = given.model == "loop" and bool(given.lag or given.relaxations)
     asked = _for_stage(given) if given.model == "stage" else _for_slow(given) if slow else _for_loop(given)

@@ -18,6 +18,7 @@ from fits.io._errors import DataError
 from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import refuse_repeats
+from fits.io._threads import one_thread
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
@@ -33,6 +34,7 @@ _UNKNOWN = (
 )
 
 
+@one_thread
 def diagnose(
     records: AnyRuns,
     *,

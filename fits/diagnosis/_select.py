@@ -232,7 +232,7 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
             z = float(standard_deviations(drop, sum(law.size for law in new)))
             if model.cost - end[-1].cost < thresholds.minor_share * drop or z <= bars[rival.form]:
                 continue
-            if one.family.p(z / sigma) >= false_alarm:
+            if one.family.p(z / sigma) >= false_alarm or rival.criterion > one.criterion:
                 continue
             rivals = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
             causes = [Cause(rival.name, z, one.family.p(z), rivals, drop / len(new))] * len(new)

@@ -12,6 +12,7 @@ from fits.io._errors import DataError
 from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._jax_setup import require_float64
 from fits.io._record import Record, refuse_repeats
+from fits.io._threads import one_thread
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
 from fits.loop._design import columns_of
 from fits.loop._grid import Estimate, grid_estimate
@@ -31,6 +32,7 @@ from microid import FAMILIES, Preisach
 _SHAPE_LEVELS = 34
 
 
+@one_thread
 def fit(
     records: AnyRuns,
     *,

@@ -12,6 +12,7 @@ import numpy as np
 from fits.io._errors import DataError
 from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record
+from fits.io._threads import one_thread
 from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
 from fits.loop._misfit import misfits, remarks_on, worst
@@ -61,6 +62,7 @@ def default_stage(hold: Hold = "first") -> Stage:
     return stage.freeze("driver.gain", "mechanics.gain")
 
 
+@one_thread
 def fit_stage(
     records: AnyRuns,
     *,
