@@ -1,9 +1,19 @@
-"""The band of a loop's fit holds truths of other making: relays on a grid, and plays in a narrow ridge."""
+"""The band of a loop's fit holds truths of other making: relays on a grid, plays in a ridge, and a few plays."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 import fits
+from fits.loop._design import Grid
+from fits.loop._finer import bounded_factor, factor_with_plays, play_columns
+from fits.loop._grid import solve_grid
+from fits.loop._moments import gather, grid_of
+from fits.loop._path import Path
+from fits.loop._prior import Hyper, Posterior
+from fits.loop._run import prepare_run, simulate_run
+from fits.loop._surface import Surface
 from fits.stats._noise import repeated_square
 
 NOISE_um, SAMPLES = 0.03, 1500
@@ -27,8 +37,7 @@ def _relays(voltage_V, number=120):
     return out_um
 
 
-def _ridge(voltage_V, rng):
-    radius_V = rng.normal(15, 1, 300)
+def _plays(voltage_V, radius_V):
     play, out_um = voltage_V[0] + radius_V, 0.13 * voltage_V
     for k, now in enumerate(voltage_V):
         play = np.clip(play, now - radius_V, now + radius_V)
@@ -40,7 +49,7 @@ def _ridge(voltage_V, rng):
 @pytest.mark.parametrize("law", ["relays", "ridge"])
 def test_the_band_owns_up_to_structure_finer_than_the_grid(rng, law):
     voltage_V = _voltage_V()
-    true_um = _relays(voltage_V) if law == "relays" else _ridge(voltage_V, rng)
+    true_um = _relays(voltage_V) if law == "relays" else _plays(voltage_V, rng.normal(15, 1, 300))
     covered, rms_um = [], []
     for _ in range(3):
         read_um = true_um + NOISE_um * rng.standard_normal(SAMPLES)
@@ -54,6 +63,60 @@ def test_the_band_owns_up_to_structure_finer_than_the_grid(rng, law):
     assert np.mean(covered) > 0.8
     # A band as wide as that would hold anything.
     assert max(rms_um) < NOISE_um
+
+
+@pytest.mark.parametrize("law", ["few", "many"])
+def test_few_plays_widen_the_band_and_a_smooth_law_of_many_does_not(rng, law):
+    voltage_V = _voltage_V()
+    many_V = stats.gamma(2, scale=7).ppf((np.arange(300) + 0.5) / 300)
+    true_um = _plays(voltage_V, np.array([4.0, 11, 19, 26, 33]) if law == "few" else many_V)
+    read_um = true_um + NOISE_um * rng.standard_normal(SAMPLES)
+    record = fits.Record(0.01 * np.arange(SAMPLES), voltage_V, read_um, source=f"{law}.csv")
+    run = prepare_run(record, (0.0, 100.0), "negative", 1 / 3)
+    data, stroke_um = gather(grid_of([run], 24), [run]), float(np.ptp(true_um))
+    solution = solve_grid(data, stroke_um, Hyper.start())
+    found = factor_with_plays(data, [run], solution, stroke_um)
+    plain_um = solution.posterior.factor() * stroke_um
+
+    def sd_um(grid, factor_um):
+        moves = Surface.of(*grid.densities(factor_um), *grid.ends_V).respond(run.path[0])
+        return np.linalg.norm(moves - moves[run.fitted].mean(axis=0), axis=1)
+
+    off_um = true_um - simulate_run(data.grid.surface(solution.columns * stroke_um), run)
+    off_um -= off_um[run.fitted].mean()
+    before = sd_um(data.grid, plain_um)
+    after = before if found is None else sd_um(*found[:2])
+    if law == "few":
+        assert np.mean(after) > 1.05 * np.mean(before)
+    else:
+        assert np.mean(after) < 1.5 * np.mean(before)
+    assert np.all(np.abs(off_um) < 8 * after)
+
+
+def test_columns_of_plays_respond_as_plays_do():
+    levels, voltage_V = 45, _voltage_V()
+    plays, grid = play_columns(levels), Grid(jnp.asarray(0.0), jnp.asarray(100.0), levels)
+    for k in (2, 15, 35):
+        half_V = 50 * (k + 1) / (levels - 1)
+        place, exact = voltage_V[0] + half_V, []
+        for now in voltage_V:
+            place = float(np.clip(place, now - half_V, now + half_V))
+            exact.append(place / 100)
+        out = grid.surface(plays[:, k]).respond(Path.of(np.array([0.0]), voltage_V))[:, 0]
+        # Kinks are spread over the interval between two levels.
+        np.testing.assert_allclose(out - out[0], np.array(exact) - exact[0], rtol=0, atol=0.3 / (levels - 1))
+
+
+def test_a_bound_that_presses_narrows_its_column_and_no_other():
+    precision = np.diag([4.0, 1.0, 1.0])
+    posterior = Posterior(np.array([-3.0, 5.0, -40.0]), precision, np.sqrt(precision))
+    factor = bounded_factor(posterior)
+    sd = np.sqrt(np.diagonal(factor @ factor.T))
+    exact = [
+        stats.truncnorm(-mean * root, np.inf, mean, 1 / root).std() for mean, root in ((-3, 2), (5, 1), (-40, 1))
+    ]
+    # The tail of a normal distribution is somewhat shorter than the exponential one.
+    np.testing.assert_allclose(sd, exact, rtol=0.1)
 
 
 def test_what_comes_back_with_the_voltage_is_told_from_noise(rng):

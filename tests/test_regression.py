@@ -9,6 +9,7 @@ from scipy.stats import multivariate_normal
 
 import fits
 from fits.loop._design import Grid, columns_of
+from fits.loop._finer import play_columns
 from fits.loop._moments import gather
 from fits.loop._prior import Evidence, Hyper, Posterior, interpolation, maximise_evidence, roughness
 from fits.loop._run import prepare_run, simulate_run
@@ -101,6 +102,13 @@ def test_slope_of_the_evidence_is_that_of_its_values(problem):
         ahead, behind = ([evidence.value(logs + sign * step * unit) for unit in np.eye(5)] for sign in (1, -1))
         slope = (np.array(ahead) - behind) / (2 * step)
         np.testing.assert_allclose(evidence.slope(np.array(logs)), slope, rtol=1e-4, atol=1e-3)
+    # And so it is beside plays, whose weight is the last.
+    plays = play_columns(LEVELS)
+    both = data.total.project(np.concatenate([np.eye(len(plays)), plays], axis=1))
+    evidence, logs = Evidence(both, roughness(LEVELS).with_plays(plays.shape[1])), (-3.0, -1.0, -4.0, -2.0, -1.0, 3.0)
+    ahead, behind = ([evidence.value(logs + sign * step * unit) for unit in np.eye(6)] for sign in (1, -1))
+    slope = (np.array(ahead) - behind) / (2 * step)
+    np.testing.assert_allclose(evidence.slope(np.array(logs)), slope, rtol=1e-4, atol=1e-3)
 
 
 def test_quasi_newton_steps_find_the_bottom_of_a_valley_and_come_back_from_where_nothing_is_finite():

@@ -14,10 +14,11 @@ from fits.io._jax_setup import require_float64
 from fits.io._record import Record, refuse_repeats
 from fits.io._threads import one_thread
 from fits.loop._choose_grid import LADDER, choose_grid, try_grid, weigh_robustly
-from fits.loop._design import columns_of
+from fits.loop._design import Grid, columns_of
+from fits.loop._finer import factor_with_plays
 from fits.loop._grid import Estimate, grid_estimate
 from fits.loop._left_over import suggestions
-from fits.loop._moments import Data, gather, grid_of
+from fits.loop._moments import RunMean, gather, grid_of
 from fits.loop._parts_agree import check_loops
 from fits.loop._path import branches
 from fits.loop._result import FitResult, FitStatus, RunReport
@@ -107,6 +108,11 @@ def fit(
     if found.correlation > WHITE:
         progress("looking for lags and relaxations")
         remarks += suggestions(runs, surface, stroke, tried.solution.hyper)
+    mean = tried.data.means[0]
+    believed = tried.data.grid, found.factor_um, mean.response @ found.factor_um
+    if family == "grid" and found.correlation <= WHITE:  # elsewhere blocks say how smooth it is, not the evidence
+        progress("looking for plays between the levels")
+        believed = factor_with_plays(tried.data, runs, tried.solution, stroke) or believed
     progress("checking the records")
     miss, told = check_loops(runs, prepare, surface, stroke, tried.solution.hyper, loss == "huber")
     offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]
@@ -119,7 +125,7 @@ def fit(
         reports.append(_report(found, surface, off, run))
     return FitResult(
         model=_with_offset(model, offsets[0]),
-        uncertainty=_uncertainty(tried.data, found),
+        uncertainty=_uncertainty(mean, found, believed),
         status=FitStatus.CONVERGED,
         remarks=(*told, *remarks),
         runs=tuple(reports),
@@ -153,14 +159,13 @@ def check_fit(
     return fraction, aside, command_range_V([*records, *aside])
 
 
-def _uncertainty(data: Data, found: Estimate) -> Uncertainty:
+def _uncertainty(mean: RunMean, found: Estimate, believed: tuple[Grid, np.ndarray, np.ndarray]) -> Uncertainty:
     """Perturbations by the columns of a factor of the covariance, and of the sensor offset alone."""
-    mean, grid = data.means[0], data.grid
-    columns = np.concatenate([found.factor_um.T, np.zeros((1, grid.columns))])
+    grid, factor_um, response_um = believed
+    columns = np.concatenate([factor_um.T, np.zeros((1, grid.columns))])
     # The mean displacement of a run fixes the offset: it makes up for what a perturbation does to that.
-    moved = -(mean.response @ found.factor_um)
     sd = found.noise_um * (found.correlation / mean.count) ** 0.5
-    offset_um, discrepancy_um = jnp.asarray(np.append(moved, sd)), jnp.asarray(found.discrepancy_um)
+    offset_um, discrepancy_um = jnp.asarray(np.append(-response_um, sd)), jnp.asarray(found.discrepancy_um)
     return Uncertainty(jnp.asarray(columns), offset_um, discrepancy_um, grid)
 
 

@@ -4,6 +4,7 @@ The algebra is that of NumPy and SciPy where the moments are NumPy's, so that no
 traced programs, such as many fits at once, it is JAX's.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -18,8 +19,9 @@ from fits.loop._moments import Moments, zero_dimensional
 from fits.stats._bfgs import minimise
 
 # Logarithms of the weights where the data say nothing: a density, of some strokes per squared range, whose slope is
-# ten, along the diagonal a third, and whose curvature is free, and a reversible slope whose curvature is ten.
-_MIDDLING = (-12.0, np.log(1e-2), 2.0, np.log(1e-2))
+# ten, along the diagonal a third, and whose curvature is free, a reversible slope whose curvature is ten, and plays
+# of a thousandth of the stroke.
+_MIDDLING = (-12.0, np.log(1e-2), 2.0, np.log(1e-2), 14.0)
 # How far, in e-folds, they are believed to be from there.
 _WIDTH = 6.0
 # What rounding may take off a diagonal, relative to its largest entry.
@@ -33,6 +35,7 @@ class Hyper(eqx.Module):
     slope, as a density may have kinks anywhere, of which curvature would be too sure, `log_along` its squared slope
     along the diagonal, as loops of one size are alike at all biases (exactly so in sums of plays), and
     `log_reversible` the squared curvature of the reversible slope. `log_variance` is of noise, in squared strokes.
+    `log_plays` weighs the squares of what plays add to the density, if there are any (see `with_plays`).
     """
 
     log_density: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
@@ -40,12 +43,13 @@ class Hyper(eqx.Module):
     log_along: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
     log_reversible: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
     log_variance: Float[Array | np.ndarray, ""] = eqx.field(converter=zero_dimensional)
+    log_plays: Float[Array | np.ndarray, ""] | None = eqx.field(converter=zero_dimensional, default=None)
 
     @classmethod
     def start(cls) -> "Hyper":
         """Weights that are believed beforehand, and noise of a thousandth of the stroke."""
         # Curvature is found from where it counts.
-        return cls.of(np.log(1e-2), *_MIDDLING[1:], np.log(1e-6))
+        return cls.of(np.log(1e-2), *_MIDDLING[1:4], np.log(1e-6))
 
     @classmethod
     def of(cls, *logs: Any) -> "Hyper":
@@ -54,12 +58,13 @@ class Hyper(eqx.Module):
 
     def relaxed(self, efolds: float) -> "Hyper":
         """The same with all slopes and curvature counting less by so many e-folds."""
-        return Hyper.of(*(weight - efolds for weight in self.weights), self.log_variance)
+        return Hyper.of(*(weight - efolds for weight in self.weights[:4]), self.log_variance)
 
     @property
     def weights(self) -> list[Any]:
         """Logarithms of the weights of all kinds, in the order of `Roughness`."""
-        return [self.log_density, self.log_slope, self.log_along, self.log_reversible]
+        plays = [] if self.log_plays is None else [self.log_plays]
+        return [self.log_density, self.log_slope, self.log_along, self.log_reversible, *plays]
 
 
 class Roughness(eqx.Module):
@@ -69,11 +74,12 @@ class Roughness(eqx.Module):
     slope: Float[Array | np.ndarray, "D D"]
     along: Float[Array | np.ndarray, "D D"]
     reversible: Float[Array | np.ndarray, "D D"]
+    plays: Float[Array | np.ndarray, "D D"] | None = None
 
     def precision(self, hyper: Hyper) -> Float[Array | np.ndarray, "D D"]:
         """Prior precision of the columns in strokes, shape `(D, D)`; positive definite."""
         xp, _ = _algebra(self.density, hyper.log_density)
-        forms = (self.density, self.slope, self.along, self.reversible)
+        forms = jax.tree.leaves(self)
         uneven = sum(xp.exp(weight) * form for weight, form in zip(hyper.weights, forms, strict=True))
         # What is even costs nothing, but no density of 100 strokes is believed; and a great weight on the rest
         # must not make it negative by rounding.
@@ -83,6 +89,11 @@ class Roughness(eqx.Module):
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Roughness":
         """Keep only combinations of columns."""
         return jax.tree.map(lambda form: basis.T @ form @ basis, self)
+
+    def with_plays(self, count: int) -> "Roughness":
+        """The same beside so many plays behind the columns, which are as they are without each other."""
+        padded = jax.tree.map(lambda form: np.pad(form, (0, count)), self)
+        return replace(padded, plays=np.diag(np.repeat([0.0, 1.0], [len(self.density), count])))
 
 
 def roughness(levels: int) -> Roughness:
@@ -201,7 +212,7 @@ def _unchecked(xp: Any) -> dict[str, Any]:
 class Evidence:
     """Negative logarithm of the evidence of moments, but for a constant (MacKay 1992; Rasmussen & Williams 2006).
 
-    Values and slopes are those at the logarithms of `Hyper`, in its order, shape `(5,)`.
+    Values and slopes are those at the logarithms of `Hyper`, in its order, shape `(5,)`, or `(6,)` with plays.
     """
 
     def __init__(self, moments: Moments, rough: Roughness):
@@ -217,26 +228,37 @@ class Evidence:
         misfit = moments.energy_um2 / variance - half @ half
         volume, prior_volume = (2 * np.sum(np.log(np.diagonal(one))) for one in (root, prior_root))
         # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
-        unlikely = np.sum(((logs[:4] - _MIDDLING) / _WIDTH) ** 2)
+        unlikely = np.sum(_off_middling(logs) ** 2)
         return float(moments.count * logs[4] + misfit + volume - prior_volume + unlikely) / 2
 
+    def of(self, hyper: Hyper) -> float:
+        """The evidence itself."""
+        return -self.value(np.array([float(log) for log in jax.tree.leaves(hyper)]))
+
     def slope(self, logs: np.ndarray) -> np.ndarray:
-        """The derivatives, shape `(5,)`."""
+        """The derivatives, of the same shape."""
         moments, variance = self._moments, np.exp(logs[4])
         prior = self._rough.precision(Hyper.of(*logs))
-        forms = [np.exp(log) * form for log, form in zip(logs, jax.tree.leaves(self._rough), strict=False)]
+        weights = np.delete(logs, 4)
+        forms = [np.exp(log) * form for log, form in zip(weights, jax.tree.leaves(self._rough), strict=True)]
         # The floor of the precision follows its largest diagonal entry.
         largest = int(np.argmax(sum(np.diagonal(form) for form in forms)))
         covariance, alone = _inverse(moments.gram / variance + prior), _inverse(prior)
         mean = covariance @ moments.cross_um / variance
-        out = np.empty(5)
+        out = 2 * _off_middling(logs) / _WIDTH
         for k, form in enumerate(forms):
             floor = _ROUNDING * form[largest, largest]
             wide = np.sum((covariance - alone) * form) + floor * np.trace(covariance - alone)
-            out[k] = mean @ form @ mean + floor * (mean @ mean) + wide + 2 * (logs[k] - _MIDDLING[k]) / _WIDTH**2
+            out[k] += mean @ form @ mean + floor * (mean @ mean) + wide
         left = moments.energy_um2 - 2 * mean @ moments.cross_um + mean @ moments.gram @ mean
-        out[4] = moments.count - (left + np.sum(covariance * moments.gram)) / variance
-        return out / 2
+        of_noise = moments.count - (left + np.sum(covariance * moments.gram)) / variance
+        return np.insert(out, 4, of_noise) / 2
+
+
+def _off_middling(logs: np.ndarray) -> np.ndarray:
+    """How far weights are from what is believed beforehand, in its widths."""
+    weights = np.delete(logs, 4)
+    return np.asarray((weights - _MIDDLING[: len(weights)]) / _WIDTH)
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
