@@ -127,6 +127,30 @@ def test_a_loss_is_asked_about_from_its_own_sample_on(rng):
     assert all_ > fixed
 
 
+@pytest.mark.parametrize("ratio", [0.25, 0.6, 2.5])
+def test_a_mode_below_the_main_one_or_above_is_met(rng, ratio):
+    # Lightly damped, so that it lies between two probes as well as on one.
+    ratio *= float(rng.uniform(0.9, 1.1))
+
+    def plant(bench, entering_um):
+        one = bench.prepared[1]
+        mechanics, stride = bench.stage.parts[-1], one.run.samples.stride
+        omega = 2 * np.pi * ratio * float(mechanics.natural_frequency_Hz)
+        fine_s = np.arange(len(entering_um[1])) / RATE_HZ / stride
+        moved = entering_um[1] - entering_um[1][0]
+        mode = lsim(([omega**2], [1, 2 * 0.015 * omega, omega**2]), moved, fine_s)[1]
+        change = 0.02 * float(mechanics.gain) * (mode - moved)[::stride][:4000]
+        return [bench.plain[0], bench.plain[1] + change]
+
+    case = made(rng, plant)
+    probes = asked(case, "second_resonance", "transport_delay", "rate_dependence")
+    best = max(score(case.projector, probes, nothing(case.bench, case.projector).residual).each, key=lambda s: s.z)
+    first_Hz = float(case.bench.stage.parts[-1].natural_frequency_Hz)
+    print(ratio, best.name, best.z, float(best.probe.effects[0].frequency_Hz) / first_Hz)
+    assert best.name == "second_resonance"
+    assert float(best.probe.effects[0].frequency_Hz) / first_Hz == pytest.approx(ratio, rel=0.1)
+
+
 @pytest.mark.study
 def test_two_losses_are_no_drift_of_the_clock(rng):
     lost = np.sort(rng.choice(np.arange(600, 3400, 400), 2, replace=False))

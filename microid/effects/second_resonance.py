@@ -45,7 +45,7 @@ class SecondResonance(AbstractEffect):
     )
     confusions: ClassVar[tuple[str, ...]] = ("transport_delay", "sensor_lowpass", "stiffness_hardening")
     experiment: ClassVar[str] = "Chirps of two small amplitudes to three times the first resonance or more."
-    source: ClassVar[str] = "modal superposition; shares of 0.01 to 0.3 at 1.3 to 6 times the first (estimate)"
+    source: ClassVar[str] = "modal superposition; shares of 0.01 to 0.3 at 0.2 to 6 times the main one (estimate)"
     view: ClassVar[View] = "frequency"
     inner: AbstractPart
     share: Float[Array, ""] = param(unit="1", scale=0.01)
@@ -54,11 +54,14 @@ class SecondResonance(AbstractEffect):
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
-        """Frequencies from 1.15 to 6 times the first resonance, close enough for the peaks between them to be met."""
+        """Frequencies from 0.2 to 6 times the first resonance, close enough for the peaks between them to be met."""
         if scales.resonance_Hz is None or inner is None:
             return ()
-        first, last = 1.15 * scales.resonance_Hz, min(6 * scales.resonance_Hz, 0.45 / scales.interval_s)
-        grid = np.geomspace(first, last, 40) if last > first else np.zeros(0)
+        ratios = np.geomspace(0.2, 6, 80)
+        # What is nearer to the first resonance is that.
+        apart = np.abs(np.log(ratios)) > np.log(1.15)
+        grid = scales.resonance_Hz * ratios[apart]
+        grid = grid[grid < 0.45 / scales.interval_s]
         share, damping = jnp.asarray(0.01), jnp.asarray(0.03)
         return tuple((cls(inner, share, jnp.asarray(float(frequency)), damping),) for frequency in grid)
 
