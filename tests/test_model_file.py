@@ -268,6 +268,8 @@ ONE = {"unit": "um", "value": 1.0}
         ("model.density.packed_um.dtype", "object"),
         ("model.density.packed_um.dtype", "int32"),
         ("model.density.lower_V.value", [0.0]),
+        ("model.density.upper_V.value", -1e3),
+        ("uncertainty.grid.upper_V.value", -1e3),
         ("model.reversible.slope_um_per_V.value", [0.1] * 6),
         ("uncertainty.columns_um.float64_base64", "AAAA"),
         ("uncertainty.columns_um.float64_base64", "*"),

@@ -120,6 +120,17 @@ def test_predictions_are_those_of_jax(hold, even, state, rng, tmp_path):
     assert np.ptp(ranges["displacement"]) > np.ptp(found.displacement_um)
 
 
+@pytest.mark.parametrize("hold", ["first", "zero"])
+def test_one_sample_is_answered_as_the_first_of_two_is(hold, rng, tmp_path):
+    stage, uncertainty = draw(rng, hold=hold)
+    plain, record = saved(tmp_path / "s.json", stage, uncertainty), program(rng, stage, True)
+    one, two = (Record(record.time_s[:n], record.voltage_V[:n], None) for n in (1, 2))
+    expected = plain.predict(two, "negative")
+    for found in (plain.predict(one, "negative"), predict(stage, uncertainty, one, "negative")):
+        assert found.displacement_um == pytest.approx(expected.displacement_um[:1], rel=1e-9)
+        assert found.displacement_sd_um == pytest.approx(expected.displacement_sd_um[:1], rel=1e-9)
+
+
 def test_the_chain_is_the_composition_of_relays_and_matrix_exponentials(rng, tmp_path):
     """Ahead of the hysteresis nothing lags, so that voltages stay at edges of cells, where relays are exact."""
     law, mechanics = random_model(rng), m.Mechanics(60.0, 0.1, 2.0)

@@ -112,6 +112,8 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
         for key, field in fields.items():
             if isinstance(field.type, type) and not isinstance(values[key], field.type):
                 raise DataError(f"{where}.{key}: expected {_words(field.type)}, found something else")
+    if {"lower_V", "upper_V"} <= set(values) and not values["lower_V"] < values["upper_V"]:
+        raise DataError(f"{where}: expected lower_V below upper_V")
     try:
         return cls(**values)
     except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError) as error:

@@ -228,7 +228,9 @@ def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterato
     table = jnp.asarray(branch_table(grid.levels))
     memory = samples.start.memory
     carried: tuple[Any, Any] = np.zeros((0 if system is None else system.order, grid.columns)), np.zeros(grid.columns)
-    interval = np.diff(run.record.time_s, prepend=2 * run.record.time_s[0] - run.record.time_s[1])
+    between_s = np.diff(run.record.time_s)
+    # The state before the first sample is one of rest, which no interval changes.
+    interval = np.append(between_s[:1] if n > 1 else 1.0, between_s)
     path = np.asarray(voltage)[:n]
     for first in range(0, n, _PIECE):
         pad = (0, max(0, first + _PIECE - n))
