@@ -57,10 +57,9 @@ class SecondResonance(AbstractEffect):
         """Frequencies from 0.2 to 6 times the first resonance, close enough for the peaks between them to be met."""
         if scales.resonance_Hz is None or inner is None:
             return ()
-        ratios = np.geomspace(0.2, 6, 80)
         # What is nearer to the first resonance is that.
-        apart = np.abs(np.log(ratios)) > np.log(1.15)
-        grid = scales.resonance_Hz * ratios[apart]
+        below, above = np.geomspace(0.2, 1 / 1.15, 18), np.geomspace(1.15, 6, 40)
+        grid = scales.resonance_Hz * np.concatenate([below, above])
         grid = grid[grid < 0.45 / scales.interval_s]
         share, damping = jnp.asarray(0.01), jnp.asarray(0.03)
         return tuple((cls(inner, share, jnp.asarray(float(frequency)), damping),) for frequency in grid)
