@@ -324,3 +324,15 @@ def test_programs_make_room_where_records_are_long(monkeypatch):
 def test_a_signal_without_columns_is_whitened(rng):
     noise = Noise(0.1, np.array([0.5]))
     assert noise.whiten(np.zeros((20, 0))).shape == (20, 0)
+
+
+def test_errors_that_noise_makes_alike_count_once(rng):
+    # Of an AR(1) of a, (1 + a) / (1 - a) samples are worth one.
+    held = [SimpleNamespace(held_out=np.arange(5) >= at) for at in (2, 4)]
+    errors = rng.standard_normal(4)
+    case = SimpleNamespace(
+        regression=SimpleNamespace(baseline=SimpleNamespace(runs=held)),
+        noise=(Noise(0.3, WHITE), Noise(0.3, np.array([0.5]))),
+    )
+    expected = np.sum(errors[:3] ** 2) + errors[3] ** 2 / 3
+    assert Projector.surprise(case, errors) == pytest.approx(expected, rel=1e-3)

@@ -39,9 +39,11 @@ class Rival:
     @classmethod
     def of(cls, projector: Projector, found: Refit) -> "Rival":
         """The last effect that was fitted."""
-        unseen, errors = projector.surprise(found.change_um), projector.held_out(found.change_um)
-        criterion = found.criterion(projector.count) + unseen
-        return cls(found.laws[-1].form.name, found, criterion, found.cost + unseen, errors)
+        errors = projector.held_out(found.change_um)
+        unseen = projector.surprise(errors)
+        return cls(
+            found.laws[-1].form.name, found, found.criterion(projector.count) + unseen, found.cost + unseen, errors
+        )
 
     @property
     def fitted_cost(self) -> float:
@@ -94,13 +96,13 @@ def compare_rivals(
         if one.form not in fitted or found.criterion(projector.count) < fitted[one.form].criterion(projector.count):
             fitted[one.form] = found
     rivals = [Rival.of(projector, one) for one in fitted.values()]
-    without = model.cost + projector.surprise(model.change_um)
+    without = model.cost + projector.surprise(before)
     return _ranked(bench, projector, rivals, without, before, [one.probe for one in scores], thresholds)
 
 
 def criterion(projector: Projector, model: Refit) -> float:
     """Information criterion of what was fitted, and how improbable that makes what was held out: small is good."""
-    return model.criterion(projector.count) + projector.surprise(model.change_um)
+    return model.criterion(projector.count) + projector.surprise(projector.held_out(model.change_um))
 
 
 def _predicts_worse(before: np.ndarray, after: np.ndarray, thresholds: Thresholds) -> bool:

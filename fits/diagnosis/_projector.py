@@ -233,9 +233,9 @@ class Projector:
                 found.append(left[held] / self.noise[k].total_um)
         return np.concatenate(found) if found else np.zeros(0)
 
-    def surprise(self, change_um: Sequence[np.ndarray]) -> float:
-        """Sum of squares of these errors, those that noise makes alike counted once: -2 ln of their probability."""
-        errors, found, first = self.held_out(change_um), 0.0, 0
+    def surprise(self, errors: np.ndarray) -> float:
+        """-2 ln of the probability of these errors, shape `(n,)`: their squares, of those that noise makes alike one."""
+        found, first = 0.0, 0
         for run, noise in zip(self.regression.baseline.runs, self.noise, strict=True):
             own = errors[first : first + int(run.held_out.sum())]
             found += float(own @ own) / max(noise.correlation_samples, 1.0)
