@@ -234,7 +234,7 @@ class Projector:
         return np.concatenate(found) if found else np.zeros(0)
 
     def surprise(self, errors: np.ndarray) -> float:
-        """-2 ln of the probability of these errors, shape `(n,)`: their squares, of those that noise makes alike one."""
+        """-2 ln of the probability of such errors, shape `(n,)`, of which those that noise makes alike count once."""
         found, first = 0.0, 0
         for run, noise in zip(self.regression.baseline.runs, self.noise, strict=True):
             own = errors[first : first + int(run.held_out.sum())]
