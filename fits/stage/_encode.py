@@ -112,7 +112,8 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
         for key, field in fields.items():
             if isinstance(field.type, type) and not isinstance(values[key], field.type):
                 raise DataError(f"{where}.{key}: expected {_words(field.type)}, found something else")
-    if {"lower_V", "upper_V"} <= set(values) and not values["lower_V"] < values["upper_V"]:
+    limits = [np.asarray(values[key]) for key in ("lower_V", "upper_V") if key in values]  # compared without JAX
+    if len(limits) == 2 and not np.all(limits[0] < limits[1]):
         raise DataError(f"{where}: expected lower_V below upper_V")
     try:
         return cls(**values)
