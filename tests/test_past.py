@@ -7,7 +7,7 @@ from scipy.interpolate import BSpline
 
 from fits import Record
 from fits.diagnosis._baseline import has_known_loop
-from fits.loop._past import past_columns
+from fits.loop._past import past_columns, rough_past_columns
 from fits.loop._run import prepare_run
 
 LEVELS = 120
@@ -68,6 +68,31 @@ def test_relays_not_yet_swept_add_what_the_columns_span(rng, way):
     assert np.std(difference) > 0.01
     # What is left is the relays' own coarseness, and what a sum of two functions misses.
     assert np.std(left) < 0.05 * np.std(difference)
+
+
+def play(voltage, radius, at):
+    """One play, one loop in Python over the samples."""
+    out = np.empty(len(voltage))
+    for k, value in enumerate(voltage):
+        at = out[k] = min(max(at, value - radius), value + radius)
+    return out
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_past_of_few_plays_has_kinks_that_no_spline_follows(rng, way):
+    voltage = WAYS[way](4000)
+    difference = np.zeros(len(voltage))
+    for radius in rng.uniform(0.02, 0.3, 6):
+        before = voltage[0] + radius * rng.uniform(-1, 1)
+        difference += rng.exponential() * (play(voltage, radius, before) - play(voltage, radius, voltage[0] - radius))
+    smooth = np.concatenate([past_columns(jnp.asarray(voltage)), np.ones((len(voltage), 1))], axis=1)
+    rough = np.concatenate([smooth, rough_past_columns(voltage)], axis=1)
+    left, less = (
+        np.std(difference - basis @ np.linalg.lstsq(basis, difference, rcond=None)[0]) for basis in (smooth, rough)
+    )
+    assert np.std(difference) > 0.01
+    assert less < 0.5 * left
+    assert less < 0.02 * np.std(difference)
 
 
 def test_columns_are_the_b_splines_of_scipy(rng):

@@ -18,6 +18,9 @@ from fits.stats._noise import Noise, learn_noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.
 ROUGHEST = 0.5
+# Logarithms of the roughness that the search begins at, and of none.
+_SOME, _NONE = -2.0, -30.0
+_SEARCH = {"xatol": 0.05, "fatol": 0.05, "maxiter": 120}
 
 
 def along_all(projector: Projector, candidates: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
@@ -58,10 +61,11 @@ def learn_roughness(
         # The noise may be a little more or less than what was taken off.
         return float(count * np.log(max(energy - half @ half, 1e-300)) + 2 * np.sum(np.log(np.diagonal(root)))) / 2
 
-    none = unlikely(np.full(len(sizes), -30.0))
-    best, at = none, np.full(len(sizes), -30.0)
-    for start in ([-2.0, -2.0], [-2.0, -30.0], [-30.0, -2.0]):
-        found = minimize(unlikely, start, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 0.05, "maxiter": 80})
+    at = np.full(len(sizes), _NONE)
+    best = unlikely(at)
+    # All kinds together, and each alone.
+    for start in (np.full(len(sizes), _SOME), *(np.where(one, _SOME, _NONE) for one in np.eye(len(sizes)))):
+        found = minimize(unlikely, start, method="Nelder-Mead", options=_SEARCH)
         if found.fun < best - 0.5:
             best, at = float(found.fun), found.x
     return tuple(float(min(np.exp(a), ROUGHEST)) if a > -12 else 0.0 for a in at)

@@ -152,12 +152,18 @@ class Predictor:
         for k in self._old:
             effects = [self._next[k].effects(0)]
             last = regress(alone, None if last is None else _same(last, effects), effects)
-            shared = [last.rows[0], *(last.finer[kind][0] for kind in self._kinds)]
+            shared = [last.rows[0], *self._finer_of(last)]
             rows = noise.whiten(np.concatenate([*shared, np.stack(columns, axis=1)], axis=1))[run.fitted]
             nuisance, _ = qr(noise.whiten(last.nuisance[0])[run.fitted], mode="economic")
             rows -= nuisance @ (nuisance.T @ rows)
             grams[k] = rows.T @ rows
         return grams
+
+    def _finer_of(self, new: Regression) -> list[np.ndarray]:
+        """What is finer than the grid in a new run, which has nothing of the past of the old ones."""
+        old = self.projector.regression.finer
+        each = [(new.finer[kind][0], old[kind][0].shape[1]) for kind in self._kinds]
+        return [np.pad(here, ((0, 0), (0, width - here.shape[1]))) for here, width in each]
 
     def _noise(self, interval_s: float) -> Noise:
         """Noise of the run that was sampled most alike; white where none was."""

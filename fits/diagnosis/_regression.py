@@ -12,11 +12,12 @@ from scipy.linalg import cholesky
 
 from fits.diagnosis._baseline import Baseline, simulate, with_effects
 from fits.loop._design import Grid
+from fits.loop._past import rough_past_columns
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
 from fits.stage._follow import propagated
 from fits.stage._moments import Chain, linearise, pieces
-from fits.stage._run import place_of_hysteresis
+from fits.stage._run import ahead, place_of_hysteresis
 from microid import PLACES, AbstractEffect, Coordinates, Stage
 
 # Levels of the grid of the finer structure, and how many random examples of it stand for all.
@@ -37,8 +38,8 @@ class Regression:
     shape `(n, D + p)`; `nuisance`, signals of the run's nuisance parameters, shape `(n, k)`; `residuals`, measurement
     less simulation without effects, in um, shape `(n,)`; `saturating`, the effects that the derivatives go through.
     By kind and run, `finer` is what roughness of the density changes that the grid cannot follow, shape `(n, k)`: of
-    loops of one width at all biases, as of plays, and at single places. `root` is that of the prior precision of the
-    columns, shape `(D, D)`.
+    loops of one width at all biases, as of plays, at single places, and of what an unknown past left in each run.
+    `root` is that of the prior precision of the columns, shape `(D, D)`.
     """
 
     baseline: Baseline
@@ -101,7 +102,7 @@ def regress(
             structure.append(
                 np.split(propagated(fine.coordinates, fine.place, z, run, around, moved), [_FINE], axis=1)
             )
-    kinds = tuple(zip(*structure, strict=True)) if finer is None else finer
+    kinds = (*zip(*structure, strict=True), _rough_pasts(baseline)) if finer is None else finer
     data = tuple(rows), tuple(nuisance), kinds, tuple(residuals)
     return Regression(baseline, tuple(run.fitted for run in runs), *data, root_of(baseline.prior), levelling)
 
@@ -138,7 +139,7 @@ def _slope_of_change(baseline: Baseline, effects: tuple[AbstractEffect, ...], ru
 
 
 def _roughness(baseline: Baseline) -> np.ndarray:
-    """Relative roughness of the density of both kinds, in columns of the finer grid, in um, shape `(D, k)`."""
+    """Relative roughness of the density, in columns of the finer grid, in um, shape `(D, k)`."""
     grid = baseline.chain.grid
     assert grid is not None
     smooth = interpolation(grid.levels, _FINE) @ baseline.columns_um
@@ -153,6 +154,23 @@ def _roughness(baseline: Baseline) -> np.ndarray:
     places = np.zeros((len(smooth), _EXAMPLES))
     places[:weights] = density[:, None] * rng.standard_normal((weights, _EXAMPLES)) / _EXAMPLES**0.5
     return np.concatenate([loops, places], axis=1)
+
+
+def _rough_pasts(baseline: Baseline) -> tuple[np.ndarray, ...]:
+    """Relative roughness of what an unknown past left in each run, in um, shape `(n, k)`: columns of its own."""
+    stage, (lower_V, upper_V) = baseline.stage, baseline.range_V
+    place = place_of_hysteresis(stage)
+    assert place is not None
+    own = []
+    for run in baseline.runs:
+        seen_V = np.asarray(ahead(stage, place, run.samples))[:: run.samples.stride][: len(run.record)]
+        columns = rough_past_columns(seen_V) * baseline.stroke_um / (upper_V - lower_V)
+        own.append(columns if run.has_past else columns[:, :0])
+    stops = np.cumsum([columns.shape[1] for columns in own])
+    return tuple(
+        np.pad(columns, ((0, 0), (stop - columns.shape[1], stops[-1] - stop)))
+        for columns, stop in zip(own, stops, strict=True)
+    )
 
 
 def saturating(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:

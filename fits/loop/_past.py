@@ -13,12 +13,28 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _DEGREE, _PIECES = 3, 5
+# Pieces each way of what a past may do that is finer than the splines.
+_FINE = 48
 
 
 @jax.jit
 def past_columns(voltage_V: Float[Array, " n"]) -> Float[Array, "n k"]:
     """Signals of the unknown past of a hysteresis under a voltage, shape `(n, k)`."""
     return jnp.concatenate([_spline(lax.cummax(voltage_V)), _spline(lax.cummin(voltage_V))], axis=1)
+
+
+def rough_past_columns(voltage_V: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+    """Pieces of the way that a hysteresis goes for the first time, up and down, each a ramp in V, shape `(n, k)`.
+
+    A hysteresis of few plays has kinks there that no spline follows.
+    """
+    columns = [np.zeros((len(voltage_V), 0))]
+    for reached_V in (np.maximum.accumulate(voltage_V), np.minimum.accumulate(voltage_V)):
+        ends = np.linspace(reached_V[0], reached_V[-1], _FINE + 1)
+        if ends[0] != ends[-1]:
+            low, high = np.minimum(ends[:-1], ends[1:]), np.maximum(ends[:-1], ends[1:])
+            columns.append(np.clip(reached_V[:, None], low, high) - low)
+    return np.concatenate(columns, axis=1)
 
 
 def _spline(reached_V: Float[Array, " n"]) -> Float[Array, "n k"]:
