@@ -14,8 +14,7 @@ from fits.diagnosis._baseline import Baseline, simulate, with_effects
 from fits.loop._design import Grid
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
-from fits.stage._follow import propagated
-from fits.stage._moments import Chain, linearise, pieces
+from fits.stage._moments import Chain, linearise, pieces, propagated
 from fits.stage._run import place_of_hysteresis
 from microid import PLACES, AbstractEffect, Coordinates, Stage
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import data_synth
-from fits.control._compensate_stage import simulate_model
+from fits.control._compensate import simulate_model
 from fits.io._atomic import finite_json
 from fits.io._record import Reference
 from fits.machining._design import paper_design

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from fits.control._compensate_stage import simulate_model
+from fits.control._compensate import simulate_model
 from fits.control._follow import Compensation
 from fits.control._tune_problem import Goal
 from fits.control._tune_start import slope_array
