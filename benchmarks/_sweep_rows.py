@@ -11,10 +11,9 @@ from _timing import Table, side_by_side
 from scipy.signal import StateSpace, lsim
 
 import fits
-from fits.sweeps._programs import Program, read_program
 from fits.sweeps._records import Simulated
 from fits.sweeps._spec import parse_sweep
-from fits.sweeps._stages import nominal_stage, varied
+from fits.sweeps._stages import Program, nominal_stage, read_program, varied
 from fits.sweeps._types import Block
 from fits.sweeps.kinds.simulate import SimulateJob, summary
 from microid import Preisach, Stage

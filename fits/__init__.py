@@ -73,8 +73,7 @@ if TYPE_CHECKING:
     from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, sensitivities
     from fits.machining._sobol import SobolIndices, sobol
     from fits.plots._control import plot_compensation, plot_control
-    from fits.plots._fit import plot_fit
-    from fits.plots._fit_stage import plot_stage
+    from fits.plots._fit import plot_fit, plot_stage
     from fits.plots._machining import plot_budget, plot_idle, plot_sensitivity
     from fits.plots._sweep import plot_sweep
     from fits.report._diagnosis import report_html

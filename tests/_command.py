@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from matplotlib.image import imread
 
 from fits.cli._main import cli
-from fits.stage import _plain_file
+from fits.stage import _plain_stage
 
 OFF = {"MICROID_CACHE": "off"}
 
@@ -42,7 +42,7 @@ def says_the_same_with_jax(monkeypatch, arguments, here):
     plain = run(*arguments, "--out", here, "--json")
     rows = columns_of(here) if plain.exit_code == 0 else {}
     with monkeypatch.context() as patched:
-        patched.setattr(_plain_file, "plain_model", lambda content: None)
+        patched.setattr(_plain_stage, "plain_model", lambda content: None)
         slow = run(*arguments, "--out", here, "--json")
     assert (plain.exit_code, plain.stderr) == (slow.exit_code, slow.stderr)
     if slow.exit_code:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import typing
 from pathlib import Path
 
 import equinox as eqx
@@ -248,4 +249,4 @@ def test_bad_input_ends_in_one_sentence(folder, monkeypatch, arguments, words):
 def test_choices_in_the_help_are_those_of_the_library():
     options = {option.name: option for option in cli.commands["budget"].params}
     assert tuple(options["axis"].type.choices) == (*m.AXES, "all")
-    assert tuple(options["model_measures"].type.choices) == fits.machining._budget.MEASURES
+    assert tuple(options["model_measures"].type.choices) == typing.get_args(fits.machining._budget.Measures)

@@ -30,8 +30,7 @@ from data_synth import ScenarioError
 from data_synth._engine import refinement
 from data_synth._plant import Plant
 from fits.control._gains import read_gains
-from fits.sweeps._chunks import chunk_rows, compute_chunk
-from fits.sweeps._spec import read_sweep
+from fits.sweeps._spec import chunk_rows, compute_chunk, read_sweep
 
 SAMPLE, COMMANDS = 80, 3
 STUDY = int(os.environ.get("MICROID_FUZZ", 0))

@@ -3,6 +3,7 @@ import hashlib
 import json
 import re
 import shutil
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -11,7 +12,6 @@ import numpy as np
 import pytest
 
 import fits
-import fits.stage._model_file
 import microid
 from fits import DataError, Uncertainty, load_model, save_model
 from fits.loop._design import Grid
@@ -82,12 +82,13 @@ def test_every_family_comes_back_bit_by_bit(tmp_path, rng, family):
 
 def test_the_documented_lines_read_the_file_without_microid(tmp_path, rng, monkeypatch):
     model, uncertainty = draw("grid", rng)
-    save_model(tmp_path / "model.json", model, uncertainty, REPORT)
+    save_model(tmp_path / "named.json", model, uncertainty, REPORT)
     monkeypatch.chdir(tmp_path)
-    lines = re.findall(r"(?m)^ {4}(.*)$", fits.stage._model_file.__doc__.split("are read by\n")[1])
-    assert len(lines) < 10
+    page = (Path(__file__).parents[1] / "docs" / "files.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"are read by\n\n```python\n(.*?)```", page, re.DOTALL)
+    assert len(lines.splitlines()) < 11
     found = {}
-    exec("\n".join(lines), found)
+    exec(lines, found)
     assert np.array_equal(found["weights_um"][np.tril_indices(7)], np.asarray(model.density.packed_um))
     np.testing.assert_allclose(found["weights_um"], np.asarray(model.weights_um), rtol=1e-14)
     assert found["columns_um"].tobytes() == np.asarray(uncertainty.columns_um).tobytes()

@@ -16,9 +16,8 @@ from fits.io._model_text import read_model_text
 from fits.loop._design import Grid
 from fits.stage._moments import offsets_out
 from fits.stage._motion import predicted_ranges
-from fits.stage._plain_file import plain_model
-from fits.stage._plain_linear import recur
-from fits.stage._plain_parts import PlainPart, declared, kinds
+from fits.stage._plain_linear import SYSTEMS, PlainPart, declared, recur
+from fits.stage._plain_stage import plain_model
 
 SAMPLES = 300
 EXACT = 1e-12
@@ -55,7 +54,7 @@ def program(rng, stage, even):
 
 def test_what_is_declared_is_what_microid_declares():
     made = {"Driver": m.Driver(1e-3), "Mechanics": m.Mechanics(100.0, 0.1), "Sensor": m.Sensor()}
-    assert set(kinds()) == set(made)
+    assert set(SYSTEMS) == set(made)
     for kind, part in made.items():
         found = [(name, said.unit, said.scale, said.lower, np.inf) for name, said in declared()[kind].items()]
         table = m.parameter_table(part)

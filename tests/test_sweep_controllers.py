@@ -11,7 +11,7 @@ from _sweeps import parsed
 import fits
 from fits.control._gains import GAINS
 from fits.io._record import Reference
-from fits.sweeps._chunks import chunk_count, compute_chunk
+from fits.sweeps._spec import chunk_count, compute_chunk
 from fits.sweeps._stages import memory_before, nominal_stage, varied
 from microid import BPPID, CMACPID, PID, ResonantPID, Start, margins, simulate_loop
 

@@ -71,7 +71,7 @@ import sys
 from pathlib import Path
 import jax
 jax.config.update("jax_enable_x64", True)
-from fits.sweeps._chunks import compute_chunk
+from fits.sweeps._spec import compute_chunk
 from fits.sweeps._run import run_sweep
 from fits.sweeps._spec import read_sweep
 folder = Path(sys.argv[1])

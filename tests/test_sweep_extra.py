@@ -7,7 +7,7 @@ from _command import refused, run
 from _sweeps import small
 
 from fits import DataError
-from fits.sweeps._packages import need
+from fits.sweeps._store import need
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from _sweeps import Relays, parsed, small
 from scipy.signal import StateSpace, cont2discrete, lsim
 
 from fits import DataError
-from fits.sweeps._chunks import compute_chunk
 from fits.sweeps._run import run_sweep
+from fits.sweeps._spec import compute_chunk
 from fits.sweeps._stages import nominal_stage
 
 CONTROL = """

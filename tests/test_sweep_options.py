@@ -15,11 +15,11 @@ from fits.loop._design import branch_table
 from fits.loop._prior import roughness
 from fits.loop._run import initial_state, known_samples
 from fits.plots._sweep import _edges, _heat, _logarithmic, _parallel, _Rows, _wrapped
-from fits.sweeps._chunks import chunk_count, compute_chunk
-from fits.sweeps._fit_batch import fit_batch
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep
+from fits.sweeps._spec import chunk_count, compute_chunk
 from fits.sweeps._types import Block
+from fits.sweeps.kinds.fit import fit_batch
 from microid import Staircase
 
 HEAD = """

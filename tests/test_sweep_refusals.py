@@ -14,10 +14,9 @@ from _sweeps import parsed, small
 
 from fits import DataError
 from fits.sweeps import _run
-from fits.sweeps._chunks import chunk_rows
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep, summarise
-from fits.sweeps._spec import parse_sweep, read_sweep
+from fits.sweeps._spec import chunk_rows, parse_sweep, read_sweep
 from fits.sweeps._store import opened
 from fits.sweeps._types import Rows
 from fits.sweeps.kinds import examples
@@ -118,7 +117,7 @@ def test_a_stated_chunk_is_no_larger_than_the_sweep(seed):
 
 def made_up(sweep, chunk, tell=lambda _: None):
     """Rows without any computing: figures are the first parameter, and each seventh row has failed."""
-    from fits.sweeps._chunks import rows_of
+    from fits.sweeps._spec import rows_of
 
     rows = rows_of(sweep, chunk)
     values = sweep.plan.values(rows)
@@ -261,15 +260,15 @@ def test_changed_records_are_noticed(tmp_path, monkeypatch):
 def test_a_checkout_is_told_from_others(monkeypatch):
     from importlib.metadata import PackageNotFoundError
 
-    from fits.sweeps import _packages
+    from fits.sweeps import _store
 
     def version(name):
         if name == "microid":
             raise PackageNotFoundError(name)
         return "1"
 
-    monkeypatch.setattr(_packages, "version", version)
-    before = _packages.versions.__wrapped__()["microid"]
+    monkeypatch.setattr(_store, "version", version)
+    before = _store.versions.__wrapped__()["microid"]
     assert before.startswith("checkout ")
-    monkeypatch.setattr(_packages.Path, "read_bytes", lambda path: b"other")
-    assert _packages.versions.__wrapped__()["microid"] != before
+    monkeypatch.setattr(_store.Path, "read_bytes", lambda path: b"other")
+    assert _store.versions.__wrapped__()["microid"] != before

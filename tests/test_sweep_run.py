@@ -21,10 +21,9 @@ from _sweeps import parsed, small, stage_um
 
 from fits import DataError
 from fits.sweeps import _store
-from fits.sweeps._chunks import chunk_count
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep, summarise
-from fits.sweeps._spec import read_sweep
+from fits.sweeps._spec import chunk_count, read_sweep
 from fits.sweeps._stages import memory_before, nominal_stage, varied
 from fits.sweeps._types import Block
 from fits.sweeps.kinds.simulate import SimulateJob
@@ -158,16 +157,16 @@ import jax
 jax.config.update("jax_enable_x64", True)
 warnings.simplefilter("ignore")  # JAX warns of a fork; the children only write
 import pandas as pd
-from fits.sweeps import _chunks, _run, _spec
+from fits.sweeps import _run, _spec
 
 toml, whole, out, seed, kills = sys.argv[1:]
 kept, moments = pd.read_parquet(whole), random.Random(int(seed))
 
 def compute(sweep, chunk, tell):
     time.sleep(0.05)  # so that some are killed while they compute
-    part = kept.iloc[_chunks.rows_of(sweep, chunk)]
+    part = kept.iloc[_spec.rows_of(sweep, chunk)]
     outputs = {name: part[name].to_numpy() for name in kept.columns if name not in ("row", "reason")}
-    return _chunks.Rows(outputs, tuple(part["reason"]))
+    return _spec.t.Rows(outputs, tuple(part["reason"]))
 
 _run.compute_chunk = compute
 
@@ -256,7 +255,7 @@ def test_stopped_between_any_two_writes_it_goes_on(finished, tmp_path, monkeypat
 
 
 def rows_from(sweep, folder, chunk):
-    from fits.sweeps._chunks import rows_of
+    from fits.sweeps._spec import rows_of
     from fits.sweeps._types import Rows
 
     part = table(folder).iloc[rows_of(sweep, chunk)]

@@ -6,13 +6,11 @@ from typing import TYPE_CHECKING
 from fits.io._late import late
 
 if TYPE_CHECKING:
-    from fits.control._compensate import compensate
-    from fits.control._compensate_stage import static_equivalent
+    from fits.control._compensate import compensate, static_equivalent
     from fits.control._export_c import export_c
     from fits.control._follow import compensate_plain
     from fits.control._gains import read_gains
-    from fits.control._make import Loop, Maker
-    from fits.control._setup import setup
+    from fits.control._make import Loop, Maker, setup
     from fits.control._tune_problem import Goal, passed_limits
     from fits.diagnosis._diagnose import diagnose
     from fits.diagnosis._result import Diagnosis, Step
@@ -42,8 +40,7 @@ if TYPE_CHECKING:
     from fits.paper._regenerate import paper_result
     from fits.plots._channels import plot_channels
     from fits.plots._control import plot_compensation, plot_control
-    from fits.plots._fit import plot_fit
-    from fits.plots._fit_stage import plot_stage
+    from fits.plots._fit import plot_fit, plot_stage
     from fits.plots._machining import plot_budget, plot_sensitivity
     from fits.plots._sweep import plot_sweep
     from fits.report._control import control_json, describe_control
@@ -57,7 +54,7 @@ if TYPE_CHECKING:
     from fits.stage._fit_slow import fit_slow
     from fits.stage._model_file import ModelFile, load_model, model_text
     from fits.stage._motion import predicted_ranges
-    from fits.stage._plain_file import plain_model
+    from fits.stage._plain_stage import plain_model
     from fits.stage._uncertainty import draw_plants, predict
     from fits.sweeps._run import run_sweep
     from fits.sweeps._show import describe_sweep, summarise

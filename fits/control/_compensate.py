@@ -5,21 +5,30 @@ from functools import partial
 from typing import Literal
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.control import _compensate_stage as whole
+import microid
 from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, compensate_plain, follow, within_range
 from fits.io._errors import DataError
+from fits.io._length import length
 from fits.io._record import Record, Reference
-from fits.loop._plain import PlainLoop
+from fits.loop._plain import PlainLoop, PlainModel
+from fits.loop._run import initial_state, prepare_run, simulate_run
+from fits.loop._stepped import intervals
 from fits.loop._surface import Surface
-from microid import AbstractEffect, Preisach, Stage
+from fits.stage._encode import encode
+from fits.stage._plain_stage import plain_model
+from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Reversible, Stage, Start, innermost
 
 Way = Literal["static", "dynamic"]
 
 # What is cut off a command by less than this fraction of the limits' width does not show.
-_WORTH_SAYING = 1e-4
+_SHOWS = 1e-4
+# Doubt about the displacement needed, or a start in motion, that is worth a remark: a fraction of the span.
+_WORTH_SAYING = 0.01
+_FEWEST = 16
 
 
 def compensate(
@@ -52,17 +61,17 @@ def compensate(
         if way == "dynamic":
             raise DataError("expected a stage for --dynamic, found a Preisach model, which has no mechanics.")
         return compensate_plain(plain_loop_of(model), reference, initial, clip, limits_V)
-    if (plain := whole.plain_of(model)) is not model:
+    if (plain := plain_of(model)) is not model:
         without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
         return _beside_effects(model, plain, reference, initial, without)
-    stage = whole.plain_stage_of(model)
+    stage = plain_stage_of(model)
     if way == "static" and stage is not None:
         return compensate_plain(stage, reference, initial, clip, limits_V)
-    law = plain_loop_of(whole.static_equivalent(model))
+    law = plain_loop_of(static_equivalent(model))
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":
-        needed, doubt_um = whole.demand(model, time_s, wanted, reference.source)
-    turning, moving = whole.demand_remarks(wanted, needed, doubt_um)
+        needed, doubt_um = demand(model, time_s, wanted, reference.source)
+    turning, moving = demand_remarks(wanted, needed, doubt_um)
     remarks = turning + moving
     limits = within_range(law.range_V, limits_V)
     doubt = Doubt(doubt_um, *turning) if way == "dynamic" else None
@@ -70,7 +79,7 @@ def compensate(
     if way == "dynamic":
         voltage, cut, more = _led(model, reference, voltage, limits, clip, binding(law, limits))
         clipped, remarks = clipped | cut, remarks + more
-    played = whole.simulate_model(model, Record(time_s, voltage, None, source=reference.source), initial)
+    played = simulate_model(model, Record(time_s, voltage, None, source=reference.source), initial)
     return Compensation(voltage, played, wanted, clipped, tuple(remarks))
 
 
@@ -90,8 +99,8 @@ def _beside_effects(
     for _ in range(12):
         found = invert(Reference(time_s, asked, reference.source))
         program = Record(time_s, found.voltage_V, None, source=reference.source)
-        played = whole.simulate_model(stage, program, initial)
-        change = played - whole.simulate_model(plain, program, initial)
+        played = simulate_model(stage, program, initial)
+        change = played - simulate_model(plain, program, initial)
         moved = float(np.max(np.abs(wanted - change - asked)))
         if moved <= 1e-9 * float(np.ptp(wanted)) or moved > 0.9 * before:
             break
@@ -108,7 +117,8 @@ def _led(
     bind: str,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Compensate the driver's lag within the limits: the command, which samples were cut, and remarks on that."""
-    asked_V = whole.command(stage, reference.time_s, static_V)
+    piezo_V = jnp.asarray(gains_of(stage)[0] * static_V)
+    asked_V = np.asarray(_command(stage, jnp.asarray(reference.time_s), piezo_V))
     if stage.hold == "zero":
         # A step stands for the line across its interval.
         asked_V = np.append((asked_V[:-1] + asked_V[1:]) / 2, asked_V[-1])
@@ -121,7 +131,7 @@ def _led(
             f"{asked_V[k]:.6g} V to make up for the driver's lag, but {bind}; slow the reference down, keep it away "
             "from the ends of the range, or cut the command there with --clip."
         )
-    cut = excess_V > _WORTH_SAYING * width_V
+    cut = excess_V > _SHOWS * width_V
     said = f"the command was cut to the limits at {int(cut.sum())} of its samples, by at most {excess_V.max():.3g} V."
     return voltage_V, cut, [said] if cut.any() else []
 
@@ -136,3 +146,143 @@ def plain_loop_of(model: Preisach) -> PlainLoop:
     density, slope = (np.asarray(values)[..., None] for values in _nodes(model))
     surface = Surface.of(density, slope, float(model.density.lower_V), float(model.density.upper_V))
     return PlainLoop(surface, float(model.offset_um))
+
+
+def plain_of(stage: Stage) -> Stage:
+    """The same stage without effects of `microid.EFFECTS`; itself where it has none."""
+    if not any(isinstance(part, AbstractEffect) for part in stage.parts):
+        return stage
+    parts = {
+        name: innermost(part)
+        for name, part in zip(stage.names, stage.parts, strict=True)
+        if not isinstance(part, AbstractEffect) or hasattr(part, "inner")
+    }
+    return Stage(tuple(parts.values()), tuple(parts), stage.hold, stage.substeps)
+
+
+def hysteresis_of(stage: Stage) -> Preisach:
+    """Find the one Preisach hysteresis of a stage."""
+    for part in stage.parts:
+        if isinstance(innermost(part), Preisach):
+            return innermost(part)
+    parts = ", ".join(f"{n} ({type(p).__name__})" for n, p in zip(stage.names, stage.parts, strict=True))
+    raise DataError(
+        f"expected a stage with a Preisach hysteresis, found {parts}; fit one with a hysteresis.", of_model=True
+    )
+
+
+def gains_of(stage: Stage) -> tuple[float, float, float]:
+    """Static gains of a stage ahead of its hysteresis and behind it, and the reading where the piezo's is zero."""
+    law = stage.parts.index(hysteresis_of(stage))
+    ahead, behind, offset = 1.0, 1.0, 0.0
+    for k, part in enumerate(stage.parts):
+        if not isinstance(part, AbstractLinear):
+            continue
+        gain, own = map(float, _at_rest(part))
+        if not (np.isfinite(gain) and gain > 0):
+            raise DataError(
+                f"part {stage.names[k]!r} of the stage: expected a positive static gain, found {gain:g}; turn the "
+                "sign of the column of its signal, and fit again.",
+                of_model=True,
+            )
+        if k < law:
+            ahead *= gain
+        else:
+            behind, offset = behind * gain, gain * offset + own
+    return ahead, behind, offset
+
+
+@eqx.filter_jit
+def _at_rest(part: AbstractLinear) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    return part.static_gain, part.system().offset
+
+
+def plain_stage_of(stage: Stage) -> PlainModel | None:
+    """The same stage in NumPy, without its uncertainty; None where that has no form for one of its parts."""
+    try:
+        return plain_model({"model": encode(stage), "uncertainty": None, "fit": {}})
+    except DataError:
+        return None
+
+
+def static_equivalent(model: Preisach | Stage) -> Preisach:
+    """Return the hysteresis between command and sensor, as slow commands see it: the static gains folded in.
+
+    A `DataError` refuses a stage without a Preisach hysteresis, or with a static gain that is not positive.
+    """
+    if isinstance(model, Preisach):
+        return model
+    stage = plain_of(model)
+    return _folded(hysteresis_of(stage), *map(jnp.asarray, gains_of(stage)))
+
+
+# As one program: one operation after the other they would be compiled each by itself.
+@eqx.filter_jit
+def _folded(
+    law: Preisach, ahead: Float[Array, ""], behind: Float[Array, ""], offset_um: Float[Array, ""]
+) -> Preisach:
+    lower, upper = law.density.lower_V / ahead, law.density.upper_V / ahead
+    weights = law.weights_um[np.tril_indices(law.density.levels)]
+    return Preisach(
+        GridDensity(behind * weights, lower, upper),
+        Reversible(behind * ahead * law.reversible.slope_um_per_V, lower, upper),
+        offset_um + behind * law.offset_um,
+    )
+
+
+def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: str) -> tuple[np.ndarray, float]:
+    """Find what the sensor would have to read at rest for the mechanics to follow a reference, and how sure that is.
+
+    The displacement in um has the shape `(n,)` of the times and the reference. Its largest error is estimated as a
+    third of what it would be off if every other sample were missing.
+    """
+    if len(time_s) < _FEWEST:
+        raise DataError(
+            f"{source}: expected {_FEWEST} samples or more for --dynamic, found {len(time_s)}; sample the reference "
+            "more finely, or use --static."
+        )
+    _, behind, offset_um = gains_of(stage)
+    every, other = (
+        offset_um + behind * np.asarray(_demand(stage, jnp.asarray(time_s[::n]), jnp.asarray(reference_um[::n])))
+        for n in (1, 2)
+    )
+    # Away from the ends, where splines are less sure than the reference is.
+    return every, float(np.max(np.abs(every[::2] - other)[2:-2]) / 3)
+
+
+def demand_remarks(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: float) -> tuple[list[str], list[str]]:
+    """Remarks that a reference turns faster than its samples show, and that it moves at first, from `demand`."""
+    start_um, little_um = abs(float(needed_um[0] - reference_um[0])), _WORTH_SAYING * float(np.ptp(reference_um))
+    turning = (
+        "the reference turns within a sample, so that the displacement its acceleration asks for is uncertain by "
+        f"{length(doubt_um)}; smooth it, sample it more finely, or use --static."
+    )
+    moving = (
+        f"the reference begins in motion and the stage at rest, {length(start_um)} away from what it would need; "
+        "begin with a rest and a smooth start."
+    )
+    return [turning] if doubt_um > little_um else [], [moving] if start_um > max(little_um, doubt_um) else []
+
+
+def simulate_model(model: Preisach | Stage, record: Record, initial: str) -> np.ndarray:
+    """Displacement of a hysteresis or a whole stage under a voltage, in um, shape `(n,)`; see `compensate`."""
+    law = model if isinstance(model, Preisach) else hysteresis_of(model)
+    lower, upper = float(law.density.lower_V), float(law.density.upper_V)
+    if isinstance(model, Preisach):
+        return simulate_run(model, prepare_run(record, (lower, upper), initial, 1.0))
+    if (plain := plain_stage_of(model)) is not None:
+        return plain.play(record, initial)
+    # Even times are given as the one interval between them: that takes half as long to compile.
+    each_s = intervals(record.time_s)
+    time_s = float(each_s[0]) if len(each_s) == 1 else record.time_s
+    return respond(model, time_s, record.voltage_V, Start(memory=initial_state(initial, lower, upper)))
+
+
+def respond(stage: Stage, time_s: np.ndarray | float, voltage_V: np.ndarray, start: Start) -> np.ndarray:
+    """Displacement of a stage in um, shape `(n,)` as the voltage has; the time may be one interval."""
+    return np.asarray(_respond(stage, jnp.asarray(time_s), jnp.asarray(voltage_V), start))
+
+
+_demand = eqx.filter_jit(microid.piezo_demand)
+_command = eqx.filter_jit(microid.driver_command)
+_respond = eqx.filter_jit(lambda stage, time_s, voltage_V, start: stage(time_s, voltage_V, start))

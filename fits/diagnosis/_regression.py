@@ -15,8 +15,7 @@ from fits.loop._design import Grid
 from fits.loop._past import rough_past_columns
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
-from fits.stage._follow import propagated
-from fits.stage._moments import Chain, linearise, pieces
+from fits.stage._moments import Chain, linearise, pieces, propagated
 from fits.stage._run import ahead, place_of_hysteresis
 from microid import PLACES, AbstractEffect, Coordinates, Stage
 

@@ -10,18 +10,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import microid as m
-from fits.control._compensate_stage import static_equivalent
+from fits.control._compensate import static_equivalent
 from fits.io._errors import DataError
 from fits.io._jax_setup import require_float64
+from fits.io._json import columns
+from fits.io._length import length
+from fits.io._printable import plain
 from fits.io._summary import AbstractSummary
 from fits.machining._design import Design
 from fits.machining._gains import once_per_function, quick_jit
 from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import derivatives_of, output_scale, refuse_infinite
-from fits.machining._words import describe_budget
 
 Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
-MEASURES: tuple[Measures, ...] = ("pzt", *m.AXES)
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,29 @@ class Budget(AbstractSummary):
 
     def summary(self) -> str:
         """Tell the errors of each axis, in its unit, in a table and sentences."""
-        return describe_budget(self)
+        driving, axes = self.driving, self.axes.values()
+        parts = ("stroke", "driving", "machining", "at fixed V", "measuring", "signed", "worst case", "%", "rss", "%")
+        shares = [(axis.axis, *(f"{100 * share:.2f} %" for share in axis.shares.values())) for axis in axes]
+        source = "its displacement" if self.measures == "pzt" else f"its displacement, {self.measures}, over the gain"
+        lines = [
+            f"piezo   {driving.stroke_um:.4g} um by {source}; {driving.slope_um_per_V:.4g} um/V leaves "
+            f"{driving.lowest_um:+.3g} to {driving.highest_um:+.3g} um of hysteresis",
+            f"sensor  {length(self.noise_um)}, twice its random part"
+            + (", zeroed at rest" if self.zeroed else " and its offset")
+            + (f", at {self.arm_mm:g} mm from the axes of rotation" if self.arm_mm else ""),
+            "",
+            *(f"  {row}" for row in columns([("", *parts), *map(_row, axes)], ">")),
+            "",
+            "shares of the squares in rss:",
+            *(f"  {row}" for row in columns([("", "driving", "machining", "measuring"), *shares], ">")),
+            "",
+            "driving: the largest of a full loop, with its sign; machining: worst case over the tolerances at a "
+            "fixed elongation, and at a fixed voltage",
+            "signed: this driving error, all dimensions at plus one tolerance and a reading too high; rss: root sum "
+            "of squares, of all dimensions too",
+            *(f"Note: {remark}" for remark in self.remarks),
+        ]
+        return "\n".join(lines)
 
 
 def budget(
@@ -233,4 +256,20 @@ def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, a
     yield (
         "The totals take machining at a fixed elongation of the piezo (Eq. 4); open loop the voltage is fixed, and "
         "the column beside it counts."
+    )
+
+
+def _row(axis: AxisBudget) -> tuple[str, ...]:
+    return (
+        axis.axis,
+        f"{plain(axis.stroke)} {axis.output_unit}",
+        plain(axis.driving, 3, "+"),
+        plain(axis.machining_worst_case, 3),
+        plain(axis.machining_voltage_worst_case, 3),
+        "unknown" if axis.measuring is None else plain(axis.measuring, 3),
+        plain(axis.signed, 3, "+"),
+        plain(axis.worst_case, 3),
+        f"{100 * axis.worst_case / axis.stroke:.2f}",
+        plain(axis.root_sum_square, 3),
+        f"{100 * axis.root_sum_square / axis.stroke:.2f}",
     )

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 import microid as m
 from fits.io._errors import DataError
 from fits.io._jax_setup import require_float64
+from fits.io._json import columns
 from fits.io._summary import AbstractSummary
 from fits.machining._design import Design, uniform_tolerance
 from fits.machining._gains import check_axes, gain_model, gains_of_few, once_per_function, quick_jit, twin
 from fits.machining._tolerances import tolerances
-from fits.machining._words import describe_sensitivity
 
 # So short a stroke that all motions are in proportion to it, to the last digit.
 SHORT_um = 1e-6
@@ -95,7 +95,12 @@ class SensitivityReport(AbstractSummary):
 
     def summary(self, voltage: bool = False) -> str:
         """Rank the dimensions of each axis in tables; with `voltage` add the relative changes at a fixed voltage."""
-        return describe_sensitivity(self, voltage)
+        note = (
+            "at plus one tolerance and a fixed elongation of the piezo; per 10 um of the dimension, at full stroke; "
+            "angles by 10 um across their leg"
+        )
+        tables = ["\n".join(_table(axes, self.level, voltage)) for axes in self.alike()]
+        return "\n\n".join([*tables, note])
 
     def alike(self) -> list[list[AxisSensitivity]]:
         """Group axes that are the same function of the same dimensions."""
@@ -193,3 +198,31 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
     rss_pct, worst_case_pct = 100 * math.sqrt(max(variance, 0.0)), 100 * float(np.abs(changes).sum())
     motion = scale * gain, float(derived.loaded_stroke_um), scale * stroke
     return AxisSensitivity(axis, unit, *motion, tuple(effects), rss_pct, worst_case_pct, by_voltage)
+
+
+def _table(axes: Sequence[AxisSensitivity], level: int, voltage: bool) -> list[str]:
+    axis, title = axes[0], " and ".join(each.axis for each in axes)
+    unit = axis.output_unit
+    rows = [("", "value", "tolerance", f"{unit}/10 um", "% of output", "exact %", "share")]
+    rows += [
+        (
+            effect.name,
+            f"{effect.value:.6g} {effect.unit}",
+            f"{effect.tolerance:.3g} {effect.unit}",
+            f"{effect.output_change_per_10um:+.3g}",
+            f"{effect.relative_change_pct:+.3f}",
+            f"{effect.relative_change_exact_pct:+.3f}",
+            f"{effect.share_of_variance:.4f}",
+        )
+        for effect in axis.dimensions
+    ]
+    lines = [
+        f"{title}: {axis.gain:.6g} {axis.gain_unit}, {axis.stroke:.5g} {unit} at {axis.loaded_stroke_um:.4g} um of "
+        f"the loaded piezo, level {level}",
+        *(f"  {row}" for row in columns(rows, ">")),
+        f"  root sum of squares {axis.rss_pct:.2f} %, worst case {axis.worst_case_pct:.2f} %",
+    ]
+    if voltage:
+        changes = ", ".join(f"{name} {change:+.3g}" for name, change in axis.voltage_change_pct.items())
+        lines.append(f"  at a fixed voltage, % of output: {changes or 'none'}")
+    return lines

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import data_synth
-from fits.control._compensate_stage import simulate_model
+from fits.control._compensate import simulate_model
 from fits.io._atomic import finite_json
 from fits.io._record import Reference
 from fits.machining._design import paper_design
@@ -29,8 +29,8 @@ from fits.paper._runs import (
     identify_modes,
 )
 from fits.paper._tables import AXIS_TITLES, PAPER, Measured, PaperResult, paper_json, paper_page, render
+from fits.plots._control import plot_inverse, plot_loop, plot_steps, plot_tracking
 from fits.plots._machining import plot_idle, plot_sensitivity
-from fits.plots._paper import plot_inverse, plot_loop, plot_steps, plot_tracking
 from fits.stats._metrics import errors, loop_width_pct
 from microid.control import step_metrics, tracking_errors
 

@@ -15,7 +15,7 @@ from fits.machining._budget import Budget
 from fits.machining._sensitivity import SensitivityReport
 from fits.plots import _style as style
 from fits.plots._diagnosis import residual_figure
-from fits.plots._fit_stage import linear_gain
+from fits.plots._fit import linear_gain
 from fits.plots._machining import budget_bars, tornado
 from microid import Mechanics, Stage
 

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from fits.control._compensate_stage import respond
+from fits.control._compensate import respond
 from fits.control._gains import printed_gains
 from fits.control._make import Loop, Made
 from fits.control._tune_problem import Tuning

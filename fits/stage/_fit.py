@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+import microid as m
 from fits.io._errors import DataError
 from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record
@@ -33,32 +34,21 @@ from fits.stage._solve import Problem, Solved
 from fits.stage._steps import Plan, present_problem, refine_problem, start_problem, starts_as_it_is
 from fits.stage._uncertainty import Precision, estimates
 from fits.stats._metrics import WHITE
-from microid import (
-    AbstractLinear,
-    Driver,
-    GridDensity,
-    Hold,
-    HystereticMechanics,
-    Mechanics,
-    Preisach,
-    Reversible,
-    Stage,
-)
 
 
-def default_stage(hold: Hold = "first") -> Stage:
+def default_stage(hold: m.Hold = "first") -> m.Stage:
     """The stage of Section 3.1: driver, Preisach operator and mechanics, with all gain in the operator.
 
     A gain anywhere else would only be seen together with it. `hold` says how the command runs between samples:
     `first` for lines, `smooth` for curves, `zero` for steps that each begin at a sample and are not seen by it yet.
     """
-    flat = Preisach(
-        GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
-        Reversible(jnp.ones(4), jnp.asarray(0.0), jnp.asarray(1.0)),
+    flat = m.Preisach(
+        m.GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
+        m.Reversible(jnp.ones(4), jnp.asarray(0.0), jnp.asarray(1.0)),
         jnp.asarray(0.0),
     )
-    mechanics = Mechanics(jnp.asarray(100.0), jnp.asarray(0.1))
-    stage = Stage.of(hold=hold, driver=Driver(jnp.asarray(1e-3)), hysteresis=flat, mechanics=mechanics)
+    mechanics = m.Mechanics(jnp.asarray(100.0), jnp.asarray(0.1))
+    stage = m.Stage.of(hold=hold, driver=m.Driver(jnp.asarray(1e-3)), hysteresis=flat, mechanics=mechanics)
     return stage.freeze("driver.gain", "mechanics.gain")
 
 
@@ -66,13 +56,13 @@ def default_stage(hold: Hold = "first") -> Stage:
 def fit_stage(
     records: AnyRuns,
     *,
-    stage: Stage | None = None,
+    stage: m.Stage | None = None,
     levels: int | None = None,
     holdout: float | AnyRuns = 0.2,
     initial: str | Sequence[str] = "unknown",
     loss: str = "squares",
     progress: Progress = lambda _: None,
-) -> FitResult[Stage]:
+) -> FitResult[m.Stage]:
     """Fit driver, hysteresis and mechanics jointly to slow and fast runs of one rig.
 
     The slow runs give a first hysteresis, what the fast ones make of it a frequency response, and that the poles to
@@ -144,7 +134,7 @@ def fit_stage(
     return completed(summary, solved, (*records, *aside), loss)
 
 
-def completed(found: FitResult[Stage], solved: Solved, records: Sequence[Record], loss: str) -> FitResult[Stage]:
+def completed(found: FitResult[m.Stage], solved: Solved, records: Sequence[Record], loss: str) -> FitResult[m.Stage]:
     """Add how far a fit is from noise, and say first what is wrong with its runs and records."""
     odd = remarks_on(solved.runs, solved.residuals_um, robust=loss == "huber")
     notes = [warning for record in records for warning in record.warnings]
@@ -164,7 +154,7 @@ class Solution:
 
 def solve_stage(
     records: Sequence[Record],
-    stage: Stage | None,
+    stage: m.Stage | None,
     levels: int | None,
     holdout: float | Sequence[Record],
     initial: str | Sequence[str],
@@ -188,7 +178,7 @@ def solve_stage(
         raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
     stage = default_stage() if stage is None else stage
     ahead = stage.parts[: place_of_hysteresis(stage)]
-    if stage.hold == "zero" and not any(isinstance(part, Driver) for part in ahead):
+    if stage.hold == "zero" and not any(isinstance(part, m.Driver) for part in ahead):
         raise DataError(
             "the stage holds its command in steps, which is fitted only with a driver ahead of the hysteresis: "
             "insert one, or use hold='first'"
@@ -224,7 +214,7 @@ def _refined(plan: Plan, problem: Problem) -> Solution:
         return Solution(*refine_problem(replace(plan, accept_best=True), problem), plan, failure)
 
 
-def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
+def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[m.Stage]:
     """Put the fit of a stage, and held-out runs, into figures; a `DataError` if the runs are not of one rig."""
     solved, stage = precision.solved, precision.solved.stage
     remarks = check_gains(stage, solved.runs, refuse=True)
@@ -255,17 +245,17 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[Stage]:
     )
 
 
-def _with_offset(stage: Stage, offset_um: float) -> Stage:
+def _with_offset(stage: m.Stage, offset_um: float) -> m.Stage:
     """Put a sensor's offset where the stage has room for one: ahead of a yielding spring it would load that."""
     for place, (name, part) in enumerate(zip(stage.names, stage.parts, strict=True)):
         behind = stage.parts[place + 1 :]
-        if hasattr(part, "offset_um") and not any(isinstance(one, HystereticMechanics) for one in behind):
-            gain = math.prod(float(one.static_gain) for one in behind if isinstance(one, AbstractLinear))
+        if hasattr(part, "offset_um") and not any(isinstance(one, m.HystereticMechanics) for one in behind):
+            gain = math.prod(float(one.static_gain) for one in behind if isinstance(one, m.AbstractLinear))
             return stage.swap(name, eqx.tree_at(lambda p: p.offset_um, part, part.offset_um + offset_um / gain))
     return stage
 
 
-def _report(stage: Stage, run: Run, **figures: Any) -> RunReport:
+def _report(stage: m.Stage, run: Run, **figures: Any) -> RunReport:
     # A run that was only predicted still has an offset of its own.
     counted = run if run.fitted.any() else replace(run, fitted=run.known)
     predicted = run.displacement_um - residual_of(stage, counted)

@@ -1,35 +1,4 @@
-"""Fitted models as files: JSON that explains itself.
-
-A model file is one JSON object (UTF-8; no NaN or infinity) with six keys:
-
-- `schema`: `"microid.model/1"`. Another number means another format.
-- `sha256`: of the object without this key, as `json.dumps(rest, sort_keys=True, separators=(",", ":"))` in ASCII.
-- `written_by`: name and version of the program.
-- `model`: every part is an object whose `type` is the name of a class in `microid`, with one key per field.
-- `uncertainty`: `fits.Uncertainty`, or for a whole stage `fits.StageUncertainty`, in the same form.
-- `fit`: the report of the fit, as `microid fit --json` prints it.
-
-A field that holds numbers is `{"unit": "um", "value": 1.5}`, where the value is one number or nested lists of them
-(float64, written with as many digits as reading it back exactly takes; another type is named by the key `dtype`). The
-perturbations of the uncertainty, which are many, are `{"unit": "um", "shape": [k, D], "float64_base64": "..."}`: row
-by row, little-endian float64. A tuple is a list; other fields are plain JSON. A network has `type` `MLP`, the sizes
-of its input and output, the name of its activation, and layers with `weight`, shape `(out, in)`, and `bias`. A stage
-has its `parts` in the order of the signal, and as many `names`; perturbations of its other parameters, in scaled and
-unbounded coordinates, are `coordinates`.
-
-Without microid, the weights of Eq. 9 of a grid and the perturbations are read by
-
-    import base64, json, pathlib
-    import numpy as np
-
-    content = json.loads(pathlib.Path("model.json").read_text(encoding="utf-8"))
-    packed_um = np.array(content["model"]["density"]["packed_um"]["value"])
-    n = (round((8 * len(packed_um) + 1) ** 0.5) - 1) // 2
-    weights_um = np.zeros((n, n))
-    weights_um[np.tril_indices(n)] = packed_um
-    columns = content["uncertainty"]["columns_um"]
-    columns_um = np.frombuffer(base64.b64decode(columns["float64_base64"]), "<f8").reshape(columns["shape"])
-"""
+"""Fitted models as files: JSON that explains itself; `docs/files.md` has the format."""
 
 import json
 import os

@@ -14,12 +14,68 @@ from jaxtyping import Array, Bool, Float
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
 from fits.loop._run import Run, Samples
-from fits.stage._follow import passes_linearly, propagated
 from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
-from microid import Coordinates, LinearSystem, ParameterInfo, Stage, Staircase
+from microid import Coordinates, LinearSystem, ParameterInfo, Signal, Stage, Staircase
 
 # Samples that go through the compiled regression at a time.
 _PIECE = 2048
+# Directions that are passed on at a time.
+_AT_ONCE = 64
+
+
+def passes_linearly(stage: Stage, place: int) -> bool:
+    """Whether all that follows a part is linear."""
+    after = stage.parts[place + 1 :]
+    return not after or joined(after) is not None
+
+
+def propagated(
+    coordinates: Coordinates[Stage],
+    place: int | None,
+    z: Float[Array, " p"],
+    run: Run,
+    around_um: np.ndarray,
+    moved_um: np.ndarray,
+) -> np.ndarray:
+    """Pass changes of what comes out of the hysteresis, shape `(n, k)`, on through what follows it, to first order.
+
+    They are `around_um`, shape `(n,)`. Where all that follows is linear, they have been passed on already.
+    """
+    assert place is not None
+    if passes_linearly(coordinates(z), place):
+        return moved_um
+    n, samples = len(run.record), run.samples
+    pad = len(samples.weight) - n
+    time_s = samples.time_s * samples.stride if samples.time_s.ndim == 0 else samples.time_s[:: samples.stride]
+    signal = jnp.asarray(np.pad(around_um, (0, pad), mode="edge"))
+    out = np.empty_like(moved_um)
+    for first in range(0, moved_um.shape[1], _AT_ONCE):
+        part = moved_um[:, first : first + _AT_ONCE].T
+        full = np.pad(part, ((0, _AT_ONCE - len(part)), (0, pad)))
+        answer = _propagated(coordinates, place, z, time_s, signal, jnp.asarray(full))
+        out[:, first : first + _AT_ONCE] = np.asarray(answer)[: len(part), :n].T
+    return out
+
+
+@eqx.filter_jit
+def _propagated(
+    coordinates: Coordinates[Stage],
+    place: int,
+    z: Float[Array, " p"],
+    time_s: Float[Array, " n"] | Float[Array, ""],
+    around_um: Float[Array, " n"],
+    moved_um: Float[Array, "k n"],
+) -> Float[Array, "k n"]:
+    stage = coordinates(z)
+
+    def follow(values: Float[Array, " n"]) -> Float[Array, " n"]:
+        signal = Signal(values, values[0], "first")
+        for part in stage.parts[place + 1 :]:
+            signal = part.run(time_s, signal)
+        return signal.values
+
+    _, push = jax.linearize(follow, around_um)
+    return jax.vmap(push)(moved_um)
 
 
 def offsets_out(stage: Stage, grid: bool) -> Coordinates[Stage]:
@@ -180,27 +236,16 @@ def along(
     columns_um: Float[Array, " D"] | None,
     run: Run,
     directions: Sequence[np.ndarray],
+    slope: np.ndarray | None = None,
     reduce: Callable[[np.ndarray], np.ndarray] = lambda moved: moved,
 ) -> np.ndarray:
     """Move columns, `(D, k)`, and coordinates, `(p, k)`, to first order: changes of the displacement, shape `(n, k)`.
 
-    Without columns the run is linearised at those that the stage has, whose grid may then differ from the chain's. Of
-    the changes of each piece, shape `(samples, k)`, only what `reduce` makes of them is kept.
+    Without columns the run is linearised at those that the stage has, whose grid may then differ from the chain's.
+    The `slope` along the coordinates, shape `(n, p)`, may be known. Of the changes of each piece, `(samples, k)`,
+    only what `reduce` makes of them is kept.
     """
-    slope = linearise(chain, z, columns_um, run)[1]
-    return moved_along(chain, z, columns_um, slope, run, directions, reduce)
-
-
-def moved_along(
-    chain: Chain,
-    z: Float[Array, " p"],
-    columns_um: Float[Array, " D"] | None,
-    slope: np.ndarray,
-    run: Run,
-    directions: Sequence[np.ndarray],
-    reduce: Callable[[np.ndarray], np.ndarray],
-) -> np.ndarray:
-    """The same where the slopes along the coordinates are known, shape `(n, p)`."""
+    slope = linearise(chain, z, columns_um, run)[1] if slope is None else slope
     moved_um: Iterable[np.ndarray] = (columns @ directions[0] for _, columns in pieces(chain, z, run, True))
     if chain.place is not None and not passes_linearly(stage := chain.stage(z, columns_um), chain.place):
         # What is not linear needs all of a record at a time.

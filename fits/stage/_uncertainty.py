@@ -14,7 +14,7 @@ from fits.loop._prior import interpolation
 from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
-from fits.stage._moments import Chain, along, linearise, moved_along, offsets_out
+from fits.stage._moments import Chain, along, linearise, offsets_out
 from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._metrics import TWO_SIDED_95, WHITE
@@ -53,9 +53,7 @@ class StageUncertainty(AbstractUncertainty):
         directions = np.asarray(self.columns_um).T, np.asarray(self.coordinates).T
         z = chain.coordinates.of(stage)
         out, slope, _ = linearise(chain, z, None, run)
-        square = moved_along(
-            chain, z, None, slope, run, directions, lambda moved: np.sum((moved - mean) ** 2, axis=1)
-        )
+        square = along(chain, z, None, run, directions, slope, lambda moved: np.sum((moved - mean) ** 2, axis=1))
         return Prediction(out[: len(run.record)], np.sqrt(square + float(self.discrepancy_um) ** 2))
 
 

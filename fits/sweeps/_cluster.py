@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from fits.io._errors import DataError, shown
-from fits.sweeps._chunks import compute_chunk
-from fits.sweeps._packages import need, versions
-from fits.sweeps._spec import Sweep, parse_sweep
+from fits.sweeps._spec import Sweep, compute_chunk, parse_sweep
+from fits.sweeps._store import need, versions
 from fits.sweeps._types import Rows
 
 _MOST_LOSSES = 5

@@ -19,8 +19,7 @@ from fits.io._units import parse_columns
 from fits.loop._plain import INITIAL_STATES
 from fits.loop._result import FitError
 from fits.sweeps._devices import on_cpu
-from fits.sweeps._programs import Program, read_program
-from fits.sweeps._stages import requested_stage, simulated, stage_parameters
+from fits.sweeps._stages import Program, read_program, requested_stage, simulated, stage_parameters
 from fits.sweeps._types import Block, Output, Parameter, Request, Rows
 from microid import Stage
 

@@ -11,10 +11,8 @@ import numpy as np
 
 from fits.io._atomic import atomic_path
 from fits.io._jax_setup import require_float64
-from fits.sweeps._chunks import chunk_count, compute_chunk, rows_of
-from fits.sweeps._packages import need
-from fits.sweeps._spec import Sweep
-from fits.sweeps._store import TABLE, Store, check_folder, opened
+from fits.sweeps._spec import Sweep, chunk_count, compute_chunk, rows_of
+from fits.sweeps._store import TABLE, Store, check_folder, need, opened
 from fits.sweeps._types import FAILED
 
 

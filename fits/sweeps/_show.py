@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from fits.io._errors import DataError
-from fits.sweeps._packages import need
-from fits.sweeps._store import LEDGER, RESULTS, about_of
+from fits.sweeps._store import LEDGER, RESULTS, about_of, need
 from fits.sweeps._types import DONE, FAILED
 
 SCHEMA = "microid.sweep.summary/1"

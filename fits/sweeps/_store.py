@@ -9,25 +9,26 @@ import errno
 import hashlib
 import json
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypedDict
 
 import msgspec
 import numpy as np
 
+from fits.io import _late
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import DataError
 from fits.io._file_set import DISK_TROUBLE, flush, usable_folder
 from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
 from fits.io._temporary import is_temporary
-from fits.sweeps._chunks import REASON, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of
-from fits.sweeps._packages import need, versions
-from fits.sweeps._spec import Sweep
+from fits.sweeps._spec import REASON, Sweep, bytes_per_row, chunk_count, chunk_rows, rows_of, source_of, swept_of
 from fits.sweeps._types import STATUS_WORDS, Output, Rows
 
 SCHEMA = "microid.sweep.results/1"
@@ -275,3 +276,28 @@ def _sentences(folder: Path) -> Iterator[None]:
             f"{folder}: cannot be written ({error.strerror or error}); what was done before is kept: free the disk "
             "or correct the permissions, then go on with --resume."
         ) from error
+
+
+def need(name: str) -> Any:
+    """Import a package of the extras `sweep` and `cluster`; a `DataError` says what to run if it is not installed."""
+    return _late.need(name, "sweep,cluster" if name.partition(".")[0] == "distributed" else "sweep")
+
+
+@lru_cache(maxsize=1)
+def versions() -> dict[str, str]:
+    """Version of Python and of each package that computes."""
+    found = {"python": platform.python_version()}
+    for name in ("microid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = _checkout() if name == "microid" else "not installed"
+    return found
+
+
+def _checkout() -> str:
+    """What tells a checkout that is not installed from others: a sum of its sources."""
+    total, root = hashlib.sha256(), Path(__file__).parents[2]
+    for path in sorted(path for package in ("fits", "microid") for path in (root / package).rglob("*.py")):
+        total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return f"checkout {total.hexdigest()[:12]}"

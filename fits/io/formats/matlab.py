@@ -1,18 +1,120 @@
 """MATLAB files: up to version 7 by SciPy, from 7.3 on as HDF5; arrays, structures, and the captures of dSPACE."""
 
 import io
+import math
+import struct
+import zlib
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from fits.io._read_file import refuse_large
 from fits.io._table import Found, Table, gathered
 from fits.io.formats._base import Format, register
-from fits.io.formats._mat_elements import sound_variables
 from fits.io.formats.hdf5 import open_hdf5
 
 # How a signal is written as a structure: its name, its values and its unit.
 _SIGNAL = (("Name", "Data", "Unit"), ("label", "values", "unit"), ("name", "data", "unit"))
+# Bytes of a number of each type of data; 16 to 18 are characters. Matrices and what is packed have their own types.
+_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
+_MATRIX, _PACKED, _DEEPEST = 14, 15, 16
+# Classes of matrices.
+_CELL, _STRUCT, _TEXT, _NUMBERS = 1, 2, 4, range(6, 16)
+
+_Element = tuple[int, bytes]
+
+
+class _OfMatlabAlone(ValueError):
+    """Tables, objects, functions and sparse matrices."""
+
+
+def sound_variables(path: str, data: bytes) -> list[str]:
+    """Names of the variables of version 5 that can be read: numbers, texts, structures and cell arrays.
+
+    SciPy takes for granted that their elements fit into each other. A ValueError says what does not, a `DataError`
+    that the file unpacks to too much.
+    """
+    order = "<" if data[126:128] == b"IM" else ">"
+    size, names = 0, []
+    for kind, content in _elements(data[128:], order):
+        if kind == _PACKED:
+            # No more is unpacked than is read, and the sum at its end is compared.
+            unpack = zlib.decompressobj()
+            content = unpack.decompress(content, 1_000_000_000)
+            refuse_large(path, len(content) + len(unpack.unconsumed_tail))
+            if not unpack.eof:
+                raise ValueError("packed data are cut")
+            kind, content = next(_elements(content, order), (0, b""))
+        size += len(content)
+        refuse_large(path, size)
+        if kind != _MATRIX:
+            raise ValueError("a variable is no matrix")
+        try:
+            names.append(_check_matrix(content, order, 0))
+        except _OfMatlabAlone:
+            continue
+    return names
+
+
+def _elements(data: bytes, order: str) -> Iterator[_Element]:
+    """Types and contents of what stands one behind the other."""
+    at = 0
+    while at < len(data):
+        if at + 8 > len(data):
+            raise ValueError("an element is cut")
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        begin = at + 8
+        if kind >> 16:  # up to four bytes stand within the tag
+            kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
+            at += 8
+        else:
+            at = begin + size + (0 if kind == _PACKED else -size % 8)
+        if begin + size > len(data) or (begin == at - 4 and size > 4) or kind not in (*_BYTES, _MATRIX, _PACKED):
+            raise ValueError("an element is cut or of unknown type")
+        yield kind, data[begin : begin + size]
+
+
+def _check_matrix(data: bytes, order: str, depth: int) -> str:
+    """Check a matrix and what is in it; its name comes back."""
+    if not data:
+        return ""  # an empty one within a structure
+    flags, *parts = _elements(data, order)
+    if flags[0] != 6 or len(flags[1]) != 8 or depth > _DEEPEST:
+        raise ValueError("a matrix has no flags")
+    kind = struct.unpack_from(f"{order}I", flags[1])[0]
+    complex_, kind = bool(kind & 0x800), kind & 0xFF
+    if kind not in (_CELL, _STRUCT, _TEXT, *_NUMBERS):
+        raise _OfMatlabAlone("tables and objects are not read")
+    kinds, sizes = [each for each, _ in parts[:2]], parts[0][1] if parts else b""
+    if kinds not in ([5, 1], [5, 16]) or len(sizes) % 4 or len(sizes) < 8:
+        raise ValueError("a matrix has no size or name")
+    shape = struct.unpack(f"{order}{len(sizes) // 4}i", sizes)
+    count, rest, name = math.prod(shape), parts[2:], parts[1][1].decode("latin-1")
+    if min(shape) < 0:
+        raise ValueError("a matrix has a negative size")
+    if kind in (_TEXT, *_NUMBERS):
+        # A character of a text in UTF-8 has a byte or more.
+        fits = [
+            part in _BYTES and (len(content) == count * _BYTES[part] or (part == 16 and len(content) >= count))
+            for part, content in rest
+        ]
+        if len(fits) != 1 + complex_ or not all(fits):
+            raise ValueError("a matrix holds more or less numbers than its size says")
+        return name
+    if kind == _STRUCT:
+        width = struct.unpack(f"{order}i", rest[0][1])[0] if rest and len(rest[0][1]) == 4 else 0
+        if len(rest) < 2 or width < 1 or len(rest[1][1]) % width:
+            raise ValueError("a structure has no names")
+        count *= len(rest[1][1]) // width
+        rest = rest[2:]
+    if len(rest) != count:
+        raise ValueError("a structure or cell array has more or less parts than its size says")
+    for part, content in rest:
+        if part != _MATRIX:
+            raise ValueError("a part is no matrix")
+        _check_matrix(content, order, depth + 1)
+    return name
 
 
 def open_matlab(path: str, data: bytes) -> Table:

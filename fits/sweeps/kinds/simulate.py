@@ -13,8 +13,7 @@ from msgspec import Meta
 from fits.io._errors import DataError
 from fits.io._typed import typed
 from fits.sweeps._devices import block_rows, by_rows
-from fits.sweeps._programs import Program, read_program
-from fits.sweeps._stages import requested_stage, simulated, stage_parameters
+from fits.sweeps._stages import Program, read_program, requested_stage, simulated, stage_parameters
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Request, Rows
 from microid import Stage
 
