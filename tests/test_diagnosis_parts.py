@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
 from fits import Record
@@ -18,6 +19,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Family, Probe, score
 from fits.stage._motion import program
 from fits.stats._band import band_of
+from fits.stats._compare import surprise
 from fits.stats._noise import Noise, learn_noise
 from microid import EFFECTS, AbstractPart, Scene, Signal
 
@@ -326,13 +328,21 @@ def test_a_signal_without_columns_is_whitened(rng):
     assert noise.whiten(np.zeros((20, 0))).shape == (20, 0)
 
 
-def test_errors_that_noise_makes_alike_count_once(rng):
-    # Of an AR(1) of a, (1 + a) / (1 - a) samples are worth one.
-    held = [SimpleNamespace(held_out=np.arange(5) >= at) for at in (2, 4)]
-    errors = rng.standard_normal(4)
-    case = SimpleNamespace(
-        regression=SimpleNamespace(baseline=SimpleNamespace(runs=held)),
-        noise=(Noise(0.3, WHITE), Noise(0.3, np.array([0.5]))),
-    )
-    expected = np.sum(errors[:3] ** 2) + errors[3] ** 2 / 3
-    assert Projector.surprise(case, errors) == pytest.approx(expected, rel=1e-3)
+def test_errors_are_as_improbable_as_their_noise_says(rng):
+    # An AR(1), whose inverse covariance comes from its autocovariances.
+    held = [SimpleNamespace(held_out=np.arange(5000) >= at) for at in (1000, 3000)]
+    noise = Noise(0.3, WHITE), Noise(0.3, np.array([0.7]))
+    white = rng.standard_normal(4000)
+    coloured = lfilter([(1 - 0.7**2) ** 0.5], [1.0, -0.7], rng.standard_normal(2500))[500:]
+    case = SimpleNamespace(regression=SimpleNamespace(baseline=SimpleNamespace(runs=held)), noise=noise)
+    expected = white @ white + coloured @ solve_toeplitz(0.7 ** np.arange(2000), coloured)
+    assert Projector.surprise(case, np.r_[white, coloured]) == pytest.approx(expected, rel=0.03)
+
+
+def test_a_slow_error_counts_by_its_waves_and_not_by_its_samples(rng):
+    noise, errors = Noise(1.0, WHITE), rng.standard_normal(2000)
+    wave = 10 * np.sin(np.linspace(0, 9, 2000))
+    assert 5 < surprise(errors + wave, noise) - surprise(errors, noise) < 0.005 * (wave @ wave)
+    # One that is as large at all frequencies counts with all of them.
+    louder = 2000 * np.log(4)
+    assert surprise(2 * errors, noise) - surprise(errors, noise) == pytest.approx(louder, rel=0.1)

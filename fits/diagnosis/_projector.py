@@ -14,6 +14,7 @@ from fits.diagnosis._regression import Regression
 from fits.loop._grid import non_negative
 from fits.loop._prior import Posterior
 from fits.loop._result import FitError, FitStatus
+from fits.stats._compare import surprise
 from fits.stats._noise import Noise
 
 # Part of a column of the tangent, in squares, below which what the others leave of it is rounding.
@@ -234,13 +235,10 @@ class Projector:
         return np.concatenate(found) if found else np.zeros(0)
 
     def surprise(self, errors: np.ndarray) -> float:
-        """-2 ln of the probability of such errors, shape `(n,)`, of which those that noise makes alike count once."""
-        found, first = 0.0, 0
-        for run, noise in zip(self.regression.baseline.runs, self.noise, strict=True):
-            own = errors[first : first + int(run.held_out.sum())]
-            found += float(own @ own) / max(noise.correlation_samples, 1.0)
-            first += len(own)
-        return found
+        """How improbable such errors in what was held out are, shape `(n,)`; see `fits.stats._compare.surprise`."""
+        stops = np.cumsum([int(run.held_out.sum()) for run in self.regression.baseline.runs])
+        each = zip(np.split(errors, stops[:-1]), self.noise, strict=True)
+        return sum(surprise(own, noise) for own, noise in each if len(own))
 
     def move(self, joined: np.ndarray) -> Baseline:
         """The baseline moved so that it follows a joined signal best, with columns that stay non-negative.

@@ -157,13 +157,14 @@ def _roughness(baseline: Baseline) -> np.ndarray:
 
 def _rough_pasts(baseline: Baseline) -> tuple[np.ndarray, ...]:
     """Relative roughness of what an unknown past left in each run, in um, shape `(n, k)`: columns of its own."""
-    stage, (lower_V, upper_V) = baseline.stage, baseline.range_V
+    stage, grid = baseline.stage, baseline.chain.grid
     place = place_of_hysteresis(stage)
+    assert grid is not None
     assert place is not None
-    own = []
+    levels_V, own = np.linspace(float(grid.lower_V), float(grid.upper_V), _FINE), []
     for run in baseline.runs:
         seen_V = np.asarray(ahead(stage, place, run.samples))[:: run.samples.stride][: len(run.record)]
-        columns = rough_past_columns(seen_V) * baseline.stroke_um / (upper_V - lower_V)
+        columns = rough_past_columns(seen_V, levels_V) * baseline.stroke_um / np.ptp(levels_V)
         own.append(columns if run.has_past else columns[:, :0])
     stops = np.cumsum([columns.shape[1] for columns in own])
     return tuple(

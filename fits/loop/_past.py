@@ -13,8 +13,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _DEGREE, _PIECES = 3, 5
-# Pieces each way of what a past may do that is finer than the splines.
-_FINE = 48
 
 
 @jax.jit
@@ -23,18 +21,16 @@ def past_columns(voltage_V: Float[Array, " n"]) -> Float[Array, "n k"]:
     return jnp.concatenate([_spline(lax.cummax(voltage_V)), _spline(lax.cummin(voltage_V))], axis=1)
 
 
-def rough_past_columns(voltage_V: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
-    """Pieces of the way that a hysteresis goes for the first time, up and down, each a ramp in V, shape `(n, k)`.
+def rough_past_columns(
+    voltage_V: Float[np.ndarray, " n"], levels_V: Float[np.ndarray, " l"]
+) -> Float[np.ndarray, "n k"]:
+    """Pieces, between levels, of the way that a hysteresis goes for the first time: ramps in V, shape `(n, k)`.
 
     A hysteresis of few plays has kinks there that no spline follows.
     """
-    columns = [np.zeros((len(voltage_V), 0))]
-    for reached_V in (np.maximum.accumulate(voltage_V), np.minimum.accumulate(voltage_V)):
-        ends = np.linspace(reached_V[0], reached_V[-1], _FINE + 1)
-        if ends[0] != ends[-1]:
-            low, high = np.minimum(ends[:-1], ends[1:]), np.maximum(ends[:-1], ends[1:])
-            columns.append(np.clip(reached_V[:, None], low, high) - low)
-    return np.concatenate(columns, axis=1)
+    reached_V = np.maximum.accumulate(voltage_V), np.minimum.accumulate(voltage_V)
+    ramps = np.concatenate([np.clip(one[:, None], levels_V[:-1], levels_V[1:]) for one in reached_V], axis=1)
+    return (ramps - ramps[0])[:, ramps[-1] != ramps[0]]
 
 
 def _spline(reached_V: Float[Array, " n"]) -> Float[Array, "n k"]:

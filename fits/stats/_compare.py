@@ -1,6 +1,9 @@
-"""Errors before and after, compared over blocks that are longer than errors stay alike."""
+"""How improbable errors are, and errors before and after, compared over blocks longer than errors stay alike."""
 
 import numpy as np
+from scipy.fft import dct
+
+from fits.stats._noise import Noise
 
 _BLOCKS = 24
 
@@ -17,3 +20,17 @@ def sd_of_difference(before: np.ndarray, after: np.ndarray) -> float:
     influence = before**2 / (2 * rms0) - after**2 / (2 * rms1)
     blocks = np.array([block.mean() for block in np.array_split(influence, _BLOCKS)])
     return float(np.std(blocks, ddof=1) / len(blocks) ** 0.5)
+
+
+def surprise(errors: np.ndarray, noise: Noise) -> float:
+    """-2 ln of the probability of errors, in its standard deviations, shape `(n,)`, up to what all have in common.
+
+    It is that of noise beside a discrepancy whose power in each octave of frequency is the most probable (Whittle's
+    likelihood): many samples that one slow error spoils count no more than the few waves that make it.
+    """
+    n = len(errors)
+    share = dct(errors, norm="ortho") ** 2 / noise.relative_spectrum(np.pi * np.arange(n) / n)
+    octaves = np.r_[0, 2 ** np.arange(int(n - 1).bit_length())] if n > 1 else np.zeros(1, dtype=int)
+    count = np.diff(np.r_[octaves, n])
+    mean = np.add.reduceat(share, octaves) / count
+    return float(np.sum(count * np.where(mean < 1, mean, 1 + np.log(np.maximum(mean, 1.0)))))

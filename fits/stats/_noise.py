@@ -103,6 +103,12 @@ class Noise:
         """Samples that are worth one independent one."""
         return float((self.innovation_um / (1 - np.sum(self.past)) / self.total_um) ** 2)
 
+    def relative_spectrum(self, radians: np.ndarray) -> np.ndarray:
+        """Power at frequencies in radians per sample, shape `(n,)`; one in the mean."""
+        lags = np.arange(1, len(self.past) + 1)
+        answer = 1 - np.exp(-1j * radians[:, None] * lags) @ self.past
+        return (self.innovation_um / self.total_um) ** 2 / np.abs(answer) ** 2
+
     def followed_by(self, other: "Noise") -> "Noise":
         """The noise that is left as another one where it is whitened by this one."""
         past = -np.convolve(np.r_[1.0, -self.past], np.r_[1.0, -other.past])[1:]
