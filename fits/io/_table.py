@@ -145,6 +145,8 @@ def gathered(path: str, what: str, found: Iterable[Found], interval_s: float | N
 
 def of_frame(path: str, frame: Any, units: Mapping[str, str] | None = None) -> ArrayTable:
     """Columns of a `DataFrame`, its index among them if it has a name or holds times."""
+    import pandas as pd
+
     index = frame.index
     if index.name is not None or index.nlevels > 1 or index.dtype.kind in "mM":
         frame = frame.reset_index(names=None if index.nlevels > 1 else [index.name or "time"])
@@ -153,6 +155,8 @@ def of_frame(path: str, frame: Any, units: Mapping[str, str] | None = None) -> A
         column, words = frame.iloc[:, k], "_".join(map(str, name)) if isinstance(name, tuple) else str(name)
         if getattr(column.dtype, "tz", None) is not None:
             column = column.dt.tz_convert(None)
+        if column.dtype.kind == "O":  # numbers beside words, or decimal ones; what is none is missing
+            column = pd.to_numeric(column, errors="coerce")
         values = column.to_numpy(np.float64, na_value=np.nan) if column.dtype.kind in "iuf" else column.to_numpy()
         found.append(((words,), values, (units or {}).get(words)))
     return gathered(path, "a table", found)

@@ -19,10 +19,17 @@ from fits.io._quantity import FloatArray
 from fits.io._table import MOST_COLUMNS, Problem, Table, data_error, seconds
 
 _COMMENT = re.compile(r"^ *[#%].*\n?", re.MULTILINE)
-_CLOCK = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)? ?(Z|[+-]\d\d:?\d\d)?")
+_ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)? ?(Z|[+-]\d\d:?\d\d)?")
+# A time of day behind a date of any kind or none; what has no hours has a fraction, as spreadsheets write it.
+_DAY = re.compile(
+    r"(?P<date>[\d./-]{6,10}[ T]+)?(?:(?P<hour>\d{1,2}):(?=\d\d:)|(?=\d\d:\d\d[.,]))"
+    r"(?P<minute>\d\d):(?P<second>\d\d(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])[Mm])?"
+)
 # To import pandas takes longer than NumPy takes to read so many characters.
 _FEW = 5_000_000
-_MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none", "-nan", "-nan(ind)", "1.#qnan", "-1.#ind", "--"}
+# What programs write for a number that is missing, beside words and dashes without a digit.
+_MISSING = {"1.#qnan", "-1.#ind"}
+_EMPTY = "an empty cell"
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,7 @@ class TextTable(Table):
         if columns is None or not all(name in columns for name in strict):
             return self._read_slowly(strict)
         problems = {name: self._first_problem(i) for i, name in enumerate(self.names) if name not in columns}
-        return columns, problems
+        return columns, self._worth_a_word(problems)
 
     def place(self, row: int | None = None) -> str:
         """The physical line, from 1."""
@@ -62,7 +69,7 @@ class TextTable(Table):
         lines, kept = io.StringIO(self.body, newline="\n").readlines(), []
         at = [i for i, name in enumerate(self.names) if name in strict]
         for number, cells in self.rows():
-            missing = any(cells[i].lower() in _MISSING for i in at if i < len(cells))
+            missing = any(is_missing(cells[i]) for i in at if i < len(cells))
             kept.append(not missing)
             if missing:  # a blank line, so that those below keep their numbers
                 lines[number - self.header_line - 1] = "\n"
@@ -155,7 +162,7 @@ class TextTable(Table):
             for name, column, cell in zip(self.names, values, cells, strict=True):
                 if name in problems:
                     continue
-                if name in self.clocks and _CLOCK.fullmatch(cell):
+                if name in self.clocks and is_clock(cell):
                     column.append(cell)
                     continue
                 number = self._number(cell) if name not in self.clocks else f"'{cell[:30]}'"
@@ -174,17 +181,24 @@ class TextTable(Table):
                     raise self.error(
                         f"expected time stamps, found one that is none ({error}); correct it", 0, name
                     ) from None
-        return columns, problems
+        return columns, self._worth_a_word(problems)
 
     def _first_problem(self, i: int) -> Problem:
         found = ((line, self._number(cells[i])) for line, cells in self.rows())
         other = f"line {self.header_line + 1}", "a number that pandas does not read"
         return next(((f"line {line}", text) for line, text in found if isinstance(text, str)), other)
 
+    def _worth_a_word(self, problems: dict[str, Problem]) -> dict[str, Problem]:
+        """Problems but those of columns that are empty throughout."""
+        at = {name: i for i, name in enumerate(self.names)}
+        empty = [name for name, (_, found) in problems.items() if found == _EMPTY]
+        empty = [name for name in empty if not any(cells[at[name]] for _, cells in self.rows())]
+        return {name: each for name, each in problems.items() if name not in empty}
+
     def _number(self, cell: str) -> float | str:
         """Value of a cell, or what was found instead of a finite number."""
         if not cell:
-            return "an empty cell"
+            return _EMPTY
         found = f"'{cell if len(cell) <= 30 else cell[:27] + '...'}'"
         if "_" in cell or (self.decimal == "," and "." in cell):
             return found
@@ -198,7 +212,7 @@ class TextTable(Table):
         remedy = "correct the cell, or remove its line or a column that is not needed"
         if re.fullmatch(r"[+-]?\d+[.,]\d+(?:[eE][+-]?\d+)?", cell):
             remedy = "write all numbers with one decimal mark, and separate cells by ; or tab where it is a comma"
-        elif cell.lower() in _MISSING:
+        elif is_missing(cell) and not (self.place(0) == f"line {line}" and cell and "nan" not in cell.lower()):
             remedy = "correct the cell, or leave out such lines with --missing drop"
         elif self.place(0) == f"line {line}":
             remedy = "correct the cell, or put # before the line if it is not data"
@@ -216,16 +230,42 @@ class TextTable(Table):
 
 
 def _clock(cells: list[str]) -> FloatArray:
-    """Seconds after the first of some time stamps, shape (n,)."""
-    import pandas as pd
+    """Seconds after the first of some time stamps, shape (n,); a ValueError says which is none."""
+    if _ISO.fullmatch(cells[0]):
+        import pandas as pd
 
-    stamps = pd.to_datetime([cell.strip().replace(",", ".") for cell in cells], format="ISO8601", utc=True)
-    return seconds(stamps.tz_localize(None).to_numpy())
+        stamps = pd.to_datetime([cell.strip().replace(",", ".") for cell in cells], format="ISO8601", utc=True)
+        return seconds(stamps.tz_localize(None).to_numpy())
+    found = [_DAY.fullmatch(cell.strip()) or _refuse(cell) for cell in cells]
+    if len({each["date"] for each in found}) > 1:
+        # Which of its numbers is the day is not known.
+        raise ValueError("dates that change are read in the form 2026-11-25 only")
+    time_s = np.array([_of_day_s(each) for each in found])
+    # The clock begins again at midnight, and without hours at each of them.
+    turn_s = 3600.0 if found[0]["hour"] is None else 86400.0
+    turns = np.cumsum(np.diff(time_s, prepend=time_s[0]) < -turn_s / 2)
+    return np.round((time_s - time_s[0] + turn_s * turns) * 1e9) / 1e9
+
+
+def _of_day_s(time: re.Match[str]) -> float:
+    """Time of a day in s."""
+    hour, half = int(time["hour"] or 0), (time["half"] or "").lower()
+    hour = hour % 12 + 12 * (half == "p") if half else hour
+    return 3600.0 * hour + 60.0 * float(time["minute"]) + float(time["second"].replace(",", "."))
+
+
+def _refuse(cell: str) -> re.Match[str]:
+    raise ValueError(f"'{cell[:30]}'")
 
 
 def is_clock(cell: str) -> bool:
-    """Whether a cell is an ISO 8601 time stamp of date and time."""
-    return _CLOCK.fullmatch(cell) is not None
+    """Whether a cell is an ISO 8601 time stamp of date and time, or a time of day."""
+    return (_ISO.fullmatch(cell) or _DAY.fullmatch(cell)) is not None
+
+
+def is_missing(cell: str) -> bool:
+    """Whether a cell stands for a number that is missing: one without a digit, such as `NaN` or `overload`."""
+    return cell.lower() in _MISSING or not any(map(str.isdigit, cell))
 
 
 def looks_numeric(cell: str) -> bool:
