@@ -276,7 +276,10 @@ def predicted_by(
     model = stage_or_preisach(path, loaded)
     if loaded.uncertainty is None and isinstance(model, late.Preisach):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
-    return late.predict(model, loaded.uncertainty, program, initial)
+    try:
+        return late.predict(model, loaded.uncertainty, program, initial)
+    except DataError as error:
+        raise DataError(f"{path}: {error}" if error.of_model else str(error)) from error
 
 
 def parse_rig_limits(
