@@ -130,3 +130,10 @@ def test_noise_and_impulses_are_read_off_signals(rng):
     hit = np.zeros(n, dtype=bool)
     hit[rng.choice(np.arange(20, n - 20, 37), 30, replace=False)] = True
     assert np.array_equal(impulsive(noise + np.where(hit, 1.0, 0.0)) & hit, hit)
+
+
+@pytest.mark.parametrize("estimate", [fits.fit, fits.fit_slow, fits.fit_stage])
+def test_a_number_of_levels_that_is_none_is_refused_by_every_fit(slow, estimate):
+    for levels in (1, 0, -3, 101, 8.5):
+        with pytest.raises(fits.DataError, match=f"levels: expected a whole number from 4 to 100, found {levels};"):
+            estimate([slow], levels=levels)

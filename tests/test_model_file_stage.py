@@ -155,7 +155,8 @@ def test_what_is_not_finite_is_not_written(tmp_path, rng):
 
 BROKEN = {
     ("parts",): (None, "expected a list, each of it an object with a type, found nothing"),
-    ("parts", 0): (None, "expected a list, each of it an object with a type, found a list"),
+    ("parts", 0): (None, "expected an object with a type, found nothing"),
+    ("frozen", 0): (1, "expected a text, found 1"),
     ("names",): ("x", 'expected a list, each of it a text, found "x"'),
     ("frozen",): (None, "expected a list, each of it a text, found nothing"),
     ("hold",): (1, "expected one of first, zero, smooth, found 1"),
@@ -172,7 +173,8 @@ def test_what_is_of_another_kind_is_refused_in_words_of_the_file(written, place)
         inner = inner[key]
     inner[place[-1]], words = BROKEN[place]
     path.write_text(json.dumps(hashed(content)))
-    assert f"model.{place[0]}: {words}; write the file again" in refusal(path)
+    where = place[0] if len(place) == 1 else f"{place[0]}[{place[1]}]"
+    assert f"model.{where}: {words}; write the file again" in refusal(path)
 
 
 def test_a_stage_that_turns_the_sign_ahead_of_its_hysteresis_is_refused_with_its_file(written):

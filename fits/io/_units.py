@@ -170,6 +170,8 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
     unit = scaled[2] if scaled and scaled[2] in quantity.powers else unit
     if unit not in quantity.powers or not 0 < scale < math.inf:
         found = f"found unit '{unit}'" if unit else "found no unit"
+        if scaled and scale != 1:
+            found = f"found {scaled[0]} for 1 in the column"
         option = shlex.quote(f"{column}={text}[{quantity.unit}]")
         raise DataError(
             f"{place}, column '{text}': expected a unit out of {', '.join(quantity.powers)} for {column}, {found}; "

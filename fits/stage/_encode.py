@@ -111,8 +111,7 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
     # One context, so that an `N` means the same in all fields.
     with jaxtyping.jaxtyped("context"):
         for key, field in fields.items():
-            if not _is_a(values[key], field.type):
-                raise DataError(f"{where}.{key}: expected {_words(field.type)}, found {shown(item[key])}")
+            _check(values[key], item[key], field.type, f"{where}.{key}")
     limits = [np.asarray(values[key]) for key in ("lower_V", "upper_V") if key in values]  # compared without JAX
     if len(limits) == 2 and not np.all(limits[0] < limits[1]):
         raise DataError(f"{where}: expected lower_V below upper_V")
@@ -123,15 +122,25 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
         raise DataError(f"{where}: {' '.join(str(error).split())}") from error
 
 
+def _check(value: Any, item: Any, kind: Any, where: str) -> None:
+    """Refuse what an item was decoded to where it is not of the kind that a field is declared as."""
+    within = get_args(kind)
+    if get_origin(kind) is tuple and within[-1] is ... and isinstance(value, tuple):
+        for k, one in enumerate(value):
+            _check(one, item[k], within[0], f"{where}[{k}]")
+    elif not _is_a(value, kind):
+        raise DataError(f"{where}: expected {_words(kind)}, found {shown(item)}")
+
+
 def _is_a(value: Any, kind: Any) -> bool:
-    """Whether a value is of the kind that a field is declared as, as far as files hold such."""
+    """Whether a value is of a kind, as far as files hold such."""
     within = get_args(kind)
     if get_origin(kind) is Literal:
         return isinstance(value, str) and value in within
     if get_origin(kind) in (Union, types.UnionType):
         return any(_is_a(value, one) for one in within)
-    if get_origin(kind) is tuple and within[-1] is ...:
-        return isinstance(value, tuple) and all(_is_a(one, within[0]) for one in value)
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple)
     if not isinstance(kind, type):
         return True
     return isinstance(value, kind) and not (kind is int and isinstance(value, bool))
