@@ -83,9 +83,11 @@ class ArrayTable(Table):
                 columns[name] = array
                 continue
             row = int(np.argmin(good))
-            found = str(array[row])
+            found = "no number (nan)" if np.isnan(array[row]) else str(array[row])
             if name in strict:
-                remedy = "correct it" + (", or leave such rows out with --missing drop" if found == "nan" else "")
+                remedy = "correct it" + (
+                    ", or leave such rows out with --missing drop" if np.isnan(array[row]) else ""
+                )
                 raise self.error(f"expected a finite number, found {found}; {remedy}", row, name)
             problems[name] = self.place(row), found
         return columns, problems

@@ -26,6 +26,10 @@ _AGAIN = re.compile(r" \d+$")
 _ALSO = {"timestamp": "time", "datetime": "time", "date_time": "time"}
 
 
+# Canonical column to source column, or all in one text, as for the option.
+Columns = Mapping[str, str | int] | str | None
+
+
 @dataclass(frozen=True)
 class Source:
     """Where a canonical column comes from: the source column, its unit, how many of these its 1 is, and its sign."""
@@ -59,6 +63,13 @@ def known_unit(name: str) -> str | None:
     """The unit that a name ends in, such as `um` of `x[µm]` or of `x_Micrometers`; None where it is no known one."""
     unit = split_unit(name)[1]
     return unit if any(unit in quantity.powers for quantity in QUANTITIES) else None
+
+
+def pairs_of(columns: Columns) -> Mapping[str, str]:
+    """Canonical column to source column, however they were given."""
+    if isinstance(columns, str):
+        return parse_columns(columns)
+    return {name: str(source) for name, source in (columns or {}).items()}
 
 
 def parse_columns(text: str) -> dict[str, str]:
@@ -198,7 +209,7 @@ def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str,
         if unit and not known and stem.lower() in (quantity.stem, quantity.column.lower()):
             message += f"'{near}' has the unknown unit '{unit}' instead of one out of {', '.join(quantity.powers)}; "
     message += f"name what is missing, for instance --columns {shlex.quote(','.join(guesses))}"
-    if not any(recognise(name) for name in names):
+    if ", line " in place and not any(recognise(name) for name in names):
         message += ", or put # before this line if it is not the header"
     return f"{message}."
 

@@ -167,7 +167,10 @@ def _uncertainty(mean: RunMean, found: Estimate, believed: tuple[Grid, np.ndarra
     columns = np.concatenate([factor_um.T, np.zeros((1, grid.columns))])
     # The mean displacement of a run fixes the offset: it makes up for what a perturbation does to that.
     sd = found.noise_um * (found.correlation / mean.count) ** 0.5
-    offset_um, discrepancy_um = jnp.asarray(np.append(-response_um, sd)), jnp.asarray(found.discrepancy_um)
+    offset_um, discrepancy_um = (
+        jnp.asarray(np.append(-response_um, sd)),
+        jnp.asarray(np.float64(found.discrepancy_um)),
+    )
     return Uncertainty(jnp.asarray(columns), offset_um, discrepancy_um, grid)
 
 
