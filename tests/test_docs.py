@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from _command import run
 from _docs import PAGES, REFERENCE, ROOT, blocks, commands, options_of, prose, reference_page
 
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
@@ -98,3 +99,17 @@ def test_blocks_run_by_paste(page, tmp_path):
         check=False,
     )
     assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-3000:]}"
+
+
+def test_what_a_command_is_for_is_not_cut_and_the_shell_completes_its_name():
+    told = " ".join(run("--help").stdout.split())
+    assert "..." not in told.partition("Commands:")[2]
+    for name, command in commands():
+        if " " in name:
+            continue
+        assert f"{name} {' '.join(command.help.split(chr(10) * 2)[0].split())}" in told
+    asked = {"COMP_WORDS": "microid comp", "COMP_CWORD": "1", "_MICROID_COMPLETE": "bash_complete"}
+    done = subprocess.run(
+        [sys.executable, "-m", "microid"], env=os.environ | asked, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["plain,compensate"]
