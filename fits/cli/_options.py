@@ -79,12 +79,6 @@ def picture_format(of: str) -> Callable[[Any], Any]:
     return click.option("--format", "form", type=forms, default="png", show_default=True, help=f"Of {of}.")
 
 
-def json_file(instead: str) -> Callable[[Any], Any]:
-    """Declare the option of a JSON file, which a `-` prints instead of something."""
-    words = f"JSON file to write; - prints it instead of the {instead}."
-    return click.option("--json", "json_file", metavar="FILE", help=words)
-
-
 def holdout(what: str) -> Callable[[Any], Any]:
     return click.option("--holdout", multiple=True, metavar="FRACTION|FILE", help=what)
 
