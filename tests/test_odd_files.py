@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from _command import refused, run
+from nptdms import ChannelObject, TdmsWriter
 from scipy.io import loadmat, savemat
 from test_foreign_files import LVM, RATE_Hz, assert_same, rows, signals
 
@@ -52,6 +53,8 @@ ODD = {
     "day and time": clocked(HEAD, [f"11/25/2026 {9 + (at[0] == '0')}:{at[3:]}" for at in DAY]),
     "minutes of a spreadsheet": clocked("Time,Voltage,Displacement\n", [at[3:] for at in DAY]),
     "date beside": "Scope 3\n\n" + clocked("Date,Time,U [V],Position [um]\n", [f"2026-11-25,{at}" for at in DAY]),
+    "names of two lines": '"Time\n(s)","Voltage\n(V)","Position\n(um)"\n' + rows(T, V, Y),
+    "names with spaces": "Time (s)   Voltage (V)  Position (um)\n" + rows(T, V, Y, separator="   "),
     "minutes": "t [min],U [V],x [um]\n" + rows(T / 60, V, Y),
 }  # fmt: skip
 
@@ -204,3 +207,28 @@ def test_inspect_says_what_has_to_be_stated(tmp_path):
     # What keeps a file from being read is said with its line.
     path.write_text("time_s,voltage_V\n0 s,1 V\n1 s,2 V\n")
     refused(run("inspect", path), "drive.csv, line 2, column 'time_s': expected columns of numbers, found '0 s'")
+
+
+def test_names_of_two_lines_leave_lines_their_numbers(tmp_path):
+    path = tmp_path / "two.csv"
+    path.write_text('"Time\n(s)","Voltage\n(V)","Displacement\n(um)"\n' + rows(T, V, Y).replace("0.002,", "x,", 1))
+    with pytest.raises(fits.DataError, match=r"two\.csv, line 6, column 'Time \(s\)'"):
+        fits.read_table(path)
+
+
+def test_columns_of_a_record_are_found_among_more_arrays_of_another_length(tmp_path):
+    path = tmp_path / "all.npz"
+    spectra = {name: np.zeros(121) for name in "abcdef"}
+    np.savez(path, time_s=T, voltage_V=V, displacement_um=Y, settings=np.array({"a": 1}, dtype=object), **spectra)
+    assert_same(fits.read_table(path))
+
+
+def test_the_interval_of_a_tdms_file_is_that_of_the_channels_that_are_read(tmp_path, monkeypatch):
+    path = tmp_path / "both.tdms"
+    slow, fast = {"wf_increment": 0.02}, {"wf_increment": 1 / RATE_Hz}
+    with TdmsWriter(path) as writer:
+        channels = [ChannelObject("slow", "Temperature", T[:24], slow)]
+        for name, values, unit in (("Voltage", V, "V"), ("Displacement", Y, "um")):
+            channels.append(ChannelObject("fast", name, values, fast | {"unit_string": unit}))
+        writer.write_segment(channels)
+    assert_same(pasted(path, monkeypatch))

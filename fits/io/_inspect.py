@@ -123,12 +123,10 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
             continue
         quantity = known_quantity(column)
         fit = [name for name in free if np.ptp(found[name]) > 0 and known_unit(name) in (None, *quantity.powers)]
+        # What counts from sample to sample is a time only if it is called one, and nothing else.
+        fit = [name for name in fit if np.any(np.diff(found[name]) != 1) or _score(name, "time_s") > 0]
         rising = [name for name in fit if np.all(np.diff(found[name]) > 0)]
-        if column == "time_s":
-            # What counts from sample to sample is a time only if it is called one.
-            fit = [name for name in rising if _score(name, column) > 0 or np.any(np.diff(found[name]) != 1)]
-        else:
-            fit = [name for name in fit if name not in rising] or fit
+        fit = rising if column == "time_s" else [name for name in fit if name not in rising] or fit
         if fit:
             best = max(fit, key=lambda name: _score(name, column))
             free.remove(best)

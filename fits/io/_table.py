@@ -1,5 +1,6 @@
 """What every file is opened to: named columns, which the mapping of columns chooses from."""
 
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
@@ -13,6 +14,8 @@ from fits.io._errors import DataError
 from fits.io._quantity import FloatArray, split_unit
 
 MOST_COLUMNS = 1000
+# How names of the columns of a record begin.
+_SPOKEN = re.compile(r"(time|voltage|displacement)\b|(time|voltage|displacement)_", re.IGNORECASE)
 # Where the first cell of a column stands that is not a finite number, and what was found there.
 Problem = tuple[str, str]
 # The groups that an array stands in and its name, values of any shape, and a unit if one is stated.
@@ -83,12 +86,11 @@ class ArrayTable(Table):
                 columns[name] = array
                 continue
             row = int(np.argmin(good))
-            found = "no number (nan)" if np.isnan(array[row]) else str(array[row])
+            found = str(array[row])
             if name in strict:
-                remedy = "correct it" + (
-                    ", or leave such rows out with --missing drop" if np.isnan(array[row]) else ""
-                )
-                raise self.error(f"expected a finite number, found {found}; {remedy}", row, name)
+                missing = "no number (nan); correct it, or leave such rows out with --missing drop"
+                said = missing if found == "nan" else f"{found}; correct it"
+                raise self.error(f"expected a finite number, found {said}", row, name)
             problems[name] = self.place(row), found
         return columns, problems
 
@@ -117,7 +119,7 @@ def with_unit(name: str, unit: str | None) -> str:
 
 
 def gathered(path: str, what: str, found: Iterable[Found], interval_s: float | None = None) -> ArrayTable:
-    """Make a table of what a file holds: the arrays of the length that most have, and of the longest such.
+    """Make a table of what a file holds: the arrays of the length that most columns of a record have, or else most.
 
     A matrix has a column for each of its shorter side, a compound array one for each field. Groups are left out of
     the names where that leaves them different. A `DataError` says that there is no array, and `what` was expected.
@@ -129,7 +131,9 @@ def gathered(path: str, what: str, found: Iterable[Found], interval_s: float | N
             f"{path}: expected {what} with arrays of numbers, found none; store time, voltage and displacement as "
             "plain arrays of one length."
         )
-    length = max(lengths, key=lambda n: (lengths[n], n))
+    # Spectra and settings may be more than the columns of a record, which say so by their names.
+    named = Counter(len(column) for name, column, unit in flat if _SPOKEN.match(with_unit(name[-1], unit)))
+    length = max(lengths, key=lambda n: (named[n], lengths[n], n))
     kept = [(name, column, unit) for name, column, unit in flat if len(column) == length]
     last = Counter(name[-1] for name, _, _ in kept)
     arrays: dict[str, FloatArray] = {}
@@ -158,7 +162,8 @@ def of_frame(path: str, frame: Any, units: Mapping[str, str] | None = None) -> A
         if getattr(column.dtype, "tz", None) is not None:
             column = column.dt.tz_convert(None)
         if column.dtype.kind == "O":  # numbers beside words, or decimal ones; what is none is missing
-            column = pd.to_numeric(column, errors="coerce")
+            numbers = pd.to_numeric(column, errors="coerce")
+            column = numbers if numbers.notna().any() else column
         values = column.to_numpy(np.float64, na_value=np.nan) if column.dtype.kind in "iuf" else column.to_numpy()
         found.append(((words,), values, (units or {}).get(words)))
     return gathered(path, "a table", found)

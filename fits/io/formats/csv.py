@@ -19,6 +19,8 @@ _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-
 _EXPORT = "export it as CSV text (UTF-8)"
 # So many lines are looked at for the first rows of numbers, and so many of these in a row are a table.
 _HEAD, _ENOUGH = 300, 3
+# A first line with line breaks within quotes.
+_BROKEN_HEADER = re.compile(r'(?=[^\n]*"[^"\n]*\n)([^"\n]*"[^"]{0,100}")+[^"\n]*(?=\n)')
 # What may stand between two tables, and how far a second one is looked for behind it, in characters and lines.
 _GAP = re.compile(r"\n(?:[ \t,;]*\n)+")
 _AHEAD, _FEW_LINES = 4000, 8
@@ -30,8 +32,11 @@ _Line = tuple[int, int, str]
 def open_csv(path: str, data: bytes) -> Table:
     """Find the table in a text, or the one that the path numbers; a `DataError` says that there is none."""
     text = decode(path, data)
+    broken = _BROKEN_HEADER.match(text)
+    if broken and "\n" in broken[0]:  # as cells of a spreadsheet are; the lines below keep their numbers
+        text = broken[0].replace("\n", " ") + "\n" * broken[0].count("\n") + text[broken.end() :]
     if _spaced(text):
-        text = re.sub(r"(?<=\S) +(?=\S)", "\t", text)
+        text = re.sub(r"(?<=\S) +(?=[^\s(\[])", "\t", text)  # but for those ahead of a unit in brackets
     starts = [*_beginnings(text), len(text)]
     number, remark = chosen(path, len(starts) - 1)
     begin, end = starts[number - 1 : number + 1]
