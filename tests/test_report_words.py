@@ -70,7 +70,7 @@ def test_sentence_tile_step_and_json_give_one_residual_by_one_name(rng):
         found = replace(made, causes=(), runs=runs, gain=gain, unexplained_rms_um=0.00167)
         page = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", report_html(found)))
         tiles = [size_um(re.search(rf"{name}, rms {SIZE}", page)[1]) for name in TILES]
-        words = rf"leaves a residual of {SIZE}.* noise floor of {SIZE} .* reproducible error of {SIZE}"
+        words = rf"leaves a residual of {SIZE}.* noise floor of {SIZE}. .* reproducible error of {SIZE}"
         said = [size_um(one) for one in re.search(words, verdict_sentence(found)).groups()]
         content = diagnosis_json(found)
         listed = [content[name] for name in ("residual_rms_before_um", "noise_um", "unexplained_rms_um")]
@@ -131,6 +131,15 @@ def test_evidence_that_names_no_cause_is_explained(rng):
     assert "Evidence above 8 \N{GREEK SMALL LETTER SIGMA} names no cause here" in text_of(
         replace(made, upper_bounds=(loud,))
     )
+
+
+def test_what_is_to_be_recorded_does_not_contradict_itself(rng):
+    for kind in KINDS:
+        found = replace(diagnosis(rng, kind), next_experiment=None)
+        page, steps = text_of(found), " ".join(words for words, _ in next_steps(found))
+        assert ("Record a run" in steps) == (kind == "unexplained")
+        assert ("No further experiment is proposed" in page) == ("Record a run" not in steps)
+        assert ("that beside what was found" in page) == bool(found.causes)
 
 
 def test_a_headline_has_every_effect_that_a_cause_may_be(rng):

@@ -152,8 +152,9 @@ def _found(diagnosis: Diagnosis) -> str:
     over_um = rms_um(diagnosis.runs, "before_um")
     if not diagnosis.causes and diagnosis.verdict == "unexplained":
         return (
-            f"In the fit the plain stage leaves a residual of {length(over_um)}, root mean square. Beyond a noise "
-            f"floor of {noise} that is a reproducible error of {left}, and no effect of the library explains it."
+            f"In the fit the plain stage leaves a residual of {length(over_um)}, root mean square, over a noise "
+            f"floor of {noise}. Beyond what the stage could still follow, a reproducible error of {left} is left, "
+            "and no effect of the library explains it."
         )
     if not diagnosis.causes:
         described = "describes these records down to"
