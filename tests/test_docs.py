@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
 from _command import run
@@ -19,6 +20,15 @@ def test_the_readme_is_short_and_tells_the_two_jobs_of_ci():
     assert len(text.split()) <= 900
     for mark in ("main", "test"):
         assert text.count(f"<!-- ci: {mark} -->\n```bash\npython3 -m venv .venv && ") == 1
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper_of_the_readme():
+    said, readme = ((ROOT / name).read_text(encoding="utf-8") for name in ("CITATION.cff", "README.md"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert f"\nversion: {project['version']}\n" in said
+    assert f"\nlicense: {project['license']}\n" in said
+    for words in re.findall(r"(?:title|family-names|doi): \"?([^\"}\n]+)", said):
+        assert words in " ".join(readme.replace(">", " ").split())
 
 
 def test_the_reference_is_what_the_commands_declare():
