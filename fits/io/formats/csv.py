@@ -17,8 +17,8 @@ _DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}")
 _CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _EXPORT = "export it as CSV text (UTF-8)"
-# So many lines are looked at for the first rows of numbers, and so many of these in a row are a table.
-_HEAD, _ENOUGH = 300, 3
+# So many lines, or characters, are looked at for the first rows of numbers, and so many rows are a table.
+_HEAD, _HEAD_CHARACTERS, _ENOUGH = 300, 1_000_000, 3
 # A first line with line breaks within quotes.
 _BROKEN_HEADER = re.compile(r'(?=[^\n]*"[^"\n]*\n)([^"\n]*"[^"]{0,100}")+[^"\n]*(?=\n)')
 # What may stand between two tables, and how far a second one is looked for behind it, in characters and lines.
@@ -142,7 +142,7 @@ def cut(cells: list[str]) -> list[str]:
 
 def _spaced(text: str) -> bool:
     """Whether spaces alone separate the numbers of rows."""
-    for line in itertools.islice(io.StringIO(text, newline="\n"), _HEAD):
+    for line in text[:_HEAD_CHARACTERS].split("\n")[:_HEAD]:
         cells = line.split()
         if len(cells) > 1 and all(looks_numeric(cell) and cell.strip(",") == cell for cell in cells):
             return "\t" not in line.strip()
