@@ -122,7 +122,9 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
         except (DataError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not isinstance(error, late.FitError):
                 raise
-            sentence = printable(" ".join(without_middle(str(error)).split()))
+            of_model = isinstance(error, DataError) and error.of_model
+            place = options.get("start") or options.get("model") if of_model else None
+            sentence = printable(" ".join(without_middle(f"{place}: {error}" if place else str(error)).split()))
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
             sys.exit(2)
         except OSError as error:
@@ -271,10 +273,7 @@ def predicted_by(
     model = stage_or_preisach(path, loaded)
     if loaded.uncertainty is None and isinstance(model, late.Preisach):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
-    try:
-        return late.predict(model, loaded.uncertainty, program, initial)
-    except DataError as error:
-        raise DataError(f"{path}: {error}" if error.of_model else str(error)) from error
+    return late.predict(model, loaded.uncertainty, program, initial)
 
 
 def parse_rig_limits(

@@ -59,8 +59,4 @@ def budget(given: common.Given) -> None:
 
 def _law(path: str) -> "late.Preisach":
     """The hysteresis of a model file, as slow voltages see it."""
-    model = common.stage_or_preisach(path, late.load_model(path))
-    try:
-        return late.static_equivalent(model)
-    except DataError as error:
-        raise DataError(f"{path}: {error}" if error.of_model else str(error)) from error
+    return late.static_equivalent(common.stage_or_preisach(path, late.load_model(path)))
