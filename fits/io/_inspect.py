@@ -14,7 +14,7 @@ from fits.io._quantity import BRACKETS, FloatArray, split_unit
 from fits.io._read_csv import likely_stroke, read_reference, read_table
 from fits.io._table import Table, data_error
 from fits.io._text_table import is_missing
-from fits.io._units import Source, known_quantity, known_unit, parse_columns, recognise
+from fits.io._units import Source, known_quantity, known_unit, parse_columns, recognise, recognise_again
 
 # Names by which rigs call the columns of a record, whole and in small letters; a minus is for readings of a command.
 _LIKELY = {
@@ -77,7 +77,11 @@ def inspect_table(path: AnyPath) -> Inspection:
         place, words = problems.get(first or "", ("", "none"))
         what = f"expected columns of numbers, found {words}; name another file, or write numbers such as 1234.5"
         raise data_error(os.fspath(path), what, place, first)
-    known = {spoken[0].column: Source(name, spoken[1]) for name in found if (spoken := recognise(name))}
+    known, doubtful = dict[str, Source](), set[str]()
+    for name in found:
+        if spoken := recognise_again(name):
+            doubtful |= {spoken[0].column} & known.keys()
+            known.setdefault(spoken[0].column, Source(name, spoken[1]))
     sources = known | _guessed(table, found, known)
     interval_s, even = table.interval_s, table.interval_s is not None
     if "time_s" in sources:
@@ -91,7 +95,11 @@ def inspect_table(path: AnyPath) -> Inspection:
         low, high = (None, None) if values is None else (float(values.min()), float(values.max()))
         problem = ", ".join(problems[name][::-1]) if name in problems else ""
         channels.append(Channel(k, name, known_unit(name), low, high, use, bool(use) and use not in known, problem))
-    pairs = [f"{column}={_spec(table, source)}" for column, source in sources.items() if column not in known]
+    pairs = [
+        f"{column}={_spec(table, source)}"
+        for column, source in sources.items()
+        if column not in known.keys() - doubtful
+    ]
     options = ["--columns", ",".join(pairs)] if pairs else []
     if any(source.column in holes for source in sources.values()):
         options += ["--missing", "drop"]

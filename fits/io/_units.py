@@ -59,6 +59,11 @@ def recognise(name: str) -> tuple[Quantity, str] | None:
     return None
 
 
+def recognise_again(name: str) -> tuple[Quantity, str] | None:
+    """The same of a header that may stand there twice, and then has its number behind it."""
+    return recognise(_AGAIN.sub("", name))
+
+
 def known_unit(name: str) -> str | None:
     """The unit that a name ends in, such as `um` of `x[µm]` or of `x_Micrometers`; None where it is no known one."""
     unit = split_unit(name)[1]
@@ -117,7 +122,7 @@ def find_sources(
     sources = {column: _mapped(column, text, names, place) for column, text in columns.items()}
     taken = {source.column for source in sources.values()}
     for name in names:
-        found = recognise(_AGAIN.sub("", name))
+        found = recognise_again(name)
         if found is None or name in taken:
             continue
         column = found[0].column

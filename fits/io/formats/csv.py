@@ -90,10 +90,10 @@ def _open_text(path: str, text: str) -> TextTable:
     if len(names) > MOST_COLUMNS:
         what = f"expected up to {MOST_COLUMNS:,} columns, found {len(names):,}; write a row per sample"
         raise data_error(path, what, f"line {number}")
+    names = [name or f"column_{i}" for i, name in enumerate(names, 1)]
     if units is not None:
         below_names = split_cells(lines[units][2], separator)[: len(names)]
         names = [with_unit(name, unit) for name, unit in itertools.zip_longest(names, below_names)]
-    names = [name or f"column_{i}" for i, name in enumerate(names, 1)]
     again = [i for i, name in enumerate(names) if name in names[:i]]
     for i in again:
         names[i] = f"{names[i]} {i + 1}"
