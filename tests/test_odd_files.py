@@ -11,7 +11,7 @@ import pytest
 from _command import refused, run
 from nptdms import ChannelObject, TdmsWriter
 from scipy.io import loadmat, savemat
-from test_foreign_files import LVM, RATE_Hz, assert_same, rows, signals
+from test_foreign_files import LVM, RATE_Hz, assert_same, clock, rows, signals
 
 import fits
 from fits.io._units import parse_columns
@@ -182,6 +182,26 @@ def test_channels_of_labview_that_have_times_each(tmp_path, monkeypatch):
 def test_labview_without_its_header_is_a_text(tmp_path):
     (tmp_path / "bare.lvm").write_text(rows(T, V, Y, separator="\t"))
     assert_same(fits.read_table(tmp_path / "bare.lvm", parse_columns("1,2,3")))
+
+
+@pytest.mark.parametrize("kind", ["frame", "day", "h5", "npz", "parquet"])
+def test_time_stamps_that_are_texts_are_read_in_every_form(tmp_path, monkeypatch, kind):
+    stamps = DAY if kind == "day" else [f"{at}Z" for at in clock(T)]
+    columns = {"time": stamps, "voltage_V": V, "displacement_um": Y}
+    path = tmp_path / f"run.{kind}"
+    if kind in ("frame", "day"):
+        assert_close(fits.read_table(pd.DataFrame(columns)))
+        return
+    if kind == "npz":
+        np.savez(path, **columns)
+    elif kind == "parquet":
+        pd.DataFrame(columns).to_parquet(path)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, values in columns.items():
+                file[name] = values
+            file["note"] = ["a", "b"]
+    assert_close(pasted(path, monkeypatch))
 
 
 def test_a_frame_of_objects_holds_numbers_and_what_is_none_is_named():

@@ -4,12 +4,14 @@ import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.io._clock import clock_s, is_clock, seconds
 from fits.io._errors import DataError
 from fits.io._quantity import FloatArray, split_unit
 
@@ -105,13 +107,6 @@ class ArrayTable(Table):
         return "" if row is None else f"row {(row if self.rows is None else int(self.rows[row])) + 1}"
 
 
-def seconds(times: NDArray[Any]) -> FloatArray:
-    """Times of the clock, or durations, as seconds after the first, shape (n,); a missing one is NaN."""
-    fine = times.astype(f"{times.dtype.kind}8[ns]")
-    count = fine - fine[np.argmin(np.isnat(fine))]
-    return np.where(np.isnat(count), np.nan, count.astype(np.int64) / 1e9)
-
-
 def with_unit(name: str, unit: str | None) -> str:
     """A name that ends in its unit, if one is stated beside it and the name has none."""
     plain = split_unit(f"x[{(unit or '').strip(' []()')}]")[1]
@@ -177,6 +172,11 @@ def _columns(name: tuple[str, ...], values: Any) -> Iterable[tuple[tuple[str, ..
             yield from _columns((*name, field), array[field])
     elif array.ndim == 1 and array.size > 1 and array.dtype.kind in "mM" and not np.isnat(array).all():
         yield (*name[:-1], with_unit(name[-1], "s")), seconds(array)
+    elif array.ndim == 1 and array.size > 1 and array.dtype.kind in "SUO":
+        cells = [one.decode("latin-1") if isinstance(one, bytes) else one for one in array.tolist()]
+        with suppress(ValueError):  # texts that are no time stamps, and columns of other things, hold no numbers
+            if all(isinstance(one, str) for one in cells) and is_clock(cells[0]):
+                yield (*name[:-1], with_unit(name[-1], "s")), clock_s(cells)
     elif array.ndim == 1 and array.size > 1 and array.dtype.kind in "iuf":
         yield name, array.astype(np.float64, copy=False)
     elif array.ndim == 2 and array.dtype.kind in "iuf":

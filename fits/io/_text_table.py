@@ -14,17 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.io._clock import clock_s, is_clock
 from fits.io._errors import DataError
 from fits.io._quantity import FloatArray
-from fits.io._table import MOST_COLUMNS, Problem, Table, data_error, seconds
+from fits.io._table import MOST_COLUMNS, Problem, Table, data_error
 
 _COMMENT = re.compile(r"^ *[#%].*\n?", re.MULTILINE)
-_ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)? ?(Z|[+-]\d\d:?\d\d)?")
-# A time of day behind a date of any kind or none; what has no hours has a fraction, as spreadsheets write it.
-_DAY = re.compile(
-    r"(?P<date>[\d./-]{6,10}[ T]+)?(?:(?P<hour>\d{1,2}):(?=\d\d:)|(?=\d\d:\d\d[.,]))"
-    r"(?P<minute>\d\d):(?P<second>\d\d(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])[Mm])?"
-)
 # To import pandas takes longer than NumPy takes to read so many characters.
 _FEW = 5_000_000
 # What programs write for a number that is missing, beside words and dashes without a digit.
@@ -143,7 +138,7 @@ class TextTable(Table):
             dtype = frame[i].dtype
             if name in self.clocks:
                 try:
-                    columns[name] = _clock(frame[i].to_list())
+                    columns[name] = clock_s(frame[i].to_list())
                 except (ValueError, TypeError):
                     return None
             if isinstance(dtype, np.dtype) and dtype.kind in "iuf":
@@ -176,7 +171,7 @@ class TextTable(Table):
         for name, column in zip(self.names, values, strict=True):
             if name not in problems:
                 try:
-                    columns[name] = _clock(column) if name in self.clocks else np.array(column)
+                    columns[name] = clock_s(column) if name in self.clocks else np.array(column)
                 except ValueError as error:
                     raise self.error(
                         f"expected time stamps, found one that is none ({error}); correct it", 0, name
@@ -227,40 +222,6 @@ class TextTable(Table):
         first = f"the {'header' if self.headed else 'first row'} in {self.place()}"
         what = f"expected {n} cells as in {first}, found {found}; correct the {which} cells{hint} or remove the line"
         return data_error(self.path, what, f"line {line}", column)
-
-
-def _clock(cells: list[str]) -> FloatArray:
-    """Seconds after the first of some time stamps, shape (n,); a ValueError says which is none."""
-    if _ISO.fullmatch(cells[0]):
-        import pandas as pd
-
-        stamps = pd.to_datetime([cell.strip().replace(",", ".") for cell in cells], format="ISO8601", utc=True)
-        return seconds(stamps.tz_localize(None).to_numpy())
-    found = [_DAY.fullmatch(cell.strip()) or _refuse(cell) for cell in cells]
-    if len({each["date"] for each in found}) > 1:
-        # Which of its numbers is the day is not known.
-        raise ValueError("dates that change are read in the form 2026-11-25 only")
-    time_s = np.array([_of_day_s(each) for each in found])
-    # The clock begins again at midnight, and without hours at each of them.
-    turn_s = 3600.0 if found[0]["hour"] is None else 86400.0
-    turns = np.cumsum(np.diff(time_s, prepend=time_s[0]) < -turn_s / 2)
-    return np.round((time_s - time_s[0] + turn_s * turns) * 1e9) / 1e9
-
-
-def _of_day_s(time: re.Match[str]) -> float:
-    """Time of a day in s."""
-    hour, half = int(time["hour"] or 0), (time["half"] or "").lower()
-    hour = hour % 12 + 12 * (half == "p") if half else hour
-    return 3600.0 * hour + 60.0 * float(time["minute"]) + float(time["second"].replace(",", "."))
-
-
-def _refuse(cell: str) -> re.Match[str]:
-    raise ValueError(f"'{cell[:30]}'")
-
-
-def is_clock(cell: str) -> bool:
-    """Whether a cell is an ISO 8601 time stamp of date and time, or a time of day."""
-    return (_ISO.fullmatch(cell) or _DAY.fullmatch(cell)) is not None
 
 
 def is_missing(cell: str) -> bool:

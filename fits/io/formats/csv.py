@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 
+from fits.io._clock import is_clock
 from fits.io._read_file import numbered
 from fits.io._table import MOST_COLUMNS, Table, data_error, with_unit
-from fits.io._text_table import TextTable, is_clock, looks_numeric, split_cells
+from fits.io._text_table import TextTable, looks_numeric, split_cells
 from fits.io._units import known_unit, recognise
 from fits.io.formats._base import Format, register
 

@@ -27,7 +27,7 @@ def _found(path: str, file: Any, h5py: Any) -> Iterator[Found]:
             continue
         size += each.size * each.dtype.itemsize if each.shape else 0
         refuse_large(path, size)
-        if each.shape and (each.dtype.kind in "iuf" or each.dtype.names):
+        if each.shape and (each.dtype.kind in "iufSO" or each.dtype.names):
             unit = next((each.attrs[key] for key in ("units", "unit", "Unit", "Units") if key in each.attrs), None)
             yield (
                 parts,
