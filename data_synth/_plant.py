@@ -58,9 +58,10 @@ class Plant:
             if not (value is None or 0 < value <= largest):
                 raise ValueError(f"{name} must be positive and at most {largest:g}, got {value}")
         if (self.natural_frequency_Hz is None) != (self.damping_ratio is None):
+            missing = "damping_ratio" if self.damping_ratio is None else "natural_frequency_Hz"
             raise ValueError(
                 "natural_frequency_Hz and damping_ratio must be stated together or not at all, "
-                f"got {self.natural_frequency_Hz} and {self.damping_ratio}"
+                f"and {missing} is missing"
             )
 
     def require_samples(self, sample_rate_Hz: float) -> None:

@@ -19,6 +19,9 @@ HEAD = """# Reference: commands and options
 stdout, or to the files that are named; progress and refusals go to stderr. Status 0 means done, 2 bad input, in one
 sentence and without an output file, 130 and 143 stopped. This page is written by `python tests/_docs.py`.
 
+The tab key completes commands and options once `eval "$(_MICROID_COMPLETE=bash_source microid)"` stands in
+`~/.bashrc`; in `~/.zshrc` it is `zsh_source`, and fish reads what `_MICROID_COMPLETE=fish_source microid` prints.
+
 ## Options that many commands have
 """
 
@@ -73,7 +76,7 @@ def reference_page():
         for paragraph in command.help.split("\n\n"):
             lines += ["", textwrap.fill(" ".join(paragraph.split()), 118, break_on_hyphens=False)]
         own = [option for option in options_of(command) if option.name not in SHARED]
-        also = [f"`{option.opts[0]}`" for option in options_of(command) if option.name in SHARED]
+        also = [f"`{option.opts[-1]}`" for option in options_of(command) if option.name in SHARED]
         lines += _table(own) + (["", f"Also: {', '.join(also)}."] if also else [])
     return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)) + "\n"
 

@@ -12,8 +12,11 @@ import microid as m
 from fits.cli._main import cli
 
 
-def axes(path):
-    return json.loads(path.read_text())["axes"]
+def told(*options):
+    """What the command prints as JSON."""
+    result = run("sensitivity", *options, "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    return json.loads(result.stdout)
 
 
 @pytest.fixture
@@ -27,7 +30,7 @@ def stage(tmp_path):
 
 @pytest.mark.study
 def test_the_papers_stage_is_ranked_and_compared_with_the_papers_words(tmp_path):
-    result = run("sensitivity", "--json", tmp_path / "s.json")
+    result = run("sensitivity")
     assert result.exit_code == 0, result.stderr
     for words in (
         "x and y: 6.53222 um/um",
@@ -35,17 +38,10 @@ def test_the_papers_stage_is_ranked_and_compared_with_the_papers_words(tmp_path)
         "um/10 um",
         "Fig. 7",
         "disagree",
-        s_json(tmp_path),
     ):
         assert words in result.stdout
     assert "fixed voltage" not in result.stdout
-    content = json.loads((tmp_path / "s.json").read_text())
-    assert content == fits.sensitivity_json(fits.sensitivities(fits.paper_design()))
-    assert files(tmp_path) == ["s.json"]
-
-
-def s_json(folder):
-    return f"json   {folder / 's.json'}"
+    assert told() == fits.sensitivity_json(fits.sensitivities(fits.paper_design()))
 
 
 def test_one_axis_and_a_fixed_voltage():
@@ -59,35 +55,31 @@ def test_one_axis_and_a_fixed_voltage():
 
 
 def test_json_on_stdout_is_nothing_but_json():
-    result = run("sensitivity", "--axis", "beta", "--json", "-")
-    assert list(json.loads(result.stdout)["axes"]) == ["beta"]
-    assert result.stderr == ""
+    assert list(told("--axis", "beta")["axes"]) == ["beta"]
 
 
-def test_a_stage_of_ones_own(stage, tmp_path):
-    result = run("sensitivity", stage, "--axis", "z", "--json", tmp_path / "s.json")
+def test_a_stage_of_ones_own(stage):
+    result = run("sensitivity", stage, "--axis", "z")
     assert result.exit_code == 0, result.stderr
     assert "0.05 mm" in result.stdout
     assert "Fig. 7" not in result.stdout
-    found = axes(tmp_path / "s.json")["z"]["parameters"]["t4"]
+    found = told(stage, "--axis", "z")["axes"]["z"]["parameters"]["t4"]
     assert found["tolerance"] == 0.05
     assert found["relative_change_pct"] == pytest.approx(5 * found["derivative"] / 9.148282226628, rel=1e-9)
 
 
 @pytest.mark.parametrize("length", ["0.01mm", " 10 um ", "10µm", "1e-2 mm"])
-def test_a_tolerance_is_that_of_all_lengths(stage, tmp_path, length):
-    assert run("sensitivity", stage, "--axis", "z", "--tolerance", length, "--json", tmp_path / "s").exit_code == 0
-    found = axes(tmp_path / "s")["z"]["parameters"]
+def test_a_tolerance_is_that_of_all_lengths(stage, length):
+    found = told(stage, "--axis", "z", "--tolerance", length)["axes"]["z"]["parameters"]
     assert {name: each["tolerance"] for name, each in found.items()} == {"t4": 0.01, "la2": 0.01, "alpha2": 0.01 / 9}
 
 
 def test_the_stage_it_writes_is_the_one_it_used(stage, tmp_path):
-    once, again, level_0 = (tmp_path / name for name in ("once.json", "again.json", "level_0.toml"))
+    level_0 = tmp_path / "level_0.toml"
     options = ("--axis", "z", "--tolerance", "0.013mm", "--level", 0)
-    assert run("sensitivity", stage, *options, "--json", once, "--write-stage", level_0).exit_code == 0
-    assert run("sensitivity", level_0, "--axis", "z", "--json", again).exit_code == 0
-    assert once.read_bytes() == again.read_bytes()
-    assert json.loads(once.read_text())["level"] == 0
+    once = told(stage, *options, "--write-stage", level_0)
+    assert once == told(level_0, "--axis", "z")
+    assert once["level"] == 0
     assert fits.read_design(level_0).tolerance["t4"] == 0.013
 
 
@@ -122,13 +114,13 @@ def test_an_interruption_leaves_nothing(stage, tmp_path, drawing):
         raise KeyboardInterrupt
 
     drawing(interrupt)
-    (tmp_path / "s.json").write_text("old")
-    options = ("--json", tmp_path / "s.json", "--write-stage", tmp_path / "w.toml", "--plots", tmp_path / "plots")
+    (tmp_path / "w.toml").write_text("old")
+    options = ("--write-stage", tmp_path / "w.toml", "--plots", tmp_path / "plots")
     result = run("sensitivity", stage, "--axis", "z", *options)
     assert (result.exit_code, result.stdout) == (130, "")
     assert result.stderr == "Interrupted: no unfinished file was left.\n"
-    assert files(tmp_path) == ["s.json", "stage.toml"]
-    assert (tmp_path / "s.json").read_text() == "old"
+    assert files(tmp_path) == ["stage.toml", "w.toml"]
+    assert (tmp_path / "w.toml").read_text() == "old"
 
 
 @pytest.mark.parametrize(
@@ -144,11 +136,9 @@ def test_an_interruption_leaves_nothing(stage, tmp_path, drawing):
         (["--tolerance", "1e999mm"], ["--tolerance"]),
         (["--tolerance", "1.2.3mm"], ["--tolerance"]),
         (["--tolerance", "1mm"], ["--tolerance 1mm", "geometry.t1", "0.8"]),
-        (["--json", "no/such/s.json"], ["no/such"]),
-        (["--json", "."], ["folder"]),
-        (["stage.toml", "--json", "stage.toml"], ["--json", "STAGE.toml", "overwrite"]),
+        (["--write-stage", "no/such/s.toml"], ["no/such"]),
+        (["--write-stage", "."], ["folder"]),
         (["stage.toml", "--write-stage", "./stage.toml"], ["--write-stage", "STAGE.toml", "overwrite"]),
-        (["--write-stage", "a", "--json", "a"], ["--write-stage", "--json", "overwrite"]),
         (["--plots", "stage.toml"], ["stage.toml", "--plots"]),
     ],
 )

@@ -4,8 +4,10 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
+from _command import run
 from _docs import PAGES, REFERENCE, ROOT, blocks, commands, options_of, prose, reference_page
 
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
@@ -18,6 +20,15 @@ def test_the_readme_is_short_and_tells_the_two_jobs_of_ci():
     assert len(text.split()) <= 900
     for mark in ("main", "test"):
         assert text.count(f"<!-- ci: {mark} -->\n```bash\npython3 -m venv .venv && ") == 1
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper_of_the_readme():
+    said, readme = ((ROOT / name).read_text(encoding="utf-8") for name in ("CITATION.cff", "README.md"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert f"\nversion: {project['version']}\n" in said
+    assert f"\nlicense: {project['license']}\n" in said
+    for words in re.findall(r"(?:title|family-names|doi): \"?([^\"}\n]+)", said):
+        assert words in " ".join(readme.replace(">", " ").split())
 
 
 def test_the_reference_is_what_the_commands_declare():
@@ -98,3 +109,17 @@ def test_blocks_run_by_paste(page, tmp_path):
         check=False,
     )
     assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-3000:]}"
+
+
+def test_what_a_command_is_for_is_not_cut_and_the_shell_completes_its_name():
+    told = " ".join(run("--help").stdout.split())
+    assert "..." not in told.partition("Commands:")[2]
+    for name, command in commands():
+        if " " in name:
+            continue
+        assert f"{name} {' '.join(command.help.split(chr(10) * 2)[0].split())}" in told
+    asked = {"COMP_WORDS": "microid comp", "COMP_CWORD": "1", "_MICROID_COMPLETE": "bash_complete"}
+    done = subprocess.run(
+        [sys.executable, "-m", "microid"], env=os.environ | asked, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["plain,compensate"]

@@ -144,7 +144,7 @@ def test_records_that_cannot_be_fitted_are_refused(bench):
         ([noise], {}, "noise.csv: the displacement hardly follows the voltage"),
         ([], {}, "no record"),
         ([train], {"family": "spline"}, "unknown density family 'spline'"),
-        ([train], {"levels": 3}, "between 4 and 100"),
+        ([train], {"levels": 3}, "from 4 to 100"),
         ([train], {"holdout": 0.95}, "between 0 and 0.9"),
         ([train], {"initial": "warm"}, "unknown initial state 'warm'"),
         ([turned], {}, "turned.csv: the displacement falls where the voltage rises"),

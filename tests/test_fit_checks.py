@@ -130,3 +130,35 @@ def test_noise_and_impulses_are_read_off_signals(rng):
     hit = np.zeros(n, dtype=bool)
     hit[rng.choice(np.arange(20, n - 20, 37), 30, replace=False)] = True
     assert np.array_equal(impulsive(noise + np.where(hit, 1.0, 0.0)) & hit, hit)
+
+
+@pytest.mark.parametrize("estimate", [fits.fit, fits.fit_slow, fits.fit_stage])
+def test_a_number_of_levels_that_is_none_is_refused_by_every_fit(slow, estimate):
+    for levels in (1, 0, -3, 101, 8.5):
+        with pytest.raises(fits.DataError, match=f"levels: expected a whole number from 4 to 100, found {levels};"):
+            estimate([slow], levels=levels)
+
+
+def plays(voltage_V, fresh):
+    """What a few plays make of a voltage, um: as they are when it first rises, or as its lower end left them."""
+    moved_um = 0.05 * voltage_V
+    for half_V, gain in ((2, 0.05), (6, 0.04), (12, 0.03), (25, 0.02)):
+        at_V = 0.0 if fresh else voltage_V[0] + half_V
+        for k, volts in enumerate(voltage_V):
+            at_V = min(max(at_V, volts - half_V), volts + half_V)
+            moved_um[k] += gain * at_V
+    return moved_um
+
+
+def test_the_first_way_of_a_fresh_stage_is_named(rng):
+    """Its plays begin where no voltage of the record leaves them; later they are where voltages left them."""
+    turn = np.arange(900) / 180
+    voltage_V = 50 - 50 * np.cos(2 * np.pi * turn)
+    for fresh in (True, False):
+        noisy_um = plays(voltage_V, fresh) + 0.005 * rng.standard_normal(900)
+        record = fits.Record(turn, voltage_V, noisy_um, source="rig.csv")
+        found = [remark for remark in fits.fit(record, levels=LEVELS).remarks if "first way across" in remark]
+        assert len(found) == fresh
+        if fresh:
+            stop = int(re.search(r"^rig\.csv: up to sample (\d+) ", found[0])[1])
+            assert np.argmax(voltage_V > 95) <= stop <= np.argmax(voltage_V)

@@ -265,13 +265,11 @@ def test_missing_numbers_are_refused_or_dropped(tmp_path):
     keep = np.isfinite(holes)
     path = tmp_path / "holes.csv"
     path.write_text("# rig 3\ntime_s,voltage_V,displacement_um\n" + rows(t, v, holes).replace("nan", "", 1))
-    for source, place in (
-        (path, "line 10"),
-        (pd.DataFrame({"time_s": t, "voltage_V": v, "displacement_um": holes}), "row 8"),
+    for source, place, how in (
+        (path, "line 10", "--missing drop"),
+        (pd.DataFrame({"time_s": t, "voltage_V": v, "displacement_um": holes}), "row 8", 'missing="drop"'),
     ):
-        with pytest.raises(
-            fits.DataError, match=f"{place}, column 'displacement_um': expected a finite .*--missing drop"
-        ):
+        with pytest.raises(fits.DataError, match=f"{place}, column 'displacement_um': expected a finite .*{how}"):
             fits.read_table(source)
         for how in ({}, {"columns": {"voltage_V": "2", "displacement_um": "3"}, "sample_rate_Hz": 500.0}):
             record = fits.read_table(source, missing="drop", **how)

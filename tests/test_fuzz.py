@@ -70,7 +70,7 @@ def commands(good, name, path, out, rng):
             return ["simulate", path, good["program.csv"], "--out", csv_out]
         return ["compensate", path, good["reference.csv"], "--out", csv_out, "--clip"]
     if name == "design.toml":
-        return ["sensitivity", path, "--axis", "x", "--json", out / "out.json"] if some < 0.3 else None
+        return ["sensitivity", path, "--axis", "x", "--json"] if some < 0.3 else None
     return None
 
 
@@ -195,9 +195,9 @@ def through_the_command(good, name, path, out):
         "reference.csv": ["compensate", model, path, "--out", target, "--clip"],
         "model.json": ["simulate", path, good["program.csv"], "--out", target],
         "stage.json": ["simulate", path, good["program.csv"], "--out", target],
-        "design.toml": ["sensitivity", path, "--axis", "x", "--json", out / "out.json"],
+        "design.toml": ["sensitivity", path, "--axis", "x", "--json"],
         "scenario.toml": ["synth", path, "--out", out],
-        "idle.csv": ["budget", "paper", model, path, "--axis", "x", "--json", out / "out.json"],
+        "idle.csv": ["budget", "paper", model, path, "--axis", "x", "--json"],
         "gains.json": ["control", model, good["reference.csv"], "--gains", path, "--out", target],
     }[name]
     done = subprocess.run(

@@ -1,9 +1,13 @@
 """Runs given in Python: one or several, as records, tables or names of files; and those that no fit can use."""
 
+import ast
+import re
+
 import jax
 import numpy as np
 import pandas as pd
 import pytest
+from _models import random_model
 
 import fits
 from fits.io._given import records_given
@@ -78,3 +82,80 @@ def test_a_reference_refuses_them_too():
         fits.Reference([0.0, 1.0], [np.nan, 1.0])
     with pytest.raises(fits.DataError, match=r"time_s\[1\]: expected a time after 0 s"):
         fits.Reference([0.0, 0.0], [0.0, 1.0])
+
+
+FRAME = pd.DataFrame(COLUMNS)
+
+
+def turned(frame):
+    return frame.assign(displacement_um=-frame["displacement_um"])
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        (FRAME.rename(columns={"voltage_V": "drive"}), r"fits\.read_table\(data, {'voltage_V': 'drive\[V\]'}\)"),
+        (FRAME.rename(columns={"displacement_um": "displacement"}), "{'displacement_um': 'displacement\\[um\\]'}"),
+        (FRAME.assign(voltage_V=np.nan), r'with fits\.read_table\(data, missing="drop"\)'),
+    ],
+)
+def test_refusals_of_a_frame_say_what_to_write_in_python(frame, words):
+    """And what they say works."""
+    for entry in (fits.read_table, fits.fit):
+        with pytest.raises(fits.DataError, match=words) as caught:
+            entry(frame)
+        assert "--" not in str(caught.value)
+    if said := re.search(r"read_table\(data, ({.*?})\)", str(caught.value)):
+        np.testing.assert_array_equal(fits.read_table(frame, ast.literal_eval(said[1])).voltage_V, VOLTAGE_V)
+
+
+def test_warnings_of_a_frame_say_what_to_write_in_python(tmp_path):
+    (warning,) = fits.read_table(turned(FRAME)).warnings
+    assert "fits.read_table(data, {'displacement_um': '-displacement_um'})" in warning
+    turned(FRAME).to_csv(tmp_path / "run.csv", index=False)
+    (warning,) = fits.read_table(tmp_path / "run.csv").warnings
+    assert "--columns displacement_um=-displacement_um" in warning
+
+
+def test_columns_are_named_as_for_the_option_or_by_numbers(tmp_path):
+    path = tmp_path / "numbers.csv"
+    FRAME.to_csv(path, index=False, header=False)
+    for columns in ("1,2,3", {"time_s": 1, "voltage_V": 2, "displacement_um": 3}):
+        np.testing.assert_array_equal(fits.read_table(path, columns).voltage_V, VOLTAGE_V)
+    with pytest.raises(fits.DataError, match="missing: expected refuse or drop, found 'skip'"):
+        fits.read_table(FRAME, missing="skip")
+
+
+def test_programs_and_references_are_given_as_runs_are(tmp_path):
+    law = random_model(np.random.default_rng(1))
+    ends = float(law.density.lower_V), float(law.density.upper_V)
+    frame = pd.DataFrame({"time_s": TIME_s, "voltage_V": np.interp(VOLTAGE_V, [0, 100], ends)})
+    frame.to_csv(tmp_path / "program.csv", index=False)
+    played = fits.predict(law, None, fits.Record(TIME_s, frame["voltage_V"], None)).displacement_um
+    for program in (frame, tmp_path / "program.csv", dict(frame)):
+        np.testing.assert_allclose(fits.predict(law, None, program).displacement_um, played, rtol=0, atol=1e-12)
+    wanted = {"time_s": TIME_s, "displacement_um": played}
+    found = fits.compensate(law, wanted, clip=True)
+    np.testing.assert_allclose(found.displacement_um, played, atol=1e-6)
+
+
+def test_a_record_says_what_it_holds_and_is_drawn():
+    warned = fits.Record(TIME_s, VOLTAGE_V, None, {"temperature_degC": TIME_s}, "run.csv", ("a gap.",))
+    lines = repr(warned).splitlines()
+    assert lines[0] == "run.csv: 300 samples in 2.99 s, 100 Hz"
+    assert [line.split() for line in lines[1:3]] == [
+        ["voltage_V", "0", "to", f"{VOLTAGE_V.max():.6g}"],
+        ["temperature_degC", "0", "to", "2.99"],
+    ]
+    assert lines[3:] == ["Note: a gap."]
+    assert warned._repr_html_() == f"<pre>{warned.summary()}</pre>"
+    assert repr(warned[:0]) == "run.csv: no samples"
+    for one, panels in ((warned, 1), (record(), 2), (fits.Reference(TIME_s, VOLTAGE_V), 1)):
+        picture = one.plot()
+        assert len(picture.axes) == panels
+        np.testing.assert_array_equal(picture.axes[-1].lines[0].get_xdata(), TIME_s)
+
+
+def test_what_holds_no_numbers_is_no_record():
+    with pytest.raises(fits.DataError, match="voltage_V: expected an array of numbers, found something else"):
+        record(voltage_V=["high"] * 300)

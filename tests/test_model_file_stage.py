@@ -5,6 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _command import refused, run
 from _models import random_model
 from test_model_file import REPORT, bits, hashed, refusal
 
@@ -127,7 +128,7 @@ def test_something_else_for_a_grid_is_refused(written):
     content = json.loads(path.read_text(encoding="utf-8"))
     content["uncertainty"]["grid"] = "fine"
     path.write_text(json.dumps(hashed(content)), encoding="utf-8")
-    assert "does not fit" in refusal(path)
+    assert 'uncertainty.grid: expected an object with a type or null, found "fine"' in refusal(path)
 
 
 def test_a_stage_uncertainty_needs_a_stage(tmp_path, rng):
@@ -150,3 +151,42 @@ def test_what_is_not_finite_is_not_written(tmp_path, rng):
     with pytest.raises(DataError, match="finite"):
         save_model(tmp_path / "m.json", stage, endless, REPORT)
     assert not (tmp_path / "m.json").exists()
+
+
+BROKEN = {
+    ("parts",): (None, "expected a list, each of it an object with a type, found nothing"),
+    ("parts", 0): (None, "expected an object with a type, found nothing"),
+    ("frozen", 0): (1, "expected a text, found 1"),
+    ("names",): ("x", 'expected a list, each of it a text, found "x"'),
+    ("frozen",): (None, "expected a list, each of it a text, found nothing"),
+    ("hold",): (1, "expected one of first, zero, smooth, found 1"),
+    ("substeps",): (True, "expected a whole number, found true"),
+}
+
+
+@pytest.mark.parametrize("place", BROKEN, ids=str)
+def test_what_is_of_another_kind_is_refused_in_words_of_the_file(written, place):
+    path, _, _ = written
+    content = json.loads(path.read_text())
+    inner = content["model"]
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]], words = BROKEN[place]
+    path.write_text(json.dumps(hashed(content)))
+    where = place[0] if len(place) == 1 else f"{place[0]}[{place[1]}]"
+    assert f"model.{where}: {words}; write the file again" in refusal(path)
+
+
+def test_a_stage_that_turns_the_sign_ahead_of_its_hysteresis_is_refused_with_its_file(written):
+    path, _, _ = written
+    content = json.loads(path.read_text())
+    content["model"]["parts"][0]["gain"]["value"] = -1.0
+    path.write_text(json.dumps(hashed(content)))
+    program = path.with_name("program.csv")
+    program.write_text("time_s,voltage_V\n0,0\n1,1\n2,2\n")
+    reference = path.with_name("reference.csv")
+    reference.write_text("time_s,displacement_um\n0,0\n1,1\n2,2\n")
+    out = path.with_name("out.csv")
+    refused(run("simulate", path, program, "--out", out), f"{path}: the static gain ahead of", "is -1")
+    refused(run("compensate", path, reference, "--out", out), f"{path}: part ", "a positive static gain, found -1")
+    assert not out.exists()

@@ -199,7 +199,7 @@ def model_file(tmp_path, rng):
 
 
 CHANGES = {
-    "part": (lambda c: c["model"]["parts"].__setitem__(0, 5.0), "must be a part"),
+    "part": (lambda c: c["model"]["parts"].__setitem__(0, 5.0), "parts[0]: expected an object"),
     "substeps": (lambda c: c["model"].update(substeps=10**9), "up to 1000"),
     "weights": (lambda c: c["model"]["parts"][1]["density"]["packed_um"]["value"].__setitem__(0, 1e308), "1e+30"),
     "offset": (lambda c: c["model"]["parts"][1]["offset_um"].update(value=1e300), "1e+30"),

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from fits.loop._report_words import _row
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, runs_read, stage_parameters
-from fits.report._words import NONE, length, number, plain, spread, verdict_sentence
+from fits.report._words import NONE, headline, length, number, plain, spread, verdict_sentence
 from microid import EFFECTS
 
 SIZES_um = (0.0471, 0.0123, 0.04709, 0.0470999, 0.9, np.nan)
@@ -69,7 +70,7 @@ def test_sentence_tile_step_and_json_give_one_residual_by_one_name(rng):
         found = replace(made, causes=(), runs=runs, gain=gain, unexplained_rms_um=0.00167)
         page = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", report_html(found)))
         tiles = [size_um(re.search(rf"{name}, rms {SIZE}", page)[1]) for name in TILES]
-        words = rf"leaves a residual of {SIZE}.* noise floor of {SIZE} .* reproducible error of {SIZE}"
+        words = rf"leaves a residual of {SIZE}.* noise floor of {SIZE}. .* reproducible error of {SIZE}"
         said = [size_um(one) for one in re.search(words, verdict_sentence(found)).groups()]
         content = diagnosis_json(found)
         listed = [content[name] for name in ("residual_rms_before_um", "noise_um", "unexplained_rms_um")]
@@ -90,6 +91,60 @@ def test_no_verb_follows_a_name_as_some_are_plural(rng):
         text = " ".join([verdict_sentence(found), next_steps(found)[0][0], found.summary(), page])
         assert plain(name) in text
         assert not re.search(rf"{plain(name)} ({verbs})\b", text, re.IGNORECASE)
+
+
+def text_of(found):
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", report_html(found)))
+
+
+def test_a_share_says_what_it_is_a_part_of(rng):
+    made = diagnosis(rng)
+    for name, part, other in (("floor_vibration", "noise", "misfit"), ("creep", "misfit", "noise")):
+        found = replace(made, causes=(cause(name),))
+        assert f"93 % of the {part}" in found.summary()
+        page = text_of(found)
+        assert f"Share of the {part} 93 %" in page
+        assert f"Share of the {part} it explains 93 %" in page
+        assert f"Share of the {other}" not in page
+
+
+def test_columns_are_asked_for_that_the_stage_reads(rng):
+    """An effect may have a form that reads a temperature and one that does without."""
+    made = replace(diagnosis(rng), causes=(cause("thermal_gain"),))
+    for form in (form for form in EFFECTS if form.name in ("thermal_gain", "thermal_drift")):
+        steps = " ".join(words for words, _ in next_steps(replace(made, extended=SimpleNamespace(parts=(form,)))))
+        asked = "more columns in reference.csv: temperature_degC."
+        assert (asked in steps) == (form.form == "temperature")
+
+
+def test_the_temperature_is_spoken_of_where_there_was_one(rng):
+    made = diagnosis(rng)
+    warm = replace(made.tests[0], name="temperature")
+    for tests, spoken in ((made.tests, False), ((*made.tests, warm), True)):
+        assert ("goes with the temperature, too" in text_of(replace(made, tests=tests))) == spoken
+
+
+def test_evidence_that_names_no_cause_is_explained(rng):
+    made = diagnosis(rng)
+    loud = replace(made.upper_bounds[0], z=15.1)
+    assert "names no cause here" not in text_of(made)
+    assert "Evidence above 8 \N{GREEK SMALL LETTER SIGMA} names no cause here" in text_of(
+        replace(made, upper_bounds=(loud,))
+    )
+
+
+def test_what_is_to_be_recorded_does_not_contradict_itself(rng):
+    for kind in KINDS:
+        found = replace(diagnosis(rng, kind), next_experiment=None)
+        page, steps = text_of(found), " ".join(words for words, _ in next_steps(found))
+        assert ("Record a run" in steps) == (kind == "unexplained")
+        assert ("No further experiment is proposed" in page) == ("Record a run" not in steps)
+        assert ("that beside what was found" in page) == bool(found.causes)
+
+
+def test_a_headline_has_every_effect_that_a_cause_may_be(rng):
+    made = replace(diagnosis(rng), causes=(cause("creep", ("aging",)), cause("friction")))
+    assert headline(made) == "The stage shows creep or aging and friction."
 
 
 def test_lengths_are_in_the_unit_that_they_ask_for():

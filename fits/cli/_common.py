@@ -122,7 +122,9 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
         except (DataError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not isinstance(error, late.FitError):
                 raise
-            sentence = printable(" ".join(without_middle(str(error)).split()))
+            of_model = isinstance(error, DataError) and error.of_model
+            place = options.get("start") or options.get("model") if of_model else None
+            sentence = printable(" ".join(without_middle(f"{place}: {error}" if place else str(error)).split()))
             click.echo(sentence if sentence.endswith((".", "?")) else f"{sentence}.", err=True)
             sys.exit(2)
         except OSError as error:
@@ -189,15 +191,10 @@ def page(given: Given) -> list[str]:
     return [] if given.plots is None else [f"page   {Path(given.plots) / 'index.html'}"]
 
 
-def json_place(given: Given) -> str | None:
-    """The JSON file to write, None where there is none or it is printed."""
-    return None if given.json_file == "-" else given.json_file
-
-
-def print_words(given: Given, text: str, words: str, places: Iterable[tuple[str, str | None]]) -> None:
-    """Print words, then what was written where, or instead the JSON text; what was not written has no place."""
+def with_places(words: str, places: Iterable[tuple[str, str | None]]) -> list[str]:
+    """Words, then lines of what was written where; what was not written has no place."""
     written = [f"{what:5}  {place}" for what, place in places if place is not None]
-    click.echo(text if given.json_file == "-" else "\n".join([words, *([""] if written else []), *written]))
+    return [words, *([""] if written else []), *written]
 
 
 def fraction_or_files(given: Sequence[str]) -> tuple[float, list[str]]:

@@ -15,7 +15,7 @@ from fits.io._version import written_by
 
 
 class _Commands(click.Group):
-    """Commands whose refusals of options quote what was typed, but not at any length."""
+    """Commands whose refusals of options quote what was typed, but not at any length, and whose help is whole."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -23,11 +23,17 @@ class _Commands(click.Group):
         except click.UsageError as error:
             raise click.UsageError(without_middle(error.format_message()), error.ctx) from None
 
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what each command is for, whole, where click would cut it."""
+        words = {name: command.get_short_help_str(limit=1000) for name, command in sorted(self.commands.items())}
+        with formatter.section("Commands"):
+            formatter.write_dl(list(words.items()))
+
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(written_by(), message="%(version)s")
 def cli() -> None:
-    """Identify a piezo-driven micro-positioner from CSV files of voltage and displacement.
+    """Identify a piezo-driven micro-positioner from records of voltage and displacement.
 
     Bad input ends with status 2 and one sentence on stderr. Compiled functions are kept in the user's cache folder;
     MICROID_CACHE names another, and MICROID_CACHE=off keeps none.

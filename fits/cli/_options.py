@@ -55,7 +55,7 @@ axis = click.option(
     help="Which motion.",
 )
 json_output = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-quiet = click.option("--quiet", is_flag=True, help="No progress on stderr.")
+quiet = click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
 
 
 def columns(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -77,12 +77,6 @@ def plots(what: str) -> Callable[[Any], Any]:
 def picture_format(of: str) -> Callable[[Any], Any]:
     forms = click.Choice(["png", "svg", "pdf"])
     return click.option("--format", "form", type=forms, default="png", show_default=True, help=f"Of {of}.")
-
-
-def json_file(instead: str) -> Callable[[Any], Any]:
-    """Declare the option of a JSON file, which a `-` prints instead of something."""
-    words = f"JSON file to write; - prints it instead of the {instead}."
-    return click.option("--json", "json_file", metavar="FILE", help=words)
 
 
 def holdout(what: str) -> Callable[[Any], Any]:

@@ -26,8 +26,8 @@ from fits.io._file_set import file_set
 )
 @click.option("--not-zeroed", "zeroed", flag_value=False, default=True, help="Count the offset of IDLE.csv too.")
 @options.columns
-@options.json_file("table")
 @options.plots("a plot")
+@options.json_output
 @common.in_sentences
 def budget(given: common.Given) -> None:
     """Add up what driving, machining and measuring do to each motion of a stage.
@@ -36,9 +36,6 @@ def budget(given: common.Given) -> None:
     is that of the tolerances in STAGE.toml, or of the paper's stage; the measuring error is what the sensor shows at
     rest in IDLE.csv, with the columns time_s and displacement_um.
     """
-    out = common.json_place(given)
-    for what, path in {"STAGE.toml": given.stage, "MODEL.json": given.model, "IDLE.csv": given.idle}.items():
-        common.refuse_clashes({what: None if path == "paper" else path, "--json": out})
     # What is no model is refused at once.
     late.read_model_text(given.model)
     late.start_jax()
@@ -49,24 +46,17 @@ def budget(given: common.Given) -> None:
             "none; add --arm, such as --arm 50mm."
         )
     with file_set() as files:
-        unfinished, drawings = None if out is None else files.file(out), files.folder(given.plots)
+        drawings = files.folder(given.plots)
         design = late.paper_design() if given.stage == "paper" else late.read_design(given.stage)
         noise = late.idle_noise(late.read_idle(given.idle, **common.reading(given)))
         axes = tuple(name for name in late.AXES if given.axis in (name, "all"))
         how = {"measures": given.model_measures, "arm_mm": arm_mm, "zeroed": given.zeroed}
         found = late.budget(design, _law(given.model), noise, axes, **how)
-        text = late.finite_json(late.budget_json(found))
         drawn = [] if drawings is None else late.plot_budget(found, drawings, form=given.form)
-        if unfinished is not None:
-            unfinished.write_text(f"{text}\n", encoding="utf-8")
-    places = [("json", out), *(("plot", place) for place in common.paths_in(given.plots, drawn))]
-    common.print_words(given, text, found.summary(), places)
+    places = [("plot", place) for place in common.paths_in(given.plots, drawn)]
+    common.print_result(given, late.budget_json(found), common.with_places(found.summary(), places))
 
 
 def _law(path: str) -> "late.Preisach":
     """The hysteresis of a model file, as slow voltages see it."""
-    model = common.stage_or_preisach(path, late.load_model(path))
-    try:
-        return late.static_equivalent(model)
-    except DataError as error:
-        raise DataError(f"{path}: {error}" if error.of_model else str(error)) from error
+    return late.static_equivalent(common.stage_or_preisach(path, late.load_model(path)))

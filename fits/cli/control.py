@@ -124,12 +124,7 @@ def control(given: common.Given) -> None:
     plant = common.stage_or_preisach(given.model, loaded)
     with file_set() as files:
         unfinished, drawings = files.file(given.out), files.folder(given.plots)
-        try:
-            ready = late.setup(plant, wanted, given.feedforward, initial=given.initial, limits_V=volts)
-        except DataError as error:
-            if not error.of_model:
-                raise
-            raise DataError(f"{given.model}: {error}") from error
+        ready = late.setup(plant, wanted, given.feedforward, initial=given.initial, limits_V=volts)
         skipped = round(given.skip / ready.interval_s)
         if skipped > len(wanted) - 2:
             longest = f"the reference's {wanted.time_s[-1]:g} s"

@@ -21,7 +21,7 @@ from fits.io._file_set import file_set
     "--level", type=click.IntRange(0, 1), help="0: slender leaves and rigid blocks; 1: the stage's default."
 )
 @click.option("--voltage", is_flag=True, help="Also at a fixed voltage, where a stiffer stage compresses its piezo.")
-@options.json_file("tables")
+@options.json_output
 @options.plots("plots")
 @click.option("--write-stage", metavar="FILE", help="TOML file of the stage to write, to change and come back with.")
 @common.in_sentences
@@ -32,27 +32,24 @@ def sensitivity(given: common.Given) -> None:
     followed by what the paper reads in its Fig. 7. --write-stage writes one to begin with.
     """
     late.start_jax()
-    out = common.json_place(given)
-    common.refuse_clashes({"STAGE.toml": given.stage, "--json": out, "--write-stage": given.write_stage})
+    common.refuse_clashes({"STAGE.toml": given.stage, "--write-stage": given.write_stage})
     design = _design(given.stage, given.tolerance, given.level)
     axes = tuple(name for name in late.AXES if given.axis in (name, "all"))
     with file_set() as files:
-        unfinished, drawings = None if out is None else files.file(out), files.folder(given.plots)
+        drawings = files.folder(given.plots)
         unfinished_stage = None if given.write_stage is None else files.file(given.write_stage)
         report = late.sensitivities(design, axes)
-        text = late.finite_json(late.sensitivity_json(report))
-        claimed = [] if given.stage or given.json_file == "-" else late.paper_claims(design)
+        claimed = [] if given.stage or given.as_json else late.paper_claims(design)
         claims = [claim for claim in claimed if {*claim.axes} & {*axes}]
         drawn = [] if drawings is None else late.plot_sensitivity(design, report, drawings, form=given.form)
-        if unfinished is not None:
-            unfinished.write_text(f"{text}\n", encoding="utf-8")
         if unfinished_stage is not None:
             unfinished_stage.write_text(late.design_text(design), encoding="utf-8")
     words = report.summary(given.voltage)
     if claims:
         words += f"\n\n{late.describe_claims(claims)}"
     plots = [("plot", place) for place in common.paths_in(given.plots, drawn)]
-    common.print_words(given, text, words, [("json", out), ("stage", given.write_stage), *plots])
+    places = [("stage", given.write_stage), *plots]
+    common.print_result(given, late.sensitivity_json(report), common.with_places(words, places))
 
 
 def _design(stage: str | None, tolerance: str | None, level: int | None) -> "late.Design":

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 import microid
 from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, compensate_plain, follow, within_range
 from fits.io._errors import DataError
+from fits.io._given import AnyRuns, reference_given
 from fits.io._length import length
 from fits.io._record import Record, Reference
 from fits.loop._plain import PlainLoop, PlainModel
@@ -33,7 +34,7 @@ _FEWEST = 16
 
 def compensate(
     model: Preisach | Stage,
-    reference: Reference | Record,
+    reference: AnyRuns,
     initial: str = "negative",
     clip: bool = False,
     limits_V: tuple[float, float] | None = None,
@@ -41,17 +42,19 @@ def compensate(
 ) -> Compensation:
     """Find the voltage whose displacement is the reference.
 
-    The reference is as the sensor would read it: the model's `offset_um`, its reading at negative saturation, is
-    included. The memory before the first sample is `negative`, `positive` or `demagnetised`. With `clip` the nearest
-    that can be reached is taken where the reference is out of reach, instead of refusing it. Limits are the lowest
-    and highest voltage allowed; the range the model was fitted on by default. For a stage these are commands, and its
-    range is that of its hysteresis over the gain of its driver.
+    The reference is one or a record, or what `read_reference` takes, as the sensor would read it: the model's
+    `offset_um`, its reading at negative saturation, is included. The memory before the first sample is `negative`,
+    `positive` or `demagnetised`. With `clip` the nearest that can be reached is taken where the reference is out of
+    reach, instead of refusing it. Limits are the lowest and highest voltage allowed; the range the model was fitted
+    on by default. For a stage these are commands, and its range is that of its hysteresis over the gain of its
+    driver.
 
     The way `"static"` is by the exact inverse of the hysteresis, with the static gains of a stage; its response then
     lags and rings. `"dynamic"` is by the inverse of the whole stage, for references that are smooth and begin at
     rest; see `microid.invert_stage`. A `DataError` says that the reference cannot be followed, that the limits are
     not within the model's range, or that the model has nothing dynamic to compensate.
     """
+    reference = reference_given(reference)
     if reference.displacement_um is None:
         raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
     wanted, time_s = reference.displacement_um, reference.time_s

@@ -207,9 +207,10 @@ def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> s
             f"No program within the rig's limits would tell {listed} apart for sure; this one comes nearest, with "
             f"{z:.1f} standard deviations where the records at hand have {present:.1f}."
         )
+    few = ", too few for effects so alike" if present > _TOLD_APART else ""
     return (
         f"It would tell {listed} apart by {z:.1f} standard deviations at least, where the records at hand do by "
-        f"{present:.1f}."
+        f"{present:.1f}{few}."
     )
 
 

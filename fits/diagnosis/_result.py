@@ -14,6 +14,7 @@ from fits.io._summary import AbstractSummary
 from fits.loop._result import ParameterEstimate
 from fits.stage._uncertainty import StageUncertainty
 from microid import Stage
+from microid.effects import card_of
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]
 SCHEMA = "microid.diagnosis/1"
@@ -199,8 +200,9 @@ class Diagnosis(AbstractSummary):
             also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
             chance = f"{cause.p_family:.1g}" if cause.p_family >= SMALLEST_P else f"below {SMALLEST_P:.0e}"
             lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {chance}")
+            whole = "noise" if card_of(cause.name).statistic else "misfit"
             if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
-                lines.append(f"    {length(cause.rms_um)}, {100 * cause.share_of_misfit:.0f} % of the misfit")
+                lines.append(f"    {length(cause.rms_um)}, {100 * cause.share_of_misfit:.0f} % of the {whole}")
             for each in cause.parameters:
                 unit = "" if each.unit == "1" else f" {each.unit}"
                 below, above = each.value - each.lower, each.upper - each.value

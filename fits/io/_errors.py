@@ -35,6 +35,8 @@ def without_middle(sentence: str) -> str:
 
 def shown(found: Any) -> str:
     """Write what was found in a file as TOML and JSON have it, short enough for a sentence."""
+    if found is None:
+        return "nothing"
     if isinstance(found, dict | list):
         return "a table" if isinstance(found, dict) else "a list"
     if isinstance(found, int) and abs(found) >= 10**_SHOWN:  # more digits take long to write

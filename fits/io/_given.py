@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from fits.io._errors import DataError
-from fits.io._read_csv import read_table
-from fits.io._record import Record
+from fits.io._read_csv import read_reference, read_table
+from fits.io._record import Record, Reference
 
 # One run or an iterable of several: records, names of files, or what else `read_table` takes, such as a DataFrame.
 AnyRuns = Any
@@ -29,6 +29,16 @@ def records_given(given: AnyRuns) -> tuple[Record, ...]:
         if record.displacement_um is None:
             raise DataError(f"{name}: a displacement column is needed here")
     return found
+
+
+def program_given(given: Any) -> Record:
+    """A voltage program as a record: one, the name of a file, or what else `read_table` takes."""
+    return given if isinstance(given, Record) else read_table(given, required=("time_s", "voltage_V"))
+
+
+def reference_given(given: Any) -> Record | Reference:
+    """A displacement to follow: a record or a reference, the name of a file, or what else `read_reference` takes."""
+    return given if isinstance(given, Record | Reference) else read_reference(given)
 
 
 def holdout_given(holdout: float | AnyRuns) -> float | tuple[Record, ...]:

@@ -3,16 +3,18 @@
 import os
 import re
 import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from fits.io._errors import AnyPath, DataError
 from fits.io._open_table import open_table
-from fits.io._quantity import FloatArray, split_unit
+from fits.io._quantity import BRACKETS, FloatArray, split_unit
 from fits.io._read_csv import likely_stroke, read_reference, read_table
-from fits.io._table import Table
-from fits.io._units import Source, known_quantity, known_unit, parse_columns, recognise
+from fits.io._table import Table, data_error
+from fits.io._text_table import is_missing
+from fits.io._units import Source, known_quantity, known_unit, parse_columns, recognise, recognise_again
 
 # Names by which rigs call the columns of a record, whole and in small letters; a minus is for readings of a command.
 _LIKELY = {
@@ -20,6 +22,7 @@ _LIKELY = {
     "voltage_V": r"[uv]\d*|ch1|ao\d*|.*(volt|drive|cmd|command|dac|input|pzt|piezo|spannung).*",
     "displacement_um": r"[xyzdwh]\d*|ch2|ai\d*|.*(disp|pos|gauge|height|stroke|sensor|lvdt|interf|mirror|weg).*",
 }
+_MULTIPLES_OF_s = {"min": 60.0, "h": 3600.0}
 _READING = r".*(monitor|meas|readback).*"
 
 
@@ -63,15 +66,22 @@ def inspect_table(path: AnyPath) -> Inspection:
     table = open_table(path)
     found, problems = table.read(())
     # Where numbers are missing here and there, the others of the column still say what it is.
-    holes = [name for name, (_, words) in problems.items() if "nan" in words.lower() or words == "an empty cell"]
+    holes = [name for name, (_, words) in problems.items() if is_missing(words)]
     for name in holes:
         left, kept = table.without_missing([name])
         if kept.mean() > 0.5:
             found |= {name: left.read(())[0].get(name, np.zeros(0))}
     found = {name: found[name] for name in table.names if len(found.get(name, ()))}
     if not found:
-        raise DataError(f"{os.fspath(path)}: expected columns of numbers, found none; name another file.")
-    known = {spoken[0].column: Source(name, spoken[1]) for name in found if (spoken := recognise(name))}
+        first = next(iter(problems), None)
+        place, words = problems.get(first or "", ("", "none"))
+        what = f"expected columns of numbers, found {words}; name another file, or write numbers such as 1234.5"
+        raise data_error(os.fspath(path), what, place, first)
+    known, doubtful = dict[str, Source](), set[str]()
+    for name in found:
+        if spoken := recognise_again(name):
+            doubtful |= {spoken[0].column} & known.keys()
+            known.setdefault(spoken[0].column, Source(name, spoken[1]))
     sources = known | _guessed(table, found, known)
     interval_s, even = table.interval_s, table.interval_s is not None
     if "time_s" in sources:
@@ -85,18 +95,27 @@ def inspect_table(path: AnyPath) -> Inspection:
         low, high = (None, None) if values is None else (float(values.min()), float(values.max()))
         problem = ", ".join(problems[name][::-1]) if name in problems else ""
         channels.append(Channel(k, name, known_unit(name), low, high, use, bool(use) and use not in known, problem))
-    pairs = [f"{column}={_spec(table, source)}" for column, source in sources.items() if column not in known]
+    pairs = [
+        f"{column}={_spec(table, source)}"
+        for column, source in sources.items()
+        if column not in known.keys() - doubtful
+    ]
     options = ["--columns", ",".join(pairs)] if pairs else []
     if any(source.column in holes for source in sources.values()):
         options += ["--missing", "drop"]
-    if interval_s is None:
+    # What is wrong with a time that is named is said when it is read.
+    timeless = interval_s is None and not any(
+        said[0].column == "time_s" for said in map(recognise, table.names) if said
+    )
+    if timeless:
         options += ["--sample-rate", "HZ"]
     still = "voltage_V" in sources and not np.ptp(found[sources["voltage_V"].column])
     command, remarks = _command(os.fspath(path), {*sources}, options, still), [table.remark]
-    if interval_s is None and command:
+    if timeless and command:
         remarks.append("no column is a time: write the rate of the samples in place of HZ")
     elif command and not still:
         remarks += _remarks(path, ",".join(pairs), options, {*sources})
+    remarks += _unknown_units(table, found, sources)
     rate_Hz = 1 / interval_s if interval_s and interval_s > 0 else None
     rows = max(map(len, found.values()), default=0)
     said = tuple(filter(None, dict.fromkeys(remarks)))
@@ -112,12 +131,15 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
             continue
         quantity = known_quantity(column)
         fit = [name for name in free if np.ptp(found[name]) > 0 and known_unit(name) in (None, *quantity.powers)]
-        if column == "time_s":
-            fit = [name for name in fit if np.all(np.diff(found[name]) > 0)]
+        # What counts from sample to sample is a time only if it is called one, and nothing else.
+        fit = [name for name in fit if np.any(np.diff(found[name]) != 1) or _score(name, "time_s") > 0]
+        rising = [name for name in fit if np.all(np.diff(found[name]) > 0)]
+        fit = rising if column == "time_s" else [name for name in fit if name not in rising] or fit
         if fit:
             best = max(fit, key=lambda name: _score(name, column))
             free.remove(best)
-            guessed[column] = Source(best, known_unit(best) or quantity.unit)
+            multiple = _MULTIPLES_OF_s.get(split_unit(best)[1] or "", 1.0) if column == "time_s" else 1.0
+            guessed[column] = Source(best, known_unit(best) or quantity.unit, scale=multiple)
     moved, driven = guessed.get("displacement_um"), (known | guessed).get("voltage_V")
     if moved and driven and known_unit(moved.column) is None:
         volts = known_quantity("voltage_V").convert(np.ptp(found[driven.column]), driven.unit)
@@ -128,16 +150,37 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
     return guessed
 
 
+def _unknown_units(table: Table, found: dict[str, FloatArray], sources: dict[str, Source]) -> Iterator[str]:
+    """What has to be stated of columns in units that say nothing of V, um or s, such as % or counts."""
+    for source in sources.values():
+        unit = split_unit(source.column)[1]
+        unknown = known_unit(source.column) is None and source.scale == 1
+        if unknown and unit and (unit == "%" or BRACKETS.fullmatch(source.column)):
+            yield (
+                f"column '{source.column}' is in '{unit}': write what 1 of it is in place of [{source.unit}], as in "
+                f"[0.5{source.unit}]"
+            )
+    taken = {source.column for source in sources.values()}
+    free = [name for name in found if name not in taken and np.ptp(found[name]) > 0]
+    if free and "voltage_V" in sources and "displacement_um" not in sources:
+        best = Source(max(free, key=lambda name: _score(name, "displacement_um")), "um", scale=0.5)
+        yield (
+            "no displacement was found; if a column is a reading of one, say what 1 of it is, as in --columns "
+            f"{shlex.quote(f'displacement_um={_spec(table, best)}')}"
+        )
+
+
 def _score(name: str, column: str) -> int:
     stem = "_".join(split_unit(name)[0].lower().split())
-    fits_name = re.fullmatch(_LIKELY[column], stem) is not None
-    return 4 * (known_unit(name) is not None) + 2 * fits_name - (re.fullmatch(_READING, stem) is not None)
+    fits_names = {each for each, likely in _LIKELY.items() if re.fullmatch(likely, stem)}
+    fit = 2 if column in fits_names else -3 if fits_names else 0
+    return 4 * (known_unit(name) is not None) + fit - (re.fullmatch(_READING, stem) is not None)
 
 
 def _spec(table: Table, source: Source) -> str:
     """How `--columns` names a source: by its number where the name would not pass."""
     if set(source.column) & set(",=") or source.column != source.column.strip():
-        return f"{table.names.index(source.column) + 1}[{source.unit}]"
+        return Source(f"{table.names.index(source.column) + 1}", source.unit, scale=source.scale).spec()
     return source.spec()
 
 

@@ -33,7 +33,7 @@ def open_table(source: AnyPath | Any) -> Table:
             return of_frame("DataFrame", source)
         raise DataError(
             f"expected the name of a file, a DataFrame or a mapping of arrays, found {type(source).__name__}; "
-            "give one of these."
+            'give one of these, such as {"time_s": t, "voltage_V": u, "displacement_um": y}.'
         )
     shown = os.fspath(source)
     file, number = numbered(shown)

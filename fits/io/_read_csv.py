@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from fits.io._errors import AnyPath, DataError
+from fits.io._in_python import in_python
 from fits.io._open_table import open_table
 from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._quantity import FloatArray
 from fits.io._record import Record, Reference
 from fits.io._table import Problem, Table
-from fits.io._units import Source, find_sources, known_quantity, recognise
+from fits.io._units import Columns, Source, find_sources, known_quantity, pairs_of, recognise
 
 # Piezo stages move 0.01 um/V (stack on a 1000 V amplifier) to 15 um/V (voltage logged before an amplifier of
 # ten-fold gain). Of a typical 0.1 to 1 um/V, slips of 1e3 and 1e6 lie outside these limits.
@@ -22,9 +23,10 @@ STROKE_PER_VOLT_MAX_um_per_V = 50.0
 MIN_SAMPLES = 50
 
 
+@in_python
 def read_table(
     source: AnyPath | Any,
-    columns: Mapping[str, str] | None = None,
+    columns: Columns = None,
     required: Iterable[str] = ("time_s", "voltage_V", "displacement_um"),
     sample_rate_Hz: float | None = None,
     missing: str = "refuse",
@@ -47,7 +49,7 @@ def read_table(
         Canonical column to source column, for example ``{"voltage_V": "u1_V", "displacement_um": "-height[m]"}``:
         the unit is the suffix of the source or stands in brackets, and a minus flips the sign. ``drive[1.2V]`` says
         what 1 in the column is, as in %. A source may also be the number of a column, from 1, whose unit is then the
-        canonical one if none is stated.
+        canonical one if none is stated. Or all of it as one text, as for the option `--columns`.
     required
         Canonical columns that must be there. Time and voltage always are; without ``displacement_um`` the file is
         a voltage programme, which may be short and may hold the voltage.
@@ -101,7 +103,7 @@ read_csv = read_table
 
 def read_runs(
     paths: Iterable[AnyPath],
-    columns: Mapping[str, str] | None = None,
+    columns: Columns = None,
     sample_rate_Hz: float | None = None,
     missing: str = "refuse",
 ) -> tuple[Record, ...]:
@@ -112,9 +114,10 @@ def read_runs(
     return tuple(read_table(path, columns, sample_rate_Hz=sample_rate_Hz, missing=missing) for path in paths)
 
 
+@in_python
 def read_reference(
     path: AnyPath,
-    columns: Mapping[str, str] | None = None,
+    columns: Columns = None,
     sample_rate_Hz: float | None = None,
     missing: str = "refuse",
 ) -> Reference:
@@ -142,14 +145,16 @@ class KnownColumns:
     def read(
         cls,
         path: AnyPath | Any,
-        columns: Mapping[str, str] | None,
+        columns: Columns,
         required: Sequence[str],
         more: Sequence[str] | None = None,
         sample_rate_Hz: float | None = None,
         missing: str = "refuse",
     ) -> "KnownColumns":
         """Read the required columns, and of all others, or of `more`, those that are there; see `read_table`."""
-        table, columns = open_table(path), columns or {}
+        if missing not in ("refuse", "drop"):
+            raise DataError(f"missing: expected refuse or drop, found {missing!r}.")
+        table, columns = open_table(path), pairs_of(columns)
         if not (table.headed or columns):
             what = (
                 "expected a header such as time_s,voltage_V,displacement_um, found numbers; insert the header above "

@@ -30,6 +30,8 @@ def numbered(path: str) -> tuple[str, int | None]:
 def read_bytes(path: AnyPath, what: str, most: int) -> bytes:
     """Read `what` is expected at a path, such as `a CSV file`; a `DataError` if it cannot be, or is too large."""
     name = os.fspath(path)
+    if not name:
+        raise DataError(f"expected the name of {what}, found an empty one; give one.")
     try:
         mode = os.stat(path).st_mode
         if stat.S_ISDIR(mode):
@@ -109,7 +111,8 @@ def _why(error: ValueError | RecursionError) -> str:
     if isinstance(error, RecursionError):
         return f"more than {MOST_DEPTH} nested levels"
     if isinstance(error, json.JSONDecodeError):
-        return f"{error.msg}, line {error.lineno}" if error.pos else error.msg
+        begins = "it begins with something else" if error.msg == "Expecting value" else error.msg
+        return f"{error.msg}, line {error.lineno}" if error.pos else begins
     # All else comes from Python's `int`, and is for programmers.
     toml = isinstance(error, tomllib.TOMLDecodeError)
     return str(error).rstrip(".") if toml else "an integer of thousands of digits"

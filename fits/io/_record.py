@@ -11,18 +11,22 @@ from numpy.typing import ArrayLike
 from fits.io._errors import DataError
 from fits.io._printable import printable
 from fits.io._quantity import FloatArray
+from fits.io._summary import AbstractSummary
 
 
-def _read_only(values: ArrayLike) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64)
+def _read_only(name: str, values: ArrayLike) -> FloatArray:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DataError(f"{name}: expected an array of numbers, found something else; give numbers alone") from None
     if array.flags.writeable:
         array = array.copy()  # the caller's own array stays writeable
         array.flags.writeable = False
     return array
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
+@dataclass(frozen=True, eq=False, repr=False)
+class Record(AbstractSummary):
     """One run of one rig, `n` samples long.
 
     Sample times in s increase strictly, in steps that may be uneven; commanded voltages are in V, measured
@@ -41,12 +45,16 @@ class Record:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        extra = {name: _read_only(values) for name, values in self.extra.items()}
+        extra = {name: _read_only(name, values) for name, values in self.extra.items()}
         _settle(self, ("time_s", "voltage_V", "displacement_um"), extra, " as time_s")
         object.__setattr__(self, "extra", MappingProxyType(extra))
 
     def __len__(self) -> int:
         return self.time_s.size
+
+    def summary(self) -> str:
+        """Say how many samples there are, at which rate, their ranges with units, and what looked odd."""
+        return _summary(self, {"displacement_um": self.displacement_um, **self.extra})
 
     @property
     def duration_s(self) -> float:
@@ -67,8 +75,8 @@ class Record:
         return Record, tuple((values | {"extra": dict(self.extra)}).values())
 
 
-@dataclass(frozen=True, eq=False)
-class Reference:
+@dataclass(frozen=True, eq=False, repr=False)
+class Reference(AbstractSummary):
     """A displacement wanted over time, `n` samples long.
 
     Times in s increase strictly; displacements are in um as the sensor would read them, shape (n,). For the others,
@@ -86,13 +94,31 @@ class Reference:
     def __len__(self) -> int:
         return self.time_s.size
 
+    def summary(self) -> str:
+        """Say how many samples there are, at which rate, their range with its unit, and what looked odd."""
+        return _summary(self, {"displacement_um": self.displacement_um})
+
+
+def _summary(record: "Record | Reference", columns: Mapping[str, FloatArray | None]) -> str:
+    if not len(record):
+        return f"{record.source or 'record'}: no samples"
+    steps_s = np.diff(record.time_s)
+    rate = f", {1 / np.median(steps_s):.6g} Hz" if len(steps_s) else ""
+    rate += " in the median" if len(steps_s) and np.ptp(steps_s) > 0.01 * np.median(steps_s) else ""
+    lines = [f"{record.source or 'record'}: {len(record)} samples in {np.ptp(record.time_s):.6g} s{rate}"]
+    if isinstance(record, Record):
+        columns = {"voltage_V": record.voltage_V, **columns}
+    known = {name: values for name, values in columns.items() if values is not None}
+    lines += [f"{name:20} {values.min():.6g} to {values.max():.6g}" for name, values in known.items()]
+    return "\n".join([*lines, *(f"Note: {warning}" for warning in record.warnings)])
+
 
 def _settle(
     record: Record | Reference, names: Sequence[str], extra: Mapping[str, FloatArray] | None = None, like: str = ""
 ) -> None:
     """Make arrays read-only and texts printable; what no model could be fitted to, or follow, is refused."""
     given = {name: getattr(record, name) for name in names}
-    arrays = {name: _read_only(values) for name, values in given.items() if values is not None}
+    arrays = {name: _read_only(name, values) for name, values in given.items() if values is not None}
     size = arrays["time_s"].size
     for name, array in (arrays | dict(extra or {})).items():
         if array.shape != (size,):

@@ -1,18 +1,23 @@
 """What every file is opened to: named columns, which the mapping of columns chooses from."""
 
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.io._clock import clock_s, is_clock, seconds
 from fits.io._errors import DataError
 from fits.io._quantity import FloatArray, split_unit
 
 MOST_COLUMNS = 1000
+# How names of the columns of a record begin.
+_SPOKEN = re.compile(r"(time|voltage|displacement)\b|(time|voltage|displacement)_", re.IGNORECASE)
 # Where the first cell of a column stands that is not a finite number, and what was found there.
 Problem = tuple[str, str]
 # The groups that an array stands in and its name, values of any shape, and a unit if one is stated.
@@ -85,8 +90,9 @@ class ArrayTable(Table):
             row = int(np.argmin(good))
             found = str(array[row])
             if name in strict:
-                remedy = "correct it" + (", or leave such rows out with --missing drop" if found == "nan" else "")
-                raise self.error(f"expected a finite number, found {found}; {remedy}", row, name)
+                missing = "no number (nan); correct it, or leave such rows out with --missing drop"
+                said = missing if found == "nan" else f"{found}; correct it"
+                raise self.error(f"expected a finite number, found {said}", row, name)
             problems[name] = self.place(row), found
         return columns, problems
 
@@ -101,13 +107,6 @@ class ArrayTable(Table):
         return "" if row is None else f"row {(row if self.rows is None else int(self.rows[row])) + 1}"
 
 
-def seconds(times: NDArray[Any]) -> FloatArray:
-    """Times of the clock, or durations, as seconds after the first, shape (n,); a missing one is NaN."""
-    fine = times.astype(f"{times.dtype.kind}8[ns]")
-    count = fine - fine[np.argmin(np.isnat(fine))]
-    return np.where(np.isnat(count), np.nan, count.astype(np.int64) / 1e9)
-
-
 def with_unit(name: str, unit: str | None) -> str:
     """A name that ends in its unit, if one is stated beside it and the name has none."""
     plain = split_unit(f"x[{(unit or '').strip(' []()')}]")[1]
@@ -115,7 +114,7 @@ def with_unit(name: str, unit: str | None) -> str:
 
 
 def gathered(path: str, what: str, found: Iterable[Found], interval_s: float | None = None) -> ArrayTable:
-    """Make a table of what a file holds: the arrays of the length that most have, and of the longest such.
+    """Make a table of what a file holds: the arrays of the length that most columns of a record have, or else most.
 
     A matrix has a column for each of its shorter side, a compound array one for each field. Groups are left out of
     the names where that leaves them different. A `DataError` says that there is no array, and `what` was expected.
@@ -127,7 +126,9 @@ def gathered(path: str, what: str, found: Iterable[Found], interval_s: float | N
             f"{path}: expected {what} with arrays of numbers, found none; store time, voltage and displacement as "
             "plain arrays of one length."
         )
-    length = max(lengths, key=lambda n: (lengths[n], n))
+    # Spectra and settings may be more than the columns of a record, which say so by their names.
+    named = Counter(len(column) for name, column, unit in flat if _SPOKEN.match(with_unit(name[-1], unit)))
+    length = max(lengths, key=lambda n: (named[n], lengths[n], n))
     kept = [(name, column, unit) for name, column, unit in flat if len(column) == length]
     last = Counter(name[-1] for name, _, _ in kept)
     arrays: dict[str, FloatArray] = {}
@@ -145,6 +146,8 @@ def gathered(path: str, what: str, found: Iterable[Found], interval_s: float | N
 
 def of_frame(path: str, frame: Any, units: Mapping[str, str] | None = None) -> ArrayTable:
     """Columns of a `DataFrame`, its index among them if it has a name or holds times."""
+    import pandas as pd
+
     index = frame.index
     if index.name is not None or index.nlevels > 1 or index.dtype.kind in "mM":
         frame = frame.reset_index(names=None if index.nlevels > 1 else [index.name or "time"])
@@ -153,6 +156,9 @@ def of_frame(path: str, frame: Any, units: Mapping[str, str] | None = None) -> A
         column, words = frame.iloc[:, k], "_".join(map(str, name)) if isinstance(name, tuple) else str(name)
         if getattr(column.dtype, "tz", None) is not None:
             column = column.dt.tz_convert(None)
+        if column.dtype.kind == "O":  # numbers beside words, or decimal ones; what is none is missing
+            numbers = pd.to_numeric(column, errors="coerce")
+            column = numbers if numbers.notna().any() else column
         values = column.to_numpy(np.float64, na_value=np.nan) if column.dtype.kind in "iuf" else column.to_numpy()
         found.append(((words,), values, (units or {}).get(words)))
     return gathered(path, "a table", found)
@@ -166,6 +172,11 @@ def _columns(name: tuple[str, ...], values: Any) -> Iterable[tuple[tuple[str, ..
             yield from _columns((*name, field), array[field])
     elif array.ndim == 1 and array.size > 1 and array.dtype.kind in "mM" and not np.isnat(array).all():
         yield (*name[:-1], with_unit(name[-1], "s")), seconds(array)
+    elif array.ndim == 1 and array.size > 1 and array.dtype.kind in "SUO":
+        cells = [one.decode("latin-1") if isinstance(one, bytes) else one for one in array.tolist()]
+        with suppress(ValueError):  # texts that are no time stamps, and columns of other things, hold no numbers
+            if all(isinstance(one, str) for one in cells) and is_clock(cells[0]):
+                yield (*name[:-1], with_unit(name[-1], "s")), clock_s(cells)
     elif array.ndim == 1 and array.size > 1 and array.dtype.kind in "iuf":
         yield name, array.astype(np.float64, copy=False)
     elif array.ndim == 2 and array.dtype.kind in "iuf":

@@ -14,15 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.io._clock import clock_s, is_clock
 from fits.io._errors import DataError
 from fits.io._quantity import FloatArray
-from fits.io._table import MOST_COLUMNS, Problem, Table, data_error, seconds
+from fits.io._table import MOST_COLUMNS, Problem, Table, data_error
 
 _COMMENT = re.compile(r"^ *[#%].*\n?", re.MULTILINE)
-_CLOCK = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)? ?(Z|[+-]\d\d:?\d\d)?")
 # To import pandas takes longer than NumPy takes to read so many characters.
 _FEW = 5_000_000
-_MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none", "-nan", "-nan(ind)", "1.#qnan", "-1.#ind", "--"}
+# What programs write for a number that is missing, beside words and dashes without a digit.
+_MISSING = {"1.#qnan", "-1.#ind"}
+_EMPTY = "an empty cell"
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class TextTable(Table):
         if columns is None or not all(name in columns for name in strict):
             return self._read_slowly(strict)
         problems = {name: self._first_problem(i) for i, name in enumerate(self.names) if name not in columns}
-        return columns, problems
+        return columns, self._worth_a_word(problems)
 
     def place(self, row: int | None = None) -> str:
         """The physical line, from 1."""
@@ -62,7 +64,7 @@ class TextTable(Table):
         lines, kept = io.StringIO(self.body, newline="\n").readlines(), []
         at = [i for i, name in enumerate(self.names) if name in strict]
         for number, cells in self.rows():
-            missing = any(cells[i].lower() in _MISSING for i in at if i < len(cells))
+            missing = any(is_missing(cells[i]) for i in at if i < len(cells))
             kept.append(not missing)
             if missing:  # a blank line, so that those below keep their numbers
                 lines[number - self.header_line - 1] = "\n"
@@ -136,7 +138,7 @@ class TextTable(Table):
             dtype = frame[i].dtype
             if name in self.clocks:
                 try:
-                    columns[name] = _clock(frame[i].to_list())
+                    columns[name] = clock_s(frame[i].to_list())
                 except (ValueError, TypeError):
                     return None
             if isinstance(dtype, np.dtype) and dtype.kind in "iuf":
@@ -155,7 +157,7 @@ class TextTable(Table):
             for name, column, cell in zip(self.names, values, cells, strict=True):
                 if name in problems:
                     continue
-                if name in self.clocks and _CLOCK.fullmatch(cell):
+                if name in self.clocks and is_clock(cell):
                     column.append(cell)
                     continue
                 number = self._number(cell) if name not in self.clocks else f"'{cell[:30]}'"
@@ -169,22 +171,29 @@ class TextTable(Table):
         for name, column in zip(self.names, values, strict=True):
             if name not in problems:
                 try:
-                    columns[name] = _clock(column) if name in self.clocks else np.array(column)
+                    columns[name] = clock_s(column) if name in self.clocks else np.array(column)
                 except ValueError as error:
                     raise self.error(
                         f"expected time stamps, found one that is none ({error}); correct it", 0, name
                     ) from None
-        return columns, problems
+        return columns, self._worth_a_word(problems)
 
     def _first_problem(self, i: int) -> Problem:
         found = ((line, self._number(cells[i])) for line, cells in self.rows())
         other = f"line {self.header_line + 1}", "a number that pandas does not read"
         return next(((f"line {line}", text) for line, text in found if isinstance(text, str)), other)
 
+    def _worth_a_word(self, problems: dict[str, Problem]) -> dict[str, Problem]:
+        """Problems but those of columns that are empty throughout."""
+        at = {name: i for i, name in enumerate(self.names)}
+        empty = [name for name, (_, found) in problems.items() if found == _EMPTY]
+        empty = [name for name in empty if not any(cells[at[name]] for _, cells in self.rows())]
+        return {name: each for name, each in problems.items() if name not in empty}
+
     def _number(self, cell: str) -> float | str:
         """Value of a cell, or what was found instead of a finite number."""
         if not cell:
-            return "an empty cell"
+            return _EMPTY
         found = f"'{cell if len(cell) <= 30 else cell[:27] + '...'}'"
         if "_" in cell or (self.decimal == "," and "." in cell):
             return found
@@ -198,7 +207,7 @@ class TextTable(Table):
         remedy = "correct the cell, or remove its line or a column that is not needed"
         if re.fullmatch(r"[+-]?\d+[.,]\d+(?:[eE][+-]?\d+)?", cell):
             remedy = "write all numbers with one decimal mark, and separate cells by ; or tab where it is a comma"
-        elif cell.lower() in _MISSING:
+        elif is_missing(cell) and not (self.place(0) == f"line {line}" and cell and "nan" not in cell.lower()):
             remedy = "correct the cell, or leave out such lines with --missing drop"
         elif self.place(0) == f"line {line}":
             remedy = "correct the cell, or put # before the line if it is not data"
@@ -215,17 +224,9 @@ class TextTable(Table):
         return data_error(self.path, what, f"line {line}", column)
 
 
-def _clock(cells: list[str]) -> FloatArray:
-    """Seconds after the first of some time stamps, shape (n,)."""
-    import pandas as pd
-
-    stamps = pd.to_datetime([cell.strip().replace(",", ".") for cell in cells], format="ISO8601", utc=True)
-    return seconds(stamps.tz_localize(None).to_numpy())
-
-
-def is_clock(cell: str) -> bool:
-    """Whether a cell is an ISO 8601 time stamp of date and time."""
-    return _CLOCK.fullmatch(cell) is not None
+def is_missing(cell: str) -> bool:
+    """Whether a cell stands for a number that is missing: one without a digit, such as `NaN` or `overload`."""
+    return cell.lower() in _MISSING or not any(map(str.isdigit, cell))
 
 
 def looks_numeric(cell: str) -> bool:

@@ -20,8 +20,14 @@ QUANTITIES = (
 _NUMBERED = re.compile(r"-?\d+ *(\[[^\[\]]*\])?")
 # What 1 in a column is, such as 1.2V of a drive in %.
 _SCALED = re.compile(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) *([^\d\s].*)")
+# What a header that stands in a file before is given, so that it can be told from the first.
+_AGAIN = re.compile(r" \d+$")
 # Other names of a quantity.
 _ALSO = {"timestamp": "time", "datetime": "time", "date_time": "time"}
+
+
+# Canonical column to source column, or all in one text, as for the option.
+Columns = Mapping[str, str | int] | str | None
 
 
 @dataclass(frozen=True)
@@ -53,10 +59,22 @@ def recognise(name: str) -> tuple[Quantity, str] | None:
     return None
 
 
+def recognise_again(name: str) -> tuple[Quantity, str] | None:
+    """The same of a header that may stand there twice, and then has its number behind it."""
+    return recognise(_AGAIN.sub("", name))
+
+
 def known_unit(name: str) -> str | None:
     """The unit that a name ends in, such as `um` of `x[µm]` or of `x_Micrometers`; None where it is no known one."""
     unit = split_unit(name)[1]
     return unit if any(unit in quantity.powers for quantity in QUANTITIES) else None
+
+
+def pairs_of(columns: Columns) -> Mapping[str, str]:
+    """Canonical column to source column, however they were given."""
+    if isinstance(columns, str):
+        return parse_columns(columns)
+    return {name: str(source) for name, source in (columns or {}).items()}
 
 
 def parse_columns(text: str) -> dict[str, str]:
@@ -104,7 +122,7 @@ def find_sources(
     sources = {column: _mapped(column, text, names, place) for column, text in columns.items()}
     taken = {source.column for source in sources.values()}
     for name in names:
-        found = recognise(name)
+        found = recognise_again(name)
         if found is None or name in taken:
             continue
         column = found[0].column
@@ -113,7 +131,7 @@ def find_sources(
         if column in sources:
             raise DataError(
                 f"{place}, column '{name}': expected one column for {column}, found also '{sources[column].column}'; "
-                f"choose one with --columns {column}={name}."
+                f"choose one with --columns {shlex.quote(f'{column}={name}')}."
             )
         sources[column] = Source(name, found[1])
     missing = [column for column in required if column not in sources]
@@ -162,15 +180,18 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
             f"{place}, column '{text}': expected by --columns {column}={text}, found no such column; "
             f"the nearest are {_listed(near)}."
         )
-    unit = stated or split_unit(text)[1] or (quantity.unit if numbered else None)
+    unit = stated or split_unit(_AGAIN.sub("", text))[1] or (quantity.unit if numbered else None)
     scaled = _SCALED.fullmatch(unit or "")
     scale = float(scaled[1]) if scaled and scaled[2] in quantity.powers else 1.0
     unit = scaled[2] if scaled and scaled[2] in quantity.powers else unit
     if unit not in quantity.powers or not 0 < scale < math.inf:
         found = f"found unit '{unit}'" if unit else "found no unit"
+        if scaled and scale != 1:
+            found = f"found {scaled[0]} for 1 in the column"
+        option = shlex.quote(f"{column}={text}[{quantity.unit}]")
         raise DataError(
             f"{place}, column '{text}': expected a unit out of {', '.join(quantity.powers)} for {column}, {found}; "
-            f"state the unit with --columns {shlex.quote(f'{column}={text}[{quantity.unit}]')}."
+            f"state it, or what 1 in the column is, such as 0.5{quantity.unit}, in brackets: --columns {option}."
         )
     return Source(text, str(unit), sign, scale)
 
@@ -178,7 +199,7 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
 def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str, Source], place: str) -> str:
     message = f"{place}, column '{missing[0]}': expected this column, found {_listed(names)}; "
     if len(names) == 1:
-        return f"{message}separate the columns by commas, semicolons or tabs."
+        return f"{message}separate the columns by commas, semicolons, tabs or spaces."
     taken = {source.column for source in sources.values()}
     free = [name for name in names if name not in taken]
     guesses = []
@@ -190,10 +211,10 @@ def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str,
         stem, unit = split_unit(near)
         known = unit in quantity.powers
         guesses.append(f"{quantity.column}={Source(near, str(unit) if known else quantity.unit).spec()}")
-        if unit and not known and stem.lower() == quantity.stem:
+        if unit and not known and stem.lower() in (quantity.stem, quantity.column.lower()):
             message += f"'{near}' has the unknown unit '{unit}' instead of one out of {', '.join(quantity.powers)}; "
     message += f"name what is missing, for instance --columns {shlex.quote(','.join(guesses))}"
-    if not any(recognise(name) for name in names):
+    if ", line " in place and not any(recognise(name) for name in names):
         message += ", or put # before this line if it is not the header"
     return f"{message}."
 

@@ -72,11 +72,9 @@ def fit(
         Told what is being done, a sentence at a time.
     """
     records = records_given(records)
-    fraction, aside, range_V = check_fit(records, holdout_given(holdout), loss)
+    fraction, aside, range_V = check_fit(records, holdout_given(holdout), loss, levels)
     if family not in FAMILIES:
         raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
-    if levels is not None and not 4 <= levels <= 100:
-        raise DataError(f"{levels} levels were asked for: choose between 4 and 100")
 
     def prepare(record: Record) -> Run:
         return prepare_run(record, range_V, initial, fraction)
@@ -144,12 +142,16 @@ def correlated(samples: float, what: str) -> str:
 
 
 def check_fit(
-    records: Sequence[Record], holdout: float | Sequence[Record], loss: str
+    records: Sequence[Record], holdout: float | Sequence[Record], loss: str, levels: int | None
 ) -> tuple[float, tuple[Record, ...], tuple[float, float]]:
     """Check what a fit is given; the fraction and the records held out, and the range of all voltages."""
     require_float64("estimation needs")
     if loss not in LOSSES:
         raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
+    if levels is not None and not (isinstance(levels, int | np.integer) and 4 <= levels <= 100):
+        raise DataError(
+            f"levels: expected a whole number from 4 to 100, found {levels}; leave it out to have it found"
+        )
     fraction, aside = (float(holdout), ()) if isinstance(holdout, int | float) else (0.0, tuple(holdout))
     if not 0 <= fraction <= 0.9:
         raise DataError(f"the fraction held out is {fraction:g}: choose it between 0 and 0.9")
@@ -165,7 +167,10 @@ def _uncertainty(mean: RunMean, found: Estimate, believed: tuple[Grid, np.ndarra
     columns = np.concatenate([factor_um.T, np.zeros((1, grid.columns))])
     # The mean displacement of a run fixes the offset: it makes up for what a perturbation does to that.
     sd = found.noise_um * (found.correlation / mean.count) ** 0.5
-    offset_um, discrepancy_um = jnp.asarray(np.append(-response_um, sd)), jnp.asarray(found.discrepancy_um)
+    offset_um, discrepancy_um = (
+        jnp.asarray(np.append(-response_um, sd)),
+        jnp.asarray(np.float64(found.discrepancy_um)),
+    )
     return Uncertainty(jnp.asarray(columns), offset_um, discrepancy_um, grid)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from fits.io._length import length
 from fits.io._record import Record
 from fits.loop._run import Run
 from fits.stats._noise import idle_stretches, quantum_um, rough_noise_um, stretches
@@ -14,6 +15,9 @@ from fits.stats._noise import idle_stretches, quantum_um, rough_noise_um, stretc
 _STUCK_SAMPLES = 8
 # Meanwhile the stage, by its mean gain, moves by such a part of its stroke, and by so many last digits.
 _MOVED_SHARE, _DIGITS = 0.05, 3.0
+# A voltage is at an end of its range within this part of it; a first way of so many samples is told from what follows
+# where it is off by so many times as much.
+_AT_END, _FEWEST, _FRESH = 0.02, 20, 4.0
 # So many impulses are no chance; so many are listed.
 _FEW, _LISTED = 3, 6
 
@@ -106,6 +110,7 @@ def remarks_on(runs: Sequence[Run], residuals: Sequence[np.ndarray], robust: boo
         record = run.record
         out += stuck(record)
         out += impulses(run, residual, robust)
+        out += first_way(run, residual)
         interval = float(np.median(np.diff(record.time_s)))
         if interval > 1.0:
             out.append(
@@ -113,6 +118,29 @@ def remarks_on(runs: Sequence[Run], residuals: Sequence[np.ndarray], robust: boo
                 "which is rare with piezo stages: if the time is in ms, name it so, as in --columns time_s=time_ms"
             )
     return out
+
+
+def first_way(run: Run, residual_um: np.ndarray) -> list[str]:
+    """Whether the first way across the range is off by far more than what follows, as that of a fresh stage is.
+
+    A hysteresis that is fitted knows only of voltages within the range of its runs.
+    """
+    voltage_V = run.record.voltage_V
+    share = (voltage_V - voltage_V.min()) / max(float(np.ptp(voltage_V)), 1e-300)
+    stop = max(int(np.argmax(share < _AT_END)), int(np.argmax(share > 1 - _AT_END)))
+    first, later = (run.fitted & each for each in (np.arange(share.size) < stop, np.arange(share.size) >= stop))
+    if min(first.sum(), later.sum()) < _FEWEST:
+        return []
+    off_um = residual_um - residual_um[later].mean()
+    early, late = (float(np.sqrt(np.mean(off_um[part] ** 2))) for part in (first, later))
+    if early < _FRESH * late:
+        return []
+    return [
+        f"{run.record.source}: up to sample {stop} ({run.record.time_s[stop] - run.record.time_s[0]:.4g} s), on the "
+        f"first way across the range of the voltage, readings are off by {length(early)} rms, and later by "
+        f"{length(late)}: a stage that is fresh, or was beyond this range before, begins elsewhere; leave these "
+        "samples out"
+    ]
 
 
 def stuck(record: Record) -> list[str]:

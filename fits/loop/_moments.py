@@ -214,7 +214,8 @@ def blocks_of(run: Run, pieces: int) -> np.ndarray:
 
 def grid_of(runs: Sequence[Run], levels: int) -> Grid:
     """A grid over the range of some runs, which is that of each."""
-    return Grid(jnp.asarray(runs[0].lower_V), jnp.asarray(runs[0].upper_V), levels)
+    lower_V, upper_V = (jnp.asarray(np.float64(end)) for end in (runs[0].lower_V, runs[0].upper_V))
+    return Grid(lower_V, upper_V, int(levels))
 
 
 def gather(

@@ -8,8 +8,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits.io._given import AnyRuns, program_given
 from fits.io._limits import Ranges, measured_ranges
-from fits.io._record import Record
 from fits.io._summary import AbstractSummary
 from fits.loop._misfit import Misfit
 from fits.loop._prediction import Prediction
@@ -212,9 +212,9 @@ class FitResult(AbstractSummary, Generic[_M]):
         """Say what was fitted, parameters with units, standard deviations and 95 % intervals, and how well."""
         return describe(fit_report(self))
 
-    def predict(self, record: Record, initial: str = "negative") -> Prediction:
+    def predict(self, record: AnyRuns, initial: str = "negative") -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
-        return self.uncertainty.predict(self.model, record, initial)
+        return self.uncertainty.predict(self.model, program_given(record), initial)
 
 
 def _pool(parts: Iterable[Errors | None]) -> Errors | None:

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fits.diagnosis._result import Diagnosis
+from fits.io._record import Record, Reference
 from fits.loop._result import FitResult
 from fits.machining._budget import Budget
 from fits.machining._sensitivity import SensitivityReport
@@ -32,6 +33,20 @@ def drawn(result: object) -> Figure:
 def picture_of(result: object) -> Figure:
     """Draw a result; what is registered here has a picture."""
     raise TypeError(f"there is no picture of a {type(result).__name__}")
+
+
+@picture_of.register(Record)
+@picture_of.register(Reference)
+def _(result: Record | Reference) -> Figure:
+    """What was commanded and what was measured, over the time."""
+    named = {"voltage (V)": getattr(result, "voltage_V", None), "displacement (µm)": result.displacement_um}
+    known = {name: values for name, values in named.items() if values is not None}
+    picture, grid = style.panels(style.WIDE_in, 0.6 + 1.4 * len(known), len(known), 1, sharex=True, squeeze=False)
+    for axes, (name, values) in zip(grid[:, 0], known.items(), strict=True):
+        style.curve(axes, result.time_s, values, **style.MODEL)
+        style.label(axes, "", name)
+    style.label(grid[-1, 0], "time (s)", grid[-1, 0].get_ylabel())
+    return picture
 
 
 picture_of.register(SensitivityReport, tornado)

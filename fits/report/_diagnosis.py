@@ -6,6 +6,7 @@ from typing import Any
 from jinja2 import Environment
 
 from fits.diagnosis._result import KINDS, Diagnosis, Experiment
+from fits.diagnosis._thresholds import THRESHOLDS
 from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
 from fits.report import _words
 from fits.report._next_steps import next_steps, runs_read, stage_parameters
@@ -34,6 +35,7 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
     causes, ahead = diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]
     asked = [one for one in diagnosis.upper_bounds if not one.reason]
+    unnamed = any(one.z > THRESHOLDS.strong_z for one in asked)
     asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
     gain = diagnosis.gain
     bounds = [
@@ -69,6 +71,8 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
         bars=_bars(diagnosis),
         further=further,
         bounds=bounds,
+        strong_z=THRESHOLDS.strong_z if unnamed else math.nan,
+        most_causes=THRESHOLDS.most_causes,
         tests=tests,
         program=program(ahead) if ahead else None,
         ahead_facts=_facts(ahead) if ahead else (),
@@ -80,7 +84,7 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
 def _with_words() -> Environment:
     """Templates, and the words of a diagnosis in them."""
     made = environment()
-    for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number"):
+    for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number", "whole"):
         made.filters[name] = getattr(_words, name)
     made.filters["length_of"] = length
     made.filters["without_dot"] = lambda text: text.rstrip(".")
@@ -96,7 +100,7 @@ def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     for first in diagnosis.causes[:1]:
         tiles += [
             (f"Evidence for {plain(first.name)}", f"{sigmas(first.z)} {SIGMA}"),
-            ("Share of the misfit it explains", percent(first.share_of_misfit)),
+            (f"Share of the {_words.whole(first.name)} it explains", percent(first.share_of_misfit)),
             *_arrow("Error on unused data", gain.heldout_rms_before_um, gain.heldout_rms_after_um),
         ]
     if not diagnosis.causes:

@@ -36,11 +36,13 @@ def model_kind(path: str, held: dict[str, Any]) -> str:
 def model_words(path: str, held: dict[str, Any]) -> str:
     """Put what `read_model_text` reads into words; a `DataError` where the report is not that of a fit."""
     lines = [f"{model_kind(path, held)}, written by {held['written_by']}"]
-    for row in model_numbers(held["model"]):
+    rows = list(model_numbers(held["model"]))
+    width = max((len(row["path"]) for row in rows), default=0)
+    for row in rows:
         unit = "" if row["unit"] == "1" else row["unit"]
         size = "x".join(map(str, row["shape"])) if prod(row["shape"]) else "no"
         shown = f"{row['value']:.6g} {unit}" if "value" in row else f"{size} numbers {unit and f'in {unit}'}"
-        lines.append(f"  {row['path']:34} {shown}".rstrip())
+        lines.append(f"  {row['path']:{width}}  {shown}".rstrip())
     return "\n".join([*lines, "", _known_of_fit(path, held)])
 
 

@@ -16,9 +16,10 @@ def next_steps(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Sentences that say what to do now, each with the command to paste, which may be empty."""
     ahead = diagnosis.next_experiment
     steps = [_use(diagnosis)]
-    needs = {column: None for cause in diagnosis.causes for column in card_of(cause.name).needs}
+    # Of the parts that are there: another form of the same effect may do without.
+    needs = {column: None for part in diagnosis.extended.parts for column in getattr(part, "needs", ())}
     if needs and "extended.json" in steps[0][1]:
-        steps.append((f"What was found needs more columns in reference.csv: {listed(list(needs))}.", ""))
+        steps.append((f"What was found needs more columns in reference.csv: {', '.join(needs)}.", ""))
     if ahead is not None and ahead.time_s.size > 1:
         fitted = [run.source for run in diagnosis.runs if run.fitted.any()]
         aside = [("--holdout", run.source) for run in diagnosis.runs if not run.fitted.any()]

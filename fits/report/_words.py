@@ -121,17 +121,19 @@ def rms_um(runs: Sequence[RunView], name: str) -> float:
     return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
 
 
+def whole(name: str) -> str:
+    """What the share of a cause is a part of."""
+    return "noise" if card_of(name).statistic else "misfit"
+
+
 def headline(diagnosis: Diagnosis) -> str:
     """Say in a few words what is wrong."""
-    found = listed([cause.name for cause in diagnosis.causes])
+    found = listed([listed([cause.name, *cause.also_consistent], "or") for cause in diagnosis.causes])
     if diagnosis.verdict == "no_effect":
         return "No hidden effect was found."
     if diagnosis.verdict == "unexplained":
         begin = f"The stage shows {found}, and more" if found else "Something is wrong"
         return f"{begin} that no known effect explains."
-    if len(diagnosis.causes) == 1:
-        (cause,) = diagnosis.causes
-        return f"The stage shows {listed([cause.name, *cause.also_consistent], 'or')}."
     return f"The stage shows {found}."
 
 
@@ -150,8 +152,9 @@ def _found(diagnosis: Diagnosis) -> str:
     over_um = rms_um(diagnosis.runs, "before_um")
     if not diagnosis.causes and diagnosis.verdict == "unexplained":
         return (
-            f"In the fit the plain stage leaves a residual of {length(over_um)}, root mean square. Beyond a noise "
-            f"floor of {noise} that is a reproducible error of {left}, and no effect of the library explains it."
+            f"In the fit the plain stage leaves a residual of {length(over_um)}, root mean square, over a noise "
+            f"floor of {noise}. Beyond what the stage could still follow, a reproducible error of {left} is left, "
+            "and no effect of the library explains it."
         )
     if not diagnosis.causes:
         described = "describes these records down to"

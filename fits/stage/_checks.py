@@ -27,7 +27,7 @@ UNSEEN = 0.5
 _USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
 # Remedies.
 _BEYOND = "add a run with steps, a chirp or a multisine that goes beyond the resonance"
-_FASTER, _OR_ALONE = "sample at 5 times the resonance or more", "or fit the hysteresis alone with --model loop"
+_FASTER, OR_ALONE = "sample at 5 times the resonance or more", "or fit the hysteresis alone with --model loop"
 
 
 def refuse_slopes(records: Sequence[Record]) -> None:
@@ -112,17 +112,17 @@ def refuse_unidentifiable(
                 remedy = "record it for longer, with a slower chirp or a longer period"
             raise DataError(
                 f"{loud.record.source}: {why}: {noise[loudest]:.3g} um of it stay unexplained, "
-                f"{noise[loudest] / min(noise):.3g} times as much as of the quietest run; {remedy}, {_OR_ALONE}"
+                f"{noise[loudest] / min(noise):.3g} times as much as of the quietest run; {remedy}, {OR_ALONE}"
             )
         raise DataError(
             f"{sources}: no delay and no ringing is told from the hysteresis here, so these runs hold nothing "
             f"of the driver and the mechanics; {_BEYOND}, check that voltage and displacement are not exchanged, "
-            f"{_OR_ALONE}"
+            f"{OR_ALONE}"
         )
     if beyond:
         raise DataError(
             f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, and what moves there is explained best "
-            f"by a resonance beyond half of that, so these runs do not show where it is: {_FASTER}, {_OR_ALONE}"
+            f"by a resonance beyond half of that, so these runs do not show where it is: {_FASTER}, {OR_ALONE}"
         )
     return None
 
@@ -139,7 +139,7 @@ def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit
                 raise DataError(
                     f"{one.source}: sampled at {run.rate_Hz:.4g} Hz, which is too slow for what moves in it: "
                     f"{one.share_pct:.3g} % of its stroke stay unexplained, {one.times_noise:.3g} times the sensor's "
-                    f"noise, and the resonance would lie {where}; {_FASTER}, {_OR_ALONE}"
+                    f"noise, and the resonance would lie {where}; {_FASTER}, {OR_ALONE}"
                 )
 
 

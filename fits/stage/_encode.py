@@ -6,7 +6,8 @@ import dataclasses
 import inspect
 import math
 import re
-from typing import Any
+import types
+from typing import Any, Literal, Union, get_args, get_origin
 
 import equinox as eqx
 import jax
@@ -110,8 +111,7 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
     # One context, so that an `N` means the same in all fields.
     with jaxtyping.jaxtyped("context"):
         for key, field in fields.items():
-            if isinstance(field.type, type) and not isinstance(values[key], field.type):
-                raise DataError(f"{where}.{key}: expected {_words(field.type)}, found something else")
+            _check(values[key], item[key], field.type, f"{where}.{key}")
     limits = [np.asarray(values[key]) for key in ("lower_V", "upper_V") if key in values]  # compared without JAX
     if len(limits) == 2 and not np.all(limits[0] < limits[1]):
         raise DataError(f"{where}: expected lower_V below upper_V")
@@ -122,12 +122,44 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
         raise DataError(f"{where}: {' '.join(str(error).split())}") from error
 
 
+def _check(value: Any, item: Any, kind: Any, where: str) -> None:
+    """Refuse what an item was decoded to where it is not of the kind that a field is declared as."""
+    within = get_args(kind)
+    if get_origin(kind) is tuple and within[-1] is ... and isinstance(value, tuple):
+        for k, one in enumerate(value):
+            _check(one, item[k], within[0], f"{where}[{k}]")
+    elif not _is_a(value, kind):
+        raise DataError(f"{where}: expected {_words(kind)}, found {shown(item)}")
+
+
+def _is_a(value: Any, kind: Any) -> bool:
+    """Whether a value is of a kind, as far as files hold such."""
+    within = get_args(kind)
+    if get_origin(kind) is Literal:
+        return isinstance(value, str) and value in within
+    if get_origin(kind) in (Union, types.UnionType):
+        return any(_is_a(value, one) for one in within)
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple)
+    if not isinstance(kind, type):
+        return True
+    return isinstance(value, kind) and not (kind is int and isinstance(value, bool))
+
+
 def _words(kind: Any) -> str:
     """What a field holds, for somebody who has never seen its annotation."""
+    within = get_args(kind)
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(within)}"
+    if get_origin(kind) is tuple:
+        return f"a list, each of it {_words(within[0])}"
+    if get_origin(kind) in (Union, types.UnionType):
+        return " or ".join(map(_words, within))
     if not issubclass(kind, jaxtyping.AbstractArray):
-        return "an object" if issubclass(kind, eqx.Module) else f"a value of type {kind.__name__}"
+        plain = {int: "a whole number", str: "a text", types.NoneType: "null"}
+        return plain.get(kind, "an object with a type" if issubclass(kind, eqx.Module) else "another value")
     axes = str(kind.dim_str).split()
-    return f"an array of {len(axes)} axes ({', '.join(axes)})" if axes else "a single number with its unit"
+    return f"an array of the shape ({', '.join(axes)})" if axes else "a single number with its unit"
 
 
 def _encode_array(array: np.ndarray, unit: str, packed: bool = False) -> dict[str, Any]:
@@ -156,7 +188,9 @@ def _decode_array(item: dict[str, Any], where: str, spec: ParameterSpec | None) 
 def _plain(item: dict[str, Any], where: str) -> np.ndarray:
     dtype = item.get("dtype", "float64")
     if not {"unit", "value"} <= set(item) <= {"unit", "value", "dtype"} or dtype not in _DTYPES:
-        raise DataError(f"{where}: expected the keys unit and value, and perhaps a dtype out of {', '.join(_DTYPES)}")
+        raise DataError(
+            f"{where}: expected a number or numbers with the keys unit and value, or an object with a type"
+        )
     try:
         array = np.asarray(item["value"])
     except ValueError:

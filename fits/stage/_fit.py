@@ -170,7 +170,7 @@ def solve_stage(
     `accept_best` takes the best place for an answer where the fit does not become stationary. What an unknown past
     adds may be `estimated` beside the rest. The fit goes `onward` from another one, or begins where the runs say.
     """
-    fraction, _, range_V = check_fit(records, holdout, loss)
+    fraction, _, range_V = check_fit(records, holdout, loss, levels)
     for record in records:
         refuse_many_steps(record, 1)
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)

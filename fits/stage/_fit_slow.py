@@ -59,7 +59,7 @@ def fit_slow(
         See `fit`; a number of levels of at most 32 is chosen.
     """
     records = records_given(records)
-    fraction, aside, range_V = check_fit(records, holdout_given(holdout), loss)
+    fraction, aside, range_V = check_fit(records, holdout_given(holdout), loss, levels)
     if not 0 <= relaxations <= MOST_RELAXATIONS:
         raise DataError(f"{relaxations} relaxations were asked for: choose between 0 and {MOST_RELAXATIONS}")
     stage = _stage(records, lag, relaxations)

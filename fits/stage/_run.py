@@ -128,7 +128,8 @@ def gain_ahead(stage: m.Stage) -> float | None:
     if not 0 < gain < math.inf:
         raise DataError(
             f"the static gain ahead of {stage.names[place]!r} is {gain:g}, expected a positive one: turn the sign of "
-            "the voltage column instead"
+            "the voltage column instead",
+            of_model=True,
         )
     return gain
 

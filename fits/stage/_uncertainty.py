@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.io._errors import DataError
+from fits.io._given import AnyRuns, program_given
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._prediction import Prediction
@@ -138,7 +139,7 @@ class Precision:
             jnp.asarray(factor[:, basis.shape[1] :]),
             jnp.asarray(factor[:, : basis.shape[1]]),
             jnp.asarray(factor @ mean),
-            jnp.asarray(max(0.0, shared) ** 0.5),
+            jnp.asarray(np.float64(max(0.0, shared) ** 0.5)),
             grid,
         )
 
@@ -171,17 +172,18 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
 
 
 def predict(
-    model: Preisach | Stage, uncertainty: AbstractUncertainty | None, record: Record, initial: str = "negative"
+    model: Preisach | Stage, uncertainty: AbstractUncertainty | None, record: AnyRuns, initial: str = "negative"
 ) -> Prediction:
     """Predict the displacement of a voltage program, with its uncertainty.
 
     Model and uncertainty are from a fit or a model file; without an uncertainty the standard deviations are NaN. The
-    displacement of the program, if any, is not looked at; the memory before its first sample is `negative`,
-    `positive` or `demagnetised`.
+    program is a record, or what `read_table` takes; its displacement, if any, is not looked at. The memory before its
+    first sample is `negative`, `positive` or `demagnetised`.
 
     A `DataError` says that the voltage leaves the range that the model was fitted on, that a stage has an effect of
     another column, which the program lacks, or that the uncertainty is that of another kind of model.
     """
+    record = program_given(record)
     if uncertainty is not None:
         return uncertainty.predict(model, record, initial)
     stage, run = prepare_program(as_stage(model), record, initial)

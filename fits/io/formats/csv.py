@@ -6,18 +6,22 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 
+from fits.io._clock import is_clock
 from fits.io._read_file import numbered
 from fits.io._table import MOST_COLUMNS, Table, data_error, with_unit
-from fits.io._text_table import TextTable, is_clock, looks_numeric, split_cells
+from fits.io._text_table import TextTable, looks_numeric, split_cells
 from fits.io._units import known_unit, recognise
 from fits.io.formats._base import Format, register
 
 _EXCEL_SEPARATOR = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
+_DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}")
 _CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _EXPORT = "export it as CSV text (UTF-8)"
-# So many lines are looked at for the first rows of numbers, and so many of these in a row are a table.
-_HEAD, _ENOUGH = 300, 3
+# So many lines, or characters, are looked at for the first rows of numbers, and so many rows are a table.
+_HEAD, _HEAD_CHARACTERS, _ENOUGH = 300, 1_000_000, 3
+# A first line with line breaks within quotes.
+_BROKEN_HEADER = re.compile(r'(?=[^\n]*"[^"\n]*\n)([^"\n]*"[^"]{0,100}")+[^"\n]*(?=\n)')
 # What may stand between two tables, and how far a second one is looked for behind it, in characters and lines.
 _GAP = re.compile(r"\n(?:[ \t,;]*\n)+")
 _AHEAD, _FEW_LINES = 4000, 8
@@ -29,6 +33,11 @@ _Line = tuple[int, int, str]
 def open_csv(path: str, data: bytes) -> Table:
     """Find the table in a text, or the one that the path numbers; a `DataError` says that there is none."""
     text = decode(path, data)
+    broken = _BROKEN_HEADER.match(text)
+    if broken and "\n" in broken[0]:  # as cells of a spreadsheet are; the lines below keep their numbers
+        text = broken[0].replace("\n", " ") + "\n" * broken[0].count("\n") + text[broken.end() :]
+    if _spaced(text):
+        text = re.sub(r"(?<=\S) +(?=[^\s(\[])", "\t", text)  # but for those ahead of a unit in brackets
     starts = [*_beginnings(text), len(text)]
     number, remark = chosen(path, len(starts) - 1)
     begin, end = starts[number - 1 : number + 1]
@@ -54,7 +63,7 @@ def _beginnings(text: str) -> Iterator[int]:
         lines = [before, *text[gap.end() : gap.end() + _AHEAD].split("\n")[:_FEW_LINES]]
         lines = [line for line in lines if line.strip() and not line.lstrip().startswith(("#", "%"))]
         rows = [_names(line, _separator(line)) for line in lines]
-        numbers = [all(looks_numeric(cell) or is_clock(cell) for cell in row) for row in rows]
+        numbers = [_all_numbers(row) for row in rows]
         if numbers[:2] == [True, False] and True in numbers[2:]:
             first = numbers.index(True, 2)
             if len(rows[first]) > 1 and any(len(row) == len(rows[first]) for row in rows[1:first]):
@@ -65,32 +74,33 @@ def _open_text(path: str, text: str) -> TextTable:
     separator, lines = _first_lines(text)
     if not lines:
         raise data_error(path, "expected a header and rows of numbers, found only comments; export again", "line 1")
-    k, units = 0, False
+    k, first, units = 0, 1, None
     if not separator:
-        k, separator, units = _header(lines)
-    number, start, line = lines[k]
+        k, separator, first, units = _header(lines)
+    if _all_numbers(_names(lines[k][2], separator)):
+        # A comment may be the header, if it states a unit.
+        _, noted = _first_lines(text, comments=True)
+        at, mark, below, unit_line = _header(noted)
+        if not any(map(known_unit, _names(noted[at][2], mark))) and unit_line is None:
+            number, start, line = lines[k]
+            numbered = tuple(str(i) for i in range(1, len(_names(line, separator)) + 1))
+            return checked(TextTable(path, numbered, number - 1, separator, text[start:], None, False))
+        lines, k, separator, first, units = noted, at, mark, below, unit_line
+    number, _, line = lines[k]
     names = _names(line, separator)
-    if all(looks_numeric(name) or is_clock(name) for name in names):
-        numbered = tuple(str(i) for i in range(1, len(names) + 1))
-        return checked(TextTable(path, numbered, number - 1, separator, text[start:], None, False))
     if len(names) > MOST_COLUMNS:
         what = f"expected up to {MOST_COLUMNS:,} columns, found {len(names):,}; write a row per sample"
         raise data_error(path, what, f"line {number}")
     names = [name or f"column_{i}" for i, name in enumerate(names, 1)]
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            first = names.index(name) + 1
-            what = f"expected each header once, found it in cells {first} and {i + 1}; rename or remove one"
-            raise data_error(path, what, f"line {number}", name)
-    body = text[start + len(line) + 1 :]
-    if units:
-        _, below, line = lines[k + 1]
-        names = [
-            with_unit(name, unit)
-            for name, unit in itertools.zip_longest(names, split_cells(line, separator)[: len(names)])
-        ]
-        # A blank line in its place, so that those below keep their numbers.
-        body = text[start + len(lines[k][2]) + 1 : below] + text[below + len(line) :]
+    if units is not None:
+        below_names = split_cells(lines[units][2], separator)[: len(names)]
+        names = [with_unit(name, unit) for name, unit in itertools.zip_longest(names, below_names)]
+    again = [i for i, name in enumerate(names) if name in names[:i]]
+    for i in again:
+        names[i] = f"{names[i]} {i + 1}"
+    # Blank lines in place of what stands between, so that those below keep their numbers.
+    below, start, _ = lines[first] if first < len(lines) else (number + 1, len(text), "")
+    body = "\n" * (below - number - 1) + text[start:]
     return checked(TextTable(path, tuple(names), number, separator, body))
 
 
@@ -131,45 +141,79 @@ def cut(cells: list[str]) -> list[str]:
     return cells
 
 
-def _first_lines(text: str) -> tuple[str, list[_Line]]:
-    """The separator, if a line declares it, and the first lines that are neither blank nor comments."""
+def _spaced(text: str) -> bool:
+    """Whether spaces alone separate the numbers of rows."""
+    for line in text[:_HEAD_CHARACTERS].split("\n")[:_HEAD]:
+        cells = line.split()
+        if len(cells) > 1 and all(looks_numeric(cell) and cell.strip(",") == cell for cell in cells):
+            return "\t" not in line.strip()
+    return False
+
+
+def _first_lines(text: str, comments: bool = False) -> tuple[str, list[_Line]]:
+    """The separator, if a line declares it, and the first lines that are not blank, with or without comments."""
     separator, lines, start = "", list[_Line](), 0
     for number, line in enumerate(io.StringIO(text, newline="\n"), 1):
         stripped = line.strip(" \n")
         declared = _EXCEL_SEPARATOR.fullmatch(stripped)
         if declared and not lines:
             separator = declared[1]
-        elif line.strip() and not stripped.startswith(("#", "%")):
-            lines.append((number, start, line.removesuffix("\n")))
+        elif (
+            said := stripped.lstrip("#% \t") if comments else "" if stripped.startswith(("#", "%")) else line.strip()
+        ):
+            lines.append((number, start, said if said != line.strip() else line.removesuffix("\n")))
             if len(lines) == _HEAD:
                 break
         start += len(line)
     return separator, lines
 
 
-def _header(lines: list[_Line]) -> tuple[int, str, bool]:
-    """Which line is the header, what separates its cells, and whether a line of units is below it.
+def _header(lines: list[_Line]) -> tuple[int, str, int, int | None]:
+    """Which line is the header, what separates its cells, which is the first row, and which holds units, if any does.
 
     It is the first line, unless rows of numbers are found below others that are no rows of theirs: then the first of
-    the lines above them, of as many cells, that names a known quantity, or the last that holds no units.
+    the lines above them, of as many cells, that names a known quantity, or the last words above the units.
     """
     for i in range(len(lines)):
         separator = _separator(lines[i][2])
         rows = [_names(line, separator) for _, _, line in lines[i : i + _ENOUGH]]
-        known = (looks_numeric(cell) or is_clock(cell) for row in rows for cell in row)
-        if not (all(len(row) == len(rows[0]) and any(row) for row in rows) and all(known)):
+        if not all(len(row) == len(rows[0]) and any(row) and _all_numbers(row) for row in rows):
             continue
-        width, first = len(rows[0]), i
-        while first and len(_names(lines[first - 1][2], separator)) == width:
+        wide, first = len(split_cells(lines[i][2], separator)), i
+        while first and _is_as_wide(lines[first - 1][2], separator, wide, len(rows[0])):
             first -= 1
-        above = [_names(line, separator) for _, _, line in lines[first:i]]
+        # What stands above a column without numbers says what the line is, as in the captures of dSPACE.
+        filled = [k for k in range(len(rows[0])) if any(row[k] for row in rows)]
+        above: dict[int, list[str]] = {}
+        for k in range(first, i):
+            cells = [*split_cells(lines[k][2], separator), *rows[0]][: len(rows[0])]
+            if any(cells[j] for j in filled):
+                above[k] = [cells[j] for j in filled if cells[j]]
         if not above:
             break
-        units = [all(map(_is_unit, names)) for names in above]
-        named = [k for k, names in enumerate(above) if any(map(recognise, names))]
-        k = named[0] if named else max((k for k in range(len(above)) if not units[k]), default=0)
-        return first + k, separator, k + 1 < len(above) and units[k + 1]
-    return 0, _separator(lines[0][2]), False
+        units = [k for k, cells in above.items() if 2 * sum(map(_is_unit, cells)) > len(cells)]
+        words = [k for k in above if k not in units]
+        named = [k for k, cells in above.items() if any(map(recognise, cells))]
+        over = [k for k in words if units and k < units[-1]]
+        k = next(iter(named), (over or words or [*above])[-1])
+        # A row of which a cell is damaged is a row.
+        damaged = [j for j in above if j > k and any(map(_is_number, above[j]))]
+        return k, separator, min([*damaged, i]), next((each for each in units if each > k), None)
+    return 0, _separator(lines[0][2]), 1, None
+
+
+def _is_as_wide(line: str, separator: str, wide: int, width: int) -> bool:
+    """Whether a line has as many cells as rows have, with the empty ones at the end or without."""
+    cells = split_cells(line, separator)
+    return len(cells) == wide or len(cut(cells)) == width
+
+
+def _all_numbers(cells: list[str]) -> bool:
+    return all(not cell or _is_number(cell) for cell in cells)
+
+
+def _is_number(cell: str) -> bool:
+    return bool(cell) and (looks_numeric(cell) or is_clock(cell) or _DATE.fullmatch(cell) is not None)
 
 
 def _names(line: str, separator: str) -> list[str]:
@@ -179,7 +223,7 @@ def _names(line: str, separator: str) -> list[str]:
 def _separator(line: str) -> str:
     unquoted = re.sub(r'"[^"]*"', "", line.strip())
     # Names in a semicolon file may hold commas; the reverse is rare.
-    return next((mark for mark in "\t;" if mark in unquoted), ",")
+    return next((mark for mark in "\t;|" if mark in unquoted), ",")
 
 
 def _is_unit(cell: str) -> bool:

@@ -1,4 +1,4 @@
-"""HDF5: data sets, with their units as attributes; MATLAB files from version 7.3 on are such, too."""
+"""HDF5: data sets, with their units as attributes."""
 
 import io
 from collections.abc import Iterator
@@ -23,11 +23,11 @@ def _found(path: str, file: Any, h5py: Any) -> Iterator[Found]:
     size = 0
     for name in names:
         each, parts = file[name], tuple(name.split("/"))
-        if not isinstance(each, h5py.Dataset) or parts[0] == "#refs#" or each.attrs.get("MATLAB_class") == b"char":
+        if not isinstance(each, h5py.Dataset):
             continue
         size += each.size * each.dtype.itemsize if each.shape else 0
         refuse_large(path, size)
-        if each.shape and (each.dtype.kind in "iuf" or each.dtype.names):
+        if each.shape and (each.dtype.kind in "iufSO" or each.dtype.names):
             unit = next((each.attrs[key] for key in ("units", "unit", "Unit", "Units") if key in each.attrs), None)
             yield (
                 parts,

@@ -7,7 +7,7 @@ from dataclasses import replace
 from fits.io._table import Table, data_error, with_unit
 from fits.io._text_table import TextTable, looks_numeric
 from fits.io.formats._base import Format, register
-from fits.io.formats.csv import checked, chosen, cut, decode
+from fits.io.formats.csv import checked, chosen, cut, decode, open_csv
 
 _END, _TOP = "***End_of_Header***", "Channels"
 _START = "LabVIEW Measurement"
@@ -16,6 +16,8 @@ _START = "LabVIEW Measurement"
 def open_labview(path: str, data: bytes) -> Table:
     """Read the two headers; a `DataError` says that the second, or the line of names, is missing."""
     text = decode(path, data)
+    if not text.startswith(_START) and _END not in text:  # written without a header
+        return open_csv(path, data)
     lines = text.split("\n")
     separator = "," if any(line.startswith("Separator,") for line in lines[:40]) else "\t"
     ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
@@ -33,7 +35,9 @@ def open_labview(path: str, data: bytes) -> Table:
         raise data_error(path, f"expected {_END} and a line of names below it, found none; export it again", "line 1")
     names = [name.strip() for name in lines[head].split(separator)]
     names = names[: names.index("Comment")] if "Comment" in names else cut(names)
-    units = iter(cut(keys.get("Y_Unit_Label", [])))
+    # Where each channel has a column of x, the cell of its unit stands above that.
+    labels = cut(keys.get("Y_Unit_Label", []))
+    units = iter(labels[::2] if keys.get("X_Columns", [""])[0] == "Multi" and "" in labels[1::2] else labels)
     timed = keys.get("X_Dimension", ["Time"])[0] == "Time"
     for k, name in enumerate(names):
         # A column of x stands before all others, or before each.
