@@ -211,9 +211,9 @@ def _ranked(
     return list(best.values())
 
 
-def has_occurred(bench: Bench, model: Refit) -> bool:
-    """Whether what is counted in sampling intervals is nearer to one than to none in some run, for the last law."""
-    law, x = model.laws[-1], model.x[-1]
+def has_occurred(bench: Bench, model: Refit, place: int = -1) -> bool:
+    """Whether what is counted in sampling intervals is nearer to one than to none in some run, for a law."""
+    law, x = model.laws[place], model.x[place]
     found = not law.form.counted
     for run, one in enumerate(bench.prepared):
         interval_s = float(np.median(np.diff(one.run.record.time_s)))

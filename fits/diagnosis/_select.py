@@ -11,6 +11,7 @@ from fits.diagnosis._comparison import (
     confusable_z,
     criterion,
     gain_ahead,
+    has_occurred,
     indistinguishable,
     leaders,
     model_error,
@@ -287,15 +288,15 @@ def _refined(best: Explanation, start: Explanation, search: Search) -> Selection
 def _backward(
     bench: Bench, projector: Projector, causes: list[Cause], model: Refit, tie: float
 ) -> tuple[list[Cause], Refit]:
-    """Take out what later additions made unnecessary."""
+    """Take out what later additions made unnecessary, or made so small that it has not occurred."""
     while len(causes) > 1:
         trials = []
         for k in range(len(causes)):
             laws = [law for i, law in enumerate(model.laws) if i != k]
             without = refit(bench, projector, laws, [x for i, x in enumerate(model.x) if i != k], 3)
-            trials.append((criterion(projector, without), k, without))
-        least, k, without = min(trials, key=lambda t: t[0])
-        if least > criterion(projector, model) + tie:
+            trials.append((has_occurred(bench, model, k), criterion(projector, without), k, without))
+        needed, least, k, without = min(trials, key=lambda t: t[:2])
+        if needed and least > criterion(projector, model) + tie:
             break
         causes = [cause for i, cause in enumerate(causes) if i != k]
         model = without
