@@ -62,8 +62,9 @@ class NonlinearResponse:
     weight_V
         `A` at these, shape `(s, m, n)`.
     explained
-        Share of the distortion, in squares and weighted by its variance, that the terms take off realizations that
-        were left out; zero, and so are all weights, where they take off nothing.
+        Share that the terms take off what the linear part leaves of realizations that were left out, be it
+        distortion, noise or bias: in squares, weighted by its variance. Zero, and so are all weights, where they take
+        off nothing.
     """
 
     linear: ResponseData
