@@ -20,8 +20,8 @@ __all__ = [  # noqa: RUF022
     "AbstractUncertainty", "Draws", "Errors", "Profile", "StageUncertainty", "Uncertainty", "draw_plants", "errors",
     "loop_width_pct", "profile_stage", "sample_posterior",
     # Frequency responses
-    "ModalFit", "Multisine", "ResponseData", "estimate_response", "fit_hysteresis", "fit_response", "read_multisine",
-    "read_response", "relative_error",
+    "ModalFit", "Multisine", "NonlinearResponse", "ResponseData", "estimate_nonlinear_response", "estimate_response",
+    "fit_hysteresis", "fit_response", "read_multisine", "read_response", "relative_error",
     # Diagnosis
     "Bound", "Diagnosis", "Experiment", "FoundCause", "Gain", "NoiseBand", "NoiseLine",
     "Thresholds", "diagnose", "diagnosis_json", "diagnosis_schema", "report_html",
@@ -79,6 +79,7 @@ if TYPE_CHECKING:
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
     from fits.report._machining import budget_json, sensitivity_json
+    from fits.stage._distortion import NonlinearResponse, estimate_nonlinear_response
     from fits.stage._fit import default_stage, fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._frequency import Multisine, ResponseData, estimate_response, read_multisine, read_response

@@ -146,7 +146,7 @@ def estimate_response(record: Multisine, neighbours: int | None = 0) -> Response
     frequency_Hz, u, y = record.spectra()
     gain, total = approximate(record, u, y)
     drive, moved = np.mean(u, axis=2), np.mean(y, axis=2)
-    tried = [n for n in _TRIED if 2 * n + 1 <= len(frequency_Hz)] if neighbours is None else [neighbours]
+    tried = usable(frequency_Hz) if neighbours is None else [neighbours]
     if not all(0 <= 2 * n < len(frequency_Hz) for n in tried):
         most = (len(frequency_Hz) - 1) // 2
         raise DataError(
@@ -154,8 +154,7 @@ def estimate_response(record: Multisine, neighbours: int | None = 0) -> Response
             "choose another number."
         )
     if any(tried):
-        found = [_local_polynomial(drive, moved, n) for n in tried]
-        gain, total, spread, _ = min(found, key=lambda one: float(np.linalg.norm(one[3])))
+        _, gain, total, spread, _ = together(drive, moved, tried)
     else:
         spread = np.real(np.diagonal(np.linalg.inv(np.swapaxes(drive, 1, 2).conj() @ drive), axis1=1, axis2=2))
         total = smooth(total)
@@ -164,6 +163,19 @@ def estimate_response(record: Multisine, neighbours: int | None = 0) -> Response
         between = np.mean(np.var(y, axis=2, ddof=1), axis=1) / y.shape[2]
         noise = smooth(between)[:, :, None] * spread[:, None, :]
     return ResponseData(frequency_Hz, gain, total[:, :, None] * spread[:, None, :], noise)
+
+
+def usable(frequency_Hz: NDArray[np.float64]) -> list[int]:
+    """Numbers of neighbours on each side that are tried where the record is to choose."""
+    return [n for n in _TRIED if 2 * n + 1 <= len(frequency_Hz)]
+
+
+def together(
+    drive: NDArray[Any], moved: NDArray[Any], tried: list[int]
+) -> tuple[int, NDArray[Any], NDArray[Any], NDArray[np.float64], NDArray[Any]]:
+    """The number of neighbours that predicts left-out realizations best, and what `_local_polynomial` finds by it."""
+    found = [(n, *_local_polynomial(drive, moved, n)) for n in tried]
+    return min(found, key=lambda one: float(np.linalg.norm(one[4])))
 
 
 def _local_polynomial(
@@ -176,11 +188,8 @@ def _local_polynomial(
     of each realization where the fit is to the others, `(f, r, p)`.
     """
     lines, realizations, inputs = drive.shape
-    width = 2 * neighbours + 1
-    first = np.clip(np.arange(lines) - neighbours, 0, lines - width)
-    near = first[:, None] + np.arange(width)
-    away = (near - np.arange(lines)[:, None]) / neighbours
-    powers = away[..., None] ** np.arange(_DEGREE + 1)
+    near, powers = _window(lines, neighbours)
+    width = near.shape[1]
     # Of each line: neighbours, realizations, and the columns of all inputs to each power.
     columns = np.einsum("fwd,fwrm->frwdm", powers, drive[near]).reshape(lines, realizations, width, -1)
     target = np.moveaxis(moved[near], 2, 1)
@@ -195,6 +204,30 @@ def _local_polynomial(
     predicted = np.einsum("frm,frmp->frp", drive, others[:, :, :inputs])
     spread = np.real(np.diagonal(whole, axis1=1, axis2=2))[:, :inputs]
     return np.swapaxes(found[:, :inputs], 1, 2), total, spread, moved - predicted
+
+
+def smooth_response(drive: NDArray[Any], moved: NDArray[Any], neighbours: int) -> NDArray[Any]:
+    """The response `(f, p, m)` of `_local_polynomial` alone, in little memory however many outputs there are."""
+    near, powers = _window(len(drive), neighbours)
+    adjoint = np.swapaxes(drive, 1, 2).conj()
+    inner, cross = adjoint @ drive, adjoint @ moved
+    inputs, count = drive.shape[2], powers.shape[2]
+    gram = np.einsum("fwd,fwe,fwmn->fdmen", powers, powers, inner[near], optimize=True)
+    right = np.zeros((len(drive), count, *cross.shape[1:]), dtype=complex)
+    for w in range(near.shape[1]):
+        right += powers[:, w, :, None, None] * cross[near[:, w], None]
+    size = inputs * count
+    found = np.linalg.solve(gram.reshape(-1, size, size), right.reshape(len(drive), size, -1))
+    return np.swapaxes(found[:, :inputs], 1, 2)
+
+
+def _window(lines: int, neighbours: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Of each line, the lines about it, shape `(f, w)`, and the powers of how far away they are, `(f, w, d)`."""
+    width = 2 * neighbours + 1
+    first = np.clip(np.arange(lines) - neighbours, 0, lines - width)
+    near = first[:, None] + np.arange(width)
+    away = (near - np.arange(lines)[:, None]) / neighbours
+    return near, away[..., None] ** np.arange(_DEGREE + 1)
 
 
 def approximate(record: Multisine, u: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

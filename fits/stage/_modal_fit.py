@@ -17,6 +17,7 @@ from scipy.signal import find_peaks, peak_widths
 
 from fits.io._errors import DataError
 from fits.loop._result import FitError, FitStatus
+from fits.stage._distortion import NonlinearResponse
 from fits.stage._frequency import Multisine, ResponseData, approximate, smooth
 from microid import Coordinates, HystereticModes, Modes, with_plays
 
@@ -105,10 +106,13 @@ def fit_hysteresis(
     return _fit(HystereticModes(modes, jnp.asarray(threshold)), spectra, True)
 
 
-def relative_error(model: Modes | HystereticModes | ResponseData, record: Multisine, band_Hz: _Band = None) -> float:
+def relative_error(
+    model: Modes | HystereticModes | ResponseData | NonlinearResponse, record: Multisine, band_Hz: _Band = None
+) -> float:
     """Norm of what a model leaves of the averaged output spectra in a band, over their own norm.
 
-    A measured response is one, too; a `DataError` if it is not of the lines of the record.
+    A measured response is one, too, alone or with its distortion; a `DataError` if it is not of the lines of the
+    record.
     """
     frequency, u, y = record.spectra()
     band = _in_band(frequency, band_Hz, 0)
