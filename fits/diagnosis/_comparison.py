@@ -68,8 +68,8 @@ def compare_rivals(
     """Fit the leaders beside what is there, while there is time, the best first; none as more than so many `laws`.
 
     The baseline is fitted again beside the best and those about as good: the plain stage may have given way to one
-    and not to another. What predicts held-out data worse is left out, and what does not stand out of the rest of the
-    misfit unless it predicts better.
+    and not to another. What does not stand out of the rest of the misfit is left out unless it predicts held-out data
+    better.
     """
     before, first = projector.held_out(model.change_um), len(model.laws)
     fits = list[tuple[Scored, Refit]]()
@@ -97,19 +97,12 @@ def compare_rivals(
             fitted[one.form] = found
     rivals = [Rival.of(projector, one) for one in fitted.values()]
     without = model.cost + projector.surprise(before)
-    return _ranked(bench, projector, rivals, without, before, [one.probe for one in scores], thresholds)
+    return _ranked(bench, projector, rivals, without, [one.probe for one in scores], thresholds)
 
 
 def criterion(projector: Projector, model: Refit) -> float:
     """Information criterion of what was fitted, and how improbable that makes what was held out: small is good."""
     return model.criterion(projector.count) + projector.surprise(projector.held_out(model.change_um))
-
-
-def _predicts_worse(before: np.ndarray, after: np.ndarray, thresholds: Thresholds) -> bool:
-    """Whether what was held out says no."""
-    # What else is not simulated yet may make it a little worse.
-    most = (1 + thresholds.model_error) * float(np.linalg.norm(before))
-    return improvement_z(before, after) < -thresholds.worse_z and float(np.linalg.norm(after)) > most
 
 
 def leaders(scores: Sequence[Scored]) -> list[Scored]:
@@ -166,15 +159,14 @@ def _ranked(
     projector: Projector,
     fitted: list[Rival],
     cost: float,
-    held_out: np.ndarray,
     asked: Sequence[Probe],
     thresholds: Thresholds,
 ) -> list[Rival]:
     """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
 
-    Without them there is a `cost`, and there are errors in what is `held_out`.
-    About as good are also those that are behind the best by no more than twice what it gains by that, as they may
-    gain more, until one ends behind it; and those that leave as little with the best further effect of those `asked`.
+    Without them there is a `cost`. About as good are also those that are behind the best by no more than twice what
+    it gains by that, as they may gain more, until one ends behind it; and those that leave as little with the best
+    further effect of those `asked`.
     """
     order = sorted(fitted, key=lambda one: one.criterion)
     out = list[Rival]()
@@ -196,7 +188,7 @@ def _ranked(
             continue
         end = fit_jointly(bench, projector, one.refit)
         found = Rival.of(*end[1:])
-        if _predicts_worse(held_out, found.held_out, thresholds) or not end[-1].possible(bench):
+        if not end[-1].possible(bench):
             continue
         if least == np.inf:
             near = max(usual, 2 * (one.cost - found.cost))
