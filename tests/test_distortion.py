@@ -122,6 +122,10 @@ def test_records_that_say_too_little_are_refused(rng):
     )
     with pytest.raises(fits.DataError, match="expected one period of 1024 samples of 1 voltages"):
         found.respond_periodically(np.zeros((512, 1)), INTERVAL_s)
+    at = np.arange(1024) / 1024
+    for voltage in (np.cos(2 * np.pi * 500 * at), np.full(1024, np.nan)):
+        with pytest.raises(fits.DataError, match="voltages at the lines of the record alone"):
+            found.respond_periodically(voltage[:, None], INTERVAL_s)
 
 
 @pytest.mark.study

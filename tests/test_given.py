@@ -11,6 +11,8 @@ from _models import random_model
 
 import fits
 from fits.io._given import records_given
+from fits.io._inspect import inspect_table
+from fits.io._units import parse_columns
 
 TIME_s = 0.01 * np.arange(300)
 VOLTAGE_V = 50 - 50 * np.cos(6 * TIME_s)
@@ -159,3 +161,27 @@ def test_a_record_says_what_it_holds_and_is_drawn():
 def test_what_holds_no_numbers_is_no_record():
     with pytest.raises(fits.DataError, match="voltage_V: expected an array of numbers, found something else"):
         record(voltage_V=["high"] * 300)
+
+
+def test_a_program_without_samples_is_refused():
+    empty = fits.Record(np.zeros(0), np.zeros(0), None, source="none.csv")
+    model = random_model(np.random.default_rng(1))
+    with pytest.raises(fits.DataError, match=r"none\.csv: there are no samples"):
+        fits.predict(model, None, empty)
+    with pytest.raises(fits.DataError, match="the reference: there are no samples"):
+        fits.compensate(model, fits.Reference(np.zeros(0), np.zeros(0)))
+
+
+def test_one_row_is_inspected(tmp_path):
+    path = tmp_path / "one.csv"
+    path.write_text("time_s,voltage_V,displacement_um\n0,0,0\n")
+    assert inspect_table(path).rows == 1
+
+
+def test_words_beside_the_first_rows_are_no_header(tmp_path):
+    rows = [f",,{t!r},{v!r},{y!r}" for t, v, y in zip(*(map(float, COLUMNS[name]) for name in COLUMNS), strict=True)]
+    rows[:2] = [f"{words}{row[1:]}" for words, row in zip(["Record Length,300", "Points,300"], rows, strict=False)]
+    path = tmp_path / "scope.csv"
+    path.write_text("\n".join(rows))
+    found = fits.read_csv(path, columns=parse_columns("time_s=3[s],voltage_V=4[V],displacement_um=5[um]"))
+    np.testing.assert_array_equal(found.voltage_V, VOLTAGE_V)

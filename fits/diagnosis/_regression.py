@@ -19,8 +19,8 @@ from fits.stage._moments import Chain, linearise, pieces, propagated
 from fits.stage._run import ahead, place_of_hysteresis
 from microid import PLACES, AbstractEffect, Coordinates, Stage
 
-# Levels of the grid of the finer structure, and how many random examples of it stand for all.
-_FINE, _EXAMPLES = 64, 120
+# Levels of the grid of the finer structure, how many random examples of it stand for all, and levels of a rough past.
+_FINE, _EXAMPLES, _PAST = 64, 120, 32
 # Of central differences along coordinates, which are of the size of one.
 _STEP = 1e-4
 # Part of an unknown of a run that must be left in the samples that count.
@@ -161,7 +161,7 @@ def _rough_pasts(baseline: Baseline) -> tuple[np.ndarray, ...]:
     place = place_of_hysteresis(stage)
     assert grid is not None
     assert place is not None
-    levels_V, own = np.linspace(float(grid.lower_V), float(grid.upper_V), _FINE), []
+    levels_V, own = np.linspace(float(grid.lower_V), float(grid.upper_V), _PAST), []
     for run in baseline.runs:
         seen_V = np.asarray(ahead(stage, place, run.samples))[:: run.samples.stride][: len(run.record)]
         columns = rough_past_columns(seen_V, levels_V) * baseline.stroke_um / np.ptp(levels_V)

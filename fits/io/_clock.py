@@ -12,7 +12,7 @@ _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)? ?(Z|[+-]\d\d:
 # A time of day behind a date of any kind or none; what has no hours has a fraction, as spreadsheets write it.
 _DAY = re.compile(
     r"(?P<date>[\d./-]{6,10}[ T]+)?(?:(?P<hour>\d{1,2}):(?=\d\d:)|(?=\d\d:\d\d[.,]))"
-    r"(?P<minute>\d\d):(?P<second>\d\d(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])[Mm])?"
+    r"(?P<minute>[0-5]\d):(?P<second>[0-5]\d(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])[Mm])?"
 )
 
 
@@ -28,7 +28,11 @@ def clock_s(cells: list[str]) -> FloatArray:
     if _ISO.fullmatch(cells[0]):
         import pandas as pd
 
-        stamps = pd.to_datetime([cell.strip().replace(",", ".") for cell in cells], format="ISO8601", utc=True)
+        stamps = pd.to_datetime(
+            [cell.strip().replace(",", ".") for cell in cells], format="ISO8601", utc=True, errors="coerce"
+        )
+        if stamps.isna().any():
+            _refuse(cells[int(np.argmax(stamps.isna()))])
         return seconds(stamps.tz_localize(None).to_numpy())
     found = [_DAY.fullmatch(cell.strip()) or _refuse(cell) for cell in cells]
     if len({each["date"] for each in found}) > 1:

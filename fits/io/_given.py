@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from fits.io._errors import DataError
 from fits.io._read_csv import read_reference, read_table
@@ -10,6 +10,7 @@ from fits.io._record import Record, Reference
 
 # One run or an iterable of several: records, names of files, or what else `read_table` takes, such as a DataFrame.
 AnyRuns = Any
+_Given = TypeVar("_Given", Record, Record | Reference)
 
 
 def records_given(given: AnyRuns) -> tuple[Record, ...]:
@@ -24,8 +25,7 @@ def records_given(given: AnyRuns) -> tuple[Record, ...]:
     found = tuple(one if isinstance(one, Record) else read_table(one) for one in each)
     for number, record in enumerate(found, 1):
         name = record.source or f"run {number}"
-        if len(record) == 0:
-            raise DataError(f"{name}: there are no samples; give a run that has some")
+        _with_samples(record, name)
         if record.displacement_um is None:
             raise DataError(f"{name}: a displacement column is needed here")
     return found
@@ -33,12 +33,19 @@ def records_given(given: AnyRuns) -> tuple[Record, ...]:
 
 def program_given(given: Any) -> Record:
     """A voltage program as a record: one, the name of a file, or what else `read_table` takes."""
-    return given if isinstance(given, Record) else read_table(given, required=("time_s", "voltage_V"))
+    found = given if isinstance(given, Record) else read_table(given, required=("time_s", "voltage_V"))
+    return _with_samples(found, "the program")
 
 
 def reference_given(given: Any) -> Record | Reference:
     """A displacement to follow: a record or a reference, the name of a file, or what else `read_reference` takes."""
-    return given if isinstance(given, Record | Reference) else read_reference(given)
+    return _with_samples(given if isinstance(given, Record | Reference) else read_reference(given), "the reference")
+
+
+def _with_samples(given: _Given, name: str) -> _Given:
+    if len(given.time_s) == 0:
+        raise DataError(f"{given.source or name}: there are no samples; give a run that has some")
+    return given
 
 
 def holdout_given(holdout: float | AnyRuns) -> float | tuple[Record, ...]:

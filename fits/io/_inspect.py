@@ -86,8 +86,9 @@ def inspect_table(path: AnyPath) -> Inspection:
     interval_s, even = table.interval_s, table.interval_s is not None
     if "time_s" in sources:
         steps_s = np.diff(known_quantity("time_s").convert(found[sources["time_s"].column], sources["time_s"].unit))
-        interval_s = float(np.median(steps_s))
-        even = bool(np.ptp(steps_s) < 0.01 * interval_s)
+        if len(steps_s):
+            interval_s = float(np.median(steps_s))
+            even = bool(np.ptp(steps_s) < 0.01 * interval_s)
     uses = {source.column: column for column, source in sources.items()}
     channels = []
     for k, name in enumerate(table.names, 1):

@@ -150,7 +150,7 @@ def check_fit(
         raise DataError(f"unknown loss {loss!r}: choose one of {', '.join(LOSSES)}")
     if levels is not None and not (isinstance(levels, int | np.integer) and 4 <= levels <= 100):
         raise DataError(
-            f"levels: expected a whole number from 4 to 100, found {levels}; leave it out to have it found"
+            f"levels: expected a whole number from 4 to 100, found {levels!r}; leave it out to have it found"
         )
     fraction, aside = (float(holdout), ()) if isinstance(holdout, int | float) else (0.0, tuple(holdout))
     if not 0 <= fraction <= 0.9:

@@ -31,6 +31,8 @@ _FINER = 2
 _PIECES, _RIDGES = (4, 8, 16), (1e-3, 1e-2, 1e-1, 1.0)
 # Share of the lines, the lowest ones, that tell what voltages do at rest.
 _AT_REST = 0.02
+# A voltage beside the lines of the record, over the largest at them, of which nothing is known.
+_BESIDE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ class NonlinearResponse:
         """Steady state under one period of voltages, of shape `(t, m)`: displacements in um, `(t, p)`.
 
         Only what lies at the lines of the record is known, so nothing else is in the answer: no mean either. A
-        `DataError` if the period is not that of the record.
+        `DataError` if the period or the lines are not those of the record.
         """
         voltage = np.asarray(voltage_V, dtype=float)
         inputs = self.scale.shape[1]
@@ -91,6 +93,13 @@ class NonlinearResponse:
                 f"shape {voltage.shape} at {interval_s:g} s; record the same program."
             )
         lines = _lines(self.linear.frequency_Hz, self.samples, self.interval_s)
+        every = np.abs(np.fft.rfft(voltage, axis=0)).max(axis=1)
+        # What is constant moves nothing that is in the answer.
+        beside = np.delete(every, np.r_[0, lines])
+        if not np.all(np.isfinite(every)) or np.max(beside, initial=0.0) > _BESIDE * np.max(every[lines]):
+            raise DataError(
+                "expected finite voltages at the lines of the record alone, found others; record the same program."
+            )
         drive = (np.fft.rfft(voltage, axis=0)[lines] / self.samples)[:, None]
         terms = self._terms(drive) - _apply(self.term_response_per_V, drive)
         weight = _interpolated(self.linear.frequency_Hz, self.knots_Hz, self.weight_V)

@@ -77,7 +77,7 @@ def _open_text(path: str, text: str) -> TextTable:
     k, first, units = 0, 1, None
     if not separator:
         k, separator, first, units = _header(lines)
-    if _all_numbers(_names(lines[k][2], separator)):
+    if first == k or _all_numbers(_names(lines[k][2], separator)):
         # A comment may be the header, if it states a unit.
         _, noted = _first_lines(text, comments=True)
         at, mark, below, unit_line = _header(noted)
@@ -191,6 +191,9 @@ def _header(lines: list[_Line]) -> tuple[int, str, int, int | None]:
                 above[k] = [cells[j] for j in filled if cells[j]]
         if not above:
             break
+        if all(all(map(_is_number, cells)) for cells in above.values()):
+            # Words beside the first rows of numbers, as in captures of Tektronix: there is no header.
+            return min(above), separator, min(above), None
         units = [k for k, cells in above.items() if 2 * sum(map(_is_unit, cells)) > len(cells)]
         words = [k for k in above if k not in units]
         named = [k for k, cells in above.items() if any(map(recognise, cells))]
