@@ -1,17 +1,15 @@
 """Nonlinear distortion of frequency responses: plays and products made in NumPy are found, and none in noise."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from _frequency_reference import multisine, response, state_space
+from _measured import measured
 from _plant_reference import play_positions
 
 import fits
 import fits.stage._distortion
 from fits.stage._frequency import smooth_response, together
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
 INTERVAL_s, SAMPLES, FINER = 1 / 2048, 1024, 8
 LINES = np.arange(10, 200)
 REALIZATIONS = 6
@@ -33,7 +31,7 @@ def coarse(signal):
     return np.fft.rfft(signal, axis=0)[: SAMPLES // 2 + 1] / FINER
 
 
-def measured(rng, gain, disturb, noise=1e-3):
+def recorded(rng, gain, disturb, noise=1e-3):
     """A record of a response to voltages that are disturbed first, by a function of their spectra and the linear."""
     voltage = multisine(rng, SAMPLES, LINES, 1.0, REALIZATIONS, 2)
     shown = []
@@ -59,7 +57,7 @@ def squares(_, moved):
 
 @pytest.mark.parametrize("disturb", [plays, pytest.param(squares, marks=pytest.mark.study)])
 def test_distortion_of_the_drive_is_found_and_told_ahead(rng, disturb):
-    record = measured(rng, linear(rng), disturb)
+    record = recorded(rng, linear(rng), disturb)
     learnt, tested = record.take(slice(0, 5)), record.take(slice(5, 6))
     found = fits.estimate_nonlinear_response(learnt)
     plain, bent = (fits.relative_error(model, tested) for model in (found.linear, found))
@@ -70,7 +68,7 @@ def test_distortion_of_the_drive_is_found_and_told_ahead(rng, disturb):
 
 def test_a_linear_stage_has_no_terms(rng):
     """Noise alone: the terms are left out, or tell at most a little of what is noise."""
-    record = measured(rng, linear(rng), lambda drive, _: 0 * drive, noise=0.1)
+    record = recorded(rng, linear(rng), lambda drive, _: 0 * drive, noise=0.1)
     found = fits.estimate_nonlinear_response(record.take(slice(0, 5)))
     assert 0 <= found.explained < 0.02
     tested = record.take(slice(5, 6))
@@ -113,7 +111,7 @@ def test_many_outputs_are_smoothed_as_few_are(rng):
 
 
 def test_records_that_say_too_little_are_refused(rng):
-    record = measured(rng, linear(rng), lambda drive, _: 0 * drive)
+    record = recorded(rng, linear(rng), lambda drive, _: 0 * drive)
     one = fits.Multisine(INTERVAL_s, record.voltage_V[:2, :, :, :1], record.displacement_um[:2])
     with pytest.raises(fits.DataError, match="expected three realizations and five lines or more, found 2 and 190"):
         fits.estimate_nonlinear_response(one)
@@ -131,9 +129,7 @@ def test_records_that_say_too_little_are_refused(rng):
 @pytest.mark.study
 @pytest.mark.parametrize(("level_mV", "most"), [(100, 0.035), (300, 0.025)])
 def test_the_measured_mirror_with_its_distortion(level_mV, most):
-    path = DATA / f"fsm_cubespec_{level_mV}mV_train.csv"
-    if not path.exists():
-        pytest.skip(f"{path.name} is not at hand: measured records are kept beside the repository")
+    path = measured(f"fsm_cubespec_{level_mV}mV_train.csv")
     record = fits.read_multisine(path)
     found = fits.estimate_nonlinear_response(record.take(slice(0, 4)))
     tested = record.take(slice(4, 6))

@@ -1,13 +1,12 @@
 """Identification in the frequency domain, against state matrices and SciPy; and the measured mirror where at hand."""
 
-from pathlib import Path
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
 from _frequency_reference import multisine, response, state_space
+from _measured import measured
 from _models import compiled
 from _plant_reference import play_positions
 from scipy.optimize import least_squares
@@ -17,7 +16,6 @@ import fits
 import fits.stage._modal_fit
 import microid as m
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
 INTERVAL_s, SAMPLES = 1 / 2048, 1024
 LINES = np.arange(10, 200)
 FREQUENCY_Hz = LINES / (SAMPLES * INTERVAL_s)
@@ -187,11 +185,9 @@ def test_neighbouring_lines_are_fitted_together(rng):
 
 @pytest.mark.parametrize(("level_mV", "most"), [(100, 0.050), (300, 0.039)])
 def test_the_measured_mirror_without_a_model(level_mV, most):
-    path = DATA / f"fsm_cubespec_{level_mV}mV_train.csv"
-    if not path.exists():
-        pytest.skip(f"{path.name} is not at hand: measured records are kept beside the repository")
-    measured = fits.read_multisine(path)
-    learnt, tested = measured.take(slice(0, 4)), measured.take(slice(4, 6))
+    path = measured(f"fsm_cubespec_{level_mV}mV_train.csv")
+    record = fits.read_multisine(path)
+    learnt, tested = record.take(slice(0, 4)), record.take(slice(4, 6))
     alone, together = (fits.relative_error(fits.estimate_response(learnt, n), tested) for n in (0, None))
     assert together < min(most, 0.8 * alone)
 
@@ -276,12 +272,10 @@ def test_a_search_that_does_not_arrive_has_no_answer(rng, monkeypatch):
 
 @pytest.mark.study
 def test_the_measured_mirror_held_out():
-    path = DATA / "fsm_cubespec_100mV_train.csv"
-    if not path.exists():
-        pytest.skip(f"{path.name} is not at hand: measured records are kept beside the repository")
+    path = measured("fsm_cubespec_100mV_train.csv")
     band_Hz = (760.0, 860.0)
-    measured = fits.read_multisine(path)
-    learnt, tested = measured.take(slice(0, 4)), measured.take(slice(4, 6))
+    record = fits.read_multisine(path)
+    learnt, tested = record.take(slice(0, 4)), record.take(slice(4, 6))
     linear = fits.fit_response(fits.estimate_response(learnt), 2, band_Hz, coupled=True)
     assert np.min(np.abs(linear.model.natural_frequency_Hz - 814.2)) < 1.5
     bent = fits.fit_hysteresis(learnt, linear, [0.03], band_Hz, coupled=True)

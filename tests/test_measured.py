@@ -1,25 +1,15 @@
 """Fits of measured records, where they are at hand."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from _measured import measured
 
 import fits
-
-_DATA = Path(__file__).parents[2] / "shared" / "data"
-
-
-def measured(name):
-    path = _DATA / name
-    if not path.exists():
-        pytest.skip(f"{name} is not at hand: measured records are kept beside the repository")
-    return fits.read_csv(path)
 
 
 @pytest.mark.study
 def test_sine_of_a_picma_stack_held_out():
-    record = measured("picma_p885_sine_1hz.csv")
+    record = fits.read_csv(measured("picma_p885_sine_1hz.csv"))
     found = fits.fit([record], holdout=0.3, levels=12)
     assert found.in_sample.e_rms_pct < 1.0
     assert found.held_out.e_rms_pct < 1.2
@@ -34,11 +24,11 @@ def test_sine_of_a_picma_stack_held_out():
 
 @pytest.mark.study
 def test_amplitudes_of_a_picma_stack_held_out():
-    found = fits.fit([measured("picma_p885_amplitude_modulated.csv")], holdout=0.3, levels=16)
+    found = fits.fit([fits.read_csv(measured("picma_p885_amplitude_modulated.csv"))], holdout=0.3, levels=16)
     assert found.held_out.e_rms_pct < 1.2
     assert not any("no loop smaller" in remark for remark in found.remarks)
 
 
 def test_a_record_that_never_closes_a_loop_is_refused():
     with pytest.raises(fits.DataError, match="start each run with a full loop"):
-        fits.fit([measured("afm_z_piezo_50um_2rates.csv")], holdout=0.3)
+        fits.fit([fits.read_csv(measured("afm_z_piezo_50um_2rates.csv"))], holdout=0.3)

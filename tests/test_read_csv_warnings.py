@@ -1,14 +1,12 @@
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
+from _measured import measured
 
 from fits.io._errors import DataError
 from fits.io._read_csv import read_csv
 from fits.io._units import parse_columns
-
-DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 def sine(n=400):
@@ -85,9 +83,7 @@ def test_gaps_are_warned_of_but_uneven_sampling_is_not(tmp_path, rng):
     ],
 )
 def test_real_files_are_read_without_warnings(name):
-    path = DATA / f"{name}.csv"
-    if not path.exists():
-        pytest.skip(f"{path} is not here; the measured data are not committed")
+    path = measured(f"{name}.csv")
     expected = np.loadtxt(path, delimiter=",", skiprows=1)
     record = read_csv(path)
     assert record.warnings == ()
@@ -96,15 +92,14 @@ def test_real_files_are_read_without_warnings(name):
 
 @pytest.mark.parametrize("name", ["fsm_cubespec_100mV_train.csv", "fsm_cubespec_300mV_train.csv"])
 def test_real_multi_run_files_are_split_where_the_message_says(tmp_path, name):
-    if not (DATA / name).exists():
-        pytest.skip(f"{DATA / name} is not here; the measured data are not committed")
+    path = measured(name)
     columns = parse_columns("voltage_V=u1_V,displacement_um=y1_um")
     with pytest.raises(DataError) as caught:
-        read_csv(DATA / name, columns)
+        read_csv(path, columns)
     # Two periods of 8192 samples and the header come before the first restart.
     assert ", line 16386, column 'time_s': expected strictly" in str(caught.value)
     assert "found a restart at 0 s" in str(caught.value)
-    lines = (DATA / name).read_text().split("\n")
+    lines = path.read_text().split("\n")
     (tmp_path / "a.csv").write_text("\n".join(lines[:16385]))
     record = read_csv(tmp_path / "a.csv", columns)
     assert (len(record), record.warnings) == (16384, ())
