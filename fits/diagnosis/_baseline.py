@@ -10,7 +10,7 @@ import numpy as np
 
 from fits.io._errors import DataError
 from fits.io._record import Record
-from fits.io.columns.path import PATH
+from fits.io.columns.path import PATH, gone_V
 from fits.loop._choose_grid import choose_grid
 from fits.loop._prior import roughness
 from fits.loop._result import FitError
@@ -132,7 +132,7 @@ def fit_baseline(
     DataError, FitError
         If neither can be fitted.
     """
-    records, aside = _with_paths(records, aside)
+    records, aside = with_paths(records, aside)
     voltages = [record.voltage_V for record in (*records, *aside)]
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     remarks: tuple[str, ...] = ()
@@ -186,13 +186,13 @@ def has_known_loop(records: Sequence[Record], range_V: tuple[float, float], hold
     return min(up_V, down_V) >= (1 - 2 * _NEAR) * (range_V[1] - range_V[0])
 
 
-def _with_paths(records: Sequence[Record], aside: Sequence[Record]) -> tuple[Sequence[Record], Sequence[Record]]:
+def with_paths(records: Sequence[Record], aside: Sequence[Record]) -> tuple[Sequence[Record], Sequence[Record]]:
     """Say of each record how far the command had gone before, if they were taken one after the other."""
-    if len(records) + len(aside) < 2:
+    if len(records) + len(aside) < 2 or all(PATH in record.extra for record in (*records, *aside)):
         return records, aside
     gone, out = 0.0, []
     for record in (*records, *aside):
-        path_V = gone + np.cumsum(np.abs(np.diff(record.voltage_V, prepend=record.voltage_V[0])))
+        path_V = gone + gone_V(record.voltage_V)
         gone = float(path_V[-1])
         out.append(replace(record, extra={**record.extra, PATH: path_V}))
     return out[: len(records)], out[len(records) :]

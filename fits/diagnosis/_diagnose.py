@@ -8,7 +8,9 @@ from types import MappingProxyType
 import jax
 import numpy as np
 
+from fits.diagnosis._baseline import with_paths
 from fits.diagnosis._conclude import conclude
+from fits.diagnosis._excerpts import excerpts
 from fits.diagnosis._experiment import Request
 from fits.diagnosis._prepare import Reading, prepare_diagnosis
 from fits.diagnosis._result import Diagnosis, Step
@@ -98,8 +100,9 @@ def diagnose(
 
     Notes
     -----
-    Of 20,000 samples or more, all that JAX has compiled in this process is freed now and then (`jax.clear_caches`),
-    and compiled again where it is used: with it 30,000 samples take more than 2 GB.
+    Of more than 40,000 samples a part is read, which a remark says: windows spread over each record, and means of
+    neighbours in them where cycles of the command are too long otherwise. Of 20,000 or more, all that JAX has
+    compiled in this process is freed now and then (`jax.clear_caches`), and compiled again where it is used.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
@@ -118,6 +121,7 @@ def diagnose(
     refuse_repeats([*records, *aside])
     if not budget_s > 0:
         raise DataError(f"the budget is {budget_s:g} s: give it a positive time")
+    (records, shortened), (aside, also) = map(excerpts, with_paths(records, aside))
     rng, begin_s = np.random.default_rng(seed), time.monotonic()
     end_s = begin_s + budget_s
 
@@ -126,7 +130,8 @@ def diagnose(
 
     def answer(reading: Reading, *remarks: str) -> Diagnosis:
         ready = prepare_diagnosis(reading, progress)
-        ready = replace(ready, baseline=replace(ready.baseline, remarks=(*ready.baseline.remarks, *remarks)))
+        remarks = (*shortened, *also, *ready.baseline.remarks, *remarks)
+        ready = replace(ready, baseline=replace(ready.baseline, remarks=remarks))
         progress(Step.SELECTION)
         stage = ready.bench, ready.projector, ready.probes
         found = select(*stage, false_alarm, rng, progress, thresholds, has_time)

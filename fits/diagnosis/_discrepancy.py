@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
 
-from fits.diagnosis._projector import Projector, orthonormal
+from fits.diagnosis._projector import Projector, orthonormal, take_off
 from fits.diagnosis._regression import root_of
 from fits.loop._grid import EVIDENCE_LEVELS
 from fits.loop._moments import Moments
@@ -25,11 +25,10 @@ _SEARCH = {"xatol": 0.05, "fatol": 0.05, "maxiter": 120}
 
 def along_all(projector: Projector, candidates: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     """Orthonormal columns, off the tangent, that span what candidates change in each run, shape `(rows, k)`."""
-    joined = np.empty((len(projector.residual), len(candidates)))
+    joined = np.empty((len(projector.residual), len(candidates)), order="F")
     for k, candidate in enumerate(candidates):
         joined[:, k] = projector.join(candidate)
-    # In place: of long records these are hundreds of megabytes.
-    joined -= projector.orthonormal @ (projector.orthonormal.T @ joined)
+    projector.take_off(joined)
     return orthonormal(joined)
 
 
@@ -43,12 +42,15 @@ def learn_roughness(
     taken off before.
     """
     finer = projector.regression.finer
-    joined = [projector.join(kind) for kind in finer]
-    sizes = [kind.shape[1] for kind in joined]
+    sizes = [kind[0].shape[1] for kind in finer]
     residual = projector.residual if change_um is None else projector.residual - projector.join(change_um)
-    off = projector.off(np.concatenate([*joined, residual[:, None]], axis=1))
+    off = np.empty((len(residual), sum(sizes) + 1), order="F")
+    off[:, -1] = residual
+    for kind, stop in zip(finer, np.cumsum(sizes), strict=True):
+        off[:, stop - kind[0].shape[1] : stop] = projector.join(kind)
+    projector.take_off(off)
     fixed = along_all(projector, candidates)
-    off -= fixed @ (fixed.T @ off)
+    take_off(off, fixed)
     columns, left = off[:, :-1], off[:, -1]
     gram, cross, energy = columns.T @ columns, columns.T @ left, float(left @ left)
     count = projector.count - projector.freedom - len(candidates)
@@ -82,7 +84,7 @@ def with_discrepancy(
     fixed = along_all(projector, candidates)
     left = projector.off(residual)
     left -= fixed @ (fixed.T @ left)
-    taken = np.sum(projector.orthonormal**2, axis=1) + np.sum(fixed**2, axis=1)
+    taken = projector.leverage + np.sum(fixed**2, axis=1)
     found = []
     for noise, part, freedom in zip(projector.noise, projector.split(left), projector.split(taken), strict=True):
         more = learn_noise(part, float(np.sum(freedom)))

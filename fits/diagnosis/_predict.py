@@ -123,7 +123,7 @@ class Predictor:
         """Gram matrix of what runs share and of the signals, each run's nuisance parameters eliminated."""
         signals = np.stack([projector.join(column) for column in columns], axis=1)
         root, outside = projector.root, projector.off(signals)
-        stacked = np.concatenate([root, projector.orthonormal.T @ signals], axis=1)
+        stacked = np.concatenate([root, projector.along(signals)], axis=1)
         gram = stacked.T @ stacked
         size = root.shape[1]
         gram[size:, size:] += outside.T @ outside

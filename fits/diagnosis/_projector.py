@@ -23,6 +23,8 @@ _SHOWN = 1e-9
 _PRESSED_Z = 3.0
 # The farthest that a coordinate moves at a time.
 _FARTHEST = 3.0
+# Signals that are projected at once.
+_AT_ONCE = 64
 
 
 class Projector:
@@ -70,17 +72,16 @@ class Projector:
         self._scale = np.where(self._live, size, 1.0)
         matrix /= self._scale
         self._gram = matrix.T @ matrix
-        self._bare = np.r_[0 : regression.size, at : len(size)]
-        self._matrix: np.ndarray | None = matrix
+        self._is_rough = np.isin(np.arange(len(size)), np.arange(regression.size, at))
+        self._matrix = matrix
         self.residual = self.join(regression.residuals)
         self.residual[self.count : self.count + grid] = -root @ regression.baseline.columns_um
-        self._whole: Projector | None = None
         self._factor()
 
     def _factor(self) -> None:
         """Factorise the tangent of what is not held."""
-        self._q: np.ndarray | None = None
-        self._moving = np.flatnonzero(~np.pad(self.held, (0, len(self._scale) - len(self.held))))
+        held = np.pad(self.held, (0, len(self._scale) - len(self.held)))
+        self._moving = np.flatnonzero(~(held if any(self.roughness) else held | self._is_rough))
         # A Cholesky factor, pivoted: columns that the others make up have nothing of their own to be projected on.
         factor, pivots, rank, _ = dpstrf(self._gram[np.ix_(self._moving, self._moving)], tol=_SHOWN, lower=1)
         lower, order = np.tril(factor)[:, :rank], self._moving[pivots - 1]
@@ -92,25 +93,14 @@ class Projector:
     @cached_property
     def bare(self) -> "Projector":
         """The same without roughness of the density beyond its grid."""
-        return self.beside(roughness=()) if any(self.roughness) else self
+        return self._sharing(self.held, ()) if any(self.roughness) else self
 
-    @property
-    def whole(self) -> "Projector":
-        """The same with no column held."""
-        if self._whole is None and self.held.any():
-            self._whole = Projector(self.regression, self.noise, self.roughness)
-        return self._whole or self
-
-    def _holding(self, held: np.ndarray) -> "Projector":
-        """The same with columns held, which shares all but the factors."""
-        if not held.any():
-            return self
-        if self._matrix is None:
-            return Projector(self.regression, self.noise, self.roughness, held)
+    def _sharing(self, held: np.ndarray, roughness: Sequence[float]) -> "Projector":
+        """The same with other columns held, or without roughness, which shares all but the factors."""
         other = copy(self)
         for name in ("bare", "_spread"):
             other.__dict__.pop(name, None)
-        other.held, other._whole = held, self
+        other.held, other.roughness = held, tuple(roughness)
         other._factor()
         return other
 
@@ -125,9 +115,9 @@ class Projector:
         The others are at their best then: without a bound, a few relays that one run does not reach would follow
         whatever differs from run to run.
         """
-        whole, zero = self.whole, self.regression.baseline.columns_um <= 0
-        joined = whole.residual - whole.join(change_um) if len(change_um) else whole.residual
-        cross, gram = whole._cross(joined), whole._gram
+        zero, gram = self.regression.baseline.columns_um <= 0, self._gram
+        joined = self.residual - self.join(change_um) if len(change_um) else self.residual
+        cross = self._matrix.T @ joined
         at, others = np.flatnonzero(zero), np.setdiff1d(np.arange(len(cross)), np.flatnonzero(zero))
         half = _inverse_root(gram[np.ix_(others, others)])
         along = gram[np.ix_(at, others)] @ half
@@ -135,25 +125,27 @@ class Projector:
         best = cross[at] - along @ (half.T @ cross[others])
         held = np.zeros(len(zero), dtype=bool)
         held[at] = best < -_PRESSED_Z * np.sqrt(np.maximum(left, _SHOWN))
-        return self if np.array_equal(held, self.held) else whole._holding(held)
+        return self if np.array_equal(held, self.held) else self._sharing(held, self.roughness)
 
     @property
     def freedom(self) -> float:
         """Samples that are worth one of the unknowns: what is fitted takes so many degrees of freedom off."""
-        return float(np.sum(self.orthonormal[: self.count] ** 2))
+        return float(self._inverse.shape[1] - np.sum((self._matrix[self.count :] @ self._inverse) ** 2))
 
     @property
-    def orthonormal(self) -> np.ndarray:
-        """Columns that span the tangent, whitened and joined, shape `(rows, k)`."""
-        if self._q is None:
-            assert self._matrix is not None
-            self._q, self._matrix = self._matrix @ self._inverse, None
-        return self._q
+    def leverage(self) -> np.ndarray:
+        """Part of an unknown that each joined sample is worth, shape `(rows,)`."""
+        columns = self._matrix @ self._inverse
+        return np.einsum("ij,ij->i", columns, columns)
 
     @property
     def root(self) -> np.ndarray:
-        """The tangent's columns in terms of `orthonormal`, shape `(k, unknowns)`."""
+        """The tangent's columns in terms of orthonormal ones that span it, shape `(k, unknowns)`."""
         return self._root * self._scale
+
+    def along(self, joined: np.ndarray) -> np.ndarray:
+        """Joined signals in terms of these orthonormal columns, shape `(k, ...)`."""
+        return self._inverse.T @ (self._matrix.T @ joined)
 
     @property
     def nuisance_rows(self) -> np.ndarray:
@@ -179,7 +171,12 @@ class Projector:
 
     def off(self, joined: np.ndarray) -> np.ndarray:
         """Project joined signals off the tangent."""
-        return joined - self.orthonormal @ (self.orthonormal.T @ joined)
+        return joined - self._matrix @ (self._inverse @ self.along(joined))
+
+    def take_off(self, joined: np.ndarray) -> None:
+        """Project joined signals off the tangent in place and many at once: of long records they fill the memory."""
+        for at in range(0, joined.shape[1], _AT_ONCE):
+            joined[:, at : at + _AT_ONCE] = self.off(joined[:, at : at + _AT_ONCE])
 
     def split(self, joined: np.ndarray) -> list[np.ndarray]:
         """Cut a joined signal into those of the runs, whitened, at the samples that count."""
@@ -208,15 +205,8 @@ class Projector:
         columns = self.regression.baseline.chain.size
         return answer[columns : self.regression.size], answer[:columns]
 
-    def _cross(self, joined: np.ndarray) -> np.ndarray:
-        """Products of the tangent's columns, scaled, and a joined signal; shape `(unknowns,)`."""
-        if self._matrix is None:
-            return np.asarray(self._root.T @ (self.orthonormal.T @ joined))
-        return np.asarray(self._matrix.T @ joined)
-
     def _answer(self, joined: np.ndarray) -> np.ndarray:
-        along = self.orthonormal.T @ joined if self._matrix is None else self._inverse.T @ (self._matrix.T @ joined)
-        return (self._inverse @ along) / self._scale
+        return (self._inverse @ self.along(joined)) / self._scale
 
     def held_out(self, change_um: Sequence[np.ndarray]) -> np.ndarray:
         """Errors in what is held out of the runs, in noise, one after the other, under effects; shape `(n,)`.
@@ -247,7 +237,7 @@ class Projector:
         """
         baseline, held = self.regression.baseline, 1.0
         while True:
-            dz, columns_um = self.whole._followed(joined, held)
+            dz, columns_um = self._followed(joined, held)
             if np.all(np.abs(dz) < _FARTHEST):
                 return baseline.moved(dz, columns_um - baseline.columns_um)
             # What the runs hardly show at this place says little of places far away.
@@ -257,10 +247,11 @@ class Projector:
         """Steps of coordinates that a precision holds, and non-negative columns, that follow a joined signal."""
         baseline = self.regression.baseline
         columns = baseline.chain.size
-        scale = self._scale[self._bare]
-        gram = self._gram[np.ix_(self._bare, self._bare)] * scale * scale[:, None]
-        cross = self._cross(joined)[self._bare] * scale
-        live = self._live[self._bare][columns:]
+        bare = np.flatnonzero(~self._is_rough)
+        scale = self._scale[bare]
+        gram = self._gram[np.ix_(bare, bare)] * scale * scale[:, None]
+        cross = (self._matrix.T @ joined)[bare] * scale
+        live = self._live[bare][columns:]
         coordinate = np.arange(len(live)) < self.regression.size - columns
         block = gram[columns:, columns:][np.ix_(live, live)]
         block = block + np.diag(1e-12 * np.diagonal(block) + held * coordinate[live])
@@ -289,6 +280,13 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
         scale = 1 / (np.sqrt(np.diagonal(gram)) + 1e-300)
         columns = columns @ (scale[:, None] * _inverse_root(scale[:, None] * gram * scale))
     return columns
+
+
+def take_off(joined: np.ndarray, basis: np.ndarray) -> None:
+    """Project joined signals off orthonormal columns, in place and many at once: of long records they fill memory."""
+    for at in range(0, joined.shape[1], _AT_ONCE):
+        columns = joined[:, at : at + _AT_ONCE]
+        columns -= basis @ (basis.T @ columns)
 
 
 def _inverse_root(gram: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Score tests: how much of what the baseline leaves lies along each effect that it lacks."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,7 @@ from scipy import stats
 
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._effects import Bench, Law, times, without_host
-from fits.diagnosis._projector import Projector
+from fits.diagnosis._projector import Projector, take_off
 from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
 from fits.stats._score_test import best_multiples, evidence, evidence_of, robust_z, squares
@@ -18,8 +18,6 @@ from microid import AbstractEffect, Coordinates, Scales, host
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
-# Signatures that are projected at once.
-_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -107,6 +105,8 @@ def probes_of(
     if projector is not None and groups and hasattr(groups[0][0], "after_s"):
         groups = (*groups, *((effect,) for effect in _from_onsets(bench, projector, groups[0][0])))
     for group in groups:
+        if not all(map(_is_allowed, group)):
+            continue
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
             change = _change(bench, effect)
@@ -117,6 +117,12 @@ def probes_of(
                 columns.append(tuple(change))
         if all(np.all(np.isfinite(c)) for column in columns for c in column):
             yield Probe(tuple(group), tuple(columns), one_sided(form))
+
+
+def _is_allowed(effect: AbstractEffect) -> bool:
+    """Whether all but strengths keep within their bounds: of fast or slow samples not all is asked."""
+    known = [(getattr(effect, field.name), spec_of(field)) for field in fields(effect)]
+    return all(spec is None or np.all((spec.lower <= x) & (x <= spec.upper)) for x, spec in known)
 
 
 def _change(bench: Bench, effect: AbstractEffect) -> list[np.ndarray]:
@@ -199,19 +205,16 @@ def score(
     `residual` and `basis`, shape `(rows, k)`, are joined and off the baseline's tangent.
     """
     signals = [column for probe in probes for column in probe.signatures]
-    # Columns that lie together are projected in place and many at once: of long records they fill the memory.
     joined = np.empty((len(residual), len(signals)), order="F")
     for k, column in enumerate(signals):
         joined[:, k] = projector.join(column)
     raw = squares(joined)
-    for at in range(0, len(signals), _AT_ONCE):
-        columns = joined[:, at : at + _AT_ONCE]
-        columns -= projector.orthonormal @ (projector.orthonormal.T @ columns)
-        # A line that sampling turns into a constant, for example: what is left of it is rounding. Or what has died
-        # away so far that its square is nothing.
-        columns[:, squares(columns) <= _BLIND**2 * raw[at : at + _AT_ONCE]] = 0.0
-        if basis is not None:
-            columns -= basis @ (basis.T @ columns)
+    projector.take_off(joined)
+    # A line that sampling turns into a constant, for example: what is left of it is rounding. Or what has died away
+    # so far that its square is nothing.
+    joined[:, squares(joined) <= _BLIND**2 * raw] = 0.0
+    if basis is not None:
+        take_off(joined, basis)
     found, stop = [], 0
     for probe in probes:
         own = slice(stop, stop := stop + len(probe.signatures))
