@@ -38,6 +38,19 @@ def test_creep_of_moves_before_the_record(rng):
     np.testing.assert_allclose(second - height, whole[cut:] - whole[cut], atol=1e-9)
 
 
+def test_lags_of_readings_that_begin_while_the_stage_moves():
+    """The last part of a longer record of the same motion, in lines between samples."""
+    interval, cut = 1e-3, 300
+    time = interval * np.arange(600)
+    moved = 10 * np.sin(2 * np.pi * 5 * time)
+    whole = through(BY_NAME["sensor_lowpass", ""](0.02), interval, moved)
+    lag = BY_NAME["sensor_lowpass", ""](0.02, whole[cut] - moved[cut])
+    np.testing.assert_allclose(through(lag, interval, moved[cut:]), whole[cut:], atol=1e-9)
+    line = 3.0 * time
+    delay = BY_NAME["transport_delay", ""](0.0137, 3.0)
+    np.testing.assert_allclose(through(delay, interval, line[cut:]), line[cut:] - 3.0 * 0.0137, atol=1e-9)
+
+
 def test_walls_that_take_their_time(rng):
     model = random_model(rng)
     low, high = float(model.density.lower_V), float(model.density.upper_V)

@@ -236,12 +236,16 @@ def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
     baseline = ready.baseline
     said = [warning for record in records for warning in record.warnings]
     said += [*baseline.remarks, *ready.faults.remarks]
-    for run in baseline.runs:
-        if run.has_past and not known_samples(run.record.voltage_V, *baseline.range_V).all():
-            said.append(
-                f"{run.record.source}: what the rig went through before is unknown and estimated beside the rest, so "
-                "that it is not taken for an effect; state it with --initial to have it tested"
-            )
+    pasts = [
+        run.record.source
+        for run in baseline.runs
+        if run.has_past and not known_samples(run.record.voltage_V, *baseline.range_V).all()
+    ]
+    if pasts:
+        said.append(
+            f"{', '.join(pasts)}: what the rig went through before is unknown and estimated beside the rest, so that "
+            "it is not taken for an effect; state it with --initial to have it tested"
+        )
     if ONE_WAY not in said and not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
         said.append("nothing was held out, so the gain is not measured: hold out a part, or a run with --holdout")
     return tuple(dict.fromkeys(said))

@@ -101,13 +101,15 @@ def smoothed(projector: Projector, change_um: Sequence[np.ndarray]) -> Projector
     regression = projector.regression
     baseline, count = regression.baseline, projector.count
     size, stroke_um = len(baseline.columns_um), baseline.stroke_um
-    joined = projector.join(list(regression.rows))[:count]
-    target = (projector.residual - projector.join(change_um))[:count] + joined[:, :size] @ baseline.columns_um
+    joined = projector.join(regression.rows)[:count]
+    columns = joined[:, :size]
+    target = (projector.residual - projector.join(change_um))[:count] + columns @ baseline.columns_um
     others = np.concatenate([joined[:, size:], projector.nuisance_rows[:count]], axis=1)
     scale = np.linalg.norm(others, axis=0)
     basis, _ = qr(others[:, scale > 0] / scale[scale > 0], mode="economic")
-    columns = joined[:, :size] * stroke_um
-    columns, target = (one - basis @ (basis.T @ one) for one in (columns, target))
+    columns *= stroke_um
+    take_off(columns, basis)
+    target -= basis @ (basis.T @ target)
     left = np.asarray(float(count - basis.shape[1]))
     moments = Moments(columns.T @ columns, columns.T @ target, np.asarray(target @ target), left)
     rough, levels = roughness(baseline.chain.levels), baseline.chain.levels

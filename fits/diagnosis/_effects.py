@@ -84,11 +84,16 @@ def drop_programs(records: Sequence[Record]) -> None:
     Programs, and how JAX remembers them, take more memory than records of 30,000 samples do. Of long records all that
     the process has compiled is freed; of short ones only what simulates parts, as the rest serves the next diagnosis.
     """
-    long = sum(len(record) for record in records) >= _LONG
+    long = are_long(records)
     if long or len(get_backend().live_executables()) > _MANY:
         program.cache_clear()
     if long:
         jax.clear_caches()
+
+
+def are_long(records: Sequence[Record]) -> bool:
+    """Whether records have so many samples that memory is short."""
+    return sum(len(record) for record in records) >= _LONG
 
 
 def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float) -> AbstractEffect:

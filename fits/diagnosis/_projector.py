@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
 
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._regression import Regression
+from fits.diagnosis._regression import Regression, regress
 from fits.loop._grid import non_negative
 from fits.loop._prior import Posterior
 from fits.loop._result import FitError, FitStatus
@@ -43,40 +44,65 @@ class Projector:
         roughness: Sequence[float] = (),
         held: np.ndarray | None = None,
     ):
-        self.regression, self.noise, self.roughness = regression, tuple(noise), tuple(roughness)
+        self._regression, self.noise, self.roughness = regression, tuple(noise), tuple(roughness)
         self.held = np.zeros(regression.baseline.chain.size, dtype=bool) if held is None else held
         self.masks = regression.masks
         self.count = sum(int(mask.sum()) for mask in self.masks)
         grid = regression.baseline.chain.size
-        rough = [kind for kind, size in zip(regression.finer, roughness, strict=False) if size > 0]
-        sizes = [size for size in roughness if size > 0]
-        priors = grid + sum(kind[0].shape[1] for kind in rough)
-        self._priors = priors
-        blocks = [regression.rows, *rough]
-        nuisance = self.nuisance_rows
-        stops = np.cumsum([block[0].shape[1] for block in blocks])
-        matrix = np.empty((self.count + priors, stops[-1] + nuisance.shape[1]))
-        for block, stop in zip(blocks, stops, strict=True):
-            matrix[:, stop - block[0].shape[1] : stop] = self.join(block)
-        matrix[:, stops[-1] :] = nuisance
-        root = regression.root
-        matrix[self.count : self.count + grid, :grid] = root
-        at, row = regression.size, self.count + grid
-        for kind, size in zip(rough, sizes, strict=True):
-            k = kind[0].shape[1]
-            matrix[row : row + k, at : at + k] = np.eye(k) / size
-            at, row = at + k, row + k
+        self._rough = [(kind, size) for kind, size in zip(regression.finer, roughness, strict=False) if size > 0]
+        rough = sum(kind[0].shape[1] for kind, _ in self._rough)
+        self._priors = grid + rough
+        matrix = self._joined()
         size = np.sqrt(np.einsum("ij,ij->j", matrix, matrix))
         # What changes nothing in the samples that count, as what has died away before them, stays where it is.
         self._live = size > 0
         self._scale = np.where(self._live, size, 1.0)
         matrix /= self._scale
         self._gram = matrix.T @ matrix
-        self._is_rough = np.isin(np.arange(len(size)), np.arange(regression.size, at))
-        self._matrix = matrix
+        columns = np.arange(len(size))
+        self._is_rough = (columns >= regression.size) & (columns < regression.size + rough)
+        self._kept: np.ndarray | None = matrix
         self.residual = self.join(regression.residuals)
-        self.residual[self.count : self.count + grid] = -root @ regression.baseline.columns_um
+        self.residual[self.count : self.count + grid] = -regression.root @ regression.baseline.columns_um
         self._factor()
+
+    def _joined(self) -> np.ndarray:
+        """Columns of the tangent and below them the roots of their priors, shape `(rows, unknowns)`."""
+        regression = self.regression
+        blocks = [regression.rows, *(kind for kind, _ in self._rough)]
+        nuisance = self.nuisance_rows
+        stops = np.cumsum([block[0].shape[1] for block in blocks])
+        matrix = np.empty((len(nuisance), stops[-1] + nuisance.shape[1]))
+        for block, stop in zip(blocks, stops, strict=True):
+            matrix[:, stop - block[0].shape[1] : stop] = self.join(block)
+        matrix[:, stops[-1] :] = nuisance
+        row = self.count + len(regression.root)
+        matrix[self.count : row, : len(regression.root)] = regression.root
+        for (kind, size), at in zip(self._rough, stops, strict=False):
+            k = kind[0].shape[1]
+            matrix[row : row + k, at : at + k] = np.eye(k) / size
+            row += k
+        return matrix
+
+    @property
+    def regression(self) -> Regression:
+        """All runs as one regression."""
+        if not self._regression.rows:
+            one = self._regression
+            self._regression = regress(one.baseline, one.finer, one.effects)
+        return self._regression
+
+    @property
+    def _matrix(self) -> np.ndarray:
+        """The same in columns of length one."""
+        if self._kept is None:
+            self._kept = self._joined() / self._scale
+        return self._kept
+
+    def release(self) -> None:
+        """Free what takes the memory of a long record, and is computed again where it is needed."""
+        self.__dict__.pop("bare", None)
+        self._kept, self._regression = None, replace(self._regression, rows=())
 
     def _factor(self) -> None:
         """Factorise the tangent of what is not held."""
@@ -89,6 +115,8 @@ class Projector:
         self._inverse[order[:rank]] = solve_triangular(lower[:rank], np.eye(rank), lower=True).T
         self._root = np.zeros((rank, len(self._scale)))
         self._root[:, order] = lower.T
+        # Samples that are worth one of the unknowns: what is fitted takes so many degrees of freedom off.
+        self.freedom = float(rank - np.sum((self._matrix[self.count :] @ self._inverse) ** 2))
 
     @cached_property
     def bare(self) -> "Projector":
@@ -126,11 +154,6 @@ class Projector:
         held = np.zeros(len(zero), dtype=bool)
         held[at] = best < -_PRESSED_Z * np.sqrt(np.maximum(left, _SHOWN))
         return self if np.array_equal(held, self.held) else self._sharing(held, self.roughness)
-
-    @property
-    def freedom(self) -> float:
-        """Samples that are worth one of the unknowns: what is fitted takes so many degrees of freedom off."""
-        return float(self._inverse.shape[1] - np.sum((self._matrix[self.count :] @ self._inverse) ** 2))
 
     @property
     def leverage(self) -> np.ndarray:

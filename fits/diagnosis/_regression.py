@@ -35,7 +35,7 @@ class Regression:
 
     Per run: `masks` of the samples that are fitted, shape `(n,)`; `rows`, derivatives along columns and coordinates,
     shape `(n, D + p)`; `nuisance`, signals of the run's nuisance parameters, shape `(n, k)`; `residuals`, measurement
-    less simulation without effects, in um, shape `(n,)`; `saturating`, the effects that the derivatives go through.
+    less simulation without effects, in um, shape `(n,)`; `effects`, those beside which the baseline moves.
     By kind and run, `finer` is what roughness of the density changes that the grid cannot follow, shape `(n, k)`: of
     loops of one width at all biases, as of plays, at single places, and of what an unknown past left in each run.
     `root` is that of the prior precision of the columns, shape `(D, D)`.
@@ -48,7 +48,12 @@ class Regression:
     finer: Kinds
     residuals: tuple[np.ndarray, ...]
     root: np.ndarray
-    saturating: tuple[tuple[AbstractEffect, ...], ...]
+    effects: tuple[tuple[AbstractEffect, ...], ...]
+
+    @property
+    def saturating(self) -> tuple[tuple[AbstractEffect, ...], ...]:
+        """Effects of each run that derivatives along columns go through."""
+        return tuple(map(saturating, self.effects))
 
     @property
     def size(self) -> int:
@@ -103,7 +108,9 @@ def regress(
             )
     kinds = (*zip(*structure, strict=True), _rough_pasts(baseline)) if finer is None else finer
     data = tuple(rows), tuple(nuisance), kinds, tuple(residuals)
-    return Regression(baseline, tuple(run.fitted for run in runs), *data, root_of(baseline.prior), levelling)
+    return Regression(
+        baseline, tuple(run.fitted for run in runs), *data, root_of(baseline.prior), tuple(map(tuple, effects))
+    )
 
 
 def root_of(prior: np.ndarray) -> np.ndarray:

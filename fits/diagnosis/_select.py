@@ -17,7 +17,7 @@ from fits.diagnosis._comparison import (
     model_error,
 )
 from fits.diagnosis._effects import Bench
-from fits.diagnosis._joint_fit import State, is_smoothness_confirmed, refine, relearn_noise
+from fits.diagnosis._joint_fit import State, is_smoothness_confirmed, make_room, refine, relearn_noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._score import Family, Probe, Scored, score
@@ -117,6 +117,8 @@ class Explanation:
         names, explained = {cause.name for cause in causes}, search.plain.cost - model.cost
         ahead = gain_ahead(scores.each, names, explained, search.thresholds)
         family, left = Family(scores, search.rng), criterion(projector, model)
+        if causes:
+            make_room(state)
         return cls(tuple(causes), bench, projector, model, scores.each, family, left, left - ahead)
 
     @property
@@ -158,6 +160,8 @@ def select(
         grown: dict[frozenset[str], tuple[int, Explanation]] = {}
         for one in beam:
             more = sorted(_grown(one, search), key=lambda one: one.criterion)
+            if one.causes:
+                make_room((one.bench, one.projector, one.model))
             if not more:
                 ends.append(one)
             for place, other in enumerate(more):
@@ -235,7 +239,8 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
                 continue
             if one.family.p(z / sigma) >= false_alarm or rival.criterion > one.criterion:
                 continue
-            rivals = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
+            alike = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
+            rivals = tuple(replace(other, end=None) for other in alike)
             causes = [Cause(rival.name, z, one.family.p(z), rivals, drop / len(new))] * len(new)
             found.append(Explanation.of((*one.causes, *causes), end, search))
         if found:

@@ -118,4 +118,5 @@ def _stage(records: Sequence[Record], lag: bool, relaxations: int) -> Stage:
     held = [f"{name}.{field}" for name in [*parts][1:] for field in (relaxing.relaxation, *relaxing.history)]
     if lag:
         parts["lag"] = lagging(**{lagging.lag: jnp.asarray(_LAG * interval)})
+        held += [f"lag.{field}" for field in lagging.history]
     return Stage(tuple(parts.values()), tuple(parts), frozen=tuple(held))

@@ -27,6 +27,8 @@ class SensorLowpass(AbstractEffect):
     ----------
     time_constant_s
         `tau`.
+    before_um
+        By how much the reading is ahead of the displacement at the first sample, since it moved before.
     """
 
     name: ClassVar[str] = "sensor_lowpass"
@@ -34,6 +36,7 @@ class SensorLowpass(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "sensor"
     strength: ClassVar[tuple[str, ...]] = ("time_constant_s",)
+    history: ClassVar[tuple[str, ...]] = ("before_um",)
     fingerprint: ClassVar[str] = (
         "The residual is minus the velocity times a constant, and the magnitude rolls off; so does the noise, at the "
         "same corner."
@@ -45,6 +48,7 @@ class SensorLowpass(AbstractEffect):
     column: ClassVar[str] = "drive_monitor_V"
     lag: ClassVar[str] = "time_constant_s"
     time_constant_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
+    before_um: Float[Array, ""] = param(default=0.0, unit="um")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -67,7 +71,8 @@ class SensorLowpass(AbstractEffect):
         first = (signal.before - signal.values[0]) * left[0]
         push = jnp.concatenate([first[None], push])
         behind = recur(jnp.concatenate([left[:1], left])[:, None, None], push[:, None])[:, 0]
+        begun = self.before_um * jnp.cumprod(jnp.concatenate([jnp.ones_like(left[:1]), left]))
         passed = 6 * lag / jnp.tanh(0.5 / slow) - 12 * lag**2
         bent = bend * jnp.concatenate([passed[:1], passed])
         after = "first" if signal.hold == "zero" else signal.hold
-        return Signal(signal.values + behind - bent, signal.before, after)
+        return Signal(signal.values + behind + begun - bent, signal.before, after)

@@ -20,6 +20,8 @@ class TransportDelay(AbstractEffect):
     ----------
     delay_s
         `d`.
+    before_um_per_s
+        Velocity before the first sample.
     """
 
     name: ClassVar[str] = "transport_delay"
@@ -27,6 +29,7 @@ class TransportDelay(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "time"
     strength: ClassVar[tuple[str, ...]] = ("delay_s",)
+    history: ClassVar[tuple[str, ...]] = ("before_um_per_s",)
     fingerprint: ClassVar[str] = (
         "The residual is minus the velocity times a constant at all amplitudes: the phase falls in a line with the "
         "frequency, and the magnitude stays."
@@ -38,6 +41,7 @@ class TransportDelay(AbstractEffect):
     column: ClassVar[str] = "drive_monitor_V"
     delay: ClassVar[str] = "delay_s"
     delay_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=0.0)
+    before_um_per_s: Float[Array, ""] = param(default=0.0, unit="um/s")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -46,5 +50,9 @@ class TransportDelay(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Read the signal as it was before."""
-        when = _times_of(time_s, signal.values.shape[0]) - self.delay_s
-        return Signal(_read_at(time_s, signal, when), signal.before, signal.hold)
+        time = _times_of(time_s, signal.values.shape[0])
+        when = time - self.delay_s
+        # Beside what was there before, the signal starts from rest.
+        rest = signal.values - self.before_um_per_s * time
+        read = _read_at(time_s, Signal(rest, signal.before, signal.hold), when)
+        return Signal(read + self.before_um_per_s * when, signal.before, signal.hold)
