@@ -10,9 +10,9 @@ import numpy as np
 
 from fits.diagnosis._baseline import with_paths
 from fits.diagnosis._conclude import conclude
-from fits.diagnosis._excerpts import excerpts
 from fits.diagnosis._experiment import Request
 from fits.diagnosis._prepare import Reading, prepare_diagnosis
+from fits.diagnosis._records import excerpts, joined
 from fits.diagnosis._result import Diagnosis, Step
 from fits.diagnosis._select import select
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
@@ -60,7 +60,8 @@ def diagnose(
     Parameters
     ----------
     records
-        Runs of one rig, slow and fast ones together, as for `fit`.
+        Runs of one rig, slow and fast ones together, as for `fit`. Those whose time goes on from the one before,
+        without a gap, are one run.
     holdout
         Fraction at the end of every run that is only predicted, or records that are.
     false_alarm
@@ -121,7 +122,7 @@ def diagnose(
     refuse_repeats([*records, *aside])
     if not budget_s > 0:
         raise DataError(f"the budget is {budget_s:g} s: give it a positive time")
-    (records, shortened), (aside, also) = map(excerpts, with_paths(records, aside))
+    (records, shortened), (aside, also) = map(excerpts, with_paths(joined(records), aside))
     rng, begin_s = np.random.default_rng(seed), time.monotonic()
     end_s = begin_s + budget_s
 

@@ -8,7 +8,7 @@ from _models import random_model
 
 from fits import Record, diagnose
 from fits.diagnosis._effects import Law
-from fits.diagnosis._excerpts import excerpts
+from fits.diagnosis._records import excerpts, joined
 from fits.diagnosis._score import _is_allowed
 from microid import EFFECTS, Scales
 
@@ -17,6 +17,22 @@ def record(count, cycle, source="long.csv"):
     time_s = 0.01 * np.arange(count)
     voltage_V = 50 + 40 * np.sin(2 * np.pi * np.arange(count) / cycle)
     return Record(time_s, voltage_V, 0.2 * voltage_V + 1e-3 * time_s, {"temperature_degC": time_s}, source)
+
+
+def test_files_whose_time_goes_on_are_one_record_and_others_are_not():
+    whole = record(900, 100)
+    parts = [whole[:300], whole[300:650], whole[650:]]
+    (found,) = joined(parts)
+    for name in ("time_s", "voltage_V", "displacement_um"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+    np.testing.assert_array_equal(found.extra["temperature_degC"], whole.extra["temperature_degC"])
+    assert found.source == whole.source
+    gap = [whole[:300], whole[310:]]
+    assert joined(gap) == tuple(gap)
+    again = [whole[:300], whole[:300]]
+    assert joined(again) == tuple(again)
+    slower = [whole[:300], Record(whole.time_s[300:] * 2 - 3.0, *[whole.voltage_V[300:]] * 2, source="b")]
+    assert joined(slower) == tuple(slower)
 
 
 def test_short_records_stay_as_they_are():

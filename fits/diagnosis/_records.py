@@ -1,4 +1,4 @@
-"""Excerpts of long records, so that a diagnosis stays in bounded memory and time."""
+"""Records as a diagnosis reads them: those that go on are one, and long ones are read in part, to bound memory."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -12,8 +12,44 @@ from fits.io.columns.path import PATH, gone_V
 MOST = 40_000
 # Windows of a long record, at most, and cycles of the command that each of them has, at least.
 _WINDOWS, _CYCLES = 4, 3.0
+# Intervals are the same up to this part, and what goes on comes one of them after the last sample, up to that part.
+_SAME, _NEXT = 0.01, 0.5
 # Ends of the range that the command goes between in a cycle, as a part of it.
 _END = 0.25
+
+
+def joined(records: Sequence[Record]) -> tuple[Record, ...]:
+    """Join each record to the one before where its time goes on from there: the stage knows no files."""
+    found: list[Record] = []
+    for record in records:
+        if found and _goes_on(found[-1], record):
+            found[-1] = _together(found[-1], record)
+        else:
+            found.append(record)
+    return tuple(found)
+
+
+def _goes_on(before: Record, record: Record) -> bool:
+    """Whether a record begins one sampling interval after another ends, with the same columns."""
+    if before.extra.keys() != record.extra.keys() or min(len(before), len(record)) < 2:
+        return False
+    interval_s, after_s = (float(np.median(np.diff(one.time_s))) for one in (before, record))
+    gap_s = float(record.time_s[0] - before.time_s[-1])
+    return abs(after_s / interval_s - 1) < _SAME and abs(gap_s / interval_s - 1) < _NEXT
+
+
+def _together(before: Record, record: Record) -> Record:
+    assert before.displacement_um is not None
+    assert record.displacement_um is not None
+    extra = {name: np.concatenate([values, record.extra[name]]) for name, values in before.extra.items()}
+    return Record(
+        np.concatenate([before.time_s, record.time_s]),
+        np.concatenate([before.voltage_V, record.voltage_V]),
+        np.concatenate([before.displacement_um, record.displacement_um]),
+        extra,
+        ", ".join(dict.fromkeys(one.source for one in (before, record) if one.source)),
+        (*before.warnings, *record.warnings),
+    )
 
 
 def excerpts(records: Sequence[Record], most: int = MOST) -> tuple[tuple[Record, ...], tuple[str, ...]]:
