@@ -228,7 +228,7 @@ def test_a_rotation_needs_an_arm_for_its_sensor(folder):
         (["paper", "model.json", "idle.csv", "--arm", "1e999mm"], ["--arm"]),
         (["paper", "model.json", "idle.csv", "--model-measures", "beta"], ["--model-measures beta", "--arm"]),
         (["paper", "model.json", "idle.csv", "--columns", "speed=a"], ["--columns", "speed"]),
-        (["paper", "model.json", "idle.csv", "--plots", "idle.csv"], ["idle.csv", "--plots"]),
+        (["paper", "model.json", "idle.csv", "--plots", "idle.csv"], ["idle.csv: expected a folder"]),
     ],
 )
 def test_bad_input_ends_in_one_sentence(folder, monkeypatch, arguments, words):

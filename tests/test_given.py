@@ -141,6 +141,25 @@ def test_programs_and_references_are_given_as_runs_are(tmp_path):
     np.testing.assert_allclose(found.displacement_um, played, atol=1e-6)
 
 
+def test_a_model_is_given_as_itself_as_a_fit_or_by_the_name_of_its_file(tmp_path):
+    found = fits.fit(FRAME, levels=8)
+    fits.save_model(tmp_path / "m.json", found.model, found.uncertainty, fits.fit_report(found))
+    wanted = {"time_s": TIME_s, "displacement_um": found.runs[0].offset_um + 5 + 3 * np.sin(TIME_s)}
+    voltage_V = fits.compensate(found.model, wanted, clip=True).voltage_V
+    alone = fits.predict(found.model, found.uncertainty, FRAME)
+    for model in (found.model, found, fits.load_model(tmp_path / "m.json"), tmp_path / "m.json"):
+        np.testing.assert_array_equal(fits.compensate(model, wanted, clip=True).voltage_V, voltage_V)
+        assert fits.export_c(model, tmp_path / "c")[0].exists()
+        if model is not found.model:
+            np.testing.assert_array_equal(
+                fits.predict(model, None, FRAME).displacement_sd_um, alone.displacement_sd_um
+            )
+    for model, words in ((tmp_path / "none.json", "none.json: no such file"), (3, "found a int")):
+        for use in (lambda one: fits.compensate(one, wanted), lambda one: fits.predict(one, None, FRAME)):
+            with pytest.raises(fits.DataError, match=words):
+                use(model)
+
+
 def test_a_record_says_what_it_holds_and_is_drawn():
     warned = fits.Record(TIME_s, VOLTAGE_V, None, {"temperature_degC": TIME_s}, "run.csv", ("a gap.",))
     lines = repr(warned).splitlines()

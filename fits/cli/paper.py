@@ -26,6 +26,6 @@ def paper(given: common.Given) -> None:
     late.start_jax()
     progress = common.progress_to_stderr(given.quiet)
     with file_set() as files:
-        result = late.paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), progress, given.form)
+        result = late.paper_result(given.seeds, given.seed, files.folder(given.out), progress, given.form)
     page, figures = common.paths_in(given.out, ("paper.md", "paper.json"))
     click.echo(f"page   {page}\njson   {figures}\nworse than the paper: {'; '.join(result.worse()) or 'no row'}")
