@@ -14,6 +14,7 @@ from scipy.io import loadmat, savemat
 from test_foreign_files import LVM, RATE_Hz, assert_same, clock, rows, signals
 
 import fits
+from fits.io._inspect import inspect_table
 from fits.io._units import parse_columns
 
 T, V, Y = signals()
@@ -253,3 +254,20 @@ def test_the_interval_of_a_tdms_file_is_that_of_the_channels_that_are_read(tmp_p
             channels.append(ChannelObject("fast", name, values, fast | {"unit_string": unit}))
         writer.write_segment(channels)
     assert_same(pasted(path, monkeypatch))
+
+
+def test_a_file_and_columns_that_begin_with_a_minus_are_read_by_the_command_that_is_shown(tmp_path, monkeypatch):
+    """A minus before a column turns its sign, unless it belongs to the name."""
+    monkeypatch.chdir(tmp_path)
+    time_s = np.arange(300) / 100
+    voltage_V = 50 - 50 * np.cos(3 * time_s)
+    table = np.c_[time_s, voltage_V, 0.3 * voltage_V + 0.01 * np.sin(40 * time_s)]
+    np.savetxt("-run.csv", table, delimiter=",", header="t,-U,-x", comments="")
+    told = json.loads(run("inspect", "./-run.csv", "--json").stdout)
+    assert told["remarks"] == []
+    words = shlex.split(inspect_table("-run.csv").command)
+    assert words[2] == "./-run.csv"
+    found = fits.read_table(words[2], words[words.index("--columns") + 1])
+    np.testing.assert_allclose(found.voltage_V, voltage_V)
+    turned = fits.read_table(words[2], {"time_s": "t[s]", "voltage_V": "--U[V]", "displacement_um": "-x[um]"})
+    np.testing.assert_allclose(turned.voltage_V, -voltage_V)
