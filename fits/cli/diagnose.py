@@ -39,7 +39,6 @@ _LONGEST_s = 1e5
 @options.margin
 @options.columns
 @options.json_output
-@options.quiet
 @common.in_sentences
 def diagnose(given: common.Given) -> None:
     """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.

@@ -15,7 +15,6 @@ from fits.io._file_set import file_set
 )
 @click.option("--seed", type=options.SEEDS, default=0, show_default=True, help="Where all randomness starts.")
 @options.picture_format("the pictures")
-@options.quiet
 @common.in_sentences
 def paper(given: common.Given) -> None:
     """Repeat the paper's compensation on a virtual stage: its tables and figures beside ours.

@@ -16,7 +16,6 @@ from fits.io._length import length
 @options.initial("the program")
 @options.columns
 @options.json_output
-@options.quiet
 @common.in_sentences
 def simulate(given: common.Given) -> None:
     """Predict the displacement of a voltage program, with its standard deviation.

@@ -1,6 +1,7 @@
 """Files that appear together, or not at all: all are written under temporary names, then all are renamed."""
 
 import errno
+import logging
 import os
 import shutil
 import stat
@@ -13,6 +14,7 @@ from typing import overload
 from fits.io._errors import AnyPath, DataError, reason_of
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
+_LOG = logging.getLogger(__name__)
 DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 
 
@@ -181,6 +183,8 @@ class FileSet:
                     else:
                         os.replace(move.staged, move.target)
             undo.pop_all()
+        for move in moves:
+            _LOG.debug("%s %s", "removed" if move.staged is None else "wrote", move.shown)
         for path in {move.target.parent for move in moves}:
             # Not all systems can; and what is renamed stays renamed.
             with suppress(OSError):
