@@ -160,6 +160,20 @@ def test_a_model_is_given_as_itself_as_a_fit_or_by_the_name_of_its_file(tmp_path
                 use(model)
 
 
+def test_a_fraction_may_be_of_any_type_and_runs_without_a_name_get_one():
+    plain = fits.fit(FRAME, levels=8, holdout=0.5).runs[0]
+    for half in (np.float32(0.5), np.array(0.5)):
+        assert fits.fit(FRAME, levels=8, holdout=half).runs[0] == plain
+    for several in (np.array([0.2, 0.3]), [0.2, 0.3]):
+        with pytest.raises(fits.DataError, match="holdout: expected one fraction, or runs, found a list of numbers"):
+            fits.fit(FRAME, holdout=several)
+    still = fits.Record(TIME_s, VOLTAGE_V, np.zeros(300))
+    with pytest.raises(fits.DataError, match=r"^run 1: nothing moves"):
+        fits.fit(still)
+    with pytest.raises(fits.DataError, match=r"^run 1 and run 2 hold the same samples"):
+        fits.fit([fits.Record(**COLUMNS), fits.Record(**COLUMNS)])
+
+
 def test_a_record_says_what_it_holds_and_is_drawn():
     warned = fits.Record(TIME_s, VOLTAGE_V, None, {"temperature_degC": TIME_s}, "run.csv", ("a gap.",))
     lines = repr(warned).splitlines()
