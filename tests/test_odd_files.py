@@ -271,3 +271,22 @@ def test_a_file_and_columns_that_begin_with_a_minus_are_read_by_the_command_that
     np.testing.assert_allclose(found.voltage_V, voltage_V)
     turned = fits.read_table(words[2], {"time_s": "t[s]", "voltage_V": "--U[V]", "displacement_um": "-x[um]"})
     np.testing.assert_allclose(turned.voltage_V, -voltage_V)
+
+
+@pytest.mark.parametrize("ending", [".h5", ".tdms", ".npy", ".npz"])
+def test_a_file_that_is_cut_off_is_told_of_in_our_own_words(tmp_path, ending):
+    whole = tmp_path / f"whole{ending}"
+    if ending == ".h5":
+        with h5py.File(whole, "w") as file:
+            file["time_s"] = T
+    elif ending == ".tdms":
+        with TdmsWriter(whole) as writer:
+            writer.write_segment([ChannelObject("fast", "time_s", T)])
+    else:
+        (np.save if ending == ".npy" else np.savez)(whole, T)
+    (tmp_path / f"cut{ending}").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    with pytest.raises(fits.DataError) as caught:
+        fits.read_table(tmp_path / f"cut{ending}")
+    words = str(caught.value)
+    assert words.endswith("export it again, or as CSV.") or ending == ".tdms"
+    assert "(" not in words.replace(str(tmp_path), "")
