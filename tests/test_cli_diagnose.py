@@ -100,7 +100,7 @@ def test_what_is_held_out_and_what_the_rig_stands_are_passed_on(bench):
         (["--holdout", "1.5"], ["--holdout"]),
         (["--holdout", "none.csv"], ["none.csv"]),
         (["--columns", "voltage_V=u_V"], ["u_V"]),
-        (["--out", "run.csv"], ["run.csv", "--out"]),
+        (["--out", "run.csv"], ["run.csv: expected a folder"]),
         (["--out", "run.csv/d"], ["--out"]),
     ],
 )
