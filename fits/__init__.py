@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from fits.diagnosis._result import Bound, Diagnosis, Experiment, FoundCause, Gain
     from fits.diagnosis._thresholds import Thresholds
     from fits.io._errors import DataError
-    from fits.io._read_csv import read_csv, read_reference, read_runs, read_table
+    from fits.io._in_python import read_csv, read_reference, read_runs, read_table
     from fits.io._record import Record, Reference
     from fits.loop._fit import fit
     from fits.loop._prediction import Prediction

@@ -116,7 +116,14 @@ def test_warnings_of_a_frame_say_what_to_write_in_python(tmp_path):
     assert "fits.read_table(data, {'displacement_um': '-displacement_um'})" in warning
     turned(FRAME).to_csv(tmp_path / "run.csv", index=False)
     (warning,) = fits.read_table(tmp_path / "run.csv").warnings
-    assert "--columns displacement_um=-displacement_um" in warning
+    call = f"fits.read_table({str(tmp_path / 'run.csv')!r}, {{'displacement_um': '-displacement_um'}})"
+    assert call in warning
+    (again,) = fits.read_runs([tmp_path / "run.csv"])
+    assert again.warnings[0] == warning.replace(call, "fits.read_runs(data, {'displacement_um': '-displacement_um'})")
+    FRAME.rename(columns={"voltage_V": "drive"}).to_csv(tmp_path / "other.csv", index=False)
+    for entry in (fits.read_table, fits.fit):
+        with pytest.raises(fits.DataError, match=r"other\.csv', {'voltage_V': 'drive\[V\]'}\)"):
+            entry(tmp_path / "other.csv")
 
 
 def test_columns_are_named_as_for_the_option_or_by_numbers(tmp_path):

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from fits.io._errors import DataError
-from fits.io._read_csv import read_reference, read_table
+from fits.io._in_python import read_reference, read_table
 from fits.io._record import Record, Reference
 
 # One run or an iterable of several: records, names of files, or what else `read_table` takes, such as a DataFrame.
