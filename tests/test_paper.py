@@ -326,7 +326,10 @@ def test_pictures_are_in_the_format_that_is_asked_for(tmp_path, monkeypatch, for
         return PaperResult(seed, seeds)
 
     monkeypatch.setattr(paper, "paper_result", draw)
-    result = run("paper", "--out", tmp_path / "out", "--format", form, "--quiet")
+    result = run("paper", "--out", tmp_path / "out", "--format", form, "--quiet", "--json")
     assert result.exit_code == 0, result.stderr
+    out = str(tmp_path / "out")
+    told = {"out": out, "files": [f"{out}/paper.md", f"{out}/paper.json"], "worse_than_paper": []}
+    assert json.loads(result.stdout) == told
     assert files(tmp_path / "out") == [f"fig10.{form}"]
     assert (tmp_path / "out" / f"fig10.{form}").read_bytes().startswith(begins)
