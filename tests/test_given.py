@@ -161,6 +161,11 @@ def test_a_model_is_given_as_itself_as_a_fit_or_by_the_name_of_its_file(tmp_path
             np.testing.assert_array_equal(
                 fits.predict(model, None, FRAME).displacement_sd_um, alone.displacement_sd_um
             )
+    first, *others = fits.draw_plants(found, None, 3)
+    assert len(others) == 2
+    assert fits.relay_start(tmp_path / "m.json", 1e-3) == fits.relay_start([first], 1e-3)
+    with pytest.raises(fits.DataError, match="expected a Preisach model or a stage"):
+        fits.relay_start([first, 3], 1e-3)
     for model, words in ((tmp_path / "none.json", "none.json: no such file"), (3, "found a int")):
         for use in (lambda one: fits.compensate(one, wanted), lambda one: fits.predict(one, None, FRAME)):
             with pytest.raises(fits.DataError, match=words):

@@ -196,17 +196,20 @@ def predict(
 
 
 def draw_plants(
-    model: Preisach | Stage, uncertainty: Uncertainty | StageUncertainty | None, count: int, *, seed: int = 0
+    model: Any, uncertainty: Uncertainty | StageUncertainty | None, count: int, *, seed: int = 0
 ) -> tuple[Stage, ...]:
     """Draw stages from the covariance of a fit.
 
-    Model and uncertainty are from a fit or a model file. Of `count` stages, 1 or more, the first is the fitted one.
+    Model and uncertainty are as for `predict`. Of `count` stages, 1 or more, the first is the fitted one.
     All are of one structure; a hysteresis alone becomes a stage of one part. Weights and slopes that a draw would
     make negative are zero. The model's own error (`discrepancy_um`) is not in them. A `DataError` says that there is
     no uncertainty to draw from, or that it is not that of the model.
     """
     if count < 1:
         raise ValueError(f"count must be 1 or more, got {count}")
+    from fits.stage._model_file import model_given  # which knows of the uncertainties here
+
+    model, uncertainty = model_given(model, uncertainty)
     stage = as_stage(model)
     if count == 1:
         return (stage,)
