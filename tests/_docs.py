@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "docs" / "reference.md"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 # Options that mean the same in all commands that have them.
-SHARED = ("columns", "sample_rate", "missing", "limit", "limits", "margin", "as_json", "quiet")
+SHARED = ("columns", "sample_rate", "missing", "limit", "limits", "margin", "as_json", "quiet", "verbose")
 HEAD = """# Reference: commands and options
 
 `microid COMMAND --help` says the same; `-h` is `--help`, and `microid --version` prints the version. Results go to

@@ -1,3 +1,4 @@
+import errno
 import gzip
 import os
 import pickle
@@ -9,6 +10,7 @@ import pytest
 
 from fits.io._atomic import atomic_path, atomic_write_text, write_csv
 from fits.io._errors import DataError
+from fits.io._file_set import check_file, usable_folder
 from fits.io._record import Record
 
 
@@ -82,9 +84,24 @@ def test_write_protection_is_respected(tmp_path, monkeypatch, protected):
     (tmp_path / "a.txt").write_text("old")
     locked = tmp_path if protected == "folder" else tmp_path / "a.txt"
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != locked)
+
+    def mkdir(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    if protected == "folder":
+        monkeypatch.setattr(Path, "mkdir", mkdir)
     with pytest.raises(DataError, match="cannot be written to" if protected == "folder" else "write-protected"):
         atomic_write_text(tmp_path / "a.txt", "new")
     assert (tmp_path / "a.txt").read_text() == "old"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="there is no such folder here")
+def test_a_place_that_takes_no_files_is_refused_before_the_work():
+    """Also where rights would allow it, as for the superuser."""
+    with pytest.raises(DataError, match=r"^/proc/a: the folder /proc cannot be written to \(.+\); choose another"):
+        check_file("/proc/a")
+    with pytest.raises(DataError, match=r"^/proc/a: expected a folder that can be written to"):
+        usable_folder("/proc/a")
 
 
 def test_a_full_disk_is_one_sentence_and_other_errors_pass(tmp_path):

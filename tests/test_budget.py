@@ -18,6 +18,7 @@ import fits
 import microid as m
 from fits.cli._main import cli
 from fits.loop._design import Grid
+from fits.report._machining import budget_json
 
 NAMES = {
     "x": ["l1", "t1", "la1", "alpha1", "l2", "t2", "l3"],
@@ -181,7 +182,7 @@ def command(folder, *options, stage="paper"):
 
 def test_the_command_writes_what_the_library_finds(folder, model):
     noise = fits.idle_noise(fits.read_idle(folder / "idle.csv"))
-    wanted = fits.budget_json(fits.budget(fits.paper_design(), model, noise, ("x",), zeroed=False))
+    wanted = budget_json(fits.budget(fits.paper_design(), model, noise, ("x",), zeroed=False))
     options = ("--axis", "x", "--not-zeroed")
     result = command(folder, *options, "--plots", folder / "p", stage=folder / "stage.toml")
     assert result.exit_code == 0, result.stderr
@@ -228,7 +229,7 @@ def test_a_rotation_needs_an_arm_for_its_sensor(folder):
         (["paper", "model.json", "idle.csv", "--arm", "1e999mm"], ["--arm"]),
         (["paper", "model.json", "idle.csv", "--model-measures", "beta"], ["--model-measures beta", "--arm"]),
         (["paper", "model.json", "idle.csv", "--columns", "speed=a"], ["--columns", "speed"]),
-        (["paper", "model.json", "idle.csv", "--plots", "idle.csv"], ["idle.csv", "--plots"]),
+        (["paper", "model.json", "idle.csv", "--plots", "idle.csv"], ["idle.csv: expected a folder"]),
     ],
 )
 def test_bad_input_ends_in_one_sentence(folder, monkeypatch, arguments, words):

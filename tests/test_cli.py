@@ -194,8 +194,8 @@ def test_exchanged_columns_are_noticed(bench, tmp_path):
     path = tmp_path / "exchanged.csv"
     other = header.replace("voltage_V,displacement_um", "displacement_um,voltage_V")
     path.write_text("\n".join([other, *rows]) + "\n")
-    refused(run("fit", path, "--out", tmp_path / "model.json"), "exchanged.csv", "--columns")
-    refused(run("diagnose", path, "--out", tmp_path / "report"), "exchanged.csv", "--columns")
+    refused(run("fit", path, "--out", tmp_path / "model.json"), "exchanged.csv", "the other way round")
+    refused(run("diagnose", path, "--out", tmp_path / "report"), "exchanged.csv", "the other way round")
     assert set(files(tmp_path)) <= {"exchanged.csv", "report"}
 
 

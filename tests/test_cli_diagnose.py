@@ -100,8 +100,8 @@ def test_what_is_held_out_and_what_the_rig_stands_are_passed_on(bench):
         (["--holdout", "1.5"], ["--holdout"]),
         (["--holdout", "none.csv"], ["none.csv"]),
         (["--columns", "voltage_V=u_V"], ["u_V"]),
-        (["--out", "run.csv"], ["run.csv", "--out"]),
-        (["--out", "run.csv/d"], ["--out"]),
+        (["--out", "run.csv"], ["run.csv: expected a folder"]),
+        (["--out", "run.csv/d"], ["run.csv/d: expected a folder"]),
     ],
 )
 def test_bad_options_end_in_one_sentence(bench, options, words):

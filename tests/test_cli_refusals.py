@@ -3,6 +3,7 @@ import shlex
 import numpy as np
 import pytest
 from _command import files, refused, run, without_jax
+from _docs import commands, options_of
 from test_foreign_files import rows, signals
 
 from fits import FitError, FitStatus, read_table
@@ -130,3 +131,17 @@ def test_the_option_that_a_refusal_suggests_can_be_pasted(tmp_path):
     found = read_table(path, columns=parse_columns(columns))
     assert option == "--columns"
     np.testing.assert_allclose(found.displacement_um, signals()[2] / 1000)
+
+
+def test_every_command_can_be_quiet_and_tell_more(good_csv):
+    for name, command in commands():
+        known = {spelt for option in options_of(command) for spelt in option.opts}
+        assert name == "sweep" or {"-q", "--quiet", "-v", "--verbose"} <= known, name
+    plain, told = run("inspect", good_csv), run("inspect", good_csv, "-v", "-q")
+    assert plain.stderr == ""
+    assert told.stdout == plain.stdout
+    assert f"read {good_csv}, {good_csv.stat().st_size} bytes" in told.stderr
+    assert run("inspect", good_csv).stderr == ""
+    lines = run("info", "none.json", "--verbose").stderr.splitlines()
+    assert "Traceback (most recent call last):" in lines
+    assert lines[-1] == "none.json: no such file; check the name and the folder."

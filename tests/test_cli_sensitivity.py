@@ -10,6 +10,7 @@ from _command import files, refused, run
 import fits
 import microid as m
 from fits.cli._main import cli
+from fits.report._machining import sensitivity_json
 
 
 def told(*options):
@@ -41,7 +42,7 @@ def test_the_papers_stage_is_ranked_and_compared_with_the_papers_words(tmp_path)
     ):
         assert words in result.stdout
     assert "fixed voltage" not in result.stdout
-    assert told() == fits.sensitivity_json(fits.sensitivities(fits.paper_design()))
+    assert told() == sensitivity_json(fits.sensitivities(fits.paper_design()))
 
 
 def test_one_axis_and_a_fixed_voltage():
@@ -139,7 +140,7 @@ def test_an_interruption_leaves_nothing(stage, tmp_path, drawing):
         (["--write-stage", "no/such/s.toml"], ["no/such"]),
         (["--write-stage", "."], ["folder"]),
         (["stage.toml", "--write-stage", "./stage.toml"], ["--write-stage", "STAGE.toml", "overwrite"]),
-        (["--plots", "stage.toml"], ["stage.toml", "--plots"]),
+        (["--plots", "stage.toml"], ["stage.toml: expected a folder"]),
     ],
 )
 def test_bad_input_ends_in_one_sentence(stage, monkeypatch, options, words):

@@ -7,7 +7,8 @@ import pytest
 from _command import columns_of, files, refused, run, whole_picture
 from test_cli_refusals import bad_csv, write_csv
 
-from fits import FitError, FitStatus, StageUncertainty, describe, load_model
+from fits import FitError, FitStatus, StageUncertainty, load_model
+from fits.loop._report_words import describe
 from microid import Stage
 
 SCENARIO = """

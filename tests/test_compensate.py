@@ -70,7 +70,7 @@ def test_refusals_name_sample_range_cause_and_remedy(rng):
     wanted_um[[70, 90]] = highest_um + 0.5, lowest_um - 0.5
     with pytest.raises(DataError) as refusal:
         compensate(model, reference(wanted_um))
-    for words in ("wanted.csv", "sample 71", "0.7 s", f"{lowest_um:.6g} to {highest_um:.6g} um", "fitted", "--clip"):
+    for words in ("wanted.csv", "sample 71", "0.7 s", f"{lowest_um:.6g} to {highest_um:.6g} um", "fitted", "clipped"):
         assert words in str(refusal.value)
     assert f"2 of {SAMPLES} samples" in str(refusal.value)
     assert np.flatnonzero(compensate(model, reference(wanted_um), clip=True).clipped).tolist() == [70, 90]
@@ -89,7 +89,7 @@ def test_refusals_name_sample_range_cause_and_remedy(rng):
 @pytest.mark.parametrize("limits", [(-1e3, 20), (50, 50), (60, 50), (20, 1e3), (float("nan"), 50)])
 def test_limits_that_make_no_sense_are_refused(rng, limits):
     model = random_model(rng)
-    with pytest.raises(DataError, match="--limits"):
+    with pytest.raises(DataError, match="voltage limits: expected two rising ones"):
         compensate(model, reference(np.full(3, ends_um(model)[0])), limits_V=limits)
 
 
@@ -154,7 +154,7 @@ def test_the_command_writes_a_voltage_and_a_plot(rng, model_file, tmp_path):
     whole_picture(tmp_path / "plots" / "compensation.png")
 
     csv.write_text(f"time_s,displacement_um\n0,{lowest_um}\n1,{highest_um + 1}\n")
-    refused(run("compensate", path, csv, "--out", tmp_path / "w.csv"), "r.csv", "sample 2", "--clip")
+    refused(run("compensate", path, csv, "--out", tmp_path / "w.csv"), "r.csv", "sample 2", "clipped")
     lower_V, upper_V = limits_V(model)
     high_V = 0.3 * lower_V + 0.7 * upper_V
     clipped = run("compensate", path, csv, "--out", out, "--clip", f"--limits={lower_V},{high_V}", "--json")

@@ -92,7 +92,7 @@ def test_what_a_stage_cannot_follow_is_refused_or_said(rng):
         return str(error.value)
 
     step_um = low_um + np.where(np.arange(SAMPLES) < 100, 0.3, 0.7) * stroke
-    for words in ("wanted.csv", "sample", "turns within a sample", "smooth it", "--static"):
+    for words in ("wanted.csv", "sample", "turns within a sample", "smooth it", "statically"):
         assert words in refusal(step_um)
     clipped = compensate(stage, Reference(wanted.time_s, step_um), clip=True, way="dynamic")
     assert clipped.clipped.any()
@@ -105,7 +105,7 @@ def test_what_a_stage_cannot_follow_is_refused_or_said(rng):
     assert "begins in motion" in remark
 
     too_far_um = low_um + (wanted.displacement_um - low_um) * 1.6
-    for words in ("um of the piezo", "can be reached", f"{lower_V:g} and {upper_V:g} V", "slow it down", "--clip"):
+    for words in ("um of the piezo", "can be reached", f"{lower_V:g} and {upper_V:g} V", "slow it down", "clipped"):
         assert words in refusal(too_far_um)
     # Fast, and near the end of the range of a command: the hysteresis could, the driver cannot.
     limits = (lower_V, float(compensate(stage, wanted, way="dynamic").voltage_V.max()) * 0.7)
@@ -118,7 +118,7 @@ def test_what_a_stage_cannot_follow_is_refused_or_said(rng):
     few = Reference(wanted.time_s[:9], wanted.displacement_um[:9], "wanted.csv")
     with pytest.raises(DataError, match="16 samples"):
         compensate(stage, few, way="dynamic")
-    with pytest.raises(DataError, match="--dynamic"):
+    with pytest.raises(DataError, match="dynamically"):
         compensate(stage["hysteresis"], wanted, way="dynamic")
     with pytest.raises(DataError, match=r"plays.*hysteresis"):
         compensate(microid.Stage.of(plays=microid.PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)), wanted)

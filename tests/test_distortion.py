@@ -126,6 +126,47 @@ def test_records_that_say_too_little_are_refused(rng):
             found.respond_periodically(voltage[:, None], INTERVAL_s)
 
 
+def test_realizations_that_are_alike_and_other_amplitudes_are_refused(rng):
+    """The same distortion in all of them was taken for something that the terms tell."""
+    record = recorded(rng, linear(rng), plays)
+    same = fits.Multisine(
+        INTERVAL_s, *(np.tile(x[:1], (3, 1, 1, 1)) for x in (record.voltage_V, record.displacement_um))
+    )
+    one = fits.Multisine(INTERVAL_s, same.voltage_V[..., :1], same.displacement_um)
+    with pytest.raises(fits.DataError, match="the same voltages in realizations 1 and 2"):
+        fits.estimate_nonlinear_response(one)
+    found = fits.estimate_nonlinear_response(record)
+    for size in (0.5, 2.0):
+        with pytest.raises(fits.DataError, match="expected voltages as large as those of the record"):
+            found.respond_periodically(size * record.voltage_V[0, 0], INTERVAL_s)
+
+
+def test_a_record_without_noise_is_estimated(rng):
+    record = recorded(rng, linear(rng), lambda drive, _: 0 * drive, noise=0.0)
+    found = fits.estimate_response(record)
+    np.testing.assert_allclose(found.response_um_per_V, linear_at(record, found), rtol=1e-9)
+    assert fits.estimate_nonlinear_response(record).explained < 1
+
+
+def linear_at(record, found):
+    lines = np.rint(found.frequency_Hz * SAMPLES * INTERVAL_s).astype(int)
+    u, y = (np.fft.rfft(x[:, 0], axis=1)[:, lines] for x in (record.voltage_V, record.displacement_um))
+    solved = [np.linalg.lstsq(u[:, k], y[:, k], rcond=None)[0].T for k in range(len(lines))]
+    return np.stack(solved)
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"), [("nan", r"displacement_um\[0, 1, 2, 0\]: expected a finite"), ("word", "numbers")]
+)
+def test_a_multisine_holds_finite_numbers_alone(rng, bad, words):
+    shown = np.zeros((3, 2, 16, 1)).astype(object)
+    shown[0, 1, 2, 0] = np.nan if bad == "nan" else bad
+    with pytest.raises(fits.DataError, match=words):
+        fits.Multisine(INTERVAL_s, rng.standard_normal((3, 2, 16, 1)), shown)
+    with pytest.raises(fits.DataError, match="two samples or more in a period"):
+        fits.Multisine(INTERVAL_s, np.zeros((3, 2, 1, 1)), np.zeros((3, 2, 1, 1)))
+
+
 @pytest.mark.study
 @pytest.mark.parametrize(("level_mV", "most"), [(100, 0.035), (300, 0.025)])
 def test_the_measured_mirror_with_its_distortion(level_mV, most):

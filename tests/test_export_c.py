@@ -172,9 +172,9 @@ def test_a_full_memory_drops_the_smallest_swing(rng, tmp_path):
     [
         ({"name": "axis-z"}, "axis-z"),
         ({"name": "1axis"}, "1axis"),
-        ({"name": ""}, "--name"),
-        ({"size": 4}, "--memory"),
-        ({"limits_V": (-1e3, 20)}, "--limits"),
+        ({"name": ""}, "name: expected"),
+        ({"size": 4}, "memory: expected"),
+        ({"limits_V": (-1e3, 20)}, "voltage limits"),
     ],
 )
 def test_bad_requests_write_nothing(rng, tmp_path, options, words):

@@ -163,7 +163,7 @@ def test_names_that_cannot_be_are_refused_before_the_work(tmp_path, name, words)
     place = name and str(tmp_path / name)
     refused(words, lambda files: files.file(place))
     below = place and os.path.join(place, "below")
-    refused("name of a folder" if name else "--out: expected", lambda files: files.folder(below, "--out"))
+    refused("name of a folder", lambda files: files.folder(below))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -90,7 +90,7 @@ def test_outliers_are_counted_and_the_robust_loss_gets_past_them(slow, rng):
     count = int(re.search(r"(\d+) readings", remark)[1])
     assert count == pytest.approx(fitted.sum(), rel=0.2)
     assert float(re.search(r"by ([\d.]+) um", remark)[1]) == pytest.approx(50, rel=0.05)
-    assert "--loss huber" in remark
+    assert "the loss huber" in remark
     robust = fit(spoilt, loss="huber")
     clean = fit(slow)
     off = [np.std(r.predict(slow).displacement_um - clean.predict(slow).displacement_um) for r in (result, robust)]

@@ -49,8 +49,8 @@ def test_what_lags_and_relaxes_is_fitted_beside_the_loop(record, result):
     assert result["lag.time_constant_s"].value == pytest.approx(LAG_s, rel=0.1)
     alone = fits.fit([record], levels=LEVELS, holdout=0.25, initial="negative")
     assert alone.held_out.rms_um > 3 * result.held_out.rms_um
-    assert any("--lag" in remark for remark in alone.remarks)
-    assert any("--relaxation" in remark for remark in alone.remarks)
+    assert any("again with a lag" in remark for remark in alone.remarks)
+    assert any("relaxations" in remark for remark in alone.remarks)
 
 
 def test_the_model_is_saved_simulated_and_inverted(record, result, tmp_path):

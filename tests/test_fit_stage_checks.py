@@ -102,7 +102,7 @@ def test_outliers_are_named_and_the_intervals_reach_the_truth(runs, rng):
     pulled = fit(slow, spoilt)
     remark = said(pulled, "jump out")
     assert int(re.search(r"(\d+) readings", remark)[1]) == pytest.approx(0.8 * hit.sum(), rel=0.25)
-    assert "--loss huber" in remark
+    assert "the loss huber" in remark
     assert "driver.time_constant_s" in said(pulled, "the intervals reach there")
     for name, value in TRUTH.items():
         assert 0.995 * pulled[name].lower < value < 1.005 * pulled[name].upper

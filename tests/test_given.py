@@ -116,7 +116,14 @@ def test_warnings_of_a_frame_say_what_to_write_in_python(tmp_path):
     assert "fits.read_table(data, {'displacement_um': '-displacement_um'})" in warning
     turned(FRAME).to_csv(tmp_path / "run.csv", index=False)
     (warning,) = fits.read_table(tmp_path / "run.csv").warnings
-    assert "--columns displacement_um=-displacement_um" in warning
+    call = f"fits.read_table({str(tmp_path / 'run.csv')!r}, {{'displacement_um': '-displacement_um'}})"
+    assert call in warning
+    (again,) = fits.read_runs([tmp_path / "run.csv"])
+    assert again.warnings[0] == warning.replace(call, "fits.read_runs(data, {'displacement_um': '-displacement_um'})")
+    FRAME.rename(columns={"voltage_V": "drive"}).to_csv(tmp_path / "other.csv", index=False)
+    for entry in (fits.read_table, fits.fit):
+        with pytest.raises(fits.DataError, match=r"other\.csv', {'voltage_V': 'drive\[V\]'}\)"):
+            entry(tmp_path / "other.csv")
 
 
 def test_columns_are_named_as_for_the_option_or_by_numbers(tmp_path):
@@ -139,6 +146,44 @@ def test_programs_and_references_are_given_as_runs_are(tmp_path):
     wanted = {"time_s": TIME_s, "displacement_um": played}
     found = fits.compensate(law, wanted, clip=True)
     np.testing.assert_allclose(found.displacement_um, played, atol=1e-6)
+
+
+def test_a_model_is_given_as_itself_as_a_fit_or_by_the_name_of_its_file(tmp_path):
+    found = fits.fit(FRAME, levels=8)
+    fits.save_model(tmp_path / "m.json", found.model, found.uncertainty, fits.fit_report(found))
+    wanted = {"time_s": TIME_s, "displacement_um": found.runs[0].offset_um + 5 + 3 * np.sin(TIME_s)}
+    voltage_V = fits.compensate(found.model, wanted, clip=True).voltage_V
+    alone = fits.predict(found.model, found.uncertainty, FRAME)
+    for model in (found.model, found, fits.load_model(tmp_path / "m.json"), tmp_path / "m.json"):
+        np.testing.assert_array_equal(fits.compensate(model, wanted, clip=True).voltage_V, voltage_V)
+        assert fits.export_c(model, tmp_path / "c")[0].exists()
+        if model is not found.model:
+            np.testing.assert_array_equal(
+                fits.predict(model, None, FRAME).displacement_sd_um, alone.displacement_sd_um
+            )
+    first, *others = fits.draw_plants(found, None, 3)
+    assert len(others) == 2
+    assert fits.relay_start(tmp_path / "m.json", 1e-3) == fits.relay_start([first], 1e-3)
+    with pytest.raises(fits.DataError, match="expected a Preisach model or a stage"):
+        fits.relay_start([first, 3], 1e-3)
+    for model, words in ((tmp_path / "none.json", "none.json: no such file"), (3, "found a int")):
+        for use in (lambda one: fits.compensate(one, wanted), lambda one: fits.predict(one, None, FRAME)):
+            with pytest.raises(fits.DataError, match=words):
+                use(model)
+
+
+def test_a_fraction_may_be_of_any_type_and_runs_without_a_name_get_one():
+    plain = fits.fit(FRAME, levels=8, holdout=0.5).runs[0]
+    for half in (np.float32(0.5), np.array(0.5)):
+        assert fits.fit(FRAME, levels=8, holdout=half).runs[0] == plain
+    for several in (np.array([0.2, 0.3]), [0.2, 0.3]):
+        with pytest.raises(fits.DataError, match="holdout: expected one fraction, or runs, found a list of numbers"):
+            fits.fit(FRAME, holdout=several)
+    still = fits.Record(TIME_s, VOLTAGE_V, np.zeros(300))
+    with pytest.raises(fits.DataError, match=r"^run 1: nothing moves"):
+        fits.fit(still)
+    with pytest.raises(fits.DataError, match=r"^run 1 and run 2 hold the same samples"):
+        fits.fit([fits.Record(**COLUMNS), fits.Record(**COLUMNS)])
 
 
 def test_a_record_says_what_it_holds_and_is_drawn():

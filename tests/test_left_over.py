@@ -42,9 +42,9 @@ def suggested(rng, gain, lag_s):
 @pytest.mark.parametrize(
     ("gain", "lag_s", "options"),
     [
-        pytest.param(0.0, LAG_s, ["--lag"], id="lag"),
-        pytest.param(0.01, LAG_s, ["--lag", "--lag --relaxation 3"], id="both", marks=pytest.mark.study),
-        pytest.param(0.03, 0.0, ["--relaxation 3"], id="relaxations", marks=pytest.mark.study),
+        pytest.param(0.0, LAG_s, ["a lag"], id="lag"),
+        pytest.param(0.01, LAG_s, ["a lag", "a lag and 3 relaxations"], id="both", marks=pytest.mark.study),
+        pytest.param(0.03, 0.0, ["3 relaxations"], id="relaxations", marks=pytest.mark.study),
         pytest.param(0.0, 0.0, [], id="neither", marks=pytest.mark.study),
     ],
 )

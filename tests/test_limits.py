@@ -80,7 +80,7 @@ def test_what_is_stated_comes_before_what_was_reached():
         "displacement": pytest.approx((-1.0, 23.0)),
         "velocity": pytest.approx((-3.3, 3.3)),
     }
-    with pytest.raises(DataError, match="--margin"):
+    with pytest.raises(DataError, match="margin: expected"):
         allowed(reached, {}, -0.1)
 
 

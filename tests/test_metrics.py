@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fits import errors, loop_width_pct
+from fits import errors
+from fits.stats._metrics import loop_width_pct
 
 
 def test_errors_are_percentages_of_the_measured_range():

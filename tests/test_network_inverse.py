@@ -81,7 +81,7 @@ def test_it_sees_the_remembered_extremes_and_no_noise(rng):
 
 @pytest.mark.parametrize(
     ("voltage_V", "displacement_um", "words"),
-    [(np.arange(300.0), None, "--columns"), (np.arange(50.0), np.arange(50.0), "200 samples"),
+    [(np.arange(300.0), None, "displacement column"), (np.arange(50.0), np.arange(50.0), "200 samples"),
      (np.arange(300.0), np.zeros(300), "move")],
 )  # fmt: skip
 def test_records_that_teach_nothing_are_refused(voltage_V, displacement_um, words):

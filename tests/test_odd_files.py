@@ -14,6 +14,7 @@ from scipy.io import loadmat, savemat
 from test_foreign_files import LVM, RATE_Hz, assert_same, clock, rows, signals
 
 import fits
+from fits.io._inspect import inspect_table
 from fits.io._units import parse_columns
 
 T, V, Y = signals()
@@ -93,7 +94,7 @@ def test_an_odd_text_is_read_as_it_was_written(tmp_path, monkeypatch, name):
 def test_a_column_that_stands_there_twice_has_to_be_chosen(tmp_path, monkeypatch):
     path = tmp_path / "twice.csv"
     path.write_text("time_s,voltage_V,displacement_um,voltage_V\n" + rows(T, V, Y, 2 * V))
-    with pytest.raises(fits.DataError, match=r"line 1, column 'voltage_V 4'.*--columns 'voltage_V=voltage_V 4'"):
+    with pytest.raises(fits.DataError, match=r"line 1, column 'voltage_V 4'.*{'voltage_V': 'voltage_V 4'}"):
         fits.read_table(path)
     assert_same(fits.read_table(path, {"voltage_V": "voltage_V"}))
     np.testing.assert_array_equal(fits.read_table(path, {"voltage_V": "voltage_V 4"}).voltage_V, 2 * V)
@@ -253,3 +254,39 @@ def test_the_interval_of_a_tdms_file_is_that_of_the_channels_that_are_read(tmp_p
             channels.append(ChannelObject("fast", name, values, fast | {"unit_string": unit}))
         writer.write_segment(channels)
     assert_same(pasted(path, monkeypatch))
+
+
+def test_a_file_and_columns_that_begin_with_a_minus_are_read_by_the_command_that_is_shown(tmp_path, monkeypatch):
+    """A minus before a column turns its sign, unless it belongs to the name."""
+    monkeypatch.chdir(tmp_path)
+    time_s = np.arange(300) / 100
+    voltage_V = 50 - 50 * np.cos(3 * time_s)
+    table = np.c_[time_s, voltage_V, 0.3 * voltage_V + 0.01 * np.sin(40 * time_s)]
+    np.savetxt("-run.csv", table, delimiter=",", header="t,-U,-x", comments="")
+    told = json.loads(run("inspect", "./-run.csv", "--json").stdout)
+    assert told["remarks"] == []
+    words = shlex.split(inspect_table("-run.csv").command)
+    assert words[2] == "./-run.csv"
+    found = fits.read_table(words[2], words[words.index("--columns") + 1])
+    np.testing.assert_allclose(found.voltage_V, voltage_V)
+    turned = fits.read_table(words[2], {"time_s": "t[s]", "voltage_V": "--U[V]", "displacement_um": "-x[um]"})
+    np.testing.assert_allclose(turned.voltage_V, -voltage_V)
+
+
+@pytest.mark.parametrize("ending", [".h5", ".tdms", ".npy", ".npz"])
+def test_a_file_that_is_cut_off_is_told_of_in_our_own_words(tmp_path, ending):
+    whole = tmp_path / f"whole{ending}"
+    if ending == ".h5":
+        with h5py.File(whole, "w") as file:
+            file["time_s"] = T
+    elif ending == ".tdms":
+        with TdmsWriter(whole) as writer:
+            writer.write_segment([ChannelObject("fast", "time_s", T)])
+    else:
+        (np.save if ending == ".npy" else np.savez)(whole, T)
+    (tmp_path / f"cut{ending}").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    with pytest.raises(fits.DataError) as caught:
+        fits.read_table(tmp_path / f"cut{ending}")
+    words = str(caught.value)
+    assert words.endswith("export it again, or as CSV.") or ending == ".tdms"
+    assert "(" not in words.replace(str(tmp_path), "")

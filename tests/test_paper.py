@@ -255,8 +255,8 @@ def test_rows_are_called_worse_that_are(short):
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        (["--out", "taken.txt"], "--out"),
-        (["--out", "taken.txt/below"], "--out"),
+        (["--out", "taken.txt"], "taken.txt: expected a folder"),
+        (["--out", "taken.txt/below"], "taken.txt/below: expected a folder"),
         (["--out", "new", "--seeds", "0"], "--seeds"),
         (["--out", "new", "--seed", "-1"], "--seed"),
         (["--out", "new", "--seed", "9" * 26], "--seed"),
@@ -274,7 +274,7 @@ def test_refusals(options, word, tmp_path, monkeypatch):
 
 def test_a_place_that_is_no_folder_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "taken").write_text("taken")
-    refused(run("paper", "--out", tmp_path / "taken"), "taken", "expected a folder", "--out")
+    refused(run("paper", "--out", tmp_path / "taken"), "taken", "expected a folder")
 
 
 def test_an_interruption_leaves_nothing(tmp_path, monkeypatch):
@@ -326,7 +326,10 @@ def test_pictures_are_in_the_format_that_is_asked_for(tmp_path, monkeypatch, for
         return PaperResult(seed, seeds)
 
     monkeypatch.setattr(paper, "paper_result", draw)
-    result = run("paper", "--out", tmp_path / "out", "--format", form, "--quiet")
+    result = run("paper", "--out", tmp_path / "out", "--format", form, "--quiet", "--json")
     assert result.exit_code == 0, result.stderr
+    out = str(tmp_path / "out")
+    told = {"out": out, "files": [f"{out}/paper.md", f"{out}/paper.json"], "worse_than_paper": []}
+    assert json.loads(result.stdout) == told
     assert files(tmp_path / "out") == [f"fig10.{form}"]
     assert (tmp_path / "out" / f"fig10.{form}").read_bytes().startswith(begins)

@@ -17,7 +17,7 @@ from fits import DataError, FitResult, FitStatus, LevelTrial, Record, RunReport,
 from fits.io._summary import AbstractSummary
 from fits.loop._design import Grid
 from fits.plots._results import picture_of
-from fits.plots._style import thinned
+from fits.plots._style import legend, thinned
 
 LOWER_V, UPPER_V, LEVELS = 0.0, 100.0, 9
 
@@ -167,3 +167,12 @@ def test_pictures_are_written_as_vectors_on_demand(rng, model, tmp_path, form, f
     paths = fits.plot_fit(result_of(model, [report("run.csv")], rng), [measured], tmp_path, holdout=0.3, form=form)
     assert [path.suffix for path in paths] == [f".{form}"] * 4
     assert all(path.read_bytes().startswith(first) for path in paths)
+
+
+def test_a_legend_shows_a_dot_that_can_be_seen():
+    picture, axes = plt.subplots()
+    axes.plot([0, 1], ".", markersize=0.8, label="measured")
+    axes.plot([0, 1], "x", markersize=6, label="failed")
+    legend(picture, (axes,))
+    assert [line.get_markersize() for line in picture.legends[0].get_lines()] == [2.5, 6]
+    plt.close(picture)

@@ -12,7 +12,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fits.io._errors import DataError
-from fits.io._read_csv import read_csv, read_runs
+from fits.io._read_csv import read_runs
+from fits.io._read_csv import read_table as read_csv
 from fits.io._units import parse_columns
 
 N = 60

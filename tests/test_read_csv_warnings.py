@@ -5,7 +5,7 @@ import pytest
 from _measured import measured
 
 from fits.io._errors import DataError
-from fits.io._read_csv import read_csv
+from fits.io._read_csv import read_table as read_csv
 from fits.io._units import parse_columns
 
 

@@ -138,7 +138,9 @@ def test_what_is_to_be_recorded_does_not_contradict_itself(rng):
         found = replace(diagnosis(rng, kind), next_experiment=None)
         page, steps = text_of(found), " ".join(words for words, _ in next_steps(found))
         assert ("Record a run" in steps) == (kind == "unexplained")
-        assert ("No further experiment is proposed" in page) == ("Record a run" not in steps)
+        assert ("what to record instead stands at the top" in page) == ("Record a run" in steps)
+        # Why not, a remark says where there is a reason: the page has none of its own beside it.
+        assert "would not tell which known effect" not in page
         assert ("that beside what was found" in page) == bool(found.causes)
 
 

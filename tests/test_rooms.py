@@ -1,6 +1,7 @@
 """The rooms of `fits`: what each may import."""
 
 import ast
+import re
 
 import pytest
 from test_architecture import ROOT, imports, relative
@@ -73,3 +74,24 @@ def test_no_effect_is_known_by_its_name_in_fits():
 def test_rooms_are_what_the_folder_shows():
     here = {path.name for path in (ROOT / "fits").iterdir() if path.name != "__pycache__"}
     assert here == {*ROOMS, "__init__.py", "__main__.py"}
+
+
+# What only the command calls, or reads for it, and how files are read.
+OF_THE_COMMAND = {
+    *("fits/diagnosis/_conclude.py", "fits/report/_model_words.py", "fits/report/_next_steps.py"),
+    *("fits/control/_gains.py", "fits/control/_tune_problem.py", "fits/io/_in_python.py", "fits/io/_inspect.py"),
+    *("fits/io/_limits.py", "fits/io/_read_csv.py", "fits/io/_table.py", "fits/io/_text_table.py"),
+    "fits/io/_units.py",
+}
+
+
+def test_sentences_that_python_reads_too_name_no_options_of_the_command():
+    paths = [path for path in (ROOT / "fits").rglob("*.py") if path.parent.name != "cli"]
+    assert {relative(path) for path in paths} >= OF_THE_COMMAND
+    for path in paths:
+        if relative(path) not in OF_THE_COMMAND:
+            strings = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
+            texts = [str(node.value) for node in strings if isinstance(node, ast.Constant)]
+            options = {found for text in texts for found in re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)}
+            # What a docstring tells of the command is told to who reads the code.
+            assert options <= {"--example", "--write-stage"}, f"{relative(path)} names {', '.join(sorted(options))}"

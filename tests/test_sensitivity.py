@@ -12,6 +12,8 @@ from _models import compiled
 
 import fits
 import microid as m
+from fits.machining._claims import describe_claims
+from fits.report._machining import sensitivity_json
 
 # Section 8.1 of the project's derivation of the closed forms, which came before the code: % of output at plus one
 # tolerance, ranked, then root sum of squares and worst case; and to how many digits.
@@ -231,7 +233,7 @@ def test_no_finite_number_is_refused():
 
 
 def test_the_json_is_that_of_the_schema(paper):
-    content = json.loads(json.dumps(fits.sensitivity_json(paper), allow_nan=False))
+    content = json.loads(json.dumps(sensitivity_json(paper), allow_nan=False))
     assert (content["schema"], content["level"]) == ("microid.sensitivity/1", 1)
     assert list(content["axes"]) == ["x", "y", "z", "alpha", "beta", "gamma"]
     x = content["axes"]["x"]
@@ -291,7 +293,7 @@ def test_the_papers_reading_of_its_figure_7():
     assert same.number == pytest.approx(1, rel=1e-12)
     for claim in found.values():
         assert claim.reason.endswith(".")
-        assert claim.reason in " ".join(fits.describe_claims([claim]).split())
+        assert claim.reason in " ".join(describe_claims([claim]).split())
 
 
 def test_verdicts_follow_the_numbers():

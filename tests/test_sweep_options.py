@@ -241,3 +241,13 @@ def test_rows_that_failed_are_drawn_as_such_and_names_whole():
     red = [line for line in axes.lines if line.get_color() is not None and tuple(line.get_color()[:1]) == (0.8,)]
     assert len(red) == 3  # two rows, and the key
     assert _wrapped("hysteresis.density.packed_um", 12) == "hysteresis.\ndensity.\npacked_um"
+
+
+def test_logarithmic_parameters_have_logarithmic_coordinates_and_failures_at_the_rim_are_whole():
+    swept = {"controller.gain": np.geomspace(5, 500, 9), "mechanics.gain": np.arange(9.0)}
+    rows = _Rows(swept, {}, "width_pct", np.append(np.arange(8.0), np.nan))
+    axes, _ = _parallel(rows).axes
+    assert {"5", "15.8", "50", "158", "500"} <= {text.get_text() for text in axes.texts}
+    np.testing.assert_allclose([line.get_ydata()[0] for line in axes.lines[:9]], np.linspace(0, 1, 9))
+    (failed,) = _heat(rows, tuple(swept)).axes[0].lines
+    assert not failed.get_clip_on()

@@ -153,7 +153,7 @@ def test_a_wrong_cluster_leaves_no_folder(tmp_path, seed, cluster):
     (tmp_path / "sweep.toml").write_text(small(seed))
     result = run("sweep", tmp_path / "sweep.toml", "--out", tmp_path / "out", "--cluster", cluster)
     refused(result, "expected local:N")
-    assert result.stderr.count("--cluster") == 1
+    assert result.stderr.startswith("cluster: ")
     assert not (tmp_path / "out").exists()
 
 
@@ -199,7 +199,7 @@ def test_broken_results_are_a_sentence_and_are_mended(kept, broken):
     else:
         (store / ".zmetadata").write_text("[")
     if broken != "array":
-        refused(run("sweep", "show", out), "results.zarr is missing or broken", "--resume")
+        refused(run("sweep", "show", out), "results.zarr is missing or broken", "resume")
     assert run("sweep", file, "--out", out, "--resume").exit_code == 0
     assert open_sweep(out).load().equals(before)
 

@@ -275,7 +275,7 @@ def test_a_full_disk_is_a_sentence_and_the_rest_stays(finished, tmp_path, monkey
         write(path, text)
 
     monkeypatch.setattr(_store, "atomic_write_text", full)
-    with pytest.raises(DataError, match=r"No space left on device.*--resume"):
+    with pytest.raises(DataError, match=r"No space left on device.*resume"):
         run_sweep(sweep, out)
     monkeypatch.setattr(_store, "atomic_write_text", write)
     assert summarise(out)["chunks_done"] == 1
@@ -295,7 +295,7 @@ def test_the_command_refuses_in_one_sentence(finished, tmp_path, seed):
     sweep, whole = finished
     file = tmp_path / "sweep.toml"
     file.write_text(sweep.text)
-    refused(run("sweep", file, "--out", whole), "add --resume")
+    refused(run("sweep", file, "--out", whole), "resume it to go on")
     (tmp_path / "other.toml").write_text(small(seed + 1))
     refused(run("sweep", tmp_path / "other.toml", "--out", whole, "--resume"), "another sweep")
     refused(run("sweep", tmp_path / "none.toml", "--out", whole), "no such file")

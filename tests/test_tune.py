@@ -15,6 +15,7 @@ import microid as m
 import microid.control as c
 from fits.control._tune import _problem
 from fits.control._tune_problem import Goal, judge
+from fits.control._tune_start import ultimate_point
 
 T = 1e-3
 SAMPLES = 160
@@ -64,14 +65,14 @@ def cost_by_numpy(runs, reference, effort, rate):
 def test_the_ultimate_point_of_three_equal_lags_is_eight(rng):
     """`(1 + τ s)^-3` turns by 180 degrees at `√3 / τ`, where its modulus is an eighth."""
     tau_s, gain = rng.uniform(1e-3, 1e-2), rng.uniform(0.05, 0.5)
-    found = fits.ultimate_point(stage_of((tau_s, 1 / (2 * np.pi * tau_s), 1.0), gain), tau_s / 2000)
+    found = ultimate_point(stage_of((tau_s, 1 / (2 * np.pi * tau_s), 1.0), gain), tau_s / 2000)
     assert found.gain_V_per_um == pytest.approx(8 / gain, rel=3e-3)
     assert found.period_s == pytest.approx(2 * np.pi * tau_s / np.sqrt(3), rel=3e-3)
 
 
 def test_the_start_follows_the_rules_and_is_safe_for_every_plant(rng):
     plants = [stage_of(*one) for one in drawn(rng)]
-    point, pid = fits.ultimate_point(plants[0], T), fits.relay_start(plants, T)
+    point, pid = ultimate_point(plants[0], T), fits.relay_start(plants, T)
     halvings = np.log2(0.6 * point.gain_V_per_um / float(pid.proportional_V_per_um))
     assert halvings == pytest.approx(round(halvings), abs=1e-9)
     assert float(pid.proportional_V_per_um / pid.integral_V_per_um_s) == pytest.approx(point.period_s / 2)

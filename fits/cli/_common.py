@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import functools
+import logging
 import math
 import os
 import re
@@ -10,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType, SimpleNamespace
@@ -24,6 +25,7 @@ from fits.io._file_set import discard_all
 from fits.io._printable import printable
 
 NOTHING_LEFT = "no unfinished file was left"
+_LOG = logging.getLogger("fits")
 # Beyond this a command says what it does.
 _SILENCE_s = 2.0
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*([a-zµμ]+)\s*")
@@ -110,13 +112,34 @@ class Given(SimpleNamespace):
     """What a command was given, by the names of its options."""
 
 
-def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
-    """Hand a command its options in one piece; bad input and interruption end in one line on stderr and a status."""
+@contextlib.contextmanager
+def _logged(verbose: bool) -> Iterator[None]:
+    """Pass on to stderr, if asked, what `fits` logs: files read and written, JAX, and where an error came from."""
+    handler = logging.StreamHandler() if verbose else logging.NullHandler()
+    _LOG.addHandler(handler)
+    _LOG.setLevel(logging.DEBUG if verbose else logging.WARNING)
+    try:
+        yield
+    except (DataError, RuntimeError, OSError):
+        _LOG.debug("it was refused here:", exc_info=True)
+        raise
+    finally:
+        _LOG.removeHandler(handler)
 
+
+def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
+    """Hand a command its options in one piece; bad input and interruption end in one line on stderr and a status.
+
+    Every command has the options that say how much it tells.
+    """
+
+    @click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
+    @click.option("-v", "--verbose", is_flag=True, help="Log what is read, written and refused, on stderr.")
     @functools.wraps(command)
-    def run(**options: Any) -> None:
+    def run(verbose: bool = False, **options: Any) -> None:
         try:
-            command(Given(**options))
+            with _logged(verbose):
+                command(Given(**options))
         except KeyboardInterrupt as stop:
             stopped(stop, NOTHING_LEFT)
         except (DataError, RuntimeError) as error:

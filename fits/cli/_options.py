@@ -55,7 +55,6 @@ axis = click.option(
     help="Which motion.",
 )
 json_output = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-quiet = click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
 
 
 def columns(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -83,7 +83,6 @@ def _names() -> list[str]:
 @click.option("--seed", type=options.SEEDS, default=0, help="Of noise, plants and starts (default 0).")
 @options.columns
 @options.json_output
-@options.quiet
 @common.in_sentences
 def control(given: common.Given) -> None:
     """Tune a controller on a model, and run it along a reference.

@@ -39,7 +39,6 @@ _LONGEST_s = 1e5
 @options.margin
 @options.columns
 @options.json_output
-@options.quiet
 @common.in_sentences
 def diagnose(given: common.Given) -> None:
     """Say what a fitted stage gets wrong, which physical effect causes it, and what to measure next.
@@ -59,7 +58,7 @@ def diagnose(given: common.Given) -> None:
     fraction, files = common.fraction_or_files(given.holdout)
     for name in (_REPORT, _JSON, _BASELINE, _EXTENDED, _PROGRAM):
         common.refuse_overwriting(os.path.join(given.out, name), [*given.runs, *files])
-    usable_folder(given.out, "--out")
+    usable_folder(given.out)
     records = late.read_runs(given.runs, **how)
     aside = [late.read_table(file, **how) for file in files]
     # Only now, so that what cannot be read is refused at once.
@@ -103,7 +102,7 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
     texts |= {_BASELINE: model("baseline"), _EXTENDED: model("extended")}
     ahead = diagnosis.next_experiment
     with file_set() as files:
-        place = files.folder(out, "--out")
+        place = files.folder(out)
         for name, text in texts.items():
             (place / name).write_text(text, encoding="utf-8")
         if ahead is not None:

@@ -64,7 +64,6 @@ _HOLDS: dict[str, "late.Hold"] = {"lines": "first", "steps": "zero", "curves": "
 )
 @click.option("--seed", type=options.SEEDS, help="Seed of the starts (default 0).")
 @options.json_output
-@options.quiet
 @common.in_sentences
 def fit(given: common.Given) -> None:
     """Fit Preisach weights to measured loops, or a whole stage to slow and fast runs.

@@ -15,7 +15,7 @@ from fits.io._file_set import file_set
 )
 @click.option("--seed", type=options.SEEDS, default=0, show_default=True, help="Where all randomness starts.")
 @options.picture_format("the pictures")
-@options.quiet
+@options.json_output
 @common.in_sentences
 def paper(given: common.Given) -> None:
     """Repeat the paper's compensation on a virtual stage: its tables and figures beside ours.
@@ -26,6 +26,8 @@ def paper(given: common.Given) -> None:
     late.start_jax()
     progress = common.progress_to_stderr(given.quiet)
     with file_set() as files:
-        result = late.paper_result(given.seeds, given.seed, files.folder(given.out, "--out"), progress, given.form)
+        result = late.paper_result(given.seeds, given.seed, files.folder(given.out), progress, given.form)
     page, figures = common.paths_in(given.out, ("paper.md", "paper.json"))
-    click.echo(f"page   {page}\njson   {figures}\nworse than the paper: {'; '.join(result.worse()) or 'no row'}")
+    worse = result.worse()
+    lines = [f"page   {page}", f"json   {figures}", f"worse than the paper: {'; '.join(worse) or 'no row'}"]
+    common.print_result(given, {"out": given.out, "files": [page, figures], "worse_than_paper": worse}, lines)

@@ -5,6 +5,7 @@ import click
 from fits.cli import _common as common
 from fits.cli import _late as late
 from fits.cli import _options as options
+from fits.io._file_set import check_file
 from fits.io._length import length
 
 
@@ -15,7 +16,6 @@ from fits.io._length import length
 @options.initial("the program")
 @options.columns
 @options.json_output
-@options.quiet
 @common.in_sentences
 def simulate(given: common.Given) -> None:
     """Predict the displacement of a voltage program, with its standard deviation.
@@ -27,6 +27,7 @@ def simulate(given: common.Given) -> None:
 
     progress = common.now_and_then(common.progress_to_stderr(given.quiet))
     common.refuse_overwriting(given.out, [given.model, given.program])
+    check_file(given.out)
     record = late.read_table(given.program, required=("time_s", "voltage_V"), **common.reading(given))
     loaded = common.opened(given.model)
     prediction = common.predicted_by(given.model, loaded, record, given.initial, progress)

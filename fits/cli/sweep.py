@@ -45,7 +45,6 @@ def sweep(context: click.Context, example: str | None) -> None:
     "--cluster", metavar="ADDRESS|local:N", help="A Dask scheduler, or N processes of this machine, to compute on."
 )
 @options.json_output
-@options.quiet
 @common.in_sentences
 def run(given: common.Given) -> None:
     """Run SWEEP.toml.

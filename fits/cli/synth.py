@@ -42,7 +42,7 @@ def synth(given: common.Given) -> None:
     import data_synth
 
     with file_set() as made:
-        folder = made.folder(given.out, "--out")
+        folder = made.folder(given.out)
         if given.scenario == data_synth.BOUCWEN:
             seed = given.seed or 0
             contents = data_synth.boucwen_files(seed, given.samples)

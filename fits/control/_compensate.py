@@ -20,6 +20,7 @@ from fits.loop._run import initial_state, prepare_run, simulate_run
 from fits.loop._stepped import intervals
 from fits.loop._surface import Surface
 from fits.stage._encode import encode
+from fits.stage._model_file import AnyModel, model_given
 from fits.stage._plain_stage import plain_model
 from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Reversible, Stage, Start, innermost
 
@@ -33,7 +34,7 @@ _FEWEST = 16
 
 
 def compensate(
-    model: Preisach | Stage,
+    model: AnyModel,
     reference: AnyRuns,
     initial: str = "negative",
     clip: bool = False,
@@ -42,7 +43,8 @@ def compensate(
 ) -> Compensation:
     """Find the voltage whose displacement is the reference.
 
-    The reference is one or a record, or what `read_reference` takes, as the sensor would read it: the model's
+    The model is a `Preisach` or a `Stage`, a fit or a model file of one, or the name of such a file. The reference is
+    one or a record, or what `read_reference` takes, as the sensor would read it: the model's
     `offset_um`, its reading at negative saturation, is included. The memory before the first sample is `negative`,
     `positive` or `demagnetised`. With `clip` the nearest that can be reached is taken where the reference is out of
     reach, instead of refusing it. Limits are the lowest and highest voltage allowed; the range the model was fitted
@@ -54,15 +56,16 @@ def compensate(
     rest; see `microid.invert_stage`. A `DataError` says that the reference cannot be followed, that the limits are
     not within the model's range, or that the model has nothing dynamic to compensate.
     """
+    model, _ = model_given(model)
     reference = reference_given(reference)
     if reference.displacement_um is None:
-        raise DataError(f"{reference.source}: a displacement column is needed here; name it with --columns.")
+        raise DataError(f"{reference.source}: a displacement column is needed here; give one.")
     wanted, time_s = reference.displacement_um, reference.time_s
     if way not in ("static", "dynamic"):
         raise ValueError(f"way must be 'static' or 'dynamic', got {way!r}")
     if isinstance(model, Preisach):
         if way == "dynamic":
-            raise DataError("expected a stage for --dynamic, found a Preisach model, which has no mechanics.")
+            raise DataError("expected a stage to compensate dynamically, found a hysteresis without mechanics.")
         return compensate_plain(plain_loop_of(model), reference, initial, clip, limits_V)
     if (plain := plain_of(model)) is not model:
         without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
@@ -132,7 +135,7 @@ def _led(
         raise DataError(
             f"{reference.source}: sample {k + 1} (time {reference.time_s[k]:g} s) needs a command of "
             f"{asked_V[k]:.6g} V to make up for the driver's lag, but {bind}; slow the reference down, keep it away "
-            "from the ends of the range, or cut the command there with --clip."
+            "from the ends of the range, or have the command clipped there."
         )
     cut = excess_V > _SHOWS * width_V
     said = f"the command was cut to the limits at {int(cut.sum())} of its samples, by at most {excess_V.max():.3g} V."
@@ -241,8 +244,8 @@ def demand(stage: Stage, time_s: np.ndarray, reference_um: np.ndarray, source: s
     """
     if len(time_s) < _FEWEST:
         raise DataError(
-            f"{source}: expected {_FEWEST} samples or more for --dynamic, found {len(time_s)}; sample the reference "
-            "more finely, or use --static."
+            f"{source}: expected {_FEWEST} samples or more to compensate dynamically, found {len(time_s)}; sample "
+            "the reference more finely, or compensate statically."
         )
     _, behind, offset_um = gains_of(stage)
     every, other = (
@@ -258,7 +261,7 @@ def demand_remarks(reference_um: np.ndarray, needed_um: np.ndarray, doubt_um: fl
     start_um, little_um = abs(float(needed_um[0] - reference_um[0])), _WORTH_SAYING * float(np.ptp(reference_um))
     turning = (
         "the reference turns within a sample, so that the displacement its acceleration asks for is uncertain by "
-        f"{length(doubt_um)}; smooth it, sample it more finely, or use --static."
+        f"{length(doubt_um)}; smooth it, sample it more finely, or compensate statically."
     )
     moving = (
         f"the reference begins in motion and the stage at rest, {length(start_um)} away from what it would need; "

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +16,9 @@ from fits.io._file_set import file_set
 from fits.io._version import written_by
 from fits.loop._plain import PlainLoop
 
-if TYPE_CHECKING:
-    from microid import Preisach
-
 
 def export_c(
-    model: "Preisach | PlainLoop",
+    model: Any,
     folder: str | os.PathLike[str],
     name: str = "compensator",
     *,
@@ -30,9 +27,11 @@ def export_c(
 ) -> list[Path]:
     """Write a header and a source in C99 that do what `model` and `microid.invert` do, sample by sample.
 
-    The C needs no library, allocates nothing, loops a bounded number of times and computes in double precision. It
-    holds `8 ((N + 1)**2 + 8 (N - 1))` bytes of constants for `N` levels; a state takes 16 bytes per extreme. The
-    paths of `name.h` and `name.c` come back; the folder is made if need be, and the name stands before every name.
+    The model is a `Preisach`; or a `Stage`, of which it is what slow commands see, a fit or a model file of one, or
+    the name of such a file. The C needs no library, allocates nothing, loops a bounded number of times and computes
+    in double precision. It holds `8 ((N + 1)**2 + 8 (N - 1))` bytes of constants for `N` levels; a state takes 16
+    bytes per extreme. The paths of `name.h` and `name.c` come back; the folder is made if need be, and the name
+    stands before every name.
 
     The size is the extremes that a state remembers, two per nested loop. Where more are needed the smallest swing is
     dropped and the status says so: outputs are then off by no more than that swing until a wider loop wipes it out.
@@ -43,17 +42,19 @@ def export_c(
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,30}", name):
         raise DataError(
-            f"--name: expected a letter and then up to 30 letters, digits or underscores, found '{name}'; rename it."
+            f"name: expected a letter and then up to 30 letters, digits or underscores, found '{name}'; rename it."
         )
     if not 8 <= size <= 65_536:
-        raise DataError(f"--memory: expected 8 to 65536 extremes, found {size}; 128 suit most references.")
+        raise DataError(f"memory: expected 8 to 65536 extremes, found {size}; 128 suit most references.")
     if not isinstance(model, PlainLoop):
-        from fits.control._compensate import plain_loop_of  # with JAX, which a model in NumPy does without
+        # With JAX, which a model in NumPy does without.
+        from fits.control._compensate import plain_loop_of, static_equivalent
+        from fits.stage._model_file import model_given
 
-        model = plain_loop_of(model)
+        model = plain_loop_of(static_equivalent(model_given(model)[0]))
     fields = _fields(model, name, size, within_range(model.range_V, limits_V))
     with file_set() as files:
-        place = files.folder(folder, "--out")
+        place = files.folder(folder)
         for ending in ("h", "c"):
             template = Path(__file__).with_name("templates") / f"controller.{ending}"
             text = Template(template.read_text(encoding="utf-8")).substitute(fields)

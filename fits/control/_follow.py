@@ -70,8 +70,8 @@ def follow(
             f"{reference.source}: sample {k + 1} (time {time_s[k]:g} s) {asked}, but "
             f"{lowest[k]:.6g} to {highest[k]:.6g} um can be reached there, sensor offset included, because "
             f"{binding(law, limits)}; {int(clipped.sum())} of {len(wanted)} samples are out of reach: shift or "
-            f"shrink the reference,{' slow it down,' if doubt else ''} or take the nearest that can be reached with "
-            "--clip."
+            f"shrink the reference,{' slow it down,' if doubt else ''} or have it clipped to the nearest that can be "
+            "reached."
         )
     return voltage, clipped
 
@@ -102,8 +102,8 @@ def within_range(range_V: tuple[float, float], limits_V: tuple[float, float] | N
     low, high = map(float, limits_V)
     if not lower <= low < high <= upper:
         raise DataError(
-            f"--limits: expected two rising voltages between {lower:g} and {upper:g} V, where the model was fitted, "
-            f"found {low:g},{high:g}."
+            f"voltage limits: expected two rising ones between {lower:g} and {upper:g} V, where the model was "
+            f"fitted, found {low:g},{high:g}."
         )
     return low, high
 
@@ -129,7 +129,7 @@ def _within(
         voltage = np.where(wanted_um >= highest, limits[1], np.where(wanted_um <= lowest, limits[0], voltage))
         if np.allclose(voltage, before, rtol=0, atol=_SLACK * (limits[1] - limits[0])):
             return voltage, lowest, highest
-    raise DataError("the reference keeps crossing what the voltage limits allow; widen --limits or shrink it.")
+    raise DataError("the reference keeps crossing what the voltage limits allow; widen them or shrink it.")
 
 
 def _reach(law: PlainLoop, reached_V: np.ndarray, limit_V: float, initial: str) -> np.ndarray:

@@ -33,11 +33,11 @@ def replaced(controller: _Controller, values: Mapping[str, np.ndarray]) -> _Cont
     for row in (row for row in parameter_table(controller) if row.path in values):
         value, low, high = values[row.path], row.spec.lower, row.spec.upper
         if value.shape != tuple(row.shape):
-            raise DataError(f"--gains: expected {row.path} of shape {row.shape}, found {value.shape}.")
+            raise DataError(f"gains: expected {row.path} of shape {row.shape}, found {value.shape}.")
         if value.min() < low and high == math.inf:
-            raise DataError(f"--gains: expected {row.path} of {low:g} or more, found {value.min():g}.")
+            raise DataError(f"gains: expected {row.path} of {low:g} or more, found {value.min():g}.")
         if value.min() < low or value.max() > high:
-            raise DataError(f"--gains: expected {row.path} between {low:g} and {high:g}, found what is beyond.")
+            raise DataError(f"gains: expected {row.path} between {low:g} and {high:g}, found what is beyond.")
 
     def replace(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path).lstrip(".")
@@ -64,11 +64,11 @@ def read_gains(text: str) -> Given:
         given = _read_file(text)
     else:
         if len(values) != len(GAINS):
-            raise DataError(f"--gains: expected three numbers KP,KI,KD or a file, found {len(values)}: '{text}'.")
+            raise DataError(f"gains: expected three numbers KP,KI,KD or a file, found {len(values)}: '{text}'.")
         given = Given(dict(zip(GAINS, values, strict=True)))
     for name, value in given.pid.items():
         if not (math.isfinite(value) and value >= PID_SETTINGS[name].lower):
-            raise DataError(f"--gains: expected {name} of 0 or more, found {value:g}.")
+            raise DataError(f"gains: expected {name} of 0 or more, found {value:g}.")
     return given
 
 
@@ -77,7 +77,7 @@ def _read_file(path: str) -> Given:
     try:
         content = parse_json(read_text(path, what, MOST_JSON_BYTES), shown(path), what)
     except DataError as error:
-        raise DataError(f"--gains: {error}") from None
+        raise DataError(f"gains: {error}") from None
     content = content.get("gains", content) if isinstance(content, dict) else {}
     content = content if isinstance(content, dict) else {}
     prefix = "pid." if any(name.startswith("pid.") for name in content) else ""

@@ -96,7 +96,7 @@ def setup(
         if feedforward == "dynamic":
             if isinstance(model, m.Preisach) or len(stage.parts) == 1:
                 raise DataError(
-                    "expected a model with mechanics for --feedforward dynamic, found a hysteresis alone",
+                    "expected a model with mechanics for a dynamic feedforward, found a hysteresis alone",
                     of_model=True,
                 )
             led = invert(way="dynamic")
@@ -245,7 +245,7 @@ class Maker:
             said.append(f"{which} those of its PID controller, before it learns")
 
         def place(setting: str) -> str:
-            return "--frequency" if setting == "frequency_Hz" else f"--controller {name}: {setting}"
+            return "frequency" if setting == "frequency_Hz" else f"controller {name}: {setting}"
 
         ready, stage = loop.ready, loop.plants[0]
         task = m.ControlTask(
@@ -306,22 +306,22 @@ class Maker:
         found = {name: np.atleast_1d(own[name]) for name in several if name in own}
         shapes = {value.shape for value in found.values()}
         if found and (len(found) < len(several) or len(shapes) > 1 or len(shapes.pop()) != 1):
-            raise DataError(f"--gains: expected {', '.join(several)} with as many numbers each; state all or none.")
+            raise DataError(f"gains: expected {', '.join(several)} with as many numbers each; state all or none.")
         if not frequency_Hz:
             return own | found, []
         wanted = np.asarray(frequency_Hz)
         if found and np.array_equal(np.sort(found["frequency_Hz"]), np.sort(wanted)):
             return own | found, []
         kept = {name: x for name, x in own.items() if name not in several} | {"frequency_Hz": wanted}
-        anew = "the resonators of --gains are at other frequencies than --frequency, and made anew"
+        anew = "the resonators of the gains are at other frequencies than those stated, and made anew"
         return kept, [anew] if found else []
 
     def _check_frequencies(self, frequency_Hz: np.ndarray) -> None:
         highest = 0.5 / self.loop.ready.interval_s
         bad = frequency_Hz[~((frequency_Hz > 0) & (frequency_Hz < highest))]
         if len(bad):
-            raise DataError(f"--frequency: expected one between 0 and {highest:g} Hz, found {bad[0]:g} Hz.")
+            raise DataError(f"frequency: expected one between 0 and {highest:g} Hz, found {bad[0]:g} Hz.")
         near = np.sort(frequency_Hz)
         # Resonators that are nearer to each other fight.
         if np.any(np.diff(near) <= 1e-3 * near[1:]):
-            raise DataError("--frequency: expected frequencies that differ, found two alike; state each once.")
+            raise DataError("frequency: expected frequencies that differ, found two alike; state each once.")

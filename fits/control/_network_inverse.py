@@ -79,7 +79,7 @@ def fit_network_inverse(
     has no displacement, or too little of it, or nothing moves in it.
     """
     if record.displacement_um is None:
-        raise DataError(f"{record.source}: a displacement column is needed here; name it with --columns.")
+        raise DataError(f"{record.source}: a displacement column is needed here; give one.")
     displacement, voltage = record.displacement_um, record.voltage_V
     if len(record) < _FEWEST or np.ptp(displacement) == 0 or np.ptp(voltage) == 0:
         raise DataError(

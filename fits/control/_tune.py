@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fits.control._tune_problem import REACH, Figures, Goal, Problem, Tuning, descend, judge, reports
-from fits.control._tune_start import steepest_slope
+from fits.control._tune_start import stages_given, steepest_slope
 from fits.io._errors import DataError
 from fits.io._length import length
 from fits.loop._result import FitError, FitStatus
+from fits.stage._model_file import AnyModel
 from microid import AbstractController, Coordinates, ParameterInfo, Stage, Start, parameter_table
 
 _Controller = TypeVar("_Controller", bound=AbstractController)
@@ -43,7 +44,7 @@ class _End:
 
 def tune_controller(
     controller: _Controller,
-    plants: Stage | Sequence[Stage],
+    plants: AnyModel | Sequence[AnyModel],
     reference_um: ArrayLike,
     *,
     goal: Goal | None = None,
@@ -78,7 +79,7 @@ def tune_controller(
     `FitError` that the loop is unstable at the start, that no place within all limits was found, or none better than
     the start, although that is not an optimum.
     """
-    stages = [plants] if isinstance(plants, Stage) else list(plants)
+    stages = stages_given(plants)
     resolution = None if resolution_um is None else jnp.asarray(float(resolution_um))
     fixed = {"start": start or Start(), "delay": delay, "resolution_um": resolution}
     signals = {"feedforward_V": feedforward_V, "noise_um": noise_um}

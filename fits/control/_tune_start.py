@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +11,8 @@ from jaxtyping import Array, Float
 from scipy.optimize import brentq
 
 from fits.io._errors import DataError
-from fits.stage._run import place_of_hysteresis
+from fits.stage._model_file import AnyModel, model_given
+from fits.stage._run import as_stage, place_of_hysteresis
 from microid import PID, PrandtlIshlinskii, Preisach, Stage, loop_gain, margins
 
 
@@ -87,7 +89,13 @@ def ultimate_point(stage: Stage, interval_s: float, *, delay: int = 0) -> Ultima
     return UltimatePoint(float(-1 / depth), float(1 / frequency))
 
 
-def relay_start(plants: Stage | Sequence[Stage], interval_s: float, *, delay: int = 0) -> PID:
+def stages_given(plants: Any) -> list[Stage]:
+    """Plants as stages: one or several models, fits of them, or names of their files."""
+    each = plants if isinstance(plants, list | tuple) else [plants]
+    return [as_stage(model_given(one)[0]) for one in each]
+
+
+def relay_start(plants: AnyModel | Sequence[AnyModel], interval_s: float, *, delay: int = 0) -> PID:
     """Find a PID controller to start from: the rules of Ziegler and Nichols (1942), made safe.
 
     They give `0.6 K_u`, `P_u / 2` and `P_u / 8` for the gain and the times of integral and derivative, from the gain
@@ -96,9 +104,10 @@ def relay_start(plants: Stage | Sequence[Stage], interval_s: float, *, delay: in
 
     There are `interval_s` between two samples of the controller, whose readings are `delay` samples old. Of several
     plants the first gives the ultimate point. The controller has no limits, and a filter of a tenth of the
-    derivative's time. A `DataError` is that of `ultimate_point`, or says that no gains are small enough.
+    derivative's time. A `DataError` says that a plant is no model, that the first moves down for a voltage that goes
+    up, or does not move, or that no gains are small enough.
     """
-    stages = [plants] if isinstance(plants, Stage) else list(plants)
+    stages = stages_given(plants)
     point = ultimate_point(stages[0], interval_s, delay=delay)
     given = [(stage, slope_array(stage)) for stage in stages]
     gain, integral_s, derivative_s = 0.6 * point.gain_V_per_um, point.period_s / 2, point.period_s / 8

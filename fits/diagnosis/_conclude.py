@@ -75,7 +75,7 @@ def conclude(
     repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
     if kept and (misfit.share < thresholds.explained_share or predicts_worse(seen, thresholds.worse_z)):
-        suspects = ", ".join(cause.name for cause in kept)
+        suspects = ", ".join(cause.name.replace("_", " ") for cause in kept)
         why = "what was held out is predicted worse with that"
         if misfit.share < thresholds.explained_share:
             why = f"that explains only {misfit.share:.0%} of it"

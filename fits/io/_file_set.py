@@ -1,6 +1,7 @@
 """Files that appear together, or not at all: all are written under temporary names, then all are renamed."""
 
 import errno
+import logging
 import os
 import shutil
 import stat
@@ -13,14 +14,15 @@ from typing import overload
 from fits.io._errors import AnyPath, DataError, reason_of
 from fits.io._temporary import is_temporary, remove_stale, temporary_name
 
+_LOG = logging.getLogger(__name__)
 DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 
 
-def usable_folder(path: AnyPath, option: str) -> tuple[Path, Path]:
+def usable_folder(path: AnyPath) -> tuple[Path, Path]:
     """Refuse a folder that cannot be written to, or made; itself and the nearest one that exists come back."""
     shown = os.fspath(path)
     if not shown:
-        raise DataError(f"{option}: expected the name of a folder, found none; write . for the current one.")
+        raise DataError("expected the name of a folder, found an empty one; write . for the current one.")
     try:
         target = Path(os.path.realpath(path))
         anchor = next(place for place in (target, *target.parents) if os.path.lexists(place))
@@ -28,15 +30,27 @@ def usable_folder(path: AnyPath, option: str) -> tuple[Path, Path]:
         for name in target.relative_to(anchor).parts:
             with suppress(FileNotFoundError, NotADirectoryError):
                 os.lstat(anchor / name)
-        good = anchor.is_dir() and os.access(anchor, os.W_OK | os.X_OK)
+        wrong = _unwritable(anchor)
     except (OSError, ValueError) as error:
-        raise DataError(
-            f"{shown}: cannot be the name of a folder ({reason_of(error)}); choose another for {option}."
-        ) from None
-    if not good:
-        raise DataError(f"{shown}: expected a folder that can be written to; choose another for {option}.")
+        raise DataError(f"{shown}: cannot be the name of a folder ({reason_of(error)}); choose another.") from None
+    if wrong:
+        raise DataError(f"{shown}: expected a folder that can be written to ({wrong}); choose another.")
     remove_stale(anchor)
     return target, anchor
+
+
+def _unwritable(folder: Path) -> str:
+    """Why nothing can be made in a folder, by trying, or nothing: rights alone do not tell of what is mounted."""
+    trial = folder / temporary_name()
+    try:
+        try:
+            trial.mkdir()
+        finally:
+            if trial.exists():
+                trial.rmdir()
+    except OSError as error:
+        return reason_of(error)
+    return ""
 
 
 def check_file(path: AnyPath, shown: str | None = None) -> Path:
@@ -58,8 +72,8 @@ def check_file(path: AnyPath, shown: str | None = None) -> Path:
         raise DataError(f"{shown}: expected a regular file or a new name, found a device or a pipe; choose another.")
     if not target.parent.is_dir():
         raise DataError(f"{shown}: the folder {target.parent} does not exist; create it or choose another.")
-    if not os.access(target.parent, os.W_OK | os.X_OK):
-        raise DataError(f"{shown}: the folder {target.parent} cannot be written to; choose another.")
+    if wrong := _unwritable(target.parent):
+        raise DataError(f"{shown}: the folder {target.parent} cannot be written to ({wrong}); choose another.")
     if mode is not None and not os.access(target, os.W_OK):
         raise DataError(f"{shown}: the file is write-protected; choose another name or allow writing.")
     return target
@@ -90,12 +104,10 @@ class _Folder:
     files: Path
     target: Path
     shown: str
-    option: str
 
     def refused(self, error: OSError) -> DataError:
         """Say that nothing can be put there."""
-        why = reason_of(error)
-        return DataError(f"{self.shown}: files cannot be put there ({why}); choose another for {self.option}.")
+        return DataError(f"{self.shown}: files cannot be put there ({reason_of(error)}); choose another.")
 
 
 class FileSet:
@@ -123,21 +135,21 @@ class FileSet:
         self._files.append(_Move(None, Path(os.path.realpath(path)), os.fspath(path)))
 
     @overload
-    def folder(self, path: AnyPath, option: str = ...) -> Path: ...
+    def folder(self, path: AnyPath) -> Path: ...
     @overload
-    def folder(self, path: AnyPath | None, option: str = ...) -> Path | None: ...
-    def folder(self, path: AnyPath | None, option: str = "--plots") -> Path | None:
-        """Make a temporary folder, whose files go to the folder `path` that an option named; for None there is none.
+    def folder(self, path: AnyPath | None) -> Path | None: ...
+    def folder(self, path: AnyPath | None) -> Path | None:
+        """Make a temporary folder, whose files go to the folder `path`; for None there is none.
 
         A `DataError` says that `path`, which is made if need be, cannot be written to, or is no folder.
         """
         if path is None:
             return None
-        target, anchor = usable_folder(path, option)
+        target, anchor = usable_folder(path)
         missing = target.relative_to(anchor).parts
         staged = anchor / temporary_name()
         files = staged.joinpath(*missing[1:])
-        folder = _Folder(staged, anchor.joinpath(*missing[:1]), files, target, os.fspath(path), option)
+        folder = _Folder(staged, anchor.joinpath(*missing[:1]), files, target, os.fspath(path))
         _refuse_twice(target, folder.shown, self._all())
         # Known before it is there, so that an interruption at any moment finds it.
         self._folders.append(folder)
@@ -171,6 +183,8 @@ class FileSet:
                     else:
                         os.replace(move.staged, move.target)
             undo.pop_all()
+        for move in moves:
+            _LOG.debug("%s %s", "removed" if move.staged is None else "wrote", move.shown)
         for path in {move.target.parent for move in moves}:
             # Not all systems can; and what is renamed stays renamed.
             with suppress(OSError):

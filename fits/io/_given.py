@@ -2,10 +2,14 @@
 
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from numbers import Real
 from typing import Any, TypeVar
 
+import numpy as np
+
 from fits.io._errors import DataError
-from fits.io._read_csv import read_reference, read_table
+from fits.io._in_python import read_reference, read_table
 from fits.io._record import Record, Reference
 
 # One run or an iterable of several: records, names of files, or what else `read_table` takes, such as a DataFrame.
@@ -13,7 +17,7 @@ AnyRuns = Any
 _Given = TypeVar("_Given", Record, Record | Reference)
 
 
-def records_given(given: AnyRuns) -> tuple[Record, ...]:
+def records_given(given: AnyRuns, what: str = "run") -> tuple[Record, ...]:
     """One run or several as records of a measured displacement.
 
     A `DataError` says which cannot be read, has no samples, or was only commanded.
@@ -22,12 +26,11 @@ def records_given(given: AnyRuns) -> tuple[Record, ...]:
     is_table = hasattr(given, "columns") or hasattr(given, "to_dataframe")
     is_one = is_table or isinstance(given, Record | str | os.PathLike | Mapping) or not isinstance(given, Iterable)
     each: Iterable[Any] = (given,) if is_one else given
-    found = tuple(one if isinstance(one, Record) else read_table(one) for one in each)
-    for number, record in enumerate(found, 1):
-        name = record.source or f"run {number}"
-        _with_samples(record, name)
+    read = (one if isinstance(one, Record) else read_table(one) for one in each)
+    found = tuple(_with_samples(record, f"{what} {number}") for number, record in enumerate(read, 1))
+    for record in found:
         if record.displacement_um is None:
-            raise DataError(f"{name}: a displacement column is needed here")
+            raise DataError(f"{record.source}: a displacement column is needed here")
     return found
 
 
@@ -43,11 +46,16 @@ def reference_given(given: Any) -> Record | Reference:
 
 
 def _with_samples(given: _Given, name: str) -> _Given:
+    """Refuse what holds no sample; what has no name gets one, so that sentences can speak of it."""
     if len(given.time_s) == 0:
         raise DataError(f"{given.source or name}: there are no samples; give a run that has some")
-    return given
+    return given if given.source else replace(given, source=name)
 
 
 def holdout_given(holdout: float | AnyRuns) -> float | tuple[Record, ...]:
     """Fraction held out of every run, or runs that are held out as a whole; see `records_given`."""
-    return holdout if isinstance(holdout, int | float) else records_given(holdout)
+    if isinstance(holdout, Real) or (isinstance(holdout, np.ndarray) and holdout.ndim == 0):
+        return float(holdout)
+    if isinstance(holdout, np.ndarray | list | tuple) and any(isinstance(one, Real) for one in holdout):
+        raise DataError("holdout: expected one fraction, or runs, found a list of numbers; give one of these")
+    return records_given(holdout, "held-out run")

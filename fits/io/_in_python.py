@@ -1,43 +1,54 @@
-"""Refusals of objects of other libraries say what to write in Python, where those of files name options."""
+"""The readers as Python has them: their sentences say what to write there, where the command names options."""
 
 import functools
 import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
+from fits.io import _read_csv
 from fits.io._errors import DataError
 from fits.io._record import Record, Reference
 
 _Given = ParamSpec("_Given")
-_Made = TypeVar("_Made", Record, Reference)
+_Made = TypeVar("_Made", Record, Reference, tuple[Record, ...])
 _COLUMNS = re.compile(r"--columns (?:'([^']*)'|([^\s;)]+?)(?=[.;,)]?(?:\s|$)))")
 
 
-def in_python(read: Callable[_Given, _Made]) -> Callable[_Given, _Made]:
-    """Turn the options that a reader's sentences name into its arguments, unless the user named a file."""
+def _in_python(read: Callable[_Given, _Made]) -> Callable[_Given, _Made]:
+    """Turn the options that a reader's sentences name into its arguments."""
+
+    def renamed(made: Any, call: str) -> Any:
+        return replace(made, warnings=tuple(_as_arguments(warning, call) for warning in made.warnings))
 
     @functools.wraps(read)
     def run(*args: _Given.args, **kwargs: _Given.kwargs) -> _Made:
-        if isinstance([*args, *kwargs.values()][0], str | os.PathLike):
-            return read(*args, **kwargs)
+        source = [*args, *kwargs.values()][0]
+        named = repr(os.fspath(source)) if isinstance(source, str | os.PathLike) else "data"
+        call = "fits" + f".{read.__name__}({named}"
         try:
             made = read(*args, **kwargs)
         except DataError as error:
-            raise DataError(_as_arguments(str(error), read.__name__)) from None
-        return replace(made, warnings=tuple(_as_arguments(warning, read.__name__) for warning in made.warnings))
+            raise DataError(_as_arguments(str(error), call)) from None
+        found = tuple(renamed(one, call) for one in made) if isinstance(made, tuple) else renamed(made, call)
+        return cast(_Made, found)
 
+    run.__module__ = __name__
     return run
 
 
-def _as_arguments(sentence: str, reader: str) -> str:
-    def again(arguments: str) -> str:
-        return "fits" + f".{reader}(data, {arguments})"
-
+def _as_arguments(sentence: str, call: str) -> str:
     def pairs(found: re.Match[str]) -> str:
         named = dict(pair.split("=", 1) for pair in (found[1] or found[2]).split(",") if "=" in pair)
-        return again(str(named)) if named else "columns"
+        return f"{call}, {named})" if named else found[0]
 
-    sentence = _COLUMNS.sub(pairs, sentence).replace("--missing drop", again('missing="drop"'))
+    sentence = _COLUMNS.sub(pairs, sentence).replace("--missing drop", f'{call}, missing="drop")')
     return sentence.replace("--columns", "columns").replace("--sample-rate", "sample_rate_Hz")
+
+
+read_table = _in_python(_read_csv.read_table)
+# What it was called when it read CSV alone.
+read_csv = read_table
+read_runs = _in_python(_read_csv.read_runs)
+read_reference = _in_python(_read_csv.read_reference)

@@ -187,6 +187,7 @@ def _spec(table: Table, source: Source) -> str:
 
 def _command(path: str, there: set[str], options: list[str], still: bool) -> str:
     """What to paste; a record under a voltage that is `still` is of the noise."""
+    path = f"./{path}" if path.startswith("-") else path
     if "displacement_um" in there:
         words = ["compensate", "model.json", path, *options, "--out", "voltage.csv"]
         if "voltage_V" in there:

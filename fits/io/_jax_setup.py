@@ -1,6 +1,7 @@
 """JAX as the command needs it: double precision, and compiled functions kept between calls."""
 
 import itertools
+import logging
 import os
 import stat
 from contextlib import suppress
@@ -40,6 +41,7 @@ def start_jax(accelerator: bool = False) -> None:
         # A diagnosis compiles some 300 functions, most of them in a tenth of a second: together they matter.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    logging.getLogger(__name__).debug("JAX %s, compiled functions in %s", jax.__version__, folder or "no folder")
 
 
 def require_float64(what: str) -> None:

@@ -140,7 +140,7 @@ def allowed(reached: RangeMap, stated: RangeMap, margin: float) -> Ranges:
     range beyond what was reached; the command may not. A `DataError` refuses a margin that is negative or not finite.
     """
     if not (math.isfinite(margin) and margin >= 0):
-        raise DataError(f"--margin: expected a share of the ranges reached, 0 or more, found {margin:g}.")
+        raise DataError(f"margin: expected a share of the ranges reached, 0 or more, found {margin:g}.")
     found: Ranges = {}
     for name in UNITS:
         if name in stated:

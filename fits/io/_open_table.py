@@ -1,5 +1,6 @@
 """From a file of any format, or an object of another library, to a table of named columns."""
 
+import logging
 import os
 import warnings
 import zlib
@@ -13,6 +14,7 @@ from fits.io._read_file import MOST_CSV_BYTES, numbered, read_bytes, unpack
 from fits.io._table import Table, gathered, of_frame
 from fits.io.formats import FORMATS, Format
 
+_LOG = logging.getLogger(__name__)
 _CSV = "a CSV file"
 
 
@@ -49,13 +51,13 @@ def open_table(source: AnyPath | Any) -> Table:
             return form.open(shown, data)
     except (DataError, KeyboardInterrupt):
         raise
-    except (Exception, zlib.error) as error:  # whatever the library of a format has against its bytes
+    except (Exception, zlib.error):  # whatever the library of a format has against its bytes
         if form.name == _CSV:
             raise
-        why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        _LOG.debug("%s: the library of this format says", shown, exc_info=True)
         raise DataError(
-            f"{shown}: expected {form.name}, found a damaged one, or a kind that cannot be read ({why}); export it "
-            "again, or as CSV."
+            f"{shown}: expected {form.name}, found one that is damaged or cut off, or a kind that cannot be read; "
+            "export it again, or as CSV."
         ) from None
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from fits.io._errors import AnyPath, DataError
-from fits.io._in_python import in_python
 from fits.io._open_table import open_table
 from fits.io._plausible import SHORTEST_STEP_s, check_size
 from fits.io._quantity import FloatArray
@@ -23,7 +22,6 @@ STROKE_PER_VOLT_MAX_um_per_V = 50.0
 MIN_SAMPLES = 50
 
 
-@in_python
 def read_table(
     source: AnyPath | Any,
     columns: Columns = None,
@@ -97,10 +95,6 @@ def read_table(
     return Record(time_s, voltage_V, displacement_um, extra, os.path.basename(table.path), tuple(warnings))
 
 
-# What it was called when it read CSV alone.
-read_csv = read_table
-
-
 def read_runs(
     paths: Iterable[AnyPath],
     columns: Columns = None,
@@ -114,7 +108,6 @@ def read_runs(
     return tuple(read_table(path, columns, sample_rate_Hz=sample_rate_Hz, missing=missing) for path in paths)
 
 
-@in_python
 def read_reference(
     path: AnyPath,
     columns: Columns = None,

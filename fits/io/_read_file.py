@@ -3,6 +3,7 @@
 import gzip
 import io
 import json
+import logging
 import math
 import os
 import re
@@ -13,6 +14,7 @@ from typing import Any
 
 from fits.io._errors import AnyPath, DataError, reason_of, shown
 
+_LOG = logging.getLogger(__name__)
 # Each is many times what real files need, and fits in the memory of a small computer.
 MOST_CSV_BYTES = 512_000_000
 MOST_JSON_BYTES = 64_000_000
@@ -40,13 +42,15 @@ def read_bytes(path: AnyPath, what: str, most: int) -> bytes:
             # Reading these may wait, or go on, for ever.
             raise DataError(f"{name}: expected {what}, found a device or a pipe; name a regular file.")
         with open(path, "rb") as file:
-            return _bounded(file, name, most)
+            data = _bounded(file, name, most)
     except DataError:
         raise
     except (FileNotFoundError, NotADirectoryError):
         raise DataError(f"{name}: no such file; check the name and the folder.") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{name}: cannot be read ({reason_of(error)}); check the name and the permissions.") from None
+    _LOG.debug("read %s, %d bytes", name, len(data))
+    return data
 
 
 def read_text(path: AnyPath, what: str, most: int) -> str:

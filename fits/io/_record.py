@@ -14,7 +14,8 @@ from fits.io._quantity import FloatArray
 from fits.io._summary import AbstractSummary
 
 
-def _read_only(name: str, values: ArrayLike) -> FloatArray:
+def read_only(name: str, values: ArrayLike) -> FloatArray:
+    """Numbers that nobody can change, of any shape; a `DataError` refuses what is none."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -45,7 +46,7 @@ class Record(AbstractSummary):
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        extra = {name: _read_only(name, values) for name, values in self.extra.items()}
+        extra = {name: read_only(name, values) for name, values in self.extra.items()}
         _settle(self, ("time_s", "voltage_V", "displacement_um"), extra, " as time_s")
         object.__setattr__(self, "extra", MappingProxyType(extra))
 
@@ -118,7 +119,7 @@ def _settle(
 ) -> None:
     """Make arrays read-only and texts printable; what no model could be fitted to, or follow, is refused."""
     given = {name: getattr(record, name) for name in names}
-    arrays = {name: _read_only(name, values) for name, values in given.items() if values is not None}
+    arrays = {name: read_only(name, values) for name, values in given.items() if values is not None}
     size = arrays["time_s"].size
     for name, array in (arrays | dict(extra or {})).items():
         if array.shape != (size,):

@@ -162,7 +162,8 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
     text = text.strip()
     sign, stated = 1, None
     # A header may itself begin with a minus or end with brackets, so the literal name is tried first.
-    if text not in names and text.startswith("-"):
+    bracketed = BRACKETS.fullmatch(text)
+    if text.startswith("-") and not {text, bracketed["stem"] if bracketed else text} & set(names):
         sign, text = -1, text[1:].strip()
     if text not in names:
         match = BRACKETS.fullmatch(text)

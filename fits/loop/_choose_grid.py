@@ -116,7 +116,7 @@ def _stroke(run: Run) -> float:
         _refuse_ringing(run)
         raise DataError(
             f"{run.record.source}: the displacement hardly follows the voltage (correlation {together:.2f}), so "
-            "there is no hysteresis loop to fit; check that --columns names the right ones"
+            "there is no hysteresis loop to fit; check that the right columns are named"
         )
     if together < 0:
         raise DataError(
@@ -127,7 +127,7 @@ def _stroke(run: Run) -> float:
     if _leads(voltage, displacement) > 0.5:
         raise DataError(
             f"{run.record.source}: the displacement runs ahead of the voltage round its loops, where a piezo stays "
-            "behind: the two columns are exchanged; correct the header, or name them the other way with --columns"
+            "behind: the two columns are exchanged; correct the header, or name them the other way round"
         )
     return float(np.ptp(displacement))
 
@@ -152,7 +152,7 @@ def _refuse_ringing(run: Run) -> None:
     raise DataError(
         f"{run.record.source}: the displacement follows the voltage (coherence {follows:.2f}), but not at once, and "
         f"most near {frequency[np.argmax(gain)]:.4g} Hz: this run plays up to a resonance and beyond, and shows no "
-        "hysteresis loop; give a slow run over the whole range of the voltage, beside this one for --model stage"
+        "hysteresis loop; give a slow run over the whole range of the voltage, beside this one to fit a whole stage"
     )
 
 

@@ -87,7 +87,7 @@ def fit(
     if family == "grid":
         found = grid_estimate(tried.data, tried.solution, stroke, tried.correlation, tried.discrepancy_um)
         if levels is None and tried.data.grid.levels == LADDER[-1]:
-            remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try --levels 100")
+            remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try 100")
     else:
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
             tried = try_grid(gather(grid_of(runs, _SHAPE_LEVELS), runs), runs, stroke, tried.solution.hyper, True)
@@ -97,7 +97,7 @@ def fit(
         found, agree = solve_shape(family, tried.data, runs, stroke, smooth, starts, key, progress)
         if not agree:
             remarks.append(
-                f"the best two of {starts} starts ended at different fits; there may be a better one: raise --starts"
+                f"the best two of {starts} starts ended at different fits; there may be a better one: try more starts"
             )
     if found.correlation > WHITE:
         remarks.append(correlated(found.correlation, "creep, rate, drift or a density this family cannot follow"))

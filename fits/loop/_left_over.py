@@ -21,8 +21,8 @@ _CONSTANTS, _SHORTEST, _LONGEST = 3, 20, 1 / 4
 _LAG, _ROUNDS = 2.0, 3
 # The error must fall to this share, in blocks that were only predicted.
 _CLEARLY = 0.85
-_OPTIONS = {"a lag": "--lag", "relaxations (creep)": f"--relaxation {_CONSTANTS}"}
-_LAGS, _RELAXES = _OPTIONS
+_REMEDIES = {"a lag": "a lag", "relaxations (creep)": f"{_CONSTANTS} relaxations"}
+_LAGS, _RELAXES = _REMEDIES
 
 
 def suggestions(runs: Sequence[Run], model: Surface, stroke_um: float, hyper: Hyper) -> list[str]:
@@ -66,7 +66,7 @@ def suggestions(runs: Sequence[Run], model: Surface, stroke_um: float, hyper: Hy
         rest, added = "beside that, " if taken else "", [one for one in best if one not in taken]
         out.append(
             f"{rest}{' and '.join(added)} would take {100 * (1 - share):.0f} % of the residual away, in blocks that "
-            f"are predicted from the others: fit again with {' '.join(_OPTIONS[one] for one in best)}"
+            f"are predicted from the others: fit again with {' and '.join(_REMEDIES[one] for one in best)}"
         )
         taken, before = best, after[best]
     return out

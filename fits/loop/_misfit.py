@@ -115,7 +115,7 @@ def remarks_on(runs: Sequence[Run], residuals: Sequence[np.ndarray], robust: boo
         if interval > 1.0:
             out.append(
                 f"{record.source}: samples are {interval:.4g} s apart and the run takes {record.duration_s:.4g} s, "
-                "which is rare with piezo stages: if the time is in ms, name it so, as in --columns time_s=time_ms"
+                "which is rare with piezo stages: if the time is in ms, name it so among the columns, time_s=NAME[ms]"
             )
     return out
 
@@ -196,7 +196,7 @@ def impulses(run: Run, residual_um: np.ndarray, robust: bool) -> list[str]:
     remedy = (
         "they count less in this fit"
         if robust
-        else "they pull the fit: fit again with --loss huber, to which they count less, or leave them out"
+        else "they pull the fit: fit again with the loss huber, to which they count less, or leave them out"
     )
     return [
         f"{run.record.source}: {count} readings ({100 * count / run.fitted.sum():.2g} %) jump out by "

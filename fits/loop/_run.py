@@ -205,7 +205,7 @@ def prepare_run(
         raise DataError(
             f"{record.source}: only {fitted.sum()} samples are left to fit, {_FEWEST} are needed: the others come "
             "before the voltage has been at an end of its range, where its unknown history still counts, or are held "
-            "out; state the initial state with --initial, hold out less, or start each run with a full loop"
+            "out; state the initial state, hold out less, or start each run with a full loop"
         )
     ahead = 1.0 if gain is None else gain
     lower, upper = ahead * lower, ahead * upper

@@ -21,6 +21,7 @@ from fits.machining._design import Design
 from fits.machining._gains import once_per_function, quick_jit
 from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import derivatives_of, output_scale, refuse_infinite
+from fits.stage._model_file import AnyModel, model_given
 
 Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
 
@@ -152,7 +153,7 @@ class Budget(AbstractSummary):
 
 def budget(
     design: Design,
-    model: m.Preisach | m.Stage,
+    model: AnyModel,
     idle: IdleNoise,
     axes: Sequence[m.Axis] = m.AXES,
     *,
@@ -162,11 +163,11 @@ def budget(
 ) -> Budget:
     """Put driving, machining and measuring errors together (Eq. 1), each axis being driven over its whole range.
 
-    The model is the fitted hysteresis of a piezo, of a stage what slow commands see, and all piezos are taken to be
-    like it; its displacement `measures` the piezo's elongation, or the output of an axis, which is then divided by
-    its gain. The noise of the sensor is from `idle_noise`; zeroed at rest, the sensor has no offset. It reads a
-    rotation at a distance of `arm_mm` from the axis: without that rotations have no measuring error, and none can be
-    what the model measures.
+    The model is the fitted hysteresis of a piezo, of a stage what slow commands see, or a fit or the name of a file
+    of one, and all piezos are taken to be like it; its displacement `measures` the piezo's elongation, or the output
+    of an axis, which is then divided by its gain. The noise of the sensor is from `idle_noise`; zeroed at rest, the
+    sensor has no offset. It reads a rotation at a distance of `arm_mm` from the axis: without that rotations have no
+    measuring error, and none can be what the model measures.
 
     A `DataError` says that the model does not move, is a stage without hysteresis, or measures a rotation at no arm,
     a `RuntimeError` that JAX is not in double precision.
@@ -174,7 +175,7 @@ def budget(
     require_float64("budgets need")
     if arm_mm is not None and not (math.isfinite(arm_mm) and arm_mm > 0):
         raise DataError(f"expected an arm above 0 mm, found {arm_mm:g}; give the distance from the axis of rotation.")
-    driving = _driving(design, model, measures, arm_mm)
+    driving = _driving(design, model_given(model)[0], measures, arm_mm)
     noise_um = idle.error_um(zeroed)
     # In um, and in urad where the arm is known.
     measuring = {"um": noise_um, "rad": None if arm_mm is None else 1e3 * noise_um / arm_mm}

@@ -48,7 +48,7 @@ class Drawn:
 
 def told_apart(holdout: float | Sequence[Record], records: int, runs: int) -> tuple[float, Sequence[Record]]:
     """Tell the fraction that was held out from records; a ValueError where both are not the runs of a result."""
-    fraction, aside = (float(holdout), ()) if isinstance(holdout, int | float) else (0.0, holdout)
+    fraction, aside = (0.0, holdout) if isinstance(holdout, Sequence) else (float(holdout), ())
     if records + len(aside) != runs:
         raise ValueError(f"the result has {runs} runs, and {records + len(aside)} records were given")
     return fraction, aside

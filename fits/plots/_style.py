@@ -60,7 +60,10 @@ def legend(picture: Figure, axes: Iterable[Axes]) -> None:
     found = [zip(*each.get_legend_handles_labels(), strict=True) for each in axes]
     curves = {name: handle for each in found for handle, name in each}
     place: dict[str, Any] = {"loc": "outside upper center", "ncols": len(curves)}
-    picture.legend(curves.values(), curves.keys(), frameon=False, handlelength=1.8, **place)
+    drawn = picture.legend(curves.values(), curves.keys(), frameon=False, handlelength=1.8, **place)
+    for handle in drawn.get_lines():
+        # Dots that are many are small, and one alone would not show.
+        handle.set_markersize(max(handle.get_markersize(), 2.5))
 
 
 def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:

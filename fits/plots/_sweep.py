@@ -32,6 +32,9 @@ class _Rows:
     by: str
     values: np.ndarray
 
+    def logarithmic(self, name: str) -> bool:
+        return name not in self.words and _logarithmic(self.swept[name])
+
 
 def plot_sweep(folder: AnyPath, out: AnyPath, by: str | None = None, *, form: str = "png") -> list[Path]:
     """Draw heat maps of an output over pairs of parameters, and parallel coordinates; the files come back.
@@ -62,7 +65,9 @@ def plot_sweep(folder: AnyPath, out: AnyPath, by: str | None = None, *, form: st
 
 def _parallel(rows: _Rows) -> Figure:
     every = max(1, -(-len(rows.values) // 400))  # more lines do not show
-    names, columns = [*rows.swept, rows.by], np.stack([*rows.swept.values(), rows.values], axis=1)
+    names, logs = [*rows.swept, rows.by], [*map(rows.logarithmic, rows.swept), False]
+    shown = [np.log10(x) if log else x for x, log in zip([*rows.swept.values(), rows.values], logs, strict=True)]
+    columns = np.stack(shown, axis=1)
     low, high = np.nanmin(columns, axis=0), np.nanmax(columns, axis=0)
     size = np.where(high > low, high - low, 1)
     scaled = ((columns - low) / size)[::every]
@@ -79,7 +84,9 @@ def _parallel(rows: _Rows) -> Figure:
         axes.axvline(k, color=DARK, linewidth=0.6)
         ticks = np.arange(len(rows.words[name])) if name in rows.words else np.linspace(low[k], high[k], 5)
         for tick in ticks if high[k] > low[k] else ticks[:1]:
-            words = verbatim(rows.words[name][int(tick)], 24) if name in rows.words else f"{tick:.3g}"
+            words = f"{10**tick if logs[k] else tick:.3g}"
+            if name in rows.words:
+                words = verbatim(rows.words[name][int(tick)], 24)
             beside = (k, (tick - low[k]) / size[k]), (-3 if k == len(names) - 1 else 3, 0)
             side = "right" if k == len(names) - 1 else "left"
             axes.annotate(words, *beside, textcoords="offset points", ha=side, va="center", fontsize=6, bbox=box)
@@ -101,7 +108,7 @@ def _wrapped(name: str, most: int) -> str:
 
 
 def _heat(rows: _Rows, pair: tuple[str, str]) -> Figure:
-    logs = [name not in rows.words and _logarithmic(rows.swept[name]) for name in pair]
+    logs = [*map(rows.logarithmic, pair)]
     x, y = (np.log10(rows.swept[name]) if log else rows.swept[name] for name, log in zip(pair, logs, strict=True))
     edges, done = [_edges(x), _edges(y)], np.isfinite(rows.values)
     count, *_ = np.histogram2d(x[done], y[done], bins=edges)
@@ -113,7 +120,8 @@ def _heat(rows: _Rows, pair: tuple[str, str]) -> Figure:
     drawn = axes.pcolormesh(*corners, mean.T, cmap="viridis")
     if not done.all():
         there = (rows.swept[name][~done] for name in pair)
-        axes.plot(*there, "x", color=_FAILED, markersize=3, markeredgewidth=0.7, label="failed")
+        # Whole at the rim, too.
+        axes.plot(*there, "x", color=_FAILED, markersize=3, markeredgewidth=0.7, label="failed", clip_on=False)
         legend(picture, (axes,))
     axes.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
     axes.set(xlim=corners[0][[0, -1]], ylim=corners[1][[0, -1]])

@@ -27,7 +27,7 @@ UNSEEN = 0.5
 _USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
 # Remedies.
 _BEYOND = "add a run with steps, a chirp or a multisine that goes beyond the resonance"
-_FASTER, OR_ALONE = "sample at 5 times the resonance or more", "or fit the hysteresis alone with --model loop"
+_FASTER, OR_ALONE = "sample at 5 times the resonance or more", "or fit the hysteresis alone"
 
 
 def refuse_slopes(records: Sequence[Record]) -> None:

@@ -1,7 +1,7 @@
 """A measured frequency response and its nonlinear distortion: what hysteresis and products of signals add to it."""
 
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 from typing import Any
 
 import jax.numpy as jnp
@@ -31,6 +31,8 @@ _FINER = 2
 _PIECES, _RIDGES = (4, 8, 16), (1e-3, 1e-2, 1e-1, 1.0)
 # Share of the lines, the lowest ones, that tell what voltages do at rest.
 _AT_REST = 0.02
+# Share by which voltages may be larger or smaller than those of the record.
+_OTHER = 0.1
 # A voltage beside the lines of the record, over the largest at them, of which nothing is known.
 _BESIDE = 0.01
 
@@ -83,7 +85,7 @@ class NonlinearResponse:
         """Steady state under one period of voltages, of shape `(t, m)`: displacements in um, `(t, p)`.
 
         Only what lies at the lines of the record is known, so nothing else is in the answer: no mean either. A
-        `DataError` if the period or the lines are not those of the record.
+        `DataError` if the period, the lines or the amplitude are not those of the record.
         """
         voltage = np.asarray(voltage_V, dtype=float)
         inputs = self.scale.shape[1]
@@ -101,6 +103,12 @@ class NonlinearResponse:
                 "expected finite voltages at the lines of the record alone, found others; record the same program."
             )
         drive = (np.fft.rfft(voltage, axis=0)[lines] / self.samples)[:, None]
+        size, recorded = _rms(drive), self.scale[0]
+        if np.any(np.abs(size - recorded) > _OTHER * recorded):
+            raise DataError(
+                f"expected voltages as large as those of the record, {recorded.round(4).tolist()} V, root mean "
+                f"square, found {size.round(4).tolist()} V; record that amplitude, as distortion depends on it."
+            )
         terms = self._terms(drive) - _apply(self.term_response_per_V, drive)
         weight = _interpolated(self.linear.frequency_Hz, self.knots_Hz, self.weight_V)
         moved = _apply(self.linear.response_um_per_V, drive + _apply(weight, terms))
@@ -124,8 +132,8 @@ def estimate_nonlinear_response(record: Multisine) -> NonlinearResponse:
     frequency domain method for estimating the parameters of a non-linear structural dynamic model through feedback*
     (2000); here they are those of the linear response, which further voltages give, too.
 
-    A `DataError` as of `estimate_response`, and if there are fewer than three realizations. The result is compared by
-    `relative_error`.
+    A `DataError` as of `estimate_response`, and if there are fewer than three realizations, or two are alike. The
+    result is compared by `relative_error`.
     """
     require_float64("estimation needs")
     frequency, u, y = record.spectra()
@@ -136,6 +144,12 @@ def estimate_nonlinear_response(record: Multisine) -> NonlinearResponse:
         raise DataError(
             f"{record.source}: expected three realizations and five lines or more, found {drive.shape[1]} and "
             f"{len(frequency)}; record more."
+        )
+    alike = [(j, k) for j, k in combinations(range(drive.shape[1]), 2) if np.allclose(drive[:, j], drive[:, k], 1e-6)]
+    if alike:
+        raise DataError(
+            f"{record.source}: expected other phases in each realization, found the same voltages in realizations "
+            f"{alike[0][0] + 1} and {alike[0][1] + 1}, whose distortion is the same, too; draw the phases anew."
         )
     neighbours, gain, _, _, left_out = together(drive, moved, tried)
     linear = estimate_response(record, neighbours)
@@ -148,7 +162,7 @@ def estimate_nonlinear_response(record: Multisine) -> NonlinearResponse:
     response = smooth_response(drive, terms, neighbours)
     terms -= _apply(response, drive)
     left = moved - _apply(gain, drive)
-    weight = 1 / smooth(np.mean(np.abs(left) ** 2, axis=(1, 2))[:, None])[:, 0]
+    weight = 1 / (smooth(np.mean(np.abs(left) ** 2, axis=(1, 2))[:, None])[:, 0] + np.finfo(float).tiny)
     knots, found, explained = _chosen(frequency, gain, terms, left, left_out, weight)
     return NonlinearResponse(
         linear, samples, record.interval_s, apparent_V_per_um, scale, response, knots, found, explained

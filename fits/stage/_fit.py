@@ -111,7 +111,7 @@ def fit_stage(
         raise DataError(
             f"{gross.source}: neither a lag nor a resonance explains what moves in it: {gross.share_pct:.3g} % of "
             f"its stroke stay unexplained, {gross.times_noise:.3g} times the sensor's noise; check columns, time "
-            "stamps and sampling rate, or fit the hysteresis alone with --model loop"
+            "stamps and sampling rate, or fit the hysteresis alone"
         )
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
@@ -128,7 +128,7 @@ def fit_stage(
         summary = outliers[1].widen(summary, f"{', '.join(outliers[0])}: outliers pull this fit")
     unit = implausible(summary.parameters, [record.source for record in records])
     if unit is not None:
-        remedy = "name the right one as in --columns time_s=time_ms"
+        remedy = "name the right one among the columns, as in time_s=NAME[ms]"
         summary = Alternative.in_unit(summary, unit[1]).widen(summary, unit[0], remedy)
     summary = replace(summary, remarks=(*solved.problem.remarks, *summary.remarks))
     return completed(summary, solved, (*records, *aside), loss)

@@ -11,6 +11,7 @@ from scipy.ndimage import convolve1d
 from fits.io._errors import AnyPath, DataError
 from fits.io._open_table import open_table
 from fits.io._plausible import SHORTEST_STEP_s, check_size
+from fits.io._record import read_only
 from fits.io._table import Table
 
 _REAL, _IMAGINARY, _VARIANCE = "real_um_per_V", "imag_um_per_V", "variance_um2_per_V2"
@@ -35,14 +36,24 @@ class Multisine:
     source: str = "record"
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not belong together."""
+        """Refuse arrays that do not belong together, and what is no finite number."""
+        for name in ("voltage_V", "displacement_um"):
+            object.__setattr__(self, name, read_only(name, getattr(self, name)))
         u, y = self.voltage_V, self.displacement_um
-        if u.ndim != 4 or y.ndim != 4 or u.shape[:3] != y.shape[:3] or not self.interval_s > 0:
+        if u.ndim != 4 or y.ndim != 4 or u.shape[:3] != y.shape[:3] or not 0 < self.interval_s < np.inf:
             raise DataError(
                 f"{self.source}: expected voltages and displacements of shapes (realizations, periods, samples, "
                 f"channels) and a positive interval, got {u.shape}, {y.shape} and {self.interval_s:g} s; "
                 "arrange them so."
             )
+        if min(u.shape + y.shape) == 0 or u.shape[2] < 2:
+            raise DataError(f"{self.source}: expected two samples or more in a period, found {u.shape}; record more.")
+        for name, array in (("voltage_V", u), ("displacement_um", y)):
+            if len(odd := np.argwhere(~np.isfinite(array))):
+                raise DataError(
+                    f"{self.source}: {name}{odd[0].tolist()}: expected a finite number, found "
+                    f"{array[tuple(odd[0])]} ({len(odd)} such in all); leave such realizations out."
+                )
 
     def take(self, realizations: slice) -> "Multisine":
         """Some of the realizations, so that the others can be held out."""
@@ -158,9 +169,11 @@ def estimate_response(record: Multisine, neighbours: int | None = 0) -> Response
     else:
         spread = np.real(np.diagonal(np.linalg.inv(np.swapaxes(drive, 1, 2).conj() @ drive), axis1=1, axis2=2))
         total = smooth(total)
-    noise = None
+    # Without any noise rounding is left.
+    least = (np.finfo(float).eps * np.max(np.abs(moved), axis=(0, 1))) ** 2 + np.finfo(float).tiny
+    total, noise = np.maximum(total, least), None
     if y.shape[2] > 1:
-        between = np.mean(np.var(y, axis=2, ddof=1), axis=1) / y.shape[2]
+        between = np.maximum(np.mean(np.var(y, axis=2, ddof=1), axis=1) / y.shape[2], least)
         noise = smooth(between)[:, :, None] * spread[:, None, :]
     return ResponseData(frequency_Hz, gain, total[:, :, None] * spread[:, None, :], noise)
 

@@ -16,11 +16,15 @@ from fits.io._jax_setup import require_float64
 from fits.io._model_text import SCHEMA, hash_of, pretty, read_model_text
 from fits.io._version import written_by
 from fits.loop._design import Grid
-from fits.loop._uncertainty import Uncertainty
+from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
 from fits.stage._encode import decode, encode
 from fits.stage._moments import offsets_out
 from fits.stage._uncertainty import StageUncertainty
 from microid import Preisach, Stage
+
+Model = Preisach | Stage
+# A hysteresis or a stage; or a fit of one, what `load_model` made of its file, or the name of that.
+AnyModel = Any
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,21 @@ def load_model(path: AnyPath) -> ModelFile:
     if uncertainty and uncertainty.columns_um.shape[1] != (uncertainty.grid.columns if uncertainty.grid else 0):
         raise DataError(f"{name}: the uncertainty does not fit its grid; {again}.")
     return ModelFile(model, uncertainty, content["fit"], content["written_by"])
+
+
+def model_given(given: AnyModel, uncertainty: AbstractUncertainty | None = None) -> tuple[Model, Any]:
+    """A hysteresis or a stage and its uncertainty, from a fit, a model file that was loaded or is named, or as it is.
+
+    An uncertainty that is given counts instead of theirs. A `DataError` says that there is no such model.
+    """
+    held = load_model(given) if isinstance(given, str | os.PathLike) else given
+    model = getattr(held, "model", held)
+    if not isinstance(model, Preisach | Stage):
+        raise DataError(
+            f"expected a Preisach model or a stage, a fit of one, or the name of its file, found a "
+            f"{type(model).__name__}; give one of these"
+        )
+    return model, getattr(held, "uncertainty", None) if uncertainty is None else uncertainty
 
 
 def _moves(model: eqx.Module, uncertainty: StageUncertainty) -> bool:

@@ -1,6 +1,7 @@
 """How sure the fit of a stage is: of its parameters, however coloured the noise, of predictions and of plants."""
 
 from functools import cached_property
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -172,18 +173,22 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
 
 
 def predict(
-    model: Preisach | Stage, uncertainty: AbstractUncertainty | None, record: AnyRuns, initial: str = "negative"
+    model: Any, uncertainty: AbstractUncertainty | None, record: AnyRuns, initial: str = "negative"
 ) -> Prediction:
     """Predict the displacement of a voltage program, with its uncertainty.
 
-    Model and uncertainty are from a fit or a model file; without an uncertainty the standard deviations are NaN. The
-    program is a record, or what `read_table` takes; its displacement, if any, is not looked at. The memory before its
-    first sample is `negative`, `positive` or `demagnetised`.
+    The model is a `Preisach` or a `Stage`, or a fit or a model file with its own uncertainty, or the name of such a
+    file; where there is no uncertainty the standard deviations are NaN. The program is a record, or what `read_table`
+    takes; its displacement, if any, is not looked at. The memory before its first sample is `negative`, `positive` or
+    `demagnetised`.
 
     A `DataError` says that the voltage leaves the range that the model was fitted on, that a stage has an effect of
     another column, which the program lacks, or that the uncertainty is that of another kind of model.
     """
+    from fits.stage._model_file import model_given  # which knows of the uncertainties here
+
     record = program_given(record)
+    model, uncertainty = model_given(model, uncertainty)
     if uncertainty is not None:
         return uncertainty.predict(model, record, initial)
     stage, run = prepare_program(as_stage(model), record, initial)
@@ -191,17 +196,20 @@ def predict(
 
 
 def draw_plants(
-    model: Preisach | Stage, uncertainty: Uncertainty | StageUncertainty | None, count: int, *, seed: int = 0
+    model: Any, uncertainty: Uncertainty | StageUncertainty | None, count: int, *, seed: int = 0
 ) -> tuple[Stage, ...]:
     """Draw stages from the covariance of a fit.
 
-    Model and uncertainty are from a fit or a model file. Of `count` stages, 1 or more, the first is the fitted one.
+    Model and uncertainty are as for `predict`. Of `count` stages, 1 or more, the first is the fitted one.
     All are of one structure; a hysteresis alone becomes a stage of one part. Weights and slopes that a draw would
     make negative are zero. The model's own error (`discrepancy_um`) is not in them. A `DataError` says that there is
     no uncertainty to draw from, or that it is not that of the model.
     """
     if count < 1:
         raise ValueError(f"count must be 1 or more, got {count}")
+    from fits.stage._model_file import model_given  # which knows of the uncertainties here
+
+    model, uncertainty = model_given(model, uncertainty)
     stage = as_stage(model)
     if count == 1:
         return (stage,)

@@ -43,7 +43,7 @@ def connected(address: str) -> Iterator[Any]:
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     count = address.removeprefix("local:")
     if count != address and (not count.isdecimal() or not 1 <= int(count) <= 1024):
-        raise DataError(f"--cluster: expected local:N with a number of processes, found {shown(address)}; give one.")
+        raise DataError(f"cluster: expected local:N with a number of processes, found {shown(address)}; give one.")
     with ExitStack() as stack:
         try:
             where = address
@@ -60,7 +60,7 @@ def connected(address: str) -> Iterator[Any]:
             client = stack.enter_context(distributed.Client(where, timeout=20, set_as_default=False))
         except (OSError, TimeoutError, ValueError) as error:
             raise DataError(
-                f"--cluster: {address} does not answer ({error}); give the address of a Dask scheduler, such as "
+                f"cluster: {address} does not answer ({error}); give the address of a Dask scheduler, such as "
                 "tcp://host:8786, or local:2."
             ) from None
         yield client
@@ -110,8 +110,8 @@ def on_cluster(
                     yield chunk, found
     except (OSError, distributed.client.FuturesCancelledError, distributed.CancelledError) as error:
         raise DataError(
-            f"--cluster: the scheduler was lost ({type(error).__name__}); what was computed is kept: start it again, "
-            "then go on with --resume."
+            f"cluster: the scheduler was lost ({type(error).__name__}); what was computed is kept: start it again, "
+            "then resume the sweep."
         ) from None
 
 
@@ -142,11 +142,11 @@ class _Workers:
         if usable:
             self._seen = self._told = now
         elif self.banned:
-            raise DataError(f"--cluster: no worker can be used: {'; '.join(self.banned.values())}.")
+            raise DataError(f"cluster: no worker can be used: {'; '.join(self.banned.values())}.")
         elif now - self._seen > _GIVE_UP_s:
             raise DataError(
-                f"--cluster: the scheduler has had no worker for {_GIVE_UP_s} s; what was computed is kept: start "
-                "workers, then go on with --resume."
+                f"cluster: the scheduler has had no worker for {_GIVE_UP_s} s; what was computed is kept: start "
+                "workers, then resume the sweep."
             )
         elif now - self._told > _SILENT_s:
             self._told = now
@@ -161,10 +161,10 @@ class _Workers:
 
 def _often(chunk: int, error: Exception) -> str:
     if isinstance(error, ImportError):
-        return f"--cluster: workers cannot import what they need ({error}); install the same microid on all of them."
+        return f"cluster: workers cannot import what they need ({error}); install the same microid on all of them."
     return (
-        f"--cluster: chunk {chunk} lost its worker {_MOST_LOSSES} times, as if it took too much memory; lower "
-        "run.memory_MB, then go on with --resume."
+        f"cluster: chunk {chunk} lost its worker {_MOST_LOSSES} times, as if it took too much memory; lower "
+        "run.memory_MB, then resume the sweep."
     )
 
 

@@ -41,7 +41,7 @@ def readable(folder: str | os.PathLike[str]) -> Iterator[None]:
             raise
         why = " ".join(str(error).split()) or type(error).__name__
         raise DataError(
-            f"{os.fspath(folder)}: {RESULTS} is missing or broken ({why[:200]}); run the sweep again with --resume, "
+            f"{os.fspath(folder)}: {RESULTS} is missing or broken ({why[:200]}); resume the sweep, "
             "which computes again what is damaged."
         ) from None
 
@@ -54,7 +54,7 @@ def summarise(folder: str | os.PathLike[str], by: str | None = None, largest: bo
         done = status == DONE
         numbers = [name for name in about["outputs"] if data[name].dims == ("row",) and data[name].dtype.kind == "f"]
         if by is not None and by not in numbers:
-            raise DataError(f"--best: there is no output {by!r}; choose one of {', '.join(numbers)}.")
+            raise DataError(f"best: there is no output {by!r}; choose one of {', '.join(numbers)}.")
         by = by or (numbers[0] if numbers else None)
         kinds = Counter(str(reason).partition(" = ")[0] for reason in data["reason"].values[status == FAILED])
         return {

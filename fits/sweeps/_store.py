@@ -178,7 +178,7 @@ class Store:
 def about_of(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Read what is known of a sweep; a `DataError` says why it cannot be read."""
     if not (Path(folder) / ABOUT).exists():
-        raise DataError(f"{folder}: there is no sweep in this folder; give what --out named.")
+        raise DataError(f"{folder}: there is no sweep in this folder; give the one of its results.")
     try:
         what = "what is known of a sweep"
         about: Any = parse_json(read_text(Path(folder) / ABOUT, what, MOST_JSON_BYTES), ABOUT, what)
@@ -194,12 +194,10 @@ def about_of(folder: str | os.PathLike[str]) -> dict[str, Any]:
 def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
     """Refuse a folder that cannot be written to, or holds something else, before anything starts; see `opened`."""
     need("zarr")
-    folder, anchor = usable_folder(out, "--out")
+    folder, anchor = usable_folder(out)
     if (folder / ABOUT).exists():
         if not resume:
-            raise DataError(
-                f"{out}: there is a sweep in this folder; add --resume to go on, or choose another for --out."
-            )
+            raise DataError(f"{out}: there is a sweep in this folder; resume it to go on, or choose another folder.")
         about = about_of(out)
         for name, version in versions().items():
             before = about["versions"].get(name)
@@ -211,12 +209,12 @@ def check_folder(sweep: Sweep, out: str, resume: bool) -> None:
         if about["digest"] != sweep.digest or about["chunk_rows"] != chunk_rows(sweep):
             raise DataError(
                 f"{out}: the folder holds the results of another sweep or other files; give the one that is in its "
-                f"{TEXT}, or choose another folder for --out."
+                f"{TEXT}, or choose another folder."
             )
         return
     own = (RESULTS, LEDGER, TEXT, ".lock")
     if folder.exists() and any(path.name not in own and not is_temporary(path.name) for path in folder.iterdir()):
-        raise DataError(f"{out}: the folder holds other files; choose another for --out.")
+        raise DataError(f"{out}: the folder holds other files; choose another.")
     # The table holds all but the traces once more, and a disk that is nearly full is full for others.
     needed = len(sweep.plan) * 2 * bytes_per_row(sweep)
     free = shutil.disk_usage(anchor).free
@@ -274,7 +272,7 @@ def _sentences(folder: Path) -> Iterator[None]:
             raise
         raise DataError(
             f"{folder}: cannot be written ({error.strerror or error}); what was done before is kept: free the disk "
-            "or correct the permissions, then go on with --resume."
+            "or correct the permissions, then resume the sweep."
         ) from error
 
 
