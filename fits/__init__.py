@@ -25,8 +25,8 @@ __all__ = [  # noqa: RUF022
     "Bound", "Diagnosis", "Experiment", "FoundCause", "Gain", "Thresholds", "diagnose", "diagnosis_json",
     "diagnosis_schema", "report_html",
     # Compensation and control
-    "Compensation", "Goal", "LoopReport", "NetworkInverse", "Tuning", "compensate", "export_c", "fit_network_inverse",
-    "relay_start", "steepest_slope", "tune_controller",
+    "Compensation", "Goal", "LoopReport", "NetworkInverse", "Tuning", "compensate", "export_c", "export_simulation_c",
+    "fit_network_inverse", "relay_start", "steepest_slope", "tune_controller",
     # Dimensions, tolerances and error budgets
     "Allocation", "AllocationError", "AxisBudget", "AxisSensitivity", "AxisSpread", "Budget", "Claim", "Design",
     "DimensionEffect", "Driving", "IdleNoise", "MonteCarlo", "NoiseBand", "NoiseLine", "SecondOrder",
@@ -44,6 +44,7 @@ __all__ = [  # noqa: RUF022
 if TYPE_CHECKING:
     from fits.control._compensate import compensate
     from fits.control._export_c import export_c
+    from fits.control._export_simulation import export_simulation_c
     from fits.control._follow import Compensation
     from fits.control._network_inverse import NetworkInverse, fit_network_inverse
     from fits.control._tune import tune_controller

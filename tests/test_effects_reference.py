@@ -89,21 +89,6 @@ def test_stiffness_hardening_is_duffings(rng, spacing):
     np.testing.assert_allclose(found, truth, atol=0.04 * np.max(np.abs(truth - plain)))
 
 
-def test_friction_is_dahls_on_the_mass(rng):
-    time, push = 2e-4 * np.arange(200), wander(rng, 200, 5, 30)
-    rate, damping, amplitude, length = 2 * np.pi * 120, 0.03, 0.3, 0.8
-
-    def right_hand(y, w):
-        force = w - y[0] - amplitude * y[2]
-        return [y[1], rate**2 * force - 2 * damping * rate * y[1], (y[1] - y[2] * abs(y[1])) / length]
-
-    truth = motion(time, push, right_hand, np.array([push[0], 0.0, 0.0]))[:, 0]
-    mechanics = m.Mechanics(120.0, damping)
-    effect = BY_NAME["friction", ""](mechanics, amplitude, length)
-    found, plain = through(effect, 2e-4, push), through(mechanics, 2e-4, push)
-    np.testing.assert_allclose(found, truth, atol=0.04 * np.max(np.abs(truth - plain)))
-
-
 def test_voltage_dependent_capacitance_is_a_changing_lag(rng):
     time, push = uneven(rng, 200, 2e-4), wander(rng, 200, 0, 100)
     truth = motion(time, push, lambda v, u: (2 * u - v) / (1e-3 * (1 + 0.4 * (v - 100) / 100)), 2 * push[:1])[:, 0]

@@ -8,6 +8,7 @@ from fits.io._late import late
 if TYPE_CHECKING:
     from fits.control._compensate import compensate, static_equivalent
     from fits.control._export_c import export_c
+    from fits.control._export_simulation import export_simulation_c
     from fits.control._follow import compensate_plain
     from fits.control._gains import read_gains
     from fits.control._make import Loop, Maker, setup
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     from fits.stage._model_file import ModelFile, load_model, model_text
     from fits.stage._motion import predicted_ranges
     from fits.stage._plain_stage import plain_model
+    from fits.stage._run import yields_inside
     from fits.stage._uncertainty import draw_plants, predict
     from fits.sweeps._run import run_sweep
     from fits.sweeps._show import describe_sweep, summarise

@@ -16,6 +16,8 @@ from fits.io._file_set import file_set
 from fits.io._version import written_by
 from fits.loop._plain import PlainLoop
 
+TEMPLATES = Path(__file__).with_name("templates")
+
 
 def export_c(
     model: Any,
@@ -40,10 +42,20 @@ def export_c(
     A `DataError` says that the name is not one in C, the size is too small, the limits are not in the model's range,
     or a file cannot be written.
     """
+    require_name(name)
+    return write_texts(folder, controller_texts(model, name, size, limits_V))
+
+
+def require_name(name: str) -> None:
+    """Refuse what cannot begin names in C."""
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,30}", name):
         raise DataError(
             f"name: expected a letter and then up to 30 letters, digits or underscores, found '{name}'; rename it."
         )
+
+
+def controller_texts(model: Any, name: str, size: int, limits_V: tuple[float, float] | None = None) -> dict[str, str]:
+    """What `export_c` writes, by the names of the files."""
     if not 8 <= size <= 65_536:
         raise DataError(f"memory: expected 8 to 65536 extremes, found {size}; 128 suit most references.")
     if not isinstance(model, PlainLoop):
@@ -53,13 +65,21 @@ def export_c(
 
         model = plain_loop_of(static_equivalent(model_given(model)[0]))
     fields = _fields(model, name, size, within_range(model.range_V, limits_V))
+    return {f"{name}.{ending}": filled(f"controller.{ending}", fields) for ending in ("h", "c")}
+
+
+def filled(template: str, fields: dict[str, str]) -> str:
+    """Fill the blanks of a template in C."""
+    return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(fields)
+
+
+def write_texts(folder: str | os.PathLike[str], texts: dict[str, str]) -> list[Path]:
+    """Write texts into a folder, all or none; their paths come back."""
     with file_set() as files:
         place = files.folder(folder)
-        for ending in ("h", "c"):
-            template = Path(__file__).with_name("templates") / f"controller.{ending}"
-            text = Template(template.read_text(encoding="utf-8")).substitute(fields)
-            (place / f"{name}.{ending}").write_bytes(text.encode())
-    return [Path(folder) / f"{name}.{ending}" for ending in ("h", "c")]
+        for file, text in texts.items():
+            (place / file).write_bytes(text.encode())
+    return [Path(folder) / file for file in texts]
 
 
 def _fields(law: PlainLoop, name: str, size: int, limits_V: tuple[float, float]) -> dict[str, str]:
@@ -83,13 +103,13 @@ def _fields(law: PlainLoop, name: str, size: int, limits_V: tuple[float, float])
         "swings": str(min(31, (size - 4) // 2)),  # at most those of a demagnetised staircase in `microid`
         "intervals": str(n),
         "per_V": repr(n / (upper - lower)),
-        "window_um": _lines(window, 4),
+        "window_um": lines_of(window, 4),
         "rising_um": _rows(branch[:, :n]),
         "falling_um": _rows(branch[:, n:]),
     }
 
 
-def _lines(values: Iterable[float], indent: int) -> str:
+def lines_of(values: Iterable[float], indent: int) -> str:
     """Write constants with as many digits as reading them back exactly takes."""
     text = ", ".join(repr(float(value)) for value in values)
     return textwrap.indent(textwrap.fill(f"{text},", 118 - indent, break_on_hyphens=False), " " * indent)
