@@ -30,14 +30,14 @@ def prepare(stage: Stage, run: Run) -> Prepared:
     return Prepared(run, Scene(command, samples.beside, samples.start.memory))
 
 
-def _through(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
-    return part.run(time_s, signal, scene)
-
-
 @cache
 def program() -> Callable[[AbstractPart, Any, Signal, Scene], Signal]:
     """Send a signal through one part: compiled for each kind of part and length of signal, until it is made anew."""
-    return kept(_through)
+
+    def through(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
+        return part.run(time_s, signal, scene)
+
+    return kept(through)
 
 
 def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
