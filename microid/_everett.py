@@ -123,7 +123,7 @@ def everett(
     # The node below each diagonal triangle that makes the bilinear form linear on it.
     ghost = corner[:-1] + corner[1:] - jnp.diagonal(density_um_per_V2, -1)
     nodes = density_um_per_V2 + jnp.diag(ghost, 1)
-    window = h**2 * _running(_running(nodes).T).T
+    window = _running(_running(h**2 * nodes.T).T)
     # Along the diagonal: trapezoids of the rows up to it above, and of the columns of ghosts below it.
     rows = jnp.sum(density_um_per_V2, axis=1) - (density_um_per_V2[:, 0] + corner) / 2
     side = jnp.diagonal(density_um_per_V2, -1)
@@ -149,7 +149,12 @@ def _sums(values: Float[Array, " k *more"]) -> Float[Array, " k+1 *more"]:
 
 def _running(nodes: Float[Array, "N k"]) -> Float[Array, "N+1 k"]:
     """B-spline coefficients of the integral, from the first node on, of the hat functions along axis 0."""
-    return _sums(nodes) - nodes[:1] / 2
+
+    def add(total: Array, value: Array) -> tuple[Array, Array]:
+        return total + value, total
+
+    # Nothing behind the loop: XLA would compute that anew for every sample that reads a coefficient.
+    return lax.scan(add, -nodes[0] / 2, jnp.pad(nodes, ((0, 1), (0, 0))))[1]
 
 
 def _pieces(c1: Float[Array, " k"], c2: Float[Array, " k"], c3: Float[Array, " k"]) -> Float[Array, "4 k"]:
@@ -192,11 +197,14 @@ def _window(
 
 def _contract(table: Array, i: Array, j: Array, left: tuple[Array, ...], right: tuple[Array, ...]) -> Array:
     width = round(table.shape[0] ** 0.5)
-    first = i * width + j
-    rows = []
+    # Three coefficients of a row at a time: single ones take twice as long.
+    numbers = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(), start_index_map=(0,))
+    total = jnp.zeros_like(left[0])
     for p in range(_WINDOW):
-        rows.append(sum(right[c] * _pick(table, first + (p * width + c)) for c in range(_WINDOW)))
-    return sum((left[p] * rows[p] for p in range(_WINDOW)), start=jnp.zeros_like(left[0]))
+        first = (i * width + j + p * width)[:, None]
+        row = lax.gather(table, first, numbers, (_WINDOW,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+        total = total + left[p] * sum(right[c] * row[:, c] for c in range(_WINDOW))
+    return total
 
 
 @_window.defjvp

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,6 +12,7 @@ import microid
 from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, compensate_plain, follow, within_range
 from fits.io._errors import DataError
 from fits.io._given import AnyRuns, reference_given
+from fits.io._kept import kept
 from fits.io._length import length
 from fits.io._record import Record, Reference
 from fits.loop._plain import PlainLoop, PlainModel
@@ -142,7 +142,7 @@ def _led(
     return voltage_V, cut, [said] if cut.any() else []
 
 
-@eqx.filter_jit
+@kept
 def _nodes(model: Preisach) -> tuple[Float[Array, "N N"], Float[Array, " N"]]:
     return model.density.nodes_um_per_V2(), model.reversible.slope_um_per_V
 
@@ -198,7 +198,7 @@ def gains_of(stage: Stage) -> tuple[float, float, float]:
     return ahead, behind, offset
 
 
-@eqx.filter_jit
+@kept
 def _at_rest(part: AbstractLinear) -> tuple[Float[Array, ""], Float[Array, ""]]:
     return part.static_gain, part.system().offset
 
@@ -223,7 +223,7 @@ def static_equivalent(model: Preisach | Stage) -> Preisach:
 
 
 # As one program: one operation after the other they would be compiled each by itself.
-@eqx.filter_jit
+@kept
 def _folded(
     law: Preisach, ahead: Float[Array, ""], behind: Float[Array, ""], offset_um: Float[Array, ""]
 ) -> Preisach:
@@ -289,6 +289,6 @@ def respond(stage: Stage, time_s: np.ndarray | float, voltage_V: np.ndarray, sta
     return np.asarray(_respond(stage, jnp.asarray(time_s), jnp.asarray(voltage_V), start))
 
 
-_demand = eqx.filter_jit(microid.piezo_demand)
-_command = eqx.filter_jit(microid.driver_command)
-_respond = eqx.filter_jit(lambda stage, time_s, voltage_V, start: stage(time_s, voltage_V, start))
+_demand = kept(microid.piezo_demand)
+_command = kept(microid.driver_command)
+_respond = kept(Stage.__call__)

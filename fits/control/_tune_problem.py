@@ -11,6 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from fits.io._kept import kept
 from microid import AbstractController, ControlledRun, Coordinates, Margins, Stage, Start, margins, simulate_loop
 
 _Controller = TypeVar("_Controller", bound=AbstractController)
@@ -187,14 +188,14 @@ def _merit(
     return scale * jnp.where(jnp.isfinite(total), total, 1e9)
 
 
-@eqx.filter_jit
+@kept
 def judge(problem: Problem, y: Float[Array, " n"]) -> tuple[Figures, dict[str, Array], Float[Array, ""]]:
     """Figures at a place of the search, their excess over the limits, and the cost in um."""
     found = figures(problem, problem.controller(y))
     return found, excess(problem, found), cost_um(problem, found)
 
 
-@eqx.filter_jit
+@kept
 def descend(
     problem: Problem,
     y: Float[Array, " n"],

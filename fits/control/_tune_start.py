@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import brentq
 
 from fits.io._errors import DataError
+from fits.io._kept import kept
 from fits.stage._model_file import AnyModel, model_given
 from fits.stage._run import as_stage, place_of_hysteresis
 from microid import PID, PrandtlIshlinskii, Preisach, Stage, loop_gain, margins
@@ -51,7 +51,7 @@ def major_loop_slope(law: Preisach, fine: int) -> Float[Array, ""]:
     return jnp.max(jnp.abs(jnp.diff(output))) / (rise[1] - rise[0])
 
 
-_compiled_slope = eqx.filter_jit(major_loop_slope)
+_compiled_slope = kept(major_loop_slope)
 
 
 def slope_array(stage: Stage) -> Float[Array, ""] | None:

@@ -11,6 +11,7 @@ import click
 import jax
 
 from fits.io._errors import DataError
+from fits.io._kept import keep_in
 
 # A first run spends most of its time compiling. With these flags it takes half as long, and what is compiled is as
 # fast, within 15 %, for all but loops that take less than a millisecond.
@@ -41,6 +42,7 @@ def start_jax(accelerator: bool = False) -> None:
         # A diagnosis compiles some 300 functions, most of them in a tenth of a second: together they matter.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    keep_in(None if folder is None or accelerator else folder / "traced")
     logging.getLogger(__name__).debug("JAX %s, compiled functions in %s", jax.__version__, folder or "no folder")
 
 

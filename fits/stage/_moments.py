@@ -11,11 +11,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from fits.io._kept import kept
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._moments import Moments
 from fits.loop._run import Run, Samples
 from fits.stage._run import ahead, joined, nuisance_columns, place_of_hysteresis, project_out, respond
-from microid import Coordinates, LinearSystem, ParameterInfo, Signal, Stage, Staircase
+from microid import Coordinates, LinearSystem, ParameterInfo, Scene, Signal, Stage, Staircase
 
 # Samples that go through the compiled regression at a time.
 _PIECE = 2048
@@ -46,32 +47,35 @@ def propagated(
         return moved_um
     n, samples = len(run.record), run.samples
     pad = len(samples.weight) - n
-    time_s = samples.time_s * samples.stride if samples.time_s.ndim == 0 else samples.time_s[:: samples.stride]
     signal = jnp.asarray(np.pad(around_um, (0, pad), mode="edge"))
     out = np.empty_like(moved_um)
     for first in range(0, moved_um.shape[1], _AT_ONCE):
         part = moved_um[:, first : first + _AT_ONCE].T
         full = np.pad(part, ((0, _AT_ONCE - len(part)), (0, pad)))
-        answer = _propagated(coordinates, place, z, time_s, signal, jnp.asarray(full))
+        answer = _propagated(coordinates, place, z, samples, signal, jnp.asarray(full))
         out[:, first : first + _AT_ONCE] = np.asarray(answer)[: len(part), :n].T
     return out
 
 
-@eqx.filter_jit
+@kept
 def _propagated(
     coordinates: Coordinates[Stage],
     place: int,
     z: Float[Array, " p"],
-    time_s: Float[Array, " n"] | Float[Array, ""],
+    samples: Samples,
     around_um: Float[Array, " n"],
     moved_um: Float[Array, "k n"],
 ) -> Float[Array, "k n"]:
-    stage = coordinates(z)
+    stage, each = coordinates(z), slice(None, None, samples.stride)
+    time_s = samples.time_s * samples.stride if samples.time_s.ndim == 0 else samples.time_s[each]
+    command = Signal(samples.voltage_V[each], samples.voltage_V[0], stage.hold)
+    beside = {name: values[each] for name, values in samples.beside.items()}
+    scene = Scene(command, beside, samples.start.memory)
 
     def follow(values: Float[Array, " n"]) -> Float[Array, " n"]:
         signal = Signal(values, values[0], "first")
         for part in stage.parts[place + 1 :]:
-            signal = part.run(time_s, signal)
+            signal = part.run(time_s, signal, scene)
         return signal.values
 
     _, push = jax.linearize(follow, around_um)
@@ -132,7 +136,7 @@ class Chain(eqx.Module):
         return named, np.asarray(value), np.asarray(slope)
 
 
-@eqx.filter_jit
+@kept
 def _linearised(
     chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"] | None, samples: Samples
 ) -> tuple[Float[Array, " n"], Float[Array, "n p"], Float[Array, "n k"]]:
@@ -144,7 +148,7 @@ def _linearised(
     return out, slope, nuisance_columns(chain.stage(z, columns_um), samples)
 
 
-@eqx.filter_jit
+@kept
 def _before_and_after(
     coordinates: Coordinates[Stage], place: int, z: Float[Array, " p"], samples: Samples
 ) -> tuple[Float[Array, " n"], LinearSystem | None]:
@@ -153,7 +157,7 @@ def _before_and_after(
     return ahead(stage, place, samples)[:: samples.stride], joined(stage.parts[place + 1 :])
 
 
-@eqx.filter_jit
+@kept
 def _rows(
     grid: Grid,
     table: Float[Array, "4 k D"],

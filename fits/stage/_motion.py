@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
+from fits.io._kept import kept
 from fits.io._limits import Ranges, joined, measured_ranges
 from fits.io._record import Record
 from fits.loop._run import Run, prepare_run
@@ -33,7 +33,11 @@ def prepare(stage: Stage, run: Run) -> Prepared:
 @cache
 def program() -> Callable[[AbstractPart, Any, Signal, Scene], Signal]:
     """Send a signal through one part: compiled for each kind of part and length of signal, until it is made anew."""
-    return eqx.filter_jit(lambda part, time_s, signal, scene: part.run(time_s, signal, scene))
+
+    def through(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
+        return part.run(time_s, signal, scene)
+
+    return kept(through)
 
 
 def signals(stage: Stage, prepared: Prepared) -> list[Signal]:

@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import reduce
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float
 
 import microid as m
 from fits.io._errors import DataError
+from fits.io._kept import kept
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._past import past_columns
@@ -30,7 +30,7 @@ def respond(stage: m.Stage, samples: Samples) -> Float[Array, " n"]:
     return stage(samples.time_s, samples.voltage_V, start, samples.beside)[:: samples.stride]
 
 
-@eqx.filter_jit
+@kept
 def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, `(n, k)`: an offset in um, its past, and how the stage moved before.
 
@@ -62,7 +62,7 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     return jnp.concatenate([offset, jax.vmap(free)(jnp.eye(system.order)).T], axis=1)
 
 
-@eqx.filter_jit
+@kept
 def project_out(
     columns: Float[Array, "n k"], weight: Float[Array, " n"], values: Float[Array, " n"]
 ) -> Float[Array, " n"]:
@@ -74,7 +74,7 @@ def project_out(
     return values - scaled @ jnp.linalg.solve(gram, weighted.T @ values)
 
 
-@eqx.filter_jit
+@kept
 def _compare(stage: m.Stage, samples: Samples) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     out = respond(stage, samples)
     return out, project_out(nuisance_columns(stage, samples), samples.weight, samples.displacement_um - out)
@@ -134,7 +134,7 @@ def gain_ahead(stage: m.Stage) -> float | None:
     return gain
 
 
-@eqx.filter_jit
+@kept
 def _static_gain(parts: Sequence[Any]) -> Float[Array, ""]:
     linear = (part.static_gain for part in parts if isinstance(part, m.AbstractLinear))
     return math.prod(linear, start=jnp.ones(()))
@@ -147,7 +147,7 @@ def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
     return reduce(m.LinearSystem.then, (part.system() for part in parts))
 
 
-@eqx.filter_jit
+@kept
 def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""] | None = None) -> Float[Array, " m"]:
     """What goes into a part after a rest at the first command, or at another, at the refined times, `(m,)`."""
     signal = m.Signal(samples.voltage_V, samples.voltage_V[0] if rest_V is None else rest_V, stage.hold)
@@ -162,7 +162,7 @@ def yields_inside(stage: m.Stage) -> bool:
     return any(isinstance(part, m.HystereticMechanics) for part in stage.parts)
 
 
-@eqx.filter_jit
+@kept
 def _after_rest(stage: m.Stage, samples: Samples, rest_V: Float[Array, ""]) -> Float[Array, " n"]:
     """Response after a rest at some command, in um, `(n,)`."""
     return stage(samples.time_s, samples.voltage_V, m.Start(rest_V), samples.beside)[:: samples.stride]
@@ -220,8 +220,9 @@ def prepare_program(stage: m.Stage, record: Record, initial: str) -> tuple[m.Sta
     range_V = range_of(stage)
     refuse_outside(record, *range_V)
     needed = {name for part in stage.parts if isinstance(part, m.AbstractEffect) for name in part.needs}
+    # What nothing depends on would only make another program of the same.
+    program = replace(record, displacement_um=None, extra=record.extra if needed else {})
     needed -= {name for name, column in COLUMNS.items() if column.optional}
-    program = replace(record, displacement_um=None)
     missing = sorted(needed - set(columns_beside(program)))
     if missing:
         raise DataError(

@@ -1,0 +1,176 @@
+"""Programs that are kept between calls of the command: tracing a stage takes longer than to compute what it does."""
+
+import functools
+import hashlib
+import io
+import os
+import pickle
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+
+from fits.io._atomic import atomic_path
+from fits.io._errors import DataError
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+# Packages of which a program depends on no more than the version, and those that may change from call to call.
+_OTHERS = "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy"
+_OWN = "microid", "fits"
+_KNOWN = {*_OTHERS, *_OWN, "builtins"}
+# Where programs are kept, since `keep_in`.
+_place: list[Path] = []
+
+
+class _Unknown(Exception):
+    """Something that a name does not tell: it may be another in the next call."""
+
+
+class _Key(pickle.Pickler):
+    """Writes what decides what is traced: equal bytes are of equal programs."""
+
+    def __init__(self, file: io.BytesIO):
+        super().__init__(file)
+        # Without it equal values that are one object, or two, would be written differently.
+        self.fast = True
+
+    def reducer_override(self, value: Any) -> Any:
+        # A class or a function is written as no more than its name.
+        if hasattr(value, "__qualname__") and str(value.__module__).partition(".")[0] not in _KNOWN:
+            raise _Unknown
+        return NotImplemented
+
+
+def keep_in(folder: Path | None) -> None:
+    """Keep the programs of all `kept` functions in a folder from now on; None keeps none."""
+    _place[:] = [] if folder is None else [folder]
+
+
+def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Compile a function as `equinox.filter_jit` does, and where programs are kept, trace it in the first call only.
+
+    Programs are told apart by the name of the function, all that is no array, the shapes of arrays, versions,
+    settings, and every line of this package: of a function or class of another nothing is kept.
+    """
+    plain = eqx.filter_jit(function)
+    found: dict[Any, Callable[..., Any]] = {}
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        leaves, form = jax.tree.flatten((args, kwargs))
+        if not _place or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return plain(*args, **kwargs)
+        asked = _place[0], form, tuple(_kind(leaf) if eqx.is_array(leaf) else (type(leaf), leaf) for leaf in leaves)
+        if asked not in found:
+            found[asked] = _opened(_place[0], function, args, kwargs) or plain
+        return found[asked](*args, **kwargs)
+
+    return call
+
+
+def _kind(array: Any) -> tuple[Any, ...]:
+    return array.shape, str(array.dtype), getattr(array, "weak_type", False)
+
+
+def _opened(
+    folder: Path, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> Callable[..., Any] | None:
+    """The program of a function for arguments like these, from the folder or new; None where it cannot be kept."""
+    if function.__module__.partition(".")[0] not in _OWN:
+        return None
+    arrays, static = eqx.partition((args, kwargs), eqx.is_array)
+    content = io.BytesIO()
+    try:
+        _Key(content).dump((function.__module__, function.__qualname__, jax.tree.map(_kind, arrays), static))
+    except (_Unknown, pickle.PicklingError, AttributeError, TypeError, RecursionError):
+        return None
+    name = hashlib.sha256(_circumstances() + content.getvalue()).hexdigest()
+    found = _read(folder / name)
+    if found is None:
+        try:
+            found = _traced(function, arrays, static)
+        except (ValueError, NotImplementedError):
+            # What calls back into Python cannot be exported.
+            return None
+        _write(folder / name, found)
+    exported, places, rest = found
+    form = jax.tree.structure(places)
+
+    def program(*leaves: Any) -> Any:
+        return exported.call(*leaves)
+
+    program.__name__ = function.__name__
+    compiled = jax.jit(program)
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        leaves = jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array))
+        # Their values alone: they come bound to a device, for which others would be compiled once more.
+        values = [jnp.asarray(np.asarray(value)) for value in compiled(*leaves)]
+        return eqx.combine(jax.tree.unflatten(form, values), rest)
+
+    return call
+
+
+def _traced(function: Callable[..., Any], arrays: Any, static: Any) -> tuple[Any, Any, Any]:
+    """A program, the places of the arrays that it gives, and what else it gives."""
+    leaves, form = jax.tree.flatten(arrays)
+    given: list[Any] = []
+
+    def flat(*leaves: Any) -> list[Any]:
+        args, kwargs = eqx.combine(jax.tree.unflatten(form, leaves), static)
+        result, rest = eqx.partition(function(*args, **kwargs), eqx.is_array)
+        values, structure = jax.tree.flatten(result)
+        given[:] = jax.tree.unflatten(structure, range(len(values))), rest
+        return values
+
+    exported = jax.export.export(jax.jit(flat))(*leaves)
+    # Nobody differentiates it, and the function that would cannot be written.
+    return replace(exported, _get_vjp=None), *given
+
+
+def _read(file: Path) -> tuple[Any, Any, Any] | None:
+    """A program of the folder; None where there is none, or not all of it."""
+    try:
+        stated, content = file.read_bytes().split(b"\n", 1)
+    except (OSError, ValueError):
+        return None
+    if stated != hashlib.sha256(content).hexdigest().encode():
+        return None
+    return pickle.loads(content)
+
+
+def _write(file: Path, found: tuple[Any, Any, Any]) -> None:
+    try:
+        content = pickle.dumps(found)
+        file.parent.mkdir(mode=0o700, exist_ok=True)
+        with atomic_path(file) as temporary:
+            temporary.write_bytes(hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+    except (OSError, DataError, pickle.PicklingError, AttributeError, TypeError):
+        # It is made anew in the next call.
+        return
+
+
+@functools.cache
+def _circumstances() -> bytes:
+    """All that decides what is traced beside the arguments: versions, settings, and each line of this package."""
+    stated = [sys.version, jax.default_backend(), str(jax.config.read("jax_enable_x64"))]
+    stated += [f"{name} {version(name)}" for name in _OTHERS]
+    stated += [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(("JAX_", "EQX_"))]
+    lines = hashlib.sha256("\n".join(stated).encode())
+    for package in _OWN:
+        spec = find_spec(package)
+        assert spec is not None
+        assert spec.origin is not None
+        for file in sorted(Path(spec.origin).parent.rglob("*.py")):
+            lines.update(f"\n{package} {file.name}\n".encode() + file.read_bytes())
+    return lines.digest()
