@@ -54,6 +54,13 @@ def test_a_first_way_of_its_own_is_no_effect(rng, start_V):
     assert found.runs[0].fitted.sum() >= 0.79 * len(run)
 
 
+def test_a_line_in_the_noise_is_no_mode():
+    # Noise in which a mode without damping, which nothing drives, explains more than chance does as a rule.
+    found = diagnose([record(np.random.default_rng(0), 0.0)])
+    assert found.verdict == "no_effect"
+    assert found.baseline_parameters == ()
+
+
 def test_samples_known_whatever_was_before():
     voltage_V = np.array([0.0, 50.0, 100.0, 50.0, 0.0, 50.0])
     assert known_samples(voltage_V, 0.0, 100.0).tolist() == [True] * 6

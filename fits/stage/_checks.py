@@ -23,6 +23,8 @@ _WHOLE = 0.95
 _HIGHEST_RESONANCE = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
 UNSEEN = 0.5
+# A mode with less damping than this is a line in the noise: every stage has a thousand times as much.
+_UNDAMPED = 1e-6
 # Poles that piezo stages have, from slow macro stages and weak amplifiers to small ones with strong ones.
 _USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
 # Remedies.
@@ -83,13 +85,16 @@ def refuse_unidentifiable(
     # At a bound the slope vanishes, however far the coordinate may run.
     unseen = (spread * slope > UNSEEN) | (spread > 5)
     endings = ".time_constant_s", ".natural_frequency_Hz"
-    poles = [(name, lost) for (name, _), lost in zip(named, unseen, strict=True) if name.endswith(endings)]
+    modes = named_parts(stage, Mechanics)
+    lines = {f"{name}.natural_frequency_Hz" for name, part in modes if float(part.damping_ratio) < _UNDAMPED}
+    each = zip(named, unseen, strict=True)
+    poles = [(name, bool(lost) or name in lines) for (name, _), lost in each if name.endswith(endings)]
     if not poles:
         return None
     unidentified = [name for name, lost in poles if lost]
     sources = ", ".join(run.record.source for run in solved.runs)
     fastest = max(solved.runs, key=lambda run: run.rate_Hz)
-    mechanics = [(name, float(part.natural_frequency_Hz)) for name, part in named_parts(stage, Mechanics)]
+    mechanics = [(name, float(part.natural_frequency_Hz)) for name, part in modes]
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST_RESONANCE * fastest.rate_Hz]
     seen = shows_poles(solved, drives)
     some = bool(unidentified) and (len(unidentified) == len(poles) or not fast)
