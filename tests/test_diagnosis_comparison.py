@@ -182,7 +182,8 @@ def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(m
         end = SimpleNamespace(
             laws=model.laws, cost=cost, criterion=lambda _: cost, possible=lambda _: True, change_um=()
         )
-        return bench, SimpleNamespace(held_out=lambda _: held_out, surprise=np.linalg.norm, count=10560), end
+        data = {"held_out": lambda _: held_out, "surprise": np.linalg.norm, "count": 10560, "release": lambda: None}
+        return bench, SimpleNamespace(**data), end
 
     monkeypatch.setattr(_comparison, "fit_jointly", fit_jointly)
     fitted = [

@@ -126,7 +126,7 @@ def test_what_has_no_such_form_is_refused(rng, tmp_path):
     stage = yielding(rng, law_of(rng, "dahl"))
     with pytest.raises(fits.DataError, match="positive interval"):
         fits.export_simulation_c(stage, tmp_path / "c", "axis", 0.0)
-    with pytest.raises(fits.DataError, match="--name"):
+    with pytest.raises(fits.DataError, match="name: expected a letter"):
         fits.export_simulation_c(stage, tmp_path / "c", "axis-z", T)
     with pytest.raises(fits.DataError, match="hysteresis inside its mechanics"):
         fits.export_simulation_c(m.Stage.of(piezo=m.Piezo(0.1)), tmp_path / "c", "axis", T)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._effects import Bench
-from fits.diagnosis._joint_fit import State, fit_jointly, make_room
+from fits.diagnosis._joint_fit import State, fit_jointly
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
 from fits.diagnosis._score import Probe, Scored, best_of, score
@@ -188,7 +188,7 @@ def _ranked(
             continue
         end = fit_jointly(bench, projector, one.refit)
         found = Rival.of(*end[1:])
-        make_room(end)
+        end[1].release()
         if not end[-1].possible(bench):
             continue
         if least == np.inf:

@@ -74,7 +74,9 @@ def conclude(
     # Of what one run had of its own other runs show nothing.
     repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
-    if kept and (misfit.share < thresholds.explained_share or predicts_worse(seen, thresholds.worse_z)):
+    # Weak evidence needs the support of what was held out.
+    worse = predicts_worse(seen, 0.0 if weak else thresholds.worse_z)
+    if kept and (misfit.share < thresholds.explained_share or worse):
         suspects = ", ".join(cause.name.replace("_", " ") for cause in kept)
         why = "what was held out is predicted worse with that"
         if misfit.share < thresholds.explained_share:

@@ -13,12 +13,13 @@ from jax.extend.backend import get_backend
 from jaxtyping import Array, Float
 
 from fits.diagnosis._baseline import Baseline, with_effects
+from fits.diagnosis._records import LONG
 from fits.io._record import Record
 from fits.stage._motion import Prepared, prepare, program, signals
 from microid import AbstractEffect, Coordinates, Sensor, Signal
 
-# Samples of all records, and number of programs of some 7 MB each, from which on programs make room for each other.
-_LONG, _MANY = 20_000, 400
+# Number of programs, of some 7 MB each, from which on they make room for each other.
+_MANY = 400
 # Part of a period of the resonance between samples, beyond which a run does not resolve it.
 _PERIOD = 0.25
 # Periods of a line in a record, as its samples show it, below which it is a drift as well.
@@ -84,16 +85,11 @@ def drop_programs(records: Sequence[Record]) -> None:
     Programs, and how JAX remembers them, take more memory than records of 30,000 samples do. Of long records all that
     the process has compiled is freed; of short ones only what simulates parts, as the rest serves the next diagnosis.
     """
-    long = are_long(records)
+    long = sum(len(record) for record in records) >= LONG
     if long or len(get_backend().live_executables()) > _MANY:
         program.cache_clear()
     if long:
         jax.clear_caches()
-
-
-def are_long(records: Sequence[Record]) -> bool:
-    """Whether records have so many samples that memory is short."""
-    return sum(len(record) for record in records) >= _LONG
 
 
 def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float) -> AbstractEffect:

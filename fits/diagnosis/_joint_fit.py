@@ -8,7 +8,7 @@ import numpy as np
 
 from fits.diagnosis._baseline import Baseline, simulate
 from fits.diagnosis._discrepancy import learn_roughness, smoothed, with_discrepancy
-from fits.diagnosis._effects import Bench, are_long, scaled
+from fits.diagnosis._effects import Bench, scaled
 from fits.diagnosis._noise import find_faults
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, relocate
@@ -78,13 +78,6 @@ def alternate(bench: Bench, projector: Projector, model: Refit, rounds: Sequence
             break
         bench, projector, model = there, beside, moved
     return bench, projector, model
-
-
-def make_room(state: State) -> None:
-    """Free what is computed again where it is needed, where records are long."""
-    bench, projector, _ = state
-    if are_long([run.record for run in bench.baseline.runs]):
-        projector.release()
 
 
 def refine(

@@ -11,6 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
 
 from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._records import LONG
 from fits.diagnosis._regression import Regression, regress
 from fits.loop._grid import non_negative
 from fits.loop._prior import Posterior
@@ -100,9 +101,10 @@ class Projector:
         return self._kept
 
     def release(self) -> None:
-        """Free what takes the memory of a long record, and is computed again where it is needed."""
-        self.__dict__.pop("bare", None)
-        self._kept, self._regression = None, replace(self._regression, rows=())
+        """Free what takes the memory of long records, and is computed again where it is needed."""
+        if sum(map(len, self.masks)) >= LONG:
+            self.__dict__.pop("bare", None)
+            self._kept, self._regression = None, replace(self._regression, rows=())
 
     def _factor(self) -> None:
         """Factorise the tangent of what is not held."""

@@ -8,8 +8,8 @@ import numpy as np
 from fits.io._record import Record
 from fits.io.columns.path import PATH, gone_V
 
-# Samples in all that are diagnosed at once: some 2 GB.
-MOST = 40_000
+# Samples in all from which on memory is short, and that are diagnosed at once, in some 2 GB.
+LONG, MOST = 20_000, 40_000
 # Windows of a long record, at most, and cycles of the command that each of them has, at least.
 _WINDOWS, _CYCLES = 4, 3.0
 # Intervals are the same up to this part, and what goes on comes one of them after the last sample, up to that part.

@@ -17,7 +17,7 @@ from fits.diagnosis._comparison import (
     model_error,
 )
 from fits.diagnosis._effects import Bench
-from fits.diagnosis._joint_fit import State, is_smoothness_confirmed, make_room, refine, relearn_noise
+from fits.diagnosis._joint_fit import State, is_smoothness_confirmed, refine, relearn_noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._score import Family, Probe, Scored, score
@@ -118,7 +118,7 @@ class Explanation:
         ahead = gain_ahead(scores.each, names, explained, search.thresholds)
         family, left = Family(scores, search.rng), criterion(projector, model)
         if causes:
-            make_room(state)
+            projector.release()
         return cls(tuple(causes), bench, projector, model, scores.each, family, left, left - ahead)
 
     @property
@@ -161,7 +161,7 @@ def select(
         for one in beam:
             more = sorted(_grown(one, search), key=lambda one: one.criterion)
             if one.causes:
-                make_room((one.bench, one.projector, one.model))
+                one.projector.release()
             if not more:
                 ends.append(one)
             for place, other in enumerate(more):
