@@ -27,8 +27,8 @@ _SHORTER = 4.0
 _ROUNDING_SHARE, _UNKNOWN_VARIANCE = 1e-4, 1e6
 # Multiple of its range in the runs by which a rig may have moved at most before one, and the least of a room's.
 _FARTHER, _ROOM_K = 2.0, 0.5
-# Part of the shortest record by which another instant is tried at first.
-_FIRST_SHIFT = 0.05
+# Part of the shortest record by which another instant is tried at first, and the gain in chi-square that pays.
+_FIRST_SHIFT, _PAYS = 0.05, 1.0
 # Displacements beyond this are those of a model that runs away.
 _AWAY_um = 1e9
 # Multiples of the linearised answer from which a fit may start.
@@ -214,10 +214,9 @@ def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -
         tried = [_moved(bench, projector, model, k, way, least_s) for k, way in product(at, (-step_s, step_s))]
         best = min(tried, key=lambda one: one.cost)
         better = refit(bench, projector, best.laws, best.x, 2) if best.cost < model.cost else model
-        if better.cost < model.cost:
-            model = better
-        else:
-            step_s /= 2
+        # Where other coordinates still creep, any step would seem to pay.
+        step_s = step_s if better.cost < model.cost - _PAYS else step_s / 2
+        model = min(better, model, key=lambda one: one.cost)
     return model
 
 
