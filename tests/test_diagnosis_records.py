@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from _models import random_model
 
-from fits import Record, diagnose
+from fits import Record
 from fits.diagnosis._effects import Law
 from fits.diagnosis._records import excerpts, joined
 from fits.diagnosis._score import _is_allowed
@@ -81,28 +81,3 @@ def test_what_is_asked_of_samples_of_any_rate_can_be_fitted(rng, interval_s):
         for group in form.probes(scales, None if form in alone else model):
             laws = [Law([effect]) for effect in group if _is_allowed(effect)]
             assert all(law.size > 0 for law in laws)
-
-
-@pytest.mark.study
-def test_a_lag_is_found_in_windows_that_begin_while_the_stage_moves(rng):
-    count, interval_s, lag_s = 60_000, 0.01, 0.04
-    time_s = interval_s * np.arange(count)
-    voltage_V = 60 + 50 * np.sin(2 * np.pi * time_s / 10) * (0.6 + 0.4 * np.cos(2 * np.pi * time_s / 110))
-    half_V, weight = np.linspace(0, 45, 30), np.exp(-np.linspace(0, 3, 30))
-    place, moved = np.full(30, voltage_V[0]), np.empty(count)
-    for k, voltage in enumerate(voltage_V):
-        place = np.minimum(np.maximum(place, voltage - half_V), voltage + half_V)
-        moved[k] = 0.2 * voltage + 0.05 * (weight @ place) / weight.sum()
-    # Exact for signals in lines between the samples.
-    left, reading = np.exp(-interval_s / lag_s), np.empty(count)
-    behind = 0.0
-    for k in range(count):
-        behind = left * behind - (moved[k] - moved[k - 1]) * lag_s / interval_s * (1 - left) if k else 0.0
-        reading[k] = moved[k] + behind
-    reading += 0.01 * rng.standard_normal(count)
-    found = diagnose([Record(time_s, voltage_V, reading, source="day.csv")])
-    first = found.causes[0]
-    lags = {"sensor_lowpass": "time_constant_s", "transport_delay": "delay_s"}
-    assert first.name in lags
-    value = next(one for one in first.parameters if one.name == lags[first.name])
-    assert abs(value.value - lag_s) < 0.1 * lag_s
