@@ -137,3 +137,12 @@ def test_of_a_run_that_goes_farther_at_its_end_less_is_held_out(rng):
     assert stated.held_out.sum() == 120
     assert 0 < estimated.held_out.sum() < 120
     assert spread_of(estimated.held_out) < 0.25 * spread_of(stated.held_out)
+
+
+def test_a_run_that_begins_near_its_highest_is_fitted_as_far_as_it_goes():
+    time_s = np.arange(600) * 0.01
+    # The way up is a hundredth of the range, and all that the past before the run reaches there.
+    voltage = 0.5 + (0.4 + 0.01 * time_s / time_s[-1]) * np.cos(2 * np.pi * time_s / 0.6)
+    run = prepare_run(Record(time_s, voltage, voltage), (0.0, 1.0), "unknown", 0.2, estimated=True)
+    beyond = max(voltage[run.held_out].max(initial=0.0) - voltage[run.fitted].max(), 0.0)
+    assert beyond <= 0.02 * (voltage.max() - voltage[0])

@@ -27,7 +27,7 @@ _EXTREMES, _EXTREMES_OF_STAGE = 64, 512
 _FEWEST = 50
 # Samples that a shorter run is padded to, so that runs of many lengths share what is compiled.
 _SHORTEST = 4096
-# Part of the range by which peaks of smooth commands miss their highest.
+# Part of the way to it by which peaks of smooth commands miss their highest.
 _ALMOST = 1e-2
 # Told what is being done, a sentence at a time.
 Progress = Callable[[str], None]
@@ -200,7 +200,7 @@ def prepare_run(
     fitted = known.copy()
     if holdout > 0:
         first = n - round(holdout * n)
-        fitted[max(first, _as_far_as_it_goes(record.voltage_V, upper - lower)) if has_past else first :] = False
+        fitted[max(first, _as_far_as_it_goes(record.voltage_V)) if has_past else first :] = False
     if holdout < 1 and fitted.sum() < _FEWEST:
         raise DataError(
             f"{record.source}: only {fitted.sum()} samples are left to fit, {_FEWEST} are needed: the others come "
@@ -213,14 +213,14 @@ def prepare_run(
     return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown, has_past)
 
 
-def _as_far_as_it_goes(voltage_V: np.ndarray, width_V: float) -> int:
-    """Samples until a run has gone as far both ways as it will, but for a little of the range.
+def _as_far_as_it_goes(voltage_V: np.ndarray) -> int:
+    """Samples until a run has gone as far both ways from where it began as it will, but for a little of the way.
 
     What relays that it sweeps for the first time went through before is learnt there, and predicted by nothing.
     """
-    near_V = _ALMOST * width_V
-    there = np.maximum.accumulate(voltage_V) >= voltage_V.max() - near_V
-    there &= np.minimum.accumulate(voltage_V) <= voltage_V.min() + near_V
+    gone_V = voltage_V - voltage_V[0]
+    there = np.maximum.accumulate(gone_V) >= (1 - _ALMOST) * gone_V.max()
+    there &= np.minimum.accumulate(gone_V) <= (1 - _ALMOST) * gone_V.min()
     return int(np.argmax(there)) + 1
 
 

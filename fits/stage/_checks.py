@@ -1,6 +1,7 @@
 """Runs that cannot be fitted as one stage: what is wrong with them, in words."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -23,8 +24,8 @@ _WHOLE = 0.95
 _HIGHEST_RESONANCE = 0.45
 # Coordinates are of the order of 1; one that is known no better than this is not seen.
 UNSEEN = 0.5
-# A mode with less damping than this is a line in the noise: every stage has a thousand times as much.
-_UNDAMPED = 1e-6
+# Twice the logarithm of a likelihood ratio that noise rarely pretends.
+_CHANCE = 40.0
 # Poles that piezo stages have, from slow macro stages and weak amplifiers to small ones with strong ones.
 _USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
 # Remedies.
@@ -86,7 +87,7 @@ def refuse_unidentifiable(
     unseen = (spread * slope > UNSEEN) | (spread > 5)
     endings = ".time_constant_s", ".natural_frequency_Hz"
     modes = named_parts(stage, Mechanics)
-    lines = {f"{name}.natural_frequency_Hz" for name, part in modes if float(part.damping_ratio) < _UNDAMPED}
+    lines = {f"{name}.natural_frequency_Hz" for name, _ in modes if not _shows_mode(solved, name)}
     each = zip(named, unseen, strict=True)
     poles = [(name, bool(lost) or name in lines) for (name, _), lost in each if name.endswith(endings)]
     if not poles:
@@ -183,7 +184,22 @@ def shows_poles(solved: Solved, drives: Sequence[np.ndarray]) -> bool:
         x, y = drive[run.fitted] - drive[run.fitted].mean(), run.displacement_um[run.fitted]
         left = y - y.mean() - x * (x @ y / (x @ x))
         ratios.append(2 * run.fitted.sum() / correlation_samples([left]) * float(np.log(np.std(left) / noise)))
-    return max(ratios) >= 40.0  # twice the logarithm: noise rarely pretends more
+    return max(ratios) >= _CHANCE
+
+
+def _shows_mode(solved: Solved, name: str) -> bool:
+    """Whether what a mode does to the command makes some run likelier by far, beside motions that it is free to make.
+
+    Free motions of a mode without damping follow any line in the noise.
+    """
+    stage, drops = solved.stage, []
+    weighing = solved.weighing
+    for run, noise_um, correlation in zip(solved.runs, weighing.noise_um, weighing.correlation, strict=True):
+        done_um = simulate_stage(stage, run) - simulate_stage(stage.without(name), run)
+        instead = replace(run, record=replace(run.record, displacement_um=run.displacement_um + done_um))
+        left, without = (residual_of(stage, one)[run.fitted] for one in (run, instead))
+        drops.append(float(without @ without - left @ left) / (noise_um**2 * correlation))
+    return max(drops) >= _CHANCE
 
 
 def check_gains(stage: Stage, runs: Sequence[Run], refuse: bool = False) -> list[str]:
