@@ -86,8 +86,8 @@ def conclude(
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
     elif kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0):
-        own = ", ".join(sorted({one.name for one in extension.effects if one.per_run}))
-        remarks.append(f"{own}: not the same in the runs held out, so that extended.json is the plain stage")
+        own = ", ".join(sorted({one.name.replace("_", " ") for one in extension.effects if one.per_run}))
+        remarks.append(f"{own}: not the same in the runs held out, so that the stage is left plain")
         extension = without_effects(ready, extension)
     # Up to its own size rounding makes structure, too.
     left_over = left_over and not (rounded and rest_noise * noise_um < rounding_um)
@@ -108,7 +108,7 @@ def conclude(
     named = name_faults(faults, cyclic, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * noise_um**2
     causes = causes_of(kept, model, found, removed, named, ready.faults)
-    bound = {law.form.name for law, x in zip(model.laws, model.x, strict=True) if law.at_bound(x)}
+    bound = {law.form.name.replace("_", " ") for law, x in zip(model.laws, model.x, strict=True) if law.at_bound(x)}
     if bound:
         remarks.append(
             f"{', '.join(sorted(bound))}: a parameter ended at the bound of what such an effect may have, so that "
@@ -148,7 +148,7 @@ def conclude(
     gain, silent = _gain(found, extension, compared, noise_um)
     if silent:
         remarks.append(
-            f"{', '.join(silent)}: of what differs from run to run the extended stage has only what all have in "
+            f"{', '.join(silent).replace('_', ' ')}: of what differs from run to run the extended stage has only what all have in "
             "common, so that it may explain these runs and not the next"
         )
     sure = Certainty(found.first, found.plain, found.bench, baseline)
@@ -246,8 +246,8 @@ def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
     if pasts:
         said.append(
             f"{', '.join(pasts)}: what the rig went through before is unknown and estimated beside the rest, so that "
-            "it is not taken for an effect; state it with --initial to have it tested"
+            "it is not taken for an effect; state the initial memory to have it tested"
         )
     if ONE_WAY not in said and not baseline.aside and not any(run.held_out.any() for run in baseline.runs):
-        said.append("nothing was held out, so the gain is not measured: hold out a part, or a run with --holdout")
+        said.append("nothing was held out, so the gain is not measured: hold out a part, or a run")
     return tuple(dict.fromkeys(said))
