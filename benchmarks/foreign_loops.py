@@ -39,6 +39,17 @@ def program(name: str, rng: np.random.Generator) -> tuple[np.ndarray, float]:
     return voltage_V, 1 / 3 if name == "loops" else float((path[-1] - path[-2] + 1) / path[-1])
 
 
+def plays_V(law: str, rng: np.random.Generator) -> np.ndarray:
+    """Radii of the plays of one rig, in V, shape `(k,)`."""
+    if law == "gamma":
+        return rng.gamma(2, rng.uniform(4, 10), PLAYS)
+    if law == "lognormal":
+        return rng.lognormal(np.log(rng.uniform(5, 15)), 0.8, PLAYS)
+    if law == "ridge":
+        return rng.normal(rng.uniform(8, 25), 1.0, PLAYS)
+    return rng.uniform(2, 40, rng.integers(5, 9))
+
+
 def displacement(law: str, voltage_V: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Answer of one rig from negative saturation, in um, shape `(n,)`."""
     line, share_um = rng.uniform(0.1, 0.16), rng.uniform(3, 8)
@@ -54,14 +65,7 @@ def displacement(law: str, voltage_V: np.ndarray, rng: np.random.Generator) -> n
             on = (on | (upper <= voltage)) & (lower <= voltage)
             out_um[k] += share_um * np.sum(density * on) / np.sum(density)
         return out_um
-    if law == "gamma":
-        radius_V = rng.gamma(2, rng.uniform(4, 10), PLAYS)
-    elif law == "lognormal":
-        radius_V = rng.lognormal(np.log(rng.uniform(5, 15)), 0.8, PLAYS)
-    elif law == "ridge":
-        radius_V = rng.normal(rng.uniform(8, 25), 1.0, PLAYS)
-    else:
-        radius_V = rng.uniform(2, 40, rng.integers(5, 9))
+    radius_V = plays_V(law, rng)
     place = voltage_V[0] + radius_V
     for k, voltage in enumerate(voltage_V):
         place = np.clip(place, voltage - radius_V, voltage + radius_V)
@@ -71,12 +75,12 @@ def displacement(law: str, voltage_V: np.ndarray, rng: np.random.Generator) -> n
 
 def reading(true_um: np.ndarray, noise: str, rng: np.random.Generator) -> np.ndarray:
     """What a sensor says, in um, whose noise is white, rounded, or coloured as an AR(1) of the number given."""
-    white = rng.standard_normal(SAMPLES)
+    white = rng.standard_normal(len(true_um))
     if noise == "rounded":
         return DIGIT_um * np.round((true_um + NOISE_um * white) / DIGIT_um)
     if noise != "white":
         past = float(noise)
-        for k in range(1, SAMPLES):
+        for k in range(1, len(white)):
             white[k] = past * white[k - 1] + (1 - past**2) ** 0.5 * white[k]
     return true_um + NOISE_um * white
 

@@ -11,8 +11,9 @@ from fits.io._errors import DataError
 from fits.io._given import AnyRuns, program_given
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
+from fits.loop._grid import BELIEF_LEVELS
 from fits.loop._prediction import Prediction
-from fits.loop._prior import interpolation
+from fits.loop._prior import interpolation, roughness
 from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
@@ -23,8 +24,6 @@ from fits.stats._metrics import TWO_SIDED_95, WHITE
 from fits.stats._noise import correlation_samples, fast_length, shared_square
 from microid import Preisach, Stage
 
-# Levels on which predictions are perturbed; finer ones move no displacement.
-_LEVELS = 16
 # Precision, in scaled coordinates, that stands in for none.
 NO_PRECISION = 1e-8
 
@@ -121,27 +120,37 @@ class Precision:
         """Standard deviations of the coordinates, shape `(p,)`."""
         return np.sqrt(np.diagonal(self.covariance))
 
+    def _fewer_columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Columns of `BELIEF_LEVELS`, in those of the grid, `(D, k)`, and the precision of their prior, `(k, k)`.
+
+        The prior is that of the coarse grid itself, as in a fit of loops: the one of the fine grid would take the
+        kinks of what is read off between coarse nodes for roughness, and be too sure.
+        """
+        size, hyper = self.chain.size, self.solved.hyper
+        if hyper is None or self.chain.levels <= BELIEF_LEVELS:
+            return np.eye(size), self.prior[:size, :size]
+        prior = np.asarray(roughness(BELIEF_LEVELS).precision(hyper)) / self.solved.problem.stroke_um**2
+        return interpolation(BELIEF_LEVELS, self.chain.levels), prior
+
     def uncertainty(self) -> StageUncertainty:
         """Perturbations for predictions."""
-        size, count, grid = self.chain.size, len(self.solved.z), self.chain.grid
-        basis = np.eye(size)
-        if grid is not None and grid.levels > _LEVELS:
-            grid = Grid(grid.lower_V, grid.upper_V, _LEVELS)
-            basis = interpolation(_LEVELS, self.chain.levels)
-        whole = np.zeros((size + count, basis.shape[1] + count))
-        whole[:size, : basis.shape[1]], whole[size:, basis.shape[1] :] = basis, np.eye(count)
-        precision = whole.T @ (self.gram + self.prior) @ whole + NO_PRECISION * np.eye(whole.shape[1])
+        size, count = self.chain.size, len(self.solved.z)
+        basis, prior = self._fewer_columns()
+        few = basis.shape[1]
+        whole = np.zeros((size + count, few + count))
+        whole[:size, :few], whole[size:, few:] = basis, np.eye(count)
+        precision = whole.T @ self.gram @ whole + NO_PRECISION * np.eye(few + count)
+        precision[:few, :few] += prior
         root = np.linalg.cholesky(precision)
-        factor = np.linalg.solve(root, np.eye(len(root)))
+        factor = np.linalg.solve(root, np.eye(len(root))) @ whole.T
         left = zip(self.solved.residuals_um, self.solved.runs, strict=True)
         shared = float(np.mean([shared_square(one[run.fitted]) for one, run in left]))
-        mean = self.solved.sums[0].mean @ whole
         return StageUncertainty(
-            jnp.asarray(factor[:, basis.shape[1] :]),
-            jnp.asarray(factor[:, : basis.shape[1]]),
-            jnp.asarray(factor @ mean),
+            jnp.asarray(factor[:, size:]),
+            jnp.asarray(factor[:, :size]),
+            jnp.asarray(factor @ self.solved.sums[0].mean),
             jnp.asarray(np.float64(max(0.0, shared) ** 0.5)),
-            grid,
+            self.chain.grid,
         )
 
 
