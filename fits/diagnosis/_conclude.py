@@ -147,8 +147,9 @@ def conclude(
         compared = (*(replace(one, held_out=one.held_out & False) for one in compared[:last]), *compared[last:])
     gain, silent = _gain(found, extension, compared, noise_um)
     if silent:
+        some = ", ".join(silent).replace("_", " ")
         remarks.append(
-            f"{', '.join(silent).replace('_', ' ')}: of what differs from run to run the extended stage has only what all have in "
+            f"{some}: of what differs from run to run the extended stage has only what all have in "
             "common, so that it may explain these runs and not the next"
         )
     sure = Certainty(found.first, found.plain, found.bench, baseline)
