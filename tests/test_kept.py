@@ -1,6 +1,8 @@
 """Programs that the command keeps: they answer as those that are traced anew, and never for something else."""
 
+import os
 import shutil
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -159,6 +161,18 @@ def test_a_damaged_file_is_made_anew(folder, tmp_path, rng):
         keep_in(place)
         np.testing.assert_allclose(project_out(*given), expected, atol=1e-9)
         assert _kept._read(place / file.name) is not None
+
+
+def test_what_was_not_used_for_a_month_is_removed(folder, rng):
+    """In the folder and in that of JAX around it; what is younger, or belongs to neither, stays."""
+    folder.mkdir()
+    places = [folder / "old", folder / "young", folder.parent / "x-cache", folder.parent / "own.csv"]
+    for place, days in zip(places, (31, 29, 31, 31), strict=True):
+        place.write_text("")
+        os.utime(place, (time.time() - 86400 * days,) * 2)
+    project_out(*parted(rng)[0])
+    assert [place.exists() for place in places] == [False, True, False, True]
+    assert len(list(folder.iterdir())) == 2
 
 
 def test_inside_another_program_it_is_a_part_of_that(folder, rng):

@@ -14,9 +14,11 @@ import microid as m
 from fits import Record, StageUncertainty, predict, save_model
 from fits.io._model_text import read_model_text
 from fits.loop._design import Grid
+from fits.stage._declared import declared, form_of
 from fits.stage._moments import offsets_out
 from fits.stage._motion import predicted_ranges
-from fits.stage._plain_linear import SYSTEMS, PlainPart, declared, recur
+from fits.stage._plain_linear import _blockwise
+from fits.stage._plain_parts import SYSTEMS, PlainLinear
 from fits.stage._plain_stage import plain_model
 
 SAMPLES = 300
@@ -75,8 +77,8 @@ def test_linear_parts_are_those_of_the_matrix_exponential(damping_ratio, hold, e
     time_constant_s, frequency_Hz, rest_V = rng.uniform(1e-4, 1e-2), rng.uniform(30, 300), rng.uniform(-40, 40)
     time_s = np.cumsum(np.full(SAMPLES, 1e-3) if even else rng.uniform(0.5e-3, 2e-3, SAMPLES))
     signal = rng.uniform(-40, 40, SAMPLES)
-    driver = PlainPart("Driver", {"time_constant_s": time_constant_s, "gain": 2.0})
-    mechanics = PlainPart(
+    driver = PlainLinear("Driver", {"time_constant_s": time_constant_s, "gain": 2.0})
+    mechanics = PlainLinear(
         "Mechanics", {"natural_frequency_Hz": frequency_Hz, "damping_ratio": damping_ratio, "gain": 3.0}
     )
     system = driver.system().then(mechanics.system())
@@ -97,7 +99,7 @@ def test_blocks_of_a_recurrence_are_led_on(count, alike, rng):
     for t in range(count):
         z = step[0 if alike else t] @ z + push[t]
         expected.append(z)
-    np.testing.assert_allclose(recur(step, push, start), expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(_blockwise(step, push, start), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(("hold", "even", "state"), [("first", True, "demagnetised"), ("zero", False, "positive")])
@@ -149,7 +151,8 @@ def test_derivatives_by_parameters_are_those_of_finite_differences(rng, tmp_path
     stage, uncertainty = draw(rng, substeps=2)
     plain, record = saved(tmp_path / "s.json", stage, uncertainty), program(rng, stage, True)
     known = plain.uncertainty
-    for k, (place, name) in enumerate(known.free):
+    for k, (place, name, at) in enumerate(known.free):
+        assert at == ()
         moved = []
         for sign in (-1, 1):
             part = plain.parts[place]
@@ -173,12 +176,16 @@ def test_derivatives_by_parameters_are_those_of_finite_differences(rng, tmp_path
 
 def test_what_is_not_plain_is_left_to_jax(rng, tmp_path):
     stage, uncertainty = draw(rng)
-    place, creep = tmp_path / "s.json", next(effect for effect in m.EFFECTS if effect.name == "creep")
+    place = tmp_path / "s.json"
+    creep, slew = (next(effect for effect in m.EFFECTS if effect.name == name) for name in ("creep", "slew_limit"))
+    with pytest.raises(LookupError, match="SlewLimit has no form"):
+        form_of(slew.__name__)
     assert saved(place, stage, uncertainty) is not None
     for other in (
         m.Stage(stage.parts, stage.names, "smooth"),
         stage.swap("hysteresis", m.Piezo(0.1)),
-        m.extend(stage, creep(0.01, 0.1)),
+        m.extend(stage, creep(0.01, 0.1, 0.05)),
+        m.extend(stage, slew(50.0)),
         stage.swap("hysteresis", m.PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)),
         stage.swap("driver", m.Driver(1e-3, -1.0)),
     ):

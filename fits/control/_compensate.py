@@ -1,6 +1,5 @@
 """Feedforward: the voltage that makes a stage follow a reference (Eq. 19-21)."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -9,7 +8,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import microid
-from fits.control._follow import TOLERABLE, Compensation, Doubt, binding, compensate_plain, follow, within_range
+from fits.control._follow import (
+    TOLERABLE,
+    Compensation,
+    Doubt,
+    beside_effects,
+    binding,
+    compensate_plain,
+    follow,
+    within_range,
+)
 from fits.io._errors import DataError
 from fits.io._given import AnyRuns, reference_given
 from fits.io._kept import kept
@@ -67,12 +75,13 @@ def compensate(
         if way == "dynamic":
             raise DataError("expected a stage to compensate dynamically, found a hysteresis without mechanics.")
         return compensate_plain(plain_loop_of(model), reference, initial, clip, limits_V)
-    if (plain := plain_of(model)) is not model:
-        without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
-        return _beside_effects(model, plain, reference, initial, without)
     stage = plain_stage_of(model)
     if way == "static" and stage is not None:
         return compensate_plain(stage, reference, initial, clip, limits_V)
+    if (plain := plain_of(model)) is not model:
+        _refuse_needs(model)
+        without = partial(compensate, plain, initial=initial, clip=clip, limits_V=limits_V, way=way)
+        return beside_effects(reference, without, lambda program: simulate_model(model, program, initial))
     law = plain_loop_of(static_equivalent(model))
     needed, doubt_um = wanted, 0.0
     if way == "dynamic":
@@ -89,29 +98,14 @@ def compensate(
     return Compensation(voltage, played, wanted, clipped, tuple(remarks))
 
 
-def _beside_effects(
-    stage: Stage, plain: Stage, reference: Reference | Record, initial: str, invert: Callable[..., Compensation]
-) -> Compensation:
-    """Invert a stage with effects by fixed-point iteration with the inverse of the plain stage, which has none."""
+def _refuse_needs(stage: Stage) -> None:
+    """Refuse, in a `DataError`, a stage whose effects depend on more than the command."""
     needs = sorted({name for part in stage.parts if isinstance(part, AbstractEffect) for name in part.needs})
     if needs:
         raise DataError(
             f"the model depends on {', '.join(needs)}, which a reference does not tell; use baseline.json.",
             of_model=True,
         )
-    time_s, wanted = reference.time_s, np.asarray(reference.displacement_um)
-    asked, before = wanted, np.inf
-    # Each round reduces the error to a few percent of what it was.
-    for _ in range(12):
-        found = invert(Reference(time_s, asked, reference.source))
-        program = Record(time_s, found.voltage_V, None, source=reference.source)
-        played = simulate_model(stage, program, initial)
-        change = played - simulate_model(plain, program, initial)
-        moved = float(np.max(np.abs(wanted - change - asked)))
-        if moved <= 1e-9 * float(np.ptp(wanted)) or moved > 0.9 * before:
-            break
-        asked, before = wanted - change, moved
-    return Compensation(found.voltage_V, played, wanted, found.clipped, found.remarks)
 
 
 def _led(

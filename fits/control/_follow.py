@@ -1,6 +1,8 @@
 """What a hysteresis can follow of a reference, and the voltage for it, without JAX."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -88,10 +90,33 @@ def compensate_plain(
     model: PlainModel, reference: Reference | Record, initial: str, clip: bool, limits_V: tuple[float, float] | None
 ) -> Compensation:
     """Find the voltage whose displacement by the hysteresis of a model is the reference; see `compensate`."""
+    if (plain := model.without_effects) is not model:
+        without = partial(compensate_plain, plain, initial=initial, clip=clip, limits_V=limits_V)
+        return beside_effects(reference, without, lambda program: model.play(program, initial))
     law, wanted = model.static, np.asarray(reference.displacement_um)
     voltage, clipped = follow(law, reference, wanted, initial, clip, within_range(law.range_V, limits_V))
     program = Record(reference.time_s, voltage, None, source=reference.source)
     return Compensation(voltage, model.play(program, initial), wanted, clipped)
+
+
+def beside_effects(
+    reference: Reference | Record,
+    invert: Callable[[Reference], Compensation],
+    play: Callable[[Record], np.ndarray],
+) -> Compensation:
+    """Invert a stage with effects, which `play` simulates, by iteration with the inverse of the plain stage."""
+    time_s, wanted = reference.time_s, np.asarray(reference.displacement_um)
+    asked, before = wanted, np.inf
+    # Each round reduces the error to a few percent of what it was.
+    for _ in range(12):
+        found = invert(Reference(time_s, asked, reference.source))
+        played = play(Record(time_s, found.voltage_V, None, source=reference.source))
+        change = played - found.displacement_um
+        moved = float(np.max(np.abs(wanted - change - asked)))
+        if moved <= 1e-9 * float(np.ptp(wanted)) or moved > 0.9 * before:
+            break
+        asked, before = wanted - change, moved
+    return Compensation(found.voltage_V, played, wanted, found.clipped, found.remarks)
 
 
 def within_range(range_V: tuple[float, float], limits_V: tuple[float, float] | None) -> tuple[float, float]:

@@ -6,7 +6,9 @@ import io
 import os
 import pickle
 import sys
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -28,6 +30,8 @@ _R = TypeVar("_R")
 _OTHERS = "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy"
 _OWN = "microid", "fits"
 _KNOWN = {*_OTHERS, *_OWN, "builtins"}
+# What nobody has used for a month is removed; file systems note at least once a day that a file was read.
+_UNUSED_s = 30 * 86400.0
 # Where programs are kept, since `keep_in`.
 _place: list[Path] = []
 
@@ -150,6 +154,7 @@ def _read(file: Path) -> tuple[Any, Any, Any] | None:
 
 
 def _write(file: Path, found: tuple[Any, Any, Any]) -> None:
+    _remove_unused(file.parent)
     try:
         content = pickle.dumps(found)
         file.parent.mkdir(mode=0o700, exist_ok=True)
@@ -158,6 +163,20 @@ def _write(file: Path, found: tuple[Any, Any, Any]) -> None:
     except (OSError, DataError, pickle.PicklingError, AttributeError, TypeError):
         # It is made anew in the next call.
         return
+
+
+@functools.cache
+def _remove_unused(folder: Path) -> None:
+    """Remove, once in each process that keeps something new, what has not been used for long.
+
+    Around the folder of what is kept here is that of what JAX has compiled.
+    """
+    for file in (*folder.glob("*"), *folder.parent.glob("*-cache")):
+        # Another process may have removed it.
+        with suppress(OSError):
+            found = file.stat()
+            if time.time() - max(found.st_atime, found.st_mtime) > _UNUSED_s:
+                file.unlink()
 
 
 @functools.cache

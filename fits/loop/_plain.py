@@ -72,6 +72,11 @@ class PlainModel(abc.ABC):
     def static(self) -> "PlainLoop":
         """The hysteresis between command and sensor, as slow commands see it."""
 
+    @property
+    @abc.abstractmethod
+    def without_effects(self) -> "PlainModel":
+        """The same model without effects of `microid.EFFECTS`; itself where it has none."""
+
     @abc.abstractmethod
     def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
@@ -97,6 +102,11 @@ class PlainLoop(PlainModel):
     @property
     def static(self) -> "PlainLoop":
         """The hysteresis itself."""
+        return self
+
+    @property
+    def without_effects(self) -> "PlainLoop":
+        """It has none."""
         return self
 
     @property

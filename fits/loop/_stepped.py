@@ -7,6 +7,8 @@ from fits.io._record import Record
 
 # A hundred arrays of so many values are 8 GB.
 _MOST_STEPS = 10_000_000
+# Intervals behind a record: cubics through samples look two of them ahead, one part after another.
+_MORE = 4
 
 
 def refuse_many_steps(record: Record, stride: int) -> None:
@@ -40,16 +42,16 @@ def stepped(record: Record, steps: int, hold: str, as_run: bool) -> tuple[np.nda
     """Divide the intervals of a record: these in s, `(m,)`, or `(1,)` where they are even, and the command in V.
 
     The latter, `(m + 1,)`, runs in lines, `first`, or stays until the next sample, `zero`. `as_run`, as a fit takes a
-    record, a clock that is even but for rounding is even, and the command stays for one more interval: then it is
+    record, a clock that is even but for rounding is even, and the command stays for some more intervals: then it is
     known what bends at the last sample.
     """
     refuse_many_steps(record, steps)
     step_s = even_interval_s(record.time_s) if as_run else None
-    each_s = intervals(record.time_s) if step_s is None else np.array([step_s])
+    each_s = intervals(record.time_s) if step_s is None else np.array([step_s or 1.0])
     command_V = record.voltage_V
     if as_run:
-        command_V = np.append(command_V, command_V[-1:])
-        each_s = each_s if len(each_s) == 1 else np.append(each_s, each_s.mean())
+        command_V = np.append(command_V, np.repeat(command_V[-1:], _MORE))
+        each_s = each_s if len(each_s) == 1 else np.append(each_s, np.full(_MORE, each_s.mean()))
     share = np.arange(steps) / steps if hold == "first" else np.zeros(steps)
     finer = (command_V[:-1, None] + np.diff(command_V)[:, None] * share).ravel()
     return (each_s if len(each_s) == 1 else np.repeat(each_s, steps)) / steps, np.append(finer, command_V[-1:])

@@ -51,7 +51,7 @@ def propagated(
     out = np.empty_like(moved_um)
     for first in range(0, moved_um.shape[1], _AT_ONCE):
         part = moved_um[:, first : first + _AT_ONCE].T
-        full = np.pad(part, ((0, _AT_ONCE - len(part)), (0, pad)))
+        full = np.pad(np.pad(part, ((0, 0), (0, pad)), mode="edge"), ((0, _AT_ONCE - len(part)), (0, 0)))
         answer = _propagated(coordinates, place, z, samples, signal, jnp.asarray(full))
         out[:, first : first + _AT_ONCE] = np.asarray(answer)[: len(part), :n].T
     return out

@@ -1,4 +1,4 @@
-"""A stage of linear parts around one hysteresis in NumPy, and its model file: it has answered before JAX is imported.
+"""A stage of linear parts and effects around one hysteresis in NumPy: it has answered before JAX is imported.
 
 The algorithm is that of `microid.Stage` and `fits.StageUncertainty`.
 """
@@ -6,39 +6,53 @@ The algorithm is that of `microid.Stage` and `fits.StageUncertainty`.
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from fits.io._limits import Ranges, joined, measured_ranges
 from fits.io._record import Record
+from fits.io._threads import one_thread
 from fits.loop._path import Path
 from fits.loop._plain import PlainLoop, PlainModel, extremes_V
 from fits.loop._plain_file import ODD, array_of, fields_of, plain_loop, read_directions, read_law
 from fits.loop._prediction import Prediction, refuse_outside
 from fits.loop._stepped import intervals, stepped
 from fits.loop._surface import Surface
-from fits.stage._plain_linear import SYSTEMS, Linear, PlainPart, declared
+from fits.stage._declared import tools
+from fits.stage._plain_parts import PlainEffect, PlainLinear, PlainPart, around, read_part, through
 
+if TYPE_CHECKING:
+    from microid._in_numpy import _NumpySignal
+else:
+    _NumpySignal = tools()._NumpySignal
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 _MOST_SUBSTEPS = 1000
 _STAGE = "parts", "names", "hold", "substeps", "frozen"
 _UNCERTAINTY = "coordinates", "columns_um", "mean_um", "discrepancy_um", "grid"
 # The imaginary part of a parameter along which derivatives are taken, in units of its coordinate: its square is lost.
 _TINY = 1e-30
-# Samples whose perturbations are held at a time.
-_PIECE = 2048
+# Samples whose perturbations are held at a time, and perturbations that pass through effects at a time.
+_PIECE, _AT_ONCE = 2048, 64
+
+
+def _in_numpy(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Compute in one thread, and let pass what is not finite, which is refused where it is written."""
+    return one_thread(np.errstate(all="ignore")(function), with_scipy=False)
 
 
 @dataclass(frozen=True)
 class Directions:
     """Independent perturbations of a stage, each one standard deviation long; see `fits.StageUncertainty`.
 
-    The free parameters are places of parts and names of fields; `coordinates` is `(k, p)` and `mean_um` is `(k,)`.
-    Densities and slopes are those of `Surface.of`.
+    The free parameters are places of parts, names of fields and places in these; `coordinates` is `(k, p)` and
+    `mean_um` is `(k,)`. Densities and slopes are those of `Surface.of`.
     """
 
-    free: tuple[tuple[int, str], ...]
+    free: tuple[tuple[int, str, tuple[int, ...]], ...]
     coordinates: np.ndarray
     density: np.ndarray
     slope: np.ndarray
@@ -68,15 +82,20 @@ class PlainStage(PlainModel):
 
     @property
     def static(self) -> PlainLoop:
-        """The hysteresis with the static gains folded in."""
-        ahead, behind = _around(self.parts)
+        """The hysteresis with the static gains folded in, without effects."""
+        ahead, behind = around(self.parts)
         gain, surface = float(behind.gain.real), self.law.surface
         lower_V, upper_V = (float((end / ahead.gain).real) for end in self.law.range_V)
         folded = Surface(lower_V, upper_V, gain * surface.window_um, gain * surface.branch_um)
         return PlainLoop(folded, float(behind.offset.real) + gain * self.law.offset_um)
 
-    # What is not finite is refused where it is written.
-    @np.errstate(all="ignore")
+    @cached_property
+    def without_effects(self) -> "PlainStage":
+        """See `PlainModel`."""
+        linear = tuple(part for part in self.parts if isinstance(part, PlainLinear))
+        return self if len(linear) == len(self.parts) else replace(self, parts=linear, uncertainty=None)
+
+    @_in_numpy
     def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
         """See `PlainModel`."""
         refuse_outside(record, *self.range_V)
@@ -85,12 +104,12 @@ class PlainStage(PlainModel):
             sd_um = self._sd_um(self.uncertainty, record, initial, progress)
         return Prediction(self._respond(self.parts, record, initial, self.substeps)[:: self.substeps], sd_um)
 
-    @np.errstate(all="ignore")
+    @_in_numpy
     def play(self, record: Record, initial: str) -> np.ndarray:
         """See `PlainModel`."""
         return self._respond(self.parts, record, initial, self.substeps, as_run=False)[:: self.substeps]
 
-    @np.errstate(all="ignore")
+    @_in_numpy
     def ranges(self, program: Record, displacement_um: np.ndarray, initial: str) -> Ranges:
         """See `PlainModel`: between the samples the mechanics ring."""
         found = measured_ranges(replace(program, displacement_um=displacement_um))
@@ -107,19 +126,28 @@ class PlainStage(PlainModel):
         self, parts: Sequence[PlainPart], record: Record, initial: str, steps: int, as_run: bool = True
     ) -> np.ndarray:
         """Displacement at so many steps between samples, `((n - 1) steps + 1,)`, complex where a parameter is."""
-        ahead, behind = _around(parts)
         interval_s, command_V = stepped(record, steps, self.hold, as_run)
-        voltage, before, hold = _through(ahead, interval_s, command_V, command_V[0], self.hold)
-        displacement = self.law.respond(np.append(before, voltage), initial)
-        found, _, _ = _through(behind, interval_s, displacement[1:], displacement[0], hold)
-        return found[: (len(record) - 1) * steps + 1]
+        voltage = self._ahead(parts, interval_s, command_V)
+        given = self._switched(voltage, initial)
+        found = through((part for part in parts if not part.ahead), interval_s, given)
+        return found.values[: (len(record) - 1) * steps + 1, 0]
+
+    def _ahead(self, parts: Sequence[PlainPart], interval_s: np.ndarray, command_V: np.ndarray) -> _NumpySignal:
+        """What the hysteresis sees of a command."""
+        command = _NumpySignal(command_V[:, None], command_V[:1], self.hold)
+        return through((part for part in parts if part.ahead), interval_s, command)
+
+    def _switched(self, voltage: _NumpySignal, initial: str) -> _NumpySignal:
+        """What the hysteresis makes of what it sees."""
+        displacement = self.law.respond(np.append(voltage.before, voltage.values[:, 0]), initial)[:, None]
+        return _NumpySignal(displacement[1:], displacement[0], voltage.hold)
 
     def _sd_um(self, known: Directions, record: Record, initial: str, progress: Callable[[str], None]) -> np.ndarray:
         """Standard deviation of the displacement, `(n,)`: to first order in all perturbations."""
-        slope_um = np.empty((len(record), len(known.free)))
-        for k, (place, name) in enumerate(known.free):
+        slope_um = np.zeros((len(record), len(known.free)))
+        for k in np.flatnonzero(np.any(known.coordinates, axis=0)):
             progress("predicting")
-            slope_um[:, k] = self._slope_um(place, name, record, initial)
+            slope_um[:, k] = self._slope_um(*known.free[k], record, initial)
         found, first, n = [], 0, len(record)
         for columns_um in self._columns_um(known, record, initial):
             progress(f"predicting, {100 * first // n} % done")
@@ -128,35 +156,56 @@ class PlainStage(PlainModel):
             first += len(columns_um)
         return np.sqrt(np.concatenate(found) + known.discrepancy_um**2)
 
-    def _slope_um(self, place: int, name: str, record: Record, initial: str) -> np.ndarray:
+    def _slope_um(self, place: int, name: str, at: tuple[int, ...], record: Record, initial: str) -> np.ndarray:
         """Derivative of the displacement by the coordinate of one parameter, `(n,)`."""
         part, parts = self.parts[place], list(self.parts)
-        value = part.values[name]
-        moved = value + 1j * _TINY * part.fields[name].slope(value.real)
-        parts[place] = replace(part, values={**part.values, name: moved})
+        value = np.array(part.values[name], dtype=complex)
+        value[at] += 1j * _TINY * part.fields[name].slope(float(value[at].real))
+        parts[place] = replace(part, values={**part.values, name: value[()]})
         return np.imag(self._respond(parts, record, initial, self.substeps)[:: self.substeps]) / _TINY
 
     def _columns_um(self, known: Directions, record: Record, initial: str) -> Iterator[np.ndarray]:
         """What perturbations of the hysteresis do to the displacement, some samples at a time, `(samples, k)`."""
-        ahead, behind = _around(self.parts)
         interval_s, command_V = stepped(record, self.substeps, self.hold, as_run=True)
-        voltage_V, _, _ = _through(ahead, interval_s, command_V, command_V[0], self.hold)
+        voltage = self._ahead(self.parts, interval_s, command_V)
+        voltage_V = voltage.values[:: self.substeps, 0]
         surface = Surface.of(known.density, known.slope, *known.range_V)
+        pieces = Path.pieces(extremes_V(initial, *self.law.range_V), voltage_V[: len(record)], _PIECE)
+        responses = (surface.respond(piece) for piece in pieces)
+        behind = tuple(part for part in self.parts if not part.ahead)
+        if any(isinstance(part, PlainEffect) for part in behind):
+            around_um = self._switched(voltage, initial).values[:: self.substeps, 0]
+            each_s = self.substeps * interval_s[:: self.substeps]
+            yield from _beside(behind, each_s, around_um, responses)
+            return
+        system = around(behind)[1]
         between_s = intervals(record.time_s)
         if len(between_s) > 1:
             # The state before the first sample is one of rest, which no interval changes.
             between_s = np.append(between_s[:1], between_s)
-        states, last, first = np.zeros((len(behind.rest), len(known.mean_um))), None, 0
-        for piece in Path.pieces(
-            extremes_V(initial, *self.law.range_V), voltage_V[:: self.substeps][: len(record)], _PIECE
-        ):
-            response = surface.respond(piece)
+        states, last, first = np.zeros((len(system.rest), len(known.mean_um))), None, 0
+        for response in responses:
             # At rest before the first sample.
             change = np.diff(response, axis=0, prepend=response[:1] if last is None else last)
             each = between_s if len(between_s) == 1 else between_s[first : first + len(response)]
-            moved, states = behind.move(each, change, states, "first")
-            yield behind.gain * response + moved
+            moved, states = system.move(each, change, states, "first")
+            yield system.gain * response + moved
             last, first = response[-1:], first + len(response)
+
+
+def _beside(
+    parts: Sequence[PlainPart], interval_s: np.ndarray, around_um: np.ndarray, responses: Iterator[np.ndarray]
+) -> Iterator[np.ndarray]:
+    """Pass changes of a signal, `(t,)`, on through parts to first order: what is not linear needs a whole record."""
+    whole = np.concatenate(list(responses))
+    count, behind = len(whole), ((0, len(around_um) - len(whole)), (0, 0))
+    around_um = np.pad(around_um[:count, None], behind, mode="edge")
+    for first in range(0, whole.shape[1], _AT_ONCE):
+        some = np.pad(whole[:, first : first + _AT_ONCE], behind, mode="edge")
+        values = around_um + 1j * _TINY * some
+        found = through(parts, interval_s, _NumpySignal(values, values[0], "first")).values
+        whole[:, first : first + _AT_ONCE] = np.imag(found[:count]) / _TINY
+    yield from (whole[first : first + _PIECE] for first in range(0, count, _PIECE))
 
 
 def fine_steps(resonances_Hz: Sequence[float], record: Record) -> int:
@@ -168,31 +217,12 @@ def fine_steps(resonances_Hz: Sequence[float], record: Record) -> int:
     return int(2 ** math.ceil(math.log2(min(max(wanted, 1.0), max((1 << 18) / len(record), 1.0)))))
 
 
-def _around(parts: Sequence[PlainPart]) -> tuple[Linear, Linear]:
-    """What stands ahead of the hysteresis and behind it, as one system each."""
-    ahead, behind = (
-        reduce(Linear.then, (part.system() for part in parts if part.ahead == first), Linear.memoryless(1.0))
-        for first in (True, False)
-    )
-    return ahead, behind
-
-
-def _through(
-    system: Linear, interval_s: np.ndarray, values: np.ndarray, before: complex, hold: str
-) -> tuple[np.ndarray, complex, str]:
-    """Pass a signal, `(t,)`, through a system at rest: what comes out, what did before, and how it runs between."""
-    found = system.respond(interval_s, values[:, None], np.array([before]), hold)[:, 0]
-    if len(system.rest):
-        # Behind a step even what comes out of an inertia may have a corner.
-        hold = "first" if hold == "zero" else "smooth"
-    return found, system.offset + system.gain * before, hold
-
-
 def plain_model(content: Mapping[str, Any]) -> PlainModel | None:
     """The hysteresis or the stage of a model file, as `read_model_text` gives it.
 
     None where JAX is to take it, and to say what is wrong with it: a stage where it is not made of drivers, one
-    Preisach operator on a grid, mechanics and sensors, under a command in lines or steps, and where anything is odd.
+    Preisach operator on a grid, mechanics, sensors and effects that have a form in NumPy, under a command in lines or
+    steps, and where anything is odd.
     """
     try:
         return _stage(content) if content["model"]["type"] == "Stage" else plain_loop(content)
@@ -204,11 +234,11 @@ def _stage(content: Mapping[str, Any]) -> PlainStage | None:
     """A `PlainStage`; None, or one of the exceptions `ODD`, where it is another."""
     items, names, hold, substeps, frozen = fields_of(content["model"], "Stage", *_STAGE)
     (place,) = (k for k, item in enumerate(items) if item["type"] == "Preisach")
-    parts = tuple(_part(item) for item in (*items[:place], *items[place + 1 :]))
+    parts = tuple(read_part(item) for item in (*items[:place], *items[place + 1 :]))
     stage = PlainStage(parts, read_law(items[place]), hold, substeps, report=content["fit"])
     others = [*names[:place], *names[place + 1 :]]
     fields = {f"{name}.{field}" for name, part in zip(others, parts, strict=True) for field in part.fields}
-    gains = [part.system().gain.real for part in parts]
+    gains = [part.system().gain.real for part in parts if isinstance(part, PlainLinear)]
     if not (
         all(part.ahead == (k < place) for k, part in enumerate(parts))
         and len({*names}) == len(names)
@@ -223,33 +253,32 @@ def _stage(content: Mapping[str, Any]) -> PlainStage | None:
     return stage if known is None else replace(stage, uncertainty=_directions(known, parts, free))
 
 
-def _part(item: Mapping[str, Any]) -> PlainPart:
-    if item["type"] not in SYSTEMS:
-        raise ValueError("another part")
-    fields = declared()[item["type"]]
-    values = zip(fields.items(), fields_of(item, item["type"], *fields), strict=True)
-    return PlainPart(
-        item["type"], {name: float(array_of(value, 0, said.unit, said.lower)) for (name, said), value in values}
-    )
-
-
-def _free(names: Sequence[str], parts: Sequence[PlainPart], frozen: Sequence[str]) -> tuple[tuple[int, str], ...]:
+def _free(
+    names: Sequence[str], parts: Sequence[PlainPart], frozen: Sequence[str]
+) -> tuple[tuple[int, str, tuple[int, ...]], ...]:
     """Parameters that a fit has moved, in the order of its coordinates; see `fits.stage._moments.offsets_out`."""
     return tuple(
-        (place, field)
+        (place, field, at)
         for place, (name, part) in enumerate(zip(names, parts, strict=True))
-        for field in part.fields
+        for field, said in part.fields.items()
+        for at in np.ndindex(said.shape)
         if not {name, f"{name}.{field}"} & {*frozen} and not field.endswith("offset_um")
     )
 
 
-def _directions(item: Mapping[str, Any], parts: Sequence[PlainPart], free: tuple[tuple[int, str], ...]) -> Directions:
+def _directions(
+    item: Mapping[str, Any], parts: Sequence[PlainPart], free: tuple[tuple[int, str, tuple[int, ...]], ...]
+) -> Directions:
     coordinates, columns, mean, discrepancy, grid = fields_of(item, "StageUncertainty", *_UNCERTAINTY)
     coordinates, columns_um = array_of(coordinates, 2, packed=True), array_of(columns, 2, packed=True)
     mean_um = array_of(mean, 1, packed=True)
     if not len(mean_um) == len(columns_um) == len(coordinates) > 0 or coordinates.shape[1] != len(free):
         raise ValueError("another shape")
-    if not all(parts[place].fields[name].inside(parts[place].values[name].real) for place, name in free):
-        raise ValueError("on a bound")
+    for (place, name, at), moves in zip(free, coordinates.T, strict=True):
+        part = parts[place]
+        if not part.fields[name].inside(float(np.asarray(part.values[name])[at])):
+            raise ValueError("on a bound")
+        if isinstance(part, PlainEffect) and name in part.history and np.any(moves):
+            raise ValueError("something may go on from before the record")
     moved = read_directions(columns_um, grid)
     return Directions(free, coordinates, *moved, mean_um, float(array_of(discrepancy, 0)))

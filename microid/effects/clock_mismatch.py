@@ -3,8 +3,10 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _instants, _NumpySignal, _reading_at
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -44,3 +46,8 @@ class ClockMismatch(AbstractEffect):
         """Read the signal at the times of the other clock."""
         when = _times_of(time_s, signal.values.shape[0]) * (1 + 1e-6 * self.rate_ppm)
         return Signal(_read_at(time_s, signal, when), signal.before, signal.hold)
+
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Read the signal at the times of the other clock."""
+        when = _instants(interval_s, len(signal.values)) * (1 + 1e-6 * self.rate_ppm)
+        return signal._replace(values=_reading_at(interval_s, signal, when))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _lags, _NumpySignal
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -75,6 +76,11 @@ class Creep(AbstractEffect):
         gone_on = _gone_on(time_s, signal.values.shape[0], self.recent_um, self.older_um)
         return Signal(signal.values + crept + gone_on, signal.before, signal.hold)
 
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add creep to a displacement that was at rest."""
+        crept = self.gain_per_decade * _crept_in_numpy(interval_s, signal.values - signal.before, self.onset_s)
+        return signal._replace(values=signal.values + crept)
+
 
 @register
 class VoltageCreep(AbstractEffect):
@@ -128,6 +134,11 @@ class VoltageCreep(AbstractEffect):
         gone_on = _gone_on(time_s, signal.values.shape[0], self.recent_V, self.older_V)
         return Signal(signal.values + crept + gone_on, signal.before, signal.hold)
 
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add creep to a voltage that was constant."""
+        crept = self.gain_per_decade * _crept_in_numpy(interval_s, signal.values - signal.before, self.onset_s)
+        return signal._replace(values=signal.values + crept)
+
 
 @register
 class KelvinVoigtCreep(AbstractEffect):
@@ -180,14 +191,30 @@ class KelvinVoigtCreep(AbstractEffect):
         late = -self.before_um * jnp.expm1(-_times_of(time_s, moved.shape[0]) / self.time_constant_s)
         return Signal(signal.values + moved + late, signal.before, signal.hold)
 
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add creep to a displacement that was at rest."""
+        moved = _lags(interval_s, signal.values - signal.before, [self.time_constant_s], [self.gain])
+        return signal._replace(values=signal.values + moved)
+
 
 def _crept(time_s: Times, moved: Float[Array, " t"], onset_s: Float[Array, ""]) -> Float[Array, " t"]:
     """Answer of all relaxations to a signal from rest, of one per decade to a step of one, shape `(t,)`."""
-    ratio = 10 ** (np.arange(-_AHEAD * _PER_DECADE, _BEHIND * _PER_DECADE + 1) / _PER_DECADE)
-    weights = jnp.asarray(np.exp(-1 / ratio) / _PER_DECADE, dtype=moved.dtype)
+    ratio, weight = _relaxations()
+    weights = jnp.asarray(weight, dtype=moved.dtype)
     constants = onset_s * jnp.asarray(ratio, dtype=moved.dtype)
     each = jax.vmap(lambda constant: _lowpass(time_s, moved, constant))(constants)
     return jnp.sum(weights[:, None] * each, axis=0)
+
+
+def _crept_in_numpy(interval_s: np.ndarray, moved: np.ndarray, onset_s: Any) -> np.ndarray:
+    ratio, weight = _relaxations()
+    return _lags(interval_s, moved, onset_s * ratio, weight)
+
+
+def _relaxations() -> tuple[np.ndarray, np.ndarray]:
+    """Time constants over the onset, and what each relaxation answers a step of one with, shape `(m,)` each."""
+    ratio = 10 ** (np.arange(-_AHEAD * _PER_DECADE, _BEHIND * _PER_DECADE + 1) / _PER_DECADE)
+    return ratio, np.exp(-1 / ratio) / _PER_DECADE
 
 
 def _gone_on(time_s: Times, count: int, recent: Float[Array, ""], older: Float[Array, ""]) -> Float[Array, " t"]:

@@ -3,8 +3,10 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _NumpySignal
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -53,6 +55,12 @@ class DriverSaturation(AbstractEffect):
         values, before = (jnp.minimum(x, self.rail_V) for x in (signal.values, signal.before))
         return Signal(values, before, signal.hold)
 
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Cut off what is above the rail."""
+        rail_V: Any = self.rail_V
+        values, before = (np.where(x.real < rail_V.real, x, rail_V) for x in (signal.values, signal.before))
+        return _NumpySignal(values, before, signal.hold)
+
 
 @register
 class LowerDriverSaturation(AbstractEffect):
@@ -88,3 +96,9 @@ class LowerDriverSaturation(AbstractEffect):
         """Cut off what is below the rail."""
         values, before = (jnp.maximum(x, self.rail_V) for x in (signal.values, signal.before))
         return Signal(values, before, signal.hold)
+
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Cut off what is below the rail."""
+        rail_V: Any = self.rail_V
+        values, before = (np.where(x.real > rail_V.real, x, rail_V) for x in (signal.values, signal.before))
+        return _NumpySignal(values, before, signal.hold)

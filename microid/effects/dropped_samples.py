@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _instants, _NumpySignal, _reading_at
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -62,3 +63,9 @@ class DroppedSamples(AbstractEffect):
         width = time[1] - time[0] if time.shape[0] > 1 else jnp.ones_like(self.after_s)
         when = time + self.dropped_s * jax.nn.sigmoid((time - self.after_s) / width)
         return Signal(_read_at(time_s, signal, when), signal.before, signal.hold)
+
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Read the signal at later times after the loss."""
+        time = _instants(interval_s, len(signal.values))
+        lost = 0.5 * (1 + np.tanh((time - self.after_s) / (2 * interval_s[0])))
+        return signal._replace(values=_reading_at(interval_s, signal, time + self.dropped_s * lost))

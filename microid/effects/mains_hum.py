@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _instants, _NumpySignal
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -62,6 +63,10 @@ class MainsHum(AbstractEffect):
         """Add the lines."""
         return _hum(time_s, signal, self.cosine_um, self.sine_um, self.frequency_Hz)
 
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add the lines."""
+        return _hum_in_numpy(interval_s, signal, self.cosine_um, self.sine_um, self.frequency_Hz)
+
 
 @register
 class MainsHum60(AbstractEffect):
@@ -105,6 +110,10 @@ class MainsHum60(AbstractEffect):
         """Add the lines."""
         return _hum(time_s, signal, self.cosine_um, self.sine_um, self.frequency_Hz)
 
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add the lines."""
+        return _hum_in_numpy(interval_s, signal, self.cosine_um, self.sine_um, self.frequency_Hz)
+
 
 def _lines(cls: Any, scales: Scales, mains_Hz: float) -> tuple[tuple[Any, ...], ...]:
     seen = [h for h in range(1, _HARMONICS + 1) if 2.2 * h * mains_Hz * scales.interval_s < 1]
@@ -130,3 +139,12 @@ def _hum(
     for h in range(_HARMONICS):
         total = total + cosine_um[h] * jnp.cos((h + 1) * phase) + sine_um[h] * jnp.sin((h + 1) * phase)
     return Signal(total, signal.before, signal.hold)
+
+
+def _hum_in_numpy(
+    interval_s: np.ndarray, signal: _NumpySignal, cosine_um: Any, sine_um: Any, frequency_Hz: Any
+) -> _NumpySignal:
+    phase, total = 2 * np.pi * frequency_Hz * _instants(interval_s, len(signal.values))[:, None], signal.values
+    for h in range(_HARMONICS):
+        total = total + cosine_um[h] * np.cos((h + 1) * phase) + sine_um[h] * np.sin((h + 1) * phase)
+    return signal._replace(values=total)

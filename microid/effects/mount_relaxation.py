@@ -3,8 +3,10 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _instants, _NumpySignal
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -54,6 +56,11 @@ class MountRelaxation(AbstractEffect):
         moved = -self.change_um * jnp.expm1(-time / self.time_constant_s)
         return Signal(signal.values + moved, signal.before, signal.hold)
 
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add what has settled since the first sample."""
+        time = _instants(interval_s, len(signal.values))[:, None]
+        return signal._replace(values=signal.values - self.change_um * np.expm1(-time / self.time_constant_s))
+
 
 @register
 class LogarithmicMountRelaxation(AbstractEffect):
@@ -94,3 +101,9 @@ class LogarithmicMountRelaxation(AbstractEffect):
         time = _times_of(time_s, signal.values.shape[0])
         moved = self.change_per_decade_um * jnp.log1p(time / self.age_s) / jnp.log(10.0)
         return Signal(signal.values + moved, signal.before, signal.hold)
+
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add what has settled since the first sample."""
+        time = _instants(interval_s, len(signal.values))[:, None]
+        moved = self.change_per_decade_um * np.log1p(time / self.age_s) / np.log(10.0)
+        return signal._replace(values=signal.values + moved)

@@ -3,8 +3,10 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _decay, _NumpySignal, _sag
 from microid._linear import Times, _bend, recur
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -76,3 +78,20 @@ class SensorLowpass(AbstractEffect):
         bent = bend * jnp.concatenate([passed[:1], passed])
         after = "first" if signal.hold == "zero" else signal.hold
         return Signal(signal.values + behind + begun - bent, signal.before, after)
+
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Follow the signal, as `run` does."""
+        if len(signal.values) == 1:
+            return signal
+        lag: Any = (self.time_constant_s / interval_s)[:, None]
+        left = np.exp(-1 / np.where(lag.real > _INSTANT, lag, _INSTANT))
+        bent = _sag(interval_s, signal.values) if signal.hold == "smooth" else np.zeros_like(signal.values)
+        change = np.diff(signal.values - bent, axis=0)
+        push = -change * (left if signal.hold == "zero" else lag * (1 - left))
+        first = (signal.before - signal.values[0]) * left[0]
+        step = left if len(left) == 1 else np.concatenate([left[:1], left])
+        behind = _decay(step, np.concatenate([first[None], push]))
+        passed = 6 * lag / np.tanh(0.5 / np.where(lag.real > _INSTANT, lag, _INSTANT)) - 12 * lag**2
+        passed = passed if len(passed) == 1 else np.concatenate([passed[:1], passed])
+        after = "first" if signal.hold == "zero" else signal.hold
+        return _NumpySignal(signal.values + behind - bent * passed, signal.before, after)

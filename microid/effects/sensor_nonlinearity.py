@@ -3,8 +3,10 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _NumpySignal
 from microid._linear import Times
 from microid._param import array, param
 from microid._part import AbstractPart, Signal
@@ -54,8 +56,13 @@ class SensorNonlinearity(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Bend the reading."""
-        return Signal(self._bent(signal.values), self._bent(signal.before), signal.hold)
+        return Signal(_bent(self, signal.values), _bent(self, signal.before), signal.hold)
 
-    def _bent(self, reading: Float[Array, "..."]) -> Float[Array, "..."]:
-        place = (reading - self.centre_um) / self.half_stroke_um
-        return reading + self.half_stroke_um * place**2 * (self.quadratic + self.cubic * place)
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Bend the reading."""
+        return _NumpySignal(_bent(self, signal.values), _bent(self, signal.before), signal.hold)
+
+
+def _bent(effect: Any, reading: Any) -> Any:
+    place = (reading - effect.centre_um) / effect.half_stroke_um
+    return reading + effect.half_stroke_um * place**2 * (effect.quadratic + effect.cubic * place)

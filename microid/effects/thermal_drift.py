@@ -3,8 +3,10 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _instants, _NumpySignal
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -52,6 +54,11 @@ class ThermalDrift(AbstractEffect):
         time = _times_of(time_s, signal.values.shape[0])
         return Signal(signal.values + self.rate_um_per_s * time, signal.before, signal.hold)
 
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add the drift since the first sample."""
+        time = _instants(interval_s, len(signal.values))[:, None]
+        return signal._replace(values=signal.values + self.rate_um_per_s * time)
+
 
 @register
 class ExponentialThermalDrift(AbstractEffect):
@@ -93,6 +100,11 @@ class ExponentialThermalDrift(AbstractEffect):
         time = _times_of(time_s, signal.values.shape[0])
         moved = -self.change_um * jnp.expm1(-time / self.time_constant_s)
         return Signal(signal.values + moved, signal.before, signal.hold)
+
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Add the drift since the first sample."""
+        time = _instants(interval_s, len(signal.values))[:, None]
+        return signal._replace(values=signal.values - self.change_um * np.expm1(-time / self.time_constant_s))
 
 
 @register

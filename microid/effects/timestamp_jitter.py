@@ -2,8 +2,10 @@
 
 from typing import Any, ClassVar, Self
 
+import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _NumpySignal
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -42,6 +44,10 @@ class TimestampJitter(AbstractEffect):
         return ()
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Pass the signal on as it is."""
+        return signal
+
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Pass the signal on as it is."""
         return signal
 

@@ -3,8 +3,10 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from microid._in_numpy import _instants, _NumpySignal, _reading_at
 from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
@@ -56,3 +58,8 @@ class TransportDelay(AbstractEffect):
         rest = signal.values - self.before_um_per_s * time
         read = _read_at(time_s, Signal(rest, signal.before, signal.hold), when)
         return Signal(read + self.before_um_per_s * when, signal.before, signal.hold)
+
+    def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
+        """Read the signal as it was before."""
+        when = _instants(interval_s, len(signal.values)) - self.delay_s
+        return signal._replace(values=_reading_at(interval_s, signal, when))
