@@ -17,7 +17,9 @@ from fits.diagnosis._misfit import Misfit
 from fits.diagnosis._prepare import Prepared, _covered
 from fits.diagnosis._result import Gain
 from fits.diagnosis._select import Cause, Selection
+from fits.diagnosis._thresholds import Thresholds
 from fits.stage._fit import default_stage
+from fits.stats._compare import improvement_z
 from fits.stats._held import _regressed, _stretches_at_rest
 from microid.effects import EFFECTS
 
@@ -59,14 +61,18 @@ def test_causes_share_what_is_beyond_chance():
     assert not misfit(9.0, 39.0).unnamed(weak=True)[1]
 
 
-def named_beside(monkeypatch, parts, rest):
-    """Names that are kept where each cause explains a part of its own, in noise variances, and so much is left."""
+def named_beside(monkeypatch, parts, rest, harmful=()):
+    """Names that are kept where each cause explains a part of its own, in noise variances, and so much is left.
+
+    With each of those that are harmful, what was held out is predicted worse.
+    """
 
     def cost(names):
         return rest + sum(part for name, part in parts.items() if name not in names)
 
     def model(names):
-        return SimpleNamespace(cost=cost(names))
+        errors = np.ones(100) * (1 + sum(name in harmful for name in names))
+        return SimpleNamespace(cost=cost(names), change_um=errors)
 
     def fewer(found, kept, _):
         return model([found.causes[k].name for k in kept])
@@ -78,11 +84,16 @@ def named_beside(monkeypatch, parts, rest):
     monkeypatch.setattr(_misfit, "_in_noise", lambda found, _: found)
     monkeypatch.setattr(_misfit, "_misfit", misfit_of)
     causes = tuple(Cause(name, 9.0, 0.0, (), part) for name, part in parts.items())
-    found = Selection(causes, model([*parts]), *(None,) * 7)
-    kept, _, last, _, said = _misfit.worth_naming(None, found, (), False)
+    projector = SimpleNamespace(held_out=lambda errors: errors)
+    found = Selection(causes, model([*parts]), *(None,) * 5, projector, None)
+    ready = SimpleNamespace(reading=SimpleNamespace(thresholds=Thresholds()))
+    kept, _, last, _, said = _misfit.worth_naming(ready, found, (), False)
     names = [cause.name for cause in kept.causes]
     assert last.explained == pytest.approx(sum(parts[name] for name in names))
-    assert [words.split(" would")[0] for words in said] == sorted({*parts} - {*names}, key=parts.__getitem__)
+    left_out = [words.split(" would")[0].split(" is not")[0].replace(" ", "_") for words in said]
+    assert sorted(left_out) == sorted({*parts} - {*names})
+    # The smallest first.
+    assert harmful or left_out == sorted(left_out, key=parts.__getitem__)
     return names
 
 
@@ -98,19 +109,30 @@ def test_what_the_rest_may_make_is_not_named(monkeypatch):
     assert named_beside(monkeypatch, {"creep": 8000.0, "mains_hum": 90.0}, chance + 2500.0) == ["creep", "mains_hum"]
 
 
+def test_what_predicts_worse_is_not_named_beside_others(monkeypatch):
+    parts = {"creep": 8000.0, "friction": 4000.0, "mains_hum": 90.0}
+    chance = 40 + 3 * 80**0.5
+    assert named_beside(monkeypatch, parts, chance, ["friction"]) == ["creep", "mains_hum"]
+    assert named_beside(monkeypatch, parts, chance, ["friction", "mains_hum"]) == ["creep"]
+
+
 def compared(before, after):
     return [Compared(None, before, after, np.ones(len(before), dtype=bool))]
 
 
 def test_an_extension_is_worse_only_beyond_chance(rng):
     before = rng.standard_normal(5000)
-    assert not predicts_worse(compared(before, 0.9 * before), 2.0)
+    assert not predicts_worse(compared(before, 0.9 * before), 2.0, 0.06)
     # A little worse everywhere is no chance.
-    assert predicts_worse(compared(before, 1.03 * before), 2.0)
+    assert predicts_worse(compared(before, 1.03 * before), 2.0, 0.06)
     # Of two that are as good, chance calls one worse by two standard deviations in 2.3 of 100.
     pairs = [compared(*rng.standard_normal((2, 5000))) for _ in range(400)]
-    assert 0.002 < np.mean([predicts_worse(one, 2.0) for one in pairs]) < 0.06
-    assert not predicts_worse([Compared(None, before, 2 * before, np.zeros(5000, dtype=bool))], 2.0)
+    assert 0.002 < np.mean([predicts_worse(one, 2.0, 0.06) for one in pairs]) < 0.06
+    assert not predicts_worse([Compared(None, before, 2 * before, np.zeros(5000, dtype=bool))], 2.0, 0.06)
+    # One slow error is one, and much worse all the same.
+    slow = before + np.where(np.arange(5000) < 150, 3.0, 0.0)
+    assert improvement_z(before, slow) > -2
+    assert predicts_worse(compared(before, slow), 2.0, 0.06)
 
 
 def test_what_the_runs_held_out_do_not_share_is_left_out_of_the_stage(rng):

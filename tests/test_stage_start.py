@@ -1,9 +1,11 @@
 """Poles read off a response, and where they stand: ahead of the hysteresis or behind it."""
 
 import numpy as np
+from scipy import signal
 
 import fits
-from fits.stage._start import MeasuredResponse, start_stages
+from fits.loop._run import prepare_run
+from fits.stage._start import MeasuredResponse, measure_response, start_stages
 
 
 def poles_of(stage):
@@ -39,3 +41,17 @@ def test_poles_that_ring_have_one_place(rng):
     best = start_stages(fits.default_stage(), [measured])[0]
     assert abs(float(best["driver"].time_constant_s) / 1e-3 - 1) < 1e-3
     assert abs(2 * np.pi * float(best["mechanics"].natural_frequency_Hz) / natural - 1) < 1e-4
+
+
+def test_a_short_sweep_through_a_resonance_that_rings_for_long_shows_where_it_is(rng):
+    rate_Hz, count = 8000.0, 4000
+    time_s = np.arange(count) / rate_Hz
+    natural, damping, lag_s = 2 * np.pi * rng.uniform(300, 600), rng.uniform(0.01, 0.03), rng.uniform(3e-4, 9e-4)
+    command = 50 + 40 * signal.chirp(time_s, 20.0, time_s[-1], 1200.0, phi=-90) * signal.windows.tukey(count, 0.1)
+    system = signal.TransferFunction([natural**2], np.polymul([1.0, 2 * damping * natural, natural**2], [lag_s, 1.0]))
+    moved = 50 + signal.lsim(system, command - 50, time_s)[1] + 0.02 * rng.standard_normal(count)
+    run = prepare_run(fits.Record(time_s, command, moved), (10.0, 90.0), "unknown", 0.2, gain=None)
+    best = start_stages(fits.default_stage(), [measure_response(run, command)])[0]
+    assert abs(2 * np.pi * float(best["mechanics"].natural_frequency_Hz) / natural - 1) < 1e-3
+    assert abs(float(best["mechanics"].damping_ratio) / damping - 1) < 0.05
+    assert abs(float(best["driver"].time_constant_s) / lag_s - 1) < 0.05

@@ -75,7 +75,7 @@ def conclude(
     repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
     # Weak evidence needs the support of what was held out.
-    worse = predicts_worse(seen, 0.0 if weak else thresholds.worse_z)
+    worse = predicts_worse(seen, 0.0 if weak else thresholds.worse_z, thresholds.model_error)
     if kept and (misfit.share < thresholds.explained_share or worse):
         suspects = ", ".join(cause.name.replace("_", " ") for cause in kept)
         why = "what was held out is predicted worse with that"
@@ -85,7 +85,7 @@ def conclude(
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
-    elif kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0):
+    elif kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0, 0.0):
         own = ", ".join(sorted({one.name.replace("_", " ") for one in extension.effects if one.per_run}))
         remarks.append(f"{own}: not the same in the runs held out, so that the stage is left plain")
         extension = without_effects(ready, extension)

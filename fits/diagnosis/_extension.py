@@ -19,7 +19,7 @@ from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop._run import Run
 from fits.stage._motion import signals
 from fits.stage._run import project_out
-from fits.stats._compare import improvement_z, sd_of_difference
+from fits.stats._compare import is_worse, sd_of_difference
 from microid import AbstractEffect, Stage
 
 _ROUNDS = 6
@@ -140,9 +140,9 @@ def left_of(run: Run, nuisance: np.ndarray, response_um: np.ndarray, using: np.n
 _without = eqx.filter_jit(project_out)
 
 
-def predicts_worse(compared: Sequence[Compared], worse_z: float) -> bool:
-    """Whether the extended stage predicts what was held out worse, by so many standard deviations."""
-    return improvement_z(*_held_out(compared)) < -worse_z
+def predicts_worse(compared: Sequence[Compared], worse_z: float, most: float) -> bool:
+    """Whether the extended stage predicts what was held out worse; see `fits.stats._compare.is_worse`."""
+    return is_worse(*_held_out(compared), worse_z, most)
 
 
 def _held_out(compared: Sequence[Compared]) -> tuple[np.ndarray, np.ndarray]:

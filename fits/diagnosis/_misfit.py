@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 from scipy import stats
 
 from fits.diagnosis._prepare import Prepared
@@ -10,6 +11,7 @@ from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._residual_tests import Cycles, cycles, explain_together, run_regressors
 from fits.diagnosis._select import Selection
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
+from fits.stats._compare import is_worse
 from fits.stats._noise import Noise
 from microid.effects import card_of
 
@@ -75,29 +77,38 @@ def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
 def worth_naming(
     ready: Prepared, found: Selection, noise: tuple[Noise, ...], rounded: bool
 ) -> tuple[Selection, Selection, Misfit, Cycles, list[str]]:
-    """Leave out causes that explain a minor share of what the others leave: what explains the rest may explain that.
+    """Leave out causes that are not worth naming beside the others, the worst first.
 
-    Returns what was found, the same in the given noise, and what is said of causes that were left out.
+    They make predictions of what was held out worse, or explain a minor share of what the others leave: what explains
+    the rest may explain that. Returns what was found, the same in the given noise, and what is said of causes that
+    were left out.
     """
     said: list[str] = []
+    thresholds = ready.reading.thresholds
     while True:
         told = _in_noise(found, noise)
         misfit, repeated = _misfit(ready, told, rounded)
         names = [cause.name for cause in found.causes]
-        parts = {}
+        after = told.projector.held_out(told.model.change_um)
+        parts: dict[str, tuple[float, list[int]]] = {}
         for name in {*names} if len({*names}) > 1 else ():
             kept = [k for k, other in enumerate(names) if other != name]
             fewer = _refit_of(told, kept, 2)
             part = replace(misfit, explained=fewer.cost - told.model.cost).share
-            if not card_of(name).independent and part < misfit.thresholds.minor_share:
+            before = told.projector.held_out(fewer.change_um)
+            if is_worse(before, after, thresholds.worse_z, thresholds.model_error):
+                part = -float(np.sum(after**2) - np.sum(before**2))
+            if part < 0 or (not card_of(name).independent and part < thresholds.minor_share):
                 parts[name] = part, kept
         if not parts:
             return found, told, misfit, repeated, said
         name, (part, kept) = min(parts.items(), key=lambda item: item[1][0])
-        said.append(
-            f"{name} would explain {part:.0%} of what the other causes leave: what makes the rest may make that, "
-            "too, so that it is not named"
-        )
+        why = "what was held out is predicted worse with it than with the other causes alone"
+        if part >= 0:
+            why = (
+                f"it would explain {part:.0%} of what the other causes leave, which what makes the rest may make, too"
+            )
+        said.append(f"{name.replace('_', ' ')} is not named: {why}")
         found = replace(found, causes=tuple(found.causes[k] for k in kept), model=_refit_of(found, kept, 3))
 
 

@@ -245,7 +245,8 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
             there = shifts.copy()
             there[k] = shift
             plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
-            moved = replace(response, response=response.response * np.exp(2j * np.pi * response.frequency_Hz * shift))
+            turn = np.exp(2j * np.pi * response.frequency_Hz * shift)
+            moved = replace(response, response=response.response * turn, sampled=None)
             runs = plan.shifted(there).runs(run.stride)
             for candidate in start_stages(stage, [moved])[:1]:
                 z = np.asarray(problem.chain.coordinates.of(candidate))

@@ -19,12 +19,25 @@ _MOST_LINES = 240
 
 
 @dataclass(frozen=True)
+class Sampled:
+    """A drive and what it made of the displacement, in um, shape `(n,)` each, at even intervals."""
+
+    rate_Hz: float
+    drive: np.ndarray
+    displacement: np.ndarray
+
+
+@dataclass(frozen=True)
 class MeasuredResponse:
-    """Complex response to what the hysteresis alone would give, and its coherence, shape `(f,)` each."""
+    """Complex response to what the hysteresis alone would give, and its coherence, shape `(f,)` each.
+
+    Where it is known what it was read off, that is `sampled`.
+    """
 
     frequency_Hz: np.ndarray
     response: np.ndarray
     coherence: np.ndarray
+    sampled: Sampled | None = None
 
 
 def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
@@ -47,7 +60,8 @@ def measure_response(run: Run, drive: np.ndarray) -> MeasuredResponse:
     if seen.sum() < _LINES:
         seen = usable & (coherence > 0.3)
     kept = _thinned(frequency, np.abs(response), np.flatnonzero(seen))
-    return MeasuredResponse(frequency[kept], response[kept], np.minimum(coherence[kept], 1 - 1e-9))
+    coherence = np.minimum(coherence, 1 - 1e-9)
+    return MeasuredResponse(frequency[kept], response[kept], coherence[kept], Sampled(rate, x, y))
 
 
 def _thinned(frequency: np.ndarray, size: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -74,14 +88,18 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
     problem = _LogResponse.of(responses, [isinstance(part, Driver) for _, part in free], fixed)
     found: list[tuple[float, np.ndarray]] = []
     # Candidates may be too alike, in the logarithms of their poles, to refine both, or to keep both.
-    for x in _distinct(problem.ranked()[1][:200], 0.5)[:4]:
-        low, high = problem.bounds()
+    ranked, (low, high) = problem.ranked()[1][:200], problem.bounds()
+    for x in _distinct(ranked, 0.5)[:4]:
         end: Any = scipy.optimize.least_squares(
             problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200
         )
         found.append((float(end.cost), end.x))
     found.sort(key=lambda item: item[0])
-    ends = _distinct([x for _, x in found], 0.05)[:3]
+    ends = [x for _, x in found]
+    sampled = [one.sampled for one in responses if one.sampled is not None]
+    if sampled:
+        ends = [problem.refined_in_time([*ends, *_distinct(ranked, 0.2)], sampled, fixed), *ends]
+    ends = _distinct(ends, 0.05)[:3]
     best = [other for x in ends[:1] for other in problem.exchanged(x)]
     return [problem.applied(stage, moved, x) for x in [*ends, *best]]
 
@@ -187,6 +205,39 @@ class _LogResponse:
         cost = np.sum(np.abs(self._off(inverse)) ** 2, axis=1)
         order = np.argsort(cost)
         return cost[order], points[order]
+
+    def refined_in_time(
+        self, points: Sequence[np.ndarray], sampled: Sequence[Sampled], fixed: Sequence[AbstractLinear]
+    ) -> np.ndarray:
+        """The best of some poles by what they leave of the displacement, and what follows from there.
+
+        Where one short sweep passes a resonance that rings for long, its lines lie in few segments and lean to it.
+        """
+        spectra = []
+        for one in sampled:
+            frequency = np.fft.rfftfreq(2 * len(one.drive), 1 / one.rate_Hz)
+            spectrum = np.fft.rfft(one.drive - one.drive[0], 2 * len(one.drive))
+            for part in fixed:
+                spectrum = spectrum * np.asarray(part.frequency_response(jnp.asarray(frequency)))
+            spectra.append((replace(self, frequency_Hz=frequency), spectrum))
+
+        def left_um(x: np.ndarray) -> np.ndarray:
+            left = []
+            for (problem, spectrum), one in zip(spectra, sampled, strict=True):
+                inverse = np.prod([problem._inverse(part) for part in self._split(x)], axis=0)
+                moved = np.fft.irfft(spectrum / inverse)[: len(one.drive)]
+                moved, measured = moved - moved.mean(), one.displacement - one.displacement.mean()
+                gain = max(float(moved @ measured) / max(float(moved @ moved), 1e-300), 0.0)
+                left.append(measured - gain * moved)
+            return np.concatenate(left)
+
+        low, high = self.bounds()
+        points = [np.clip(x, low, high) for x in points]
+        best = min(points, key=lambda x: float(np.sum(left_um(x) ** 2)))
+        scale = max(float(np.std(left_um(best))), 1e-300)
+        end: Any = scipy.optimize.least_squares(lambda x: left_um(x) / scale, best, bounds=(low, high), max_nfev=50)
+        found: np.ndarray = end.x
+        return found
 
     def exchanged(self, x: np.ndarray) -> list[np.ndarray]:
         """The same poles in other places: a response does not tell which real pole lies ahead of the hysteresis."""

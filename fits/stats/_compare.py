@@ -14,6 +14,15 @@ def improvement_z(before: np.ndarray, after: np.ndarray) -> float:
     return float(np.sum(blocks) / max(float(np.linalg.norm(blocks - np.mean(blocks))), 1e-300))
 
 
+def is_worse(before: np.ndarray, after: np.ndarray, worse_z: float, most: float) -> bool:
+    """Whether errors, shape `(n,)`, grew by so many standard deviations, or their mean square by more than a part.
+
+    Where a few slow errors make them up, much worse is no more than chance by the first.
+    """
+    grown = float(np.sum(after**2) - np.sum(before**2))
+    return improvement_z(before, after) < -worse_z or grown > most * float(np.sum(before**2))
+
+
 def sd_of_difference(before: np.ndarray, after: np.ndarray) -> float:
     """Standard deviation of the difference of the root mean squares of two errors of shape `(n,)`, linearised."""
     rms0, rms1 = (max(float(np.sqrt(np.mean(one**2))), 1e-300) for one in (before, after))
