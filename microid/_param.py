@@ -55,9 +55,10 @@ def _as_inexact(value: Any) -> Any:
     return jnp.asarray(value, dtype=float)
 
 
-def array() -> Any:
+def array(*, default: float | None = None) -> Any:
     """Declare an array field that is data, not a parameter: the voltage range, say."""
-    return eqx.field(converter=_as_inexact)
+    given: dict[str, Any] = {} if default is None else {"default": default}
+    return eqx.field(converter=_as_inexact, **given)
 
 
 def static() -> Any:

@@ -25,7 +25,8 @@ def test_creep_of_moves_before_the_record(rng):
     found = through(BY_NAME["creep", "kelvin_voigt"](0.02, tau, late), 5e-3, rest) - height
     longer = 0.02 * height * (1 - np.exp(-(time + ago) / tau))
     np.testing.assert_allclose(found, longer - longer[0], atol=1e-9)
-    found = through(BY_NAME["creep", ""](0.02, 0.01, 0.0, 0.02 * height), 5e-3, rest) - height
+    older = BY_NAME["creep", ""](0.02, 0.01, 0.0, 0.02 * height, older_s=ago)
+    found = through(older, 5e-3, rest) - height
     longer = 0.02 * height * np.log10(1 + (time + ago) / 0.01)
     np.testing.assert_allclose(found, longer - longer[0], atol=2e-3 * height * 0.02)
     warmth = 20 + np.cumsum(rng.standard_normal(len(time))) / 50

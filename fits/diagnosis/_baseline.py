@@ -12,7 +12,7 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns.path import PATH, gone_V
 from fits.loop._choose_grid import choose_grid
-from fits.loop._prior import roughness
+from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, prepare_run
 from fits.stage._checks import OR_ALONE
@@ -50,11 +50,12 @@ class Baseline:
     """A fitted plain stage, and the runs prepared with several numbers of steps between samples.
 
     `chain` holds its coordinates, `z` and `columns_um` (um) where the fit ended, and `prior` the precision of the
-    columns before the data (1/um^2, shape `(D, D)`). `aside` are whole runs that are held out; of `runs` a part is.
-    Of both there are copies: `coarse` with few steps, enough for what effects change; `finest` with many; `fine` with
-    so many that the plain stage is exact within the noise. `dynamic` says whether driver and mechanics were fitted,
-    `skewed` that the readings of a run may be late or early by a small part of the sampling interval, and `blurred`
-    that instants jitter, so that in the mean a run reads its second derivative, too.
+    columns before the data (1/um^2, shape `(D, D)`), which the smoothness `hyper` makes, if that was estimated.
+    `aside` are whole runs that are held out; of `runs` a part is. Of both there are copies: `coarse` with few steps,
+    enough for what effects change; `finest` with many; `fine` with so many that the plain stage is exact within the
+    noise. `dynamic` says whether driver and mechanics were fitted, `skewed` that the readings of a run may be late
+    or early by a small part of the sampling interval, and `blurred` that instants jitter, so that in the mean a run
+    reads its second derivative, too.
     """
 
     chain: Chain
@@ -74,6 +75,7 @@ class Baseline:
     dynamic: bool
     remarks: tuple[str, ...]
     problem: Problem | None = None
+    hyper: Hyper | None = None
     skewed: bool = False
     blurred: bool = False
 
@@ -167,6 +169,7 @@ def fit_baseline(
         dynamic=True,
         remarks=solved.problem.remarks,
         problem=solved.onward,
+        hyper=solved.hyper,
     )
 
 
@@ -241,5 +244,7 @@ def _static(
     stage = Stage.of(hysteresis=grid.model(columns, np.zeros(())))
     chain = Chain(Fixed(stage), 0, grid)  # type: ignore[arg-type]
     prior = np.asarray(roughness(grid.levels).precision(tried.solution.hyper)) / stroke**2
-    same = (ready, held) * 4
-    return Baseline(chain, np.zeros(0), columns, prior, stroke, range_V, *same, dynamic=False, remarks=remarks)
+    same, hyper = (ready, held) * 4, tried.solution.hyper
+    return Baseline(
+        *(chain, np.zeros(0), columns, prior, stroke, range_V, *same), dynamic=False, remarks=remarks, hyper=hyper
+    )

@@ -13,19 +13,15 @@ from fits.diagnosis._extension import shared_effects
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, changes_along
 from fits.diagnosis._result import FoundCause
-from fits.loop._design import Grid
-from fits.loop._prior import interpolation
 from fits.loop._result import ParameterEstimate
 from fits.stage._moments import Chain
 from fits.stage._run import place_of_hysteresis
 from fits.stage._solve import scale_free
-from fits.stage._uncertainty import NO_PRECISION, StageUncertainty, estimates
+from fits.stage._uncertainty import NO_PRECISION, StageUncertainty, estimates, fewer_columns
 from fits.stats._noise import shared_square
 from microid import Preisach, Stage
 from microid.effects import card_of
 
-# Levels on which predictions are perturbed, as those of a fit are.
-_LEVELS = 16
 # Of central differences along coordinates.
 _STEP = 1e-4
 
@@ -76,29 +72,28 @@ class Certainty:
         ):
             return None
         size, others = baseline.chain.size, self.rows[0].shape[1] - baseline.chain.size
-        basis, coarse = np.eye(size), grid
-        if grid.levels > _LEVELS:
-            coarse, basis = Grid(grid.lower_V, grid.upper_V, _LEVELS), interpolation(_LEVELS, grid.levels)
-        whole = np.zeros((size + others, basis.shape[1] + others))
-        whole[:size, : basis.shape[1]], whole[size:, basis.shape[1] :] = basis, np.eye(others)
+        own = scale_free(baseline.prior, baseline.columns_um)
+        basis, prior = fewer_columns(grid.levels, own, baseline.hyper, baseline.stroke_um)
+        few = basis.shape[1]
+        whole = np.zeros((size + others, few + others))
+        whole[:size, :few], whole[size:, few:] = basis, np.eye(others)
         joined = self.projector.bare.join([one @ whole for one in self.rows])
         nuisance = np.linalg.qr(self.projector.bare.nuisance_rows)[0]
         joined = joined - nuisance @ (nuisance.T @ joined)
-        prior = np.zeros_like(whole, shape=(len(whole), len(whole)))
-        prior[:size, :size] = scale_free(baseline.prior, baseline.columns_um)
-        precision = joined.T @ joined + whole.T @ prior @ whole + NO_PRECISION * np.eye(whole.shape[1])
-        factor = np.linalg.inv(np.linalg.cholesky(precision))
+        precision = joined.T @ joined + NO_PRECISION * np.eye(few + others)
+        precision[:few, :few] += prior
+        factor = np.linalg.inv(np.linalg.cholesky(precision)) @ whole.T
         # As much wider as those of the parameters, where what is left stays alike for a while.
-        columns_um, moves = factor[:, : basis.shape[1]], factor[:, basis.shape[1] :]
+        columns_um, moves = factor[:, :size], factor[:, size:]
         moves = moves * np.maximum(self._sd / np.maximum(np.linalg.norm(moves, axis=0), 1e-300), 1.0)
-        mean = self.rows[0][baseline.runs[0].fitted].mean(axis=0) @ whole
+        mean = self.rows[0][baseline.runs[0].fitted].mean(axis=0)
         left = [one[run.fitted] for one, run in zip(residuals_um, baseline.runs, strict=False)]
         return StageUncertainty(
             jnp.asarray(moves @ self._into(stage).T),
             jnp.asarray(columns_um),
             jnp.asarray(np.concatenate([columns_um, moves], axis=1) @ mean),
             jnp.asarray(max(0.0, float(np.mean([shared_square(one) for one in left]))) ** 0.5),
-            coarse,
+            grid,
         )
 
     def _into(self, stage: Stage) -> np.ndarray:

@@ -189,9 +189,15 @@ def strength_of(law: Law, x: np.ndarray, run: int) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(getattr(effect, name))) for name in law.form.strength])
 
 
-def remembering(law: Law, x: np.ndarray) -> Law:
-    """The same effects, what went on before the runs being unknown."""
-    return Law(law.effects(x), True)
+def remembering(bench: Bench, law: Law, x: np.ndarray) -> Law:
+    """The same effects, what went on before the runs being unknown, and so long before as they are."""
+    runs = [one.run.record.duration_s for one in bench.prepared]
+    return Law([_aged(effect, of_s) for effect, of_s in zip(law.effects(x), runs, strict=True)], True)
+
+
+def _aged(effect: AbstractEffect, duration_s: float) -> AbstractEffect:
+    """The same effect, its history so old as suits a record of this duration."""
+    return replace(effect, **{name: jnp.asarray(share * duration_s) for name, share in effect.ages})
 
 
 def scaled(law: Law, x: np.ndarray, factor: float) -> Law:

@@ -192,7 +192,7 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
     if not found.laws[-1].form.history:
         return found
     # What went on before the runs is unknown where that explains more than so many coordinates do by chance.
-    unknown = fit(remembering(found.laws[-1], found.x[-1]), _ROUNDS)
+    unknown = fit(remembering(bench, found.laws[-1], found.x[-1]), _ROUNDS)
     better = unknown.criterion(projector.count) < found.criterion(projector.count)
     return unknown if better and unknown.possible(bench) else found
 

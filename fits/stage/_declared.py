@@ -107,7 +107,7 @@ def _classes(text: str) -> list[ast.ClassDef]:
 
 def _space(tree: ast.Module, file: str) -> dict[str, Any]:
     """Names of a file that a form may use; those that take more than NumPy are missing."""
-    space: dict[str, Any] = {"np": np, "math": math, "param": Declared, "array": lambda: None}
+    space: dict[str, Any] = {"np": np, "math": math, "param": Declared, "array": lambda **_: None}
     kept: list[ast.stmt] = []
     known = {*space, *dir(builtins)}
     for node in tree.body:

@@ -13,7 +13,7 @@ from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._grid import BELIEF_LEVELS
 from fits.loop._prediction import Prediction
-from fits.loop._prior import interpolation, roughness
+from fits.loop._prior import Hyper, interpolation, roughness
 from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
@@ -120,22 +120,11 @@ class Precision:
         """Standard deviations of the coordinates, shape `(p,)`."""
         return np.sqrt(np.diagonal(self.covariance))
 
-    def _fewer_columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Columns of `BELIEF_LEVELS`, in those of the grid, `(D, k)`, and the precision of their prior, `(k, k)`.
-
-        The prior is that of the coarse grid itself, as in a fit of loops: the one of the fine grid would take the
-        kinks of what is read off between coarse nodes for roughness, and be too sure.
-        """
-        size, hyper = self.chain.size, self.solved.hyper
-        if hyper is None or self.chain.levels <= BELIEF_LEVELS:
-            return np.eye(size), self.prior[:size, :size]
-        prior = np.asarray(roughness(BELIEF_LEVELS).precision(hyper)) / self.solved.problem.stroke_um**2
-        return interpolation(BELIEF_LEVELS, self.chain.levels), prior
-
     def uncertainty(self) -> StageUncertainty:
         """Perturbations for predictions."""
         size, count = self.chain.size, len(self.solved.z)
-        basis, prior = self._fewer_columns()
+        own = self.prior[:size, :size]
+        basis, prior = fewer_columns(self.chain.levels, own, self.solved.hyper, self.solved.problem.stroke_um)
         few = basis.shape[1]
         whole = np.zeros((size + count, few + count))
         whole[:size, :few], whole[size:, few:] = basis, np.eye(count)
@@ -152,6 +141,21 @@ class Precision:
             jnp.asarray(np.float64(max(0.0, shared) ** 0.5)),
             self.chain.grid,
         )
+
+
+def fewer_columns(
+    levels: int, prior: np.ndarray, hyper: Hyper | None, stroke_um: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Columns of `BELIEF_LEVELS` in those of a grid, `(D, k)`, and the precision of their prior in 1/um^2, `(k, k)`.
+
+    The prior is that of the coarse grid itself, as in a fit of loops: the one of the fine grid would take the kinks
+    of what is read off between coarse nodes for roughness, and be too sure. A grid with no more levels, or of which
+    no smoothness was estimated, keeps its own, `(D, D)`.
+    """
+    if hyper is None or levels <= BELIEF_LEVELS:
+        return np.eye(len(prior)), prior
+    coarse = np.asarray(roughness(BELIEF_LEVELS).precision(hyper)) / stroke_um**2
+    return interpolation(BELIEF_LEVELS, levels), coarse
 
 
 def estimates(chain: Chain, z: np.ndarray, sd: np.ndarray) -> tuple[ParameterEstimate, ...]:

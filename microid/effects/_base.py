@@ -85,6 +85,9 @@ class AbstractEffect(AbstractPart):
         Columns with which another form of it says what this one guesses.
     history
         Names of the fields that say what went on in it before each record; they are zero after a long rest.
+    ages
+        Names of the given fields that say how long before a record that was, and the part of its duration that stands
+        for it where nothing is known.
     moved
         Unit of what may have moved before a record, `um`, `V` or `K`: no more goes on of it than the strength times
         its range. Empty where the history is that itself.
@@ -142,6 +145,7 @@ class AbstractEffect(AbstractPart):
     needs: ClassVar[tuple[str, ...]] = ()
     unless: ClassVar[tuple[str, ...]] = ()
     history: ClassVar[tuple[str, ...]] = ()
+    ages: ClassVar[tuple[tuple[str, float], ...]] = ()
     moved: ClassVar[str] = ""
     fast: ClassVar[bool] = False
     per_run: ClassVar[bool] = False

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from microid._in_numpy import _lags, _NumpySignal
 from microid._linear import Times
-from microid._param import param
+from microid._param import array, param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, View, _lowpass, _times_of, register
 from microid.effects._grids import _decades
@@ -18,8 +18,10 @@ from microid.effects._grids import _decades
 _PER_DECADE, _AHEAD, _BEHIND = 3, 1, 5
 # What creeps more than this per decade, or than that in all, is no piezo's creep but some other lag.
 _MOST, _MOST_IN_ALL = 0.1, 0.5
-# Moves before a record that stand for all of them took place so many of its durations ago.
-_RECENT, _OLDER = 0.03, 0.5
+# Moves before a record that stand for all of them took place so many s ago, and where records are at hand so many of
+# their durations.
+_RECENT_s, _OLDER_s = 1.0, 100.0
+_AGES = ("recent_s", 0.03), ("older_s", 0.5)
 
 
 @register
@@ -40,6 +42,8 @@ class Creep(AbstractEffect):
         `t0`, where creep begins. What lags by less than its bound is a matter of driver, sensor or mechanics.
     recent_um, older_um
         What goes on of moves before the record, per decade: of some right before it, and of some long before.
+    recent_s, older_s
+        How long before the first sample those took place, given.
     """
 
     name: ClassVar[str] = "creep"
@@ -48,6 +52,7 @@ class Creep(AbstractEffect):
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
     history: ClassVar[tuple[str, ...]] = ("recent_um", "older_um")
+    ages: ClassVar[tuple[tuple[str, float], ...]] = _AGES
     moved: ClassVar[str] = "um"
     fingerprint: ClassVar[str] = (
         "After each step the residual goes on in the direction of the step, in proportion to it, along the logarithm "
@@ -64,6 +69,8 @@ class Creep(AbstractEffect):
     onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
     recent_um: Float[Array, ""] = param(default=0.0, unit="um")
     older_um: Float[Array, ""] = param(default=0.0, unit="um")
+    recent_s: Float[Array, ""] = array(default=_RECENT_s)
+    older_s: Float[Array, ""] = array(default=_OLDER_s)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -73,7 +80,8 @@ class Creep(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a displacement that was at rest."""
         crept = self.gain_per_decade * _crept(time_s, signal.values - signal.before, self.onset_s)
-        gone_on = _gone_on(time_s, signal.values.shape[0], self.recent_um, self.older_um)
+        time = _times_of(time_s, crept.shape[0])
+        gone_on = _gone_on(time, self.recent_um, self.recent_s) + _gone_on(time, self.older_um, self.older_s)
         return Signal(signal.values + crept + gone_on, signal.before, signal.hold)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
@@ -100,6 +108,8 @@ class VoltageCreep(AbstractEffect):
         `t0`, where creep begins. What lags by less than its bound is a matter of driver, sensor or mechanics.
     recent_V, older_V
         What goes on of moves before the record, per decade: of some right before it, and of some long before.
+    recent_s, older_s
+        How long before the first sample those took place, given.
     """
 
     name: ClassVar[str] = "creep"
@@ -109,6 +119,7 @@ class VoltageCreep(AbstractEffect):
     place: ClassVar[Place] = "driver"
     strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
     history: ClassVar[tuple[str, ...]] = ("recent_V", "older_V")
+    ages: ClassVar[tuple[tuple[str, float], ...]] = _AGES
     moved: ClassVar[str] = "V"
     fingerprint: ClassVar[str] = Creep.fingerprint
     confusions: ClassVar[tuple[str, ...]] = Creep.confusions
@@ -122,6 +133,8 @@ class VoltageCreep(AbstractEffect):
     onset_s: Float[Array, ""] = param(unit="s", scale=0.1, lower=0.01, upper=1e3)
     recent_V: Float[Array, ""] = param(default=0.0, unit="V")
     older_V: Float[Array, ""] = param(default=0.0, unit="V")
+    recent_s: Float[Array, ""] = array(default=_RECENT_s)
+    older_s: Float[Array, ""] = array(default=_OLDER_s)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -131,7 +144,8 @@ class VoltageCreep(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add creep to a voltage that was constant."""
         crept = self.gain_per_decade * _crept(time_s, signal.values - signal.before, self.onset_s)
-        gone_on = _gone_on(time_s, signal.values.shape[0], self.recent_V, self.older_V)
+        time = _times_of(time_s, crept.shape[0])
+        gone_on = _gone_on(time, self.recent_V, self.recent_s) + _gone_on(time, self.older_V, self.older_s)
         return Signal(signal.values + crept + gone_on, signal.before, signal.hold)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
@@ -217,13 +231,9 @@ def _relaxations() -> tuple[np.ndarray, np.ndarray]:
     return ratio, np.exp(-1 / ratio) / _PER_DECADE
 
 
-def _gone_on(time_s: Times, count: int, recent: Float[Array, ""], older: Float[Array, ""]) -> Float[Array, " t"]:
-    """What goes on of moves before the record, from its first sample on, shape `(t,)`."""
-    if count == 1:
-        return jnp.zeros(1, dtype=recent.dtype)
-    time = _times_of(time_s, count)
-    share = time / time[-1]
-    return recent * jnp.log10(1 + share / _RECENT) + older * jnp.log10(1 + share / _OLDER)
+def _gone_on(time_s: Float[Array, " t"], moved: Float[Array, ""], ago_s: Float[Array, ""]) -> Float[Array, " t"]:
+    """What goes on, from the first sample on, of moves so long before it, shape `(t,)`."""
+    return moved * jnp.log1p(time_s / ago_s) / jnp.log(10.0)
 
 
 def _onsets(form: type[Any], scales: Scales) -> tuple[tuple[Any, ...], ...]:
