@@ -56,7 +56,10 @@ def _as_inexact(value: Any) -> Any:
 
 
 def array(*, default: float | None = None) -> Any:
-    """Declare an array field that is data, not a parameter: the voltage range, say."""
+    """Declare an array field that is data, not a parameter: the voltage range, say.
+
+    Its default is in the unit of the field; without one a value must be given.
+    """
     given: dict[str, Any] = {} if default is None else {"default": default}
     return eqx.field(converter=_as_inexact, **given)
 
