@@ -12,8 +12,7 @@ import time
 
 import jax
 import numpy as np
-from foreign_loops import reading
-from foreign_stages import LAWS, FAST_V_per_s, Rig, SLOW_Hz, SLOW_V_per_s, plays, programs, ways_V
+from foreign_stages import LAWS, FAST_V_per_s, Rig, SLOW_Hz, SLOW_V_per_s, measured, programs, ways_V
 
 import fits
 
@@ -28,25 +27,20 @@ class HiddenRig(Rig):
         self.creep = rng.uniform(0.01, 0.02) if hidden == "creep" else 0.0
         self.onset_s, self.lag_s = rng.uniform(0.05, 0.2), rng.uniform(2e-3, 5e-3) if hidden == "lag" else 0.0
 
-    def answer(self, voltage_V: np.ndarray, rate_Hz: float) -> np.ndarray:
-        """Displacement at the samples of a voltage that runs in lines, from rest, in um, `(n,)`."""
-        tau_s, natural_Hz, damping = self.poles
-        omega = 2 * np.pi * natural_Hz
-        parts = int(np.ceil(20 / (rate_Hz * min(tau_s, 1 / omega))))
-        fine = np.interp(np.arange((len(voltage_V) - 1) * parts + 1) / parts, np.arange(len(voltage_V)), voltage_V)
-        lagging = self._filtered([1], [tau_s, 1], fine, rate_Hz * parts)
-        drive = self.line * lagging + self.share * plays(lagging, self.radius_V)
-        if self.creep:
-            ratio = 10 ** np.arange(-1, 5, 1 / PER_DECADE)
-            crept = sum(
-                np.exp(-1 / r) / PER_DECADE * self._filtered([1], [r * self.onset_s, 1], drive, rate_Hz * parts)
-                for r in ratio
-            )
-            drive = drive + self.creep * (crept - crept[0])
-        whole = self._filtered([omega**2], [1, 2 * damping * omega, omega**2], drive, rate_Hz * parts)
-        if self.lag_s:
-            whole = self._filtered([1], [self.lag_s, 1], whole, rate_Hz * parts)
-        return whole[::parts]
+    def behind_hysteresis(self, displacement_um: np.ndarray, rate_Hz: float) -> np.ndarray:
+        """With creep along the logarithm of time, in um, `(n,)`."""
+        if not self.creep:
+            return displacement_um
+        ratio = 10 ** np.arange(-1, 5, 1 / PER_DECADE)
+        crept = sum(
+            np.exp(-1 / r) / PER_DECADE * self._filtered([1], [r * self.onset_s, 1], displacement_um, rate_Hz)
+            for r in ratio
+        )
+        return displacement_um + self.creep * (crept - crept[0])
+
+    def read(self, displacement_um: np.ndarray, rate_Hz: float) -> np.ndarray:
+        """Through the sensor's lag, in um, `(n,)`."""
+        return self._filtered([1], [self.lag_s, 1], displacement_um, rate_Hz) if self.lag_s else displacement_um
 
 
 def scores(hidden: str, law: str, noise: str, seed: int, number: int) -> tuple[str, list[tuple[float, float, float]]]:
@@ -59,11 +53,7 @@ def scores(hidden: str, law: str, noise: str, seed: int, number: int) -> tuple[s
     fast_V = ways_V([0, *rng.uniform(5, 95, 12)], FAST_V_per_s, 2000.0)
     slow_V = ways_V([0, *rng.uniform(5, 95, 12)], SLOW_V_per_s, SLOW_Hz)
     made[2:] = [("fast ahead", fast_V, 2000.0), ("slow ahead", slow_V, SLOW_Hz)]
-    records, truths_um = [], []
-    for name, voltage_V, rate_Hz in made:
-        truths_um.append(rig.answer(voltage_V, rate_Hz))
-        read_um = reading(truths_um[-1], noise, rng)
-        records.append(fits.Record(np.arange(len(voltage_V)) / rate_Hz, voltage_V, read_um, source=f"{name}.csv"))
+    records, truths_um = measured(rig, made, noise, rng)
     found = fits.diagnose(records[:2], initial="negative")
     kept = (found.baseline, found.baseline_uncertainty)
     if hidden != "clean":

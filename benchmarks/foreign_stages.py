@@ -63,8 +63,17 @@ class Rig:
         fine = np.interp(np.arange((len(voltage_V) - 1) * parts + 1) / parts, np.arange(len(voltage_V)), voltage_V)
         lagging = self._filtered([1], [tau_s, 1], fine, rate_Hz * parts)
         drive = self.line * lagging + self.share * plays(lagging, self.radius_V)
+        drive = self.behind_hysteresis(drive, rate_Hz * parts)
         whole = self._filtered([omega**2], [1, 2 * damping * omega, omega**2], drive, rate_Hz * parts)
-        return whole[::parts]
+        return self.read(whole, rate_Hz * parts)[::parts]
+
+    def behind_hysteresis(self, displacement_um: np.ndarray, rate_Hz: float) -> np.ndarray:
+        """What drives the mechanics, in um, `(n,)`: for other rigs to change."""
+        return displacement_um
+
+    def read(self, displacement_um: np.ndarray, rate_Hz: float) -> np.ndarray:
+        """What the sensor makes of it, in um, `(n,)`: for other rigs to change."""
+        return displacement_um
 
     @staticmethod
     def _filtered(above: list[float], below: list[float], values: np.ndarray, rate_Hz: float) -> np.ndarray:
@@ -90,15 +99,23 @@ def programs(rig: Rig, rng: np.random.Generator) -> list[tuple[str, np.ndarray, 
     ]
 
 
+def measured(
+    rig: Rig, made: list[tuple[str, np.ndarray, float]], noise: str, rng: np.random.Generator
+) -> tuple[list[fits.Record], list[np.ndarray]]:
+    """Records of programs, and what each would be without noise, in um, `(n,)`."""
+    records, truths_um = [], []
+    for name, voltage_V, rate_Hz in made:
+        truths_um.append(rig.answer(voltage_V, rate_Hz))
+        read_um = reading(truths_um[-1], noise, rng)
+        records.append(fits.Record(np.arange(len(voltage_V)) / rate_Hz, voltage_V, read_um, source=f"{name}.csv"))
+    return records, truths_um
+
+
 def scores(law: str, noise: str, seed: int, number: int) -> tuple[np.ndarray, float, float]:
     """Errors of the poles of one rig in sd, share of a prediction that its band covers, and its sd over the error."""
     rng = np.random.default_rng([seed, LAWS.index(law), number])
     rig = Rig(law, rng)
-    records, truths_um = [], []
-    for name, voltage_V, rate_Hz in programs(rig, rng):
-        truths_um.append(rig.answer(voltage_V, rate_Hz))
-        read_um = reading(truths_um[-1], noise, rng)
-        records.append(fits.Record(np.arange(len(voltage_V)) / rate_Hz, voltage_V, read_um, source=f"{name}.csv"))
+    records, truths_um = measured(rig, programs(rig, rng), noise, rng)
     found = fits.fit_stage(records[:2], holdout=0.0, initial="negative")
     ahead = found.predict(records[2], initial="negative")
     off_um, sd_um = truths_um[2] - ahead.displacement_um, ahead.displacement_sd_um
