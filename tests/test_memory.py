@@ -193,10 +193,12 @@ def test_on_a_cpu_the_algorithms_of_other_devices_are_not_traced(monkeypatch):
     def refuse(_):
         raise AssertionError("traced")
 
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     assert _by_platform(np.ones(3), cpu=lax.neg, default=refuse).tolist() == [-1.0] * 3
     # Where there are other devices the place of the arrays decides.
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    found = jax.jit(lambda x: _by_platform(x, cpu=lax.neg, default=lax.abs))(np.ones(3))
+    with jax.default_device(jax.devices("cpu")[0]):
+        found = jax.jit(lambda x: _by_platform(x, cpu=lax.neg, default=lax.abs))(np.ones(3))
     assert found.tolist() == [-1.0] * 3
     with pytest.raises(AssertionError, match="traced"):
         jax.jit(lambda x: _by_platform(x, cpu=lax.neg, default=refuse))(np.ones(3))
