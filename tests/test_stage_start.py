@@ -5,7 +5,7 @@ from scipy import signal
 
 import fits
 from fits.loop._run import prepare_run
-from fits.stage._start import MeasuredResponse, measure_response, start_stages
+from fits.stage._start import MeasuredResponse, measure_response, start_lagging, start_stages
 
 
 def poles_of(stage):
@@ -55,3 +55,25 @@ def test_a_short_sweep_through_a_resonance_that_rings_for_long_shows_where_it_is
     assert abs(2 * np.pi * float(best["mechanics"].natural_frequency_Hz) / natural - 1) < 1e-3
     assert abs(float(best["mechanics"].damping_ratio) / damping - 1) < 0.05
     assert abs(float(best["driver"].time_constant_s) / lag_s - 1) < 0.05
+
+
+def test_a_lag_of_the_reading_is_found_beside_that_of_the_driver_either_way(rng):
+    """Without it the poles bend: a resonance of low damping was read as one of 0.9."""
+    frequency_Hz = np.geomspace(1, 2000, 200)
+    s = 2j * np.pi * frequency_Hz
+    natural, lags_s = 2 * np.pi * rng.uniform(80, 200), rng.uniform([2e-4, 3e-3], [1e-3, 6e-3])
+    response = natural**2 / (s**2 + 0.1 * natural * s + natural**2) / np.prod(1 + s * lags_s[:, None], axis=0)
+    measured = MeasuredResponse(frequency_Hz, 0.2 * response, np.full(len(s), 0.999))
+    found = start_lagging(fits.default_stage(), [measured])
+    for order in (lags_s, lags_s[::-1]):
+        assert any(
+            np.allclose([float(stage["driver"].time_constant_s), lag_s], order, rtol=1e-3)
+            and abs(2 * np.pi * float(stage["mechanics"].natural_frequency_Hz) / natural - 1) < 1e-3
+            and abs(float(stage["mechanics"].damping_ratio) / 0.05 - 1) < 1e-2
+            for stage, lag_s in found
+        )
+
+
+def test_responses_of_too_few_lines_say_nothing_of_a_lag():
+    few = MeasuredResponse(np.ones(3), np.ones(3, dtype=complex), np.full(3, 0.9))
+    assert start_lagging(fits.default_stage(), [few]) == []

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._effects import Bench
-from fits.diagnosis._joint_fit import State, fit_jointly
+from fits.diagnosis._joint_fit import State, fit_from_poles, fit_jointly
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
 from fits.diagnosis._score import Probe, Scored, best_of, score
@@ -183,10 +183,18 @@ def _ranked(
         if far and place < _NEAREST and not order[0].refit.is_noise(projector, thresholds.chance_z):
             ahead = left_ahead(order[0]) if ahead is None else ahead
             far = left_ahead(one) - ahead > near
-        if place >= _NEAREST or far:
+        # Its start is its own, however far it is from here.
+        ends = (
+            []
+            if order[0].refit.is_noise(projector, thresholds.chance_z)
+            else fit_from_poles(bench, projector, one.refit)
+        )
+        if place < _NEAREST and not far:
+            ends.append(fit_jointly(bench, projector, one.refit))
+        if not ends:
             out.append(one)
             continue
-        end = fit_jointly(bench, projector, one.refit)
+        end = min(ends, key=lambda state: state[-1].cost)
         found = Rival.of(*end[1:])
         end[1].release()
         if not end[-1].possible(bench):

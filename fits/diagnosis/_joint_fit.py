@@ -4,16 +4,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
 
 from fits.diagnosis._baseline import Baseline, simulate
 from fits.diagnosis._discrepancy import learn_roughness, smoothed, with_discrepancy
-from fits.diagnosis._effects import Bench, scaled
+from fits.diagnosis._effects import Bench, Law, scaled
 from fits.diagnosis._noise import find_faults
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
 from fits.diagnosis._thresholds import Thresholds
+from fits.stage._start import measure_response, start_lagging
+from fits.stage._steps import hysteresis_alone
 from fits.stats._compare import improvement_z
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
@@ -60,6 +63,33 @@ def fit_jointly(bench: Bench, projector: Projector, model: Refit) -> State:
         here = refit(bench, projector, model.laws, model.x, 4)
         moved = moved if moved[-1].cost < here.cost else (bench, projector, here)
     return moved
+
+
+def fit_from_poles(bench: Bench, projector: Projector, model: Refit) -> list[State]:
+    """Fit the last effect, a lag, jointly from poles that explain the responses of the runs together with it.
+
+    A plain stage without the lag may have bent its own poles too far for a way back from there.
+    """
+    baseline, law = bench.baseline, model.laws[-1]
+    if not (law.form.lag and baseline.dynamic):
+        return []
+    drives = hysteresis_alone(baseline.stage, baseline.runs)
+    before = replace(model, laws=model.laws[:-1], x=model.x[:-1])
+    others_um = [bench.respond_in(run, before.effects(run)) - plain for run, plain in enumerate(bench.plain)]
+    cleaned = [
+        replace(run, record=replace(run.record, displacement_um=run.displacement_um - um))
+        for run, um in zip(baseline.runs, others_um, strict=True)
+    ]
+    found = []
+    for stage, lag_s in start_lagging(baseline.stage, list(map(measure_response, cleaned, drives))):
+        there = replace(baseline, z=np.asarray(baseline.chain.coordinates.of(stage)))
+        effects = [law.effect(model.x[-1], run) for run in range(len(baseline.runs))]
+        started = Law([replace(one, **{law.form.lag: jnp.asarray(lag_s)}) for one in effects], law.remembers)
+        laws, x = model.with_law(len(model.laws) - 1, started)
+        here = refit(bench, projector, laws, x, 0)
+        state = _linearised_at(there, projector, here)
+        found.append(alternate(*state, refit(*state, laws, x, 4)))
+    return found
 
 
 def alternate(bench: Bench, projector: Projector, model: Refit, rounds: Sequence[int] = (4, 2)) -> State:

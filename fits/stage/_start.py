@@ -79,29 +79,63 @@ def start_stages(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[St
     Drivers and mechanics that are not frozen are replaced; other linear parts are taken as they are. Returns distinct
     candidates, the best first; the stage itself where the responses say nothing.
     """
-    free = [(name, part) for name, part in named_parts(stage, Driver, Mechanics) if name not in stage.frozen]
-    responses = [one for one in responses if len(one.frequency_Hz) >= _LINES]
-    if not free or not responses:
+    moved = _moved(stage)
+    found = _poles(stage, moved, responses, [isinstance(stage[name], Driver) for name in moved])
+    if found is None:
         return [stage]
-    moved = [name for name, _ in free]
+    problem, ends = found
+    best = [other for x in ends[:1] for other in problem.exchanged(x)]
+    return [problem.applied(stage, moved, x) for x in [*ends, *best]]
+
+
+def start_lagging(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[tuple[Stage, float]]:
+    """The same for a stage whose reading lags behind it, each with the time constant of that lag in s.
+
+    A response does not tell which of two lags lies ahead of the hysteresis: those of reading and driver are given
+    both ways. Nothing where the responses say nothing.
+    """
+    moved = _moved(stage)
+    drivers = [*(isinstance(stage[name], Driver) for name in moved), True]
+    found = _poles(stage, moved, responses, drivers)
+    if found is None:
+        return []
+    problem, ends = found
+    places = np.cumsum([1 if driver else 2 for driver in drivers]) - 1
+    swaps = [[at, -1] for at, driver in zip(places, drivers, strict=True) if driver]
+    out = []
+    for swap in swaps[::-1]:
+        x = ends[0].copy()
+        x[swap] = x[swap[::-1]]
+        out.append((problem.applied(stage, moved, x), float(np.exp(x[-1]))))
+    return out
+
+
+def _moved(stage: Stage) -> list[str]:
+    """Drivers and mechanics whose poles are free."""
+    return [name for name, _ in named_parts(stage, Driver, Mechanics) if name not in stage.frozen]
+
+
+def _poles(
+    stage: Stage, moved: Sequence[str], responses: Sequence[MeasuredResponse], drivers: list[bool]
+) -> tuple["_LogResponse", list[np.ndarray]] | None:
+    """Distinct poles of lags and mechanics that explain responses, the best first; None where those say nothing."""
+    responses = [one for one in responses if len(one.frequency_Hz) >= _LINES]
+    if not moved or not responses:
+        return None
     fixed = [part for name, part in named_parts(stage, AbstractLinear) if name not in moved]
-    problem = _LogResponse.of(responses, [isinstance(part, Driver) for _, part in free], fixed)
-    found: list[tuple[float, np.ndarray]] = []
+    problem, found = _LogResponse.of(responses, drivers, fixed), list[tuple[float, np.ndarray]]()
     # Candidates may be too alike, in the logarithms of their poles, to refine both, or to keep both.
     ranked, (low, high) = problem.ranked()[1][:200], problem.bounds()
     for x in _distinct(ranked, 0.5)[:4]:
-        end: Any = scipy.optimize.least_squares(
-            problem.misfit, np.clip(x, low, high), bounds=(low, high), max_nfev=200
-        )
+        start = np.clip(x, low, high)
+        end: Any = scipy.optimize.least_squares(problem.misfit, start, bounds=(low, high), max_nfev=200)
         found.append((float(end.cost), end.x))
     found.sort(key=lambda item: item[0])
     ends = [x for _, x in found]
     sampled = [one.sampled for one in responses if one.sampled is not None]
     if sampled:
         ends = [problem.refined_in_time([*ends, *_distinct(ranked, 0.2)], sampled, fixed), *ends]
-    ends = _distinct(ends, 0.05)[:3]
-    best = [other for x in ends[:1] for other in problem.exchanged(x)]
-    return [problem.applied(stage, moved, x) for x in [*ends, *best]]
+    return problem, _distinct(ends, 0.05)[:3]
 
 
 def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) -> list[float]:
@@ -255,7 +289,7 @@ class _LogResponse:
         return others
 
     def applied(self, stage: Stage, names: Sequence[str], x: np.ndarray) -> Stage:
-        for name, pole in zip(names, self._split(np.exp(x)), strict=True):
+        for name, pole in zip(names, self._split(np.exp(x)), strict=False):
             part: Any = stage[name]
             made: Any = Driver if isinstance(part, Driver) else Mechanics
             stage = stage.swap(name, made(*(jnp.asarray(value) for value in pole), part.gain))
