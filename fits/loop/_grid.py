@@ -149,12 +149,16 @@ def non_negative(posterior: Posterior) -> tuple[np.ndarray, bool]:
     lowest = posterior.mean * scale
     if not np.all(np.isfinite(lowest)):  # rounding left no Cholesky factor
         return np.zeros_like(posterior.mean), False
+    if not np.all(np.isfinite(posterior.root)):
+        return _one_by_one(posterior)
     size = len(lowest)
     bounded = 64
     while True:
         bounded = min(size, max(bounded, 2 ** int(np.ceil(np.log2(1 + 2 * np.sum(lowest < 0))))))
         order = np.sort(np.argsort(lowest, kind="stable")[:bounded])
         spread, precision, mean, unit = _marginal(posterior, order)
+        if not np.all(np.isfinite(precision)):
+            return _one_by_one(posterior)
         y, found = pivot_nonnegative(precision, -(precision @ mean), np.maximum(mean, 0), _ATOL, 500)
         if not found:
             return _one_by_one(posterior)
