@@ -18,10 +18,10 @@ from fits.diagnosis._regression import Regression
 from fits.diagnosis._residual_tests import (
     Regressors,
     _bands,
-    cycles,
     explain,
     explain_together,
     irregular,
+    repeats_in,
     run_regressors,
 )
 from fits.stats._band import Band
@@ -129,11 +129,11 @@ def test_a_period_in_the_position_is_found(rng):
     period_um = rng.uniform(0.2, 1.0)
     noise = rng.standard_normal(1400)
     wave = np.concatenate([np.cos(2 * np.pi * p / period_um + 0.3) for p in plain_um])
-    found = cycles(plain_projector(), noise + wave, plain_um)
+    found = repeats_in(plain_projector(), noise + wave, plain_um)
     assert found.period_um == pytest.approx(period_um, rel=0.01)
     assert found.z > 50
     assert found.drop == pytest.approx(1400 / 2, rel=0.25)
-    assert cycles(plain_projector(), noise, plain_um).z < 15
+    assert repeats_in(plain_projector(), noise, plain_um).z < 15
 
 
 def irregularities(values):

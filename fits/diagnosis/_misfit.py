@@ -8,10 +8,11 @@ from scipy import stats
 
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit, nothing, refit
-from fits.diagnosis._residual_tests import Cycles, cycles, explain_together, run_regressors
+from fits.diagnosis._residual_tests import explain_together, repeats_in, run_regressors
 from fits.diagnosis._select import Selection
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.stats._compare import is_worse
+from fits.stats._cycles import Cycles
 from fits.stats._noise import Noise
 from microid.effects import card_of
 
@@ -122,6 +123,6 @@ def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, C
     """What there is to be explained, and what repeats itself with the position, which counts unless `rounded`."""
     regressors = run_regressors(ready.baseline.runs, ready.bench.plain)
     rest, freedom = explain_together(found.projector, found.model.basis(), found.model.residual, regressors)
-    repeated = cycles(found.projector, found.model.residual, ready.bench.plain)
+    repeated = repeats_in(found.projector, found.model.residual, ready.bench.plain)
     rest = max(rest, 0.0 if rounded else repeated.drop)
     return Misfit(found.explained, rest, freedom, found.first.count, ready.reading.thresholds), repeated

@@ -10,6 +10,7 @@ from fits.diagnosis._regression import Regression
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
 from fits.stats._band import Band, band_of
+from fits.stats._cycles import cycles, without_cycles
 from fits.stats._noise import Noise, quantum_um, rough_noise_um
 from fits.stats._sensor_noise import floor_of, jitter_s, pooled, spikes, white_noise
 from microid.effects import Statistic
@@ -71,7 +72,7 @@ def find_faults(
     quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
     # Rounding is noise that a command at rest does not show.
     least = quantum / 12**0.5
-    floors, found, heights, jitters, bands = [], [], [], [], []
+    floors, found, heights, jitters, bands, fast, positions = [], [], [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     # After so many e-folds a motion has settled.
     settling_s = float(8.0 / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
@@ -80,14 +81,18 @@ def find_faults(
         moved = residual - rows @ np.concatenate([dw, dz])
         mask = run.fitted
         left = moved - nuisance @ np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
-        voltage_V = run.record.voltage_V
-        bad = spikes(voltage_V, left, 2 * quantum, thresholds.spike_z)
+        bad = spikes(run.record.voltage_V, left, 2 * quantum, thresholds.spike_z)
         smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
         found.append(bad)
         heights.append(np.where(bad, left - smooth, 0.0))
+        fast.append(smooth)
+        positions.append(run.displacement_um - left)
+    fast = _without_cycles(fast, positions, [run.fitted for run in baseline.runs], thresholds)
+    for run, smooth, position in zip(baseline.runs, fast, positions, strict=True):
+        voltage_V, mask = run.record.voltage_V, run.fitted
         settings = settling_s, 1e-9 * float(np.ptp(run.displacement_um)), thresholds.apart_z, thresholds.minor_share
         floors.append(floor_of(voltage_V, smooth, mask, run.rate_Hz, *settings))
-        rate = np.gradient(run.displacement_um - left, run.record.time_s)
+        rate = np.gradient(position, run.record.time_s)
         size, z, most = jitter_s(smooth[mask], rate[mask], least, thresholds.apart_z)
         jitters.append((z, size, np.abs(rate), most))
         interval = float(np.median(np.diff(run.record.time_s)))
@@ -112,6 +117,21 @@ def find_faults(
     size = size if z > thresholds.strong_z else 0.0
     made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
     return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
+
+
+def _without_cycles(
+    left_um: list[np.ndarray], positions_um: list[np.ndarray], used: list[np.ndarray], thresholds: Thresholds
+) -> list[np.ndarray]:
+    """Take off what repeats itself with the position, where most of the fastest changes are that, and no noise."""
+    each = list(zip(left_um, positions_um, used, strict=True))
+    noise_um = np.array([max(rough_noise_um(left[mask]), 1e-300) for left, _, mask in each])
+    scaled = [left[mask] / noise for (left, _, mask), noise in zip(each, noise_um, strict=True)]
+    found = cycles(scaled, [position[mask] for _, position, mask in each])
+    if found.z <= thresholds.cycles:
+        return left_um
+    rest = [without_cycles(left, position, found.period_um, mask) for left, position, mask in each]
+    less_um = np.array([rough_noise_um(left[mask]) for left, mask in zip(rest, used, strict=True)])
+    return rest if np.any(less_um**2 < (1 - thresholds.explained_share) * noise_um**2) else left_um
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,11 @@ from fits.diagnosis._result import Test
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import Run
+from fits.stats._cycles import Cycles, cycles
 from fits.stats._noise import learn_noise
 from fits.stats._score_test import standard_deviations
 
-_WAVES, _PERIODS = 12, 1920
+_WAVES = 12
 # Bands of the command, from two periods in a run to half the sampling rate, and the part of its energy that counts.
 _BANDS, _PLAYED = 12, 1e-8
 _SENTENCES = {
@@ -172,29 +173,10 @@ def explain_together(
     return seen.drop, seen.freedom
 
 
-@dataclass(frozen=True)
-class Cycles:
-    """The strongest period of a residual in the position: its evidence in e-folds, and the decrease that it takes."""
-
-    period_um: float
-    z: float
-    drop: float
-
-
-def cycles(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.ndarray]) -> Cycles:
-    """Search a joined residual for a period in the position, 16 to 2,000 in the stroke; what is slower is density."""
-    span_um = max(float(np.ptp(p)) for p in plain_um)
-    parts = [
-        (part, 2 * np.pi * plain[mask] / span_um)
-        for part, mask, plain in zip(projector.split(residual), projector.masks, plain_um, strict=True)
-    ]
-    counts = np.geomspace(16, 2000, _PERIODS)
-    drops = [
-        sum(2 * float(np.abs(part @ np.exp(1j * k * turn)) ** 2) / len(part) for part, turn in parts) for k in counts
-    ]
-    best = int(np.argmax(drops))
-    logs = stats.chi2.logsf(drops[best], 2 * len(parts)) + np.log(_PERIODS)
-    return Cycles(span_um / float(counts[best]), float(-logs), drops[best])
+def repeats_in(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.ndarray]) -> Cycles:
+    """The strongest period of a joined residual in the position; see `cycles`."""
+    positions = [plain[mask] for mask, plain in zip(projector.masks, plain_um, strict=True)]
+    return cycles(projector.split(residual), positions)
 
 
 def irregular(

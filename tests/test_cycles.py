@@ -1,0 +1,39 @@
+"""What repeats itself with the position, found and taken off before noise is read off the rest."""
+
+import numpy as np
+import pytest
+
+from fits.diagnosis._noise import _without_cycles
+from fits.diagnosis._thresholds import THRESHOLDS
+from fits.stats._cycles import cycles
+from fits.stats._noise import rough_noise_um
+
+
+def sweeps(rng, count=6000, stroke_um=30.0):
+    """Positions of a motion to and fro between random turns, in um, shape `(n,)`."""
+    turns_um = rng.uniform(0, 1, 30) * stroke_um / 4 + np.tile([0, 0.75], 15) * stroke_um
+    way_um = np.r_[0, np.cumsum(np.abs(np.diff(turns_um)))]
+    return np.interp(np.linspace(0, way_um[-1], count), way_um, turns_um)
+
+
+@pytest.mark.parametrize("amplitude_um", [0.05, 0.1])
+def test_cycles_are_no_noise(rng, amplitude_um):
+    position_um, noise_um, period_um = sweeps(rng), 0.01, rng.uniform(0.2, 0.4)
+    noise = noise_um * rng.standard_normal(len(position_um))
+    left = noise + amplitude_um * np.sin(2 * np.pi * position_um / period_um + rng.uniform(0, 6))
+    used = [np.ones(len(left), dtype=bool)]
+    (rest,) = _without_cycles([left], [position_um], used, THRESHOLDS)
+    assert rough_noise_um(left) > 2 * noise_um
+    assert rough_noise_um(rest) == pytest.approx(noise_um, rel=0.2)
+    assert cycles([left], [position_um]).period_um == pytest.approx(period_um, rel=1e-3)
+
+
+def test_noise_and_what_repeats_itself_with_time_stay(rng):
+    position_um = sweeps(rng)
+    noise = 0.01 * rng.standard_normal(len(position_um))
+    hum = noise + 0.1 * np.sin(2 * np.pi * rng.uniform(0.05, 0.2) * np.arange(len(noise)))
+    used = [np.ones(len(noise), dtype=bool)]
+    assert cycles([noise], [position_um]).z < 15
+    for left in (noise, hum):
+        (rest,) = _without_cycles([left], [position_um], used, THRESHOLDS)
+        assert rest is left
