@@ -1,5 +1,6 @@
 """What a command says and draws as one page, beside its pictures."""
 
+import re
 from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
@@ -8,6 +9,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fits.io._printable import printable
 from fits.io._version import written_by
+
+# A number and what it counts, in text and outside of commands.
+_QUANTITY = re.compile("(?<=\\d) (?=(?:%|[pnµum]?m|k?Hz|m?s|k?V|\N{GREEK SMALL LETTER SIGMA})(?![\\w/]))")
 
 
 def environment() -> Environment:
@@ -25,6 +29,12 @@ def environment() -> Environment:
         made.globals[name] = files("fits.report").joinpath(file).read_text(encoding="utf-8")
     made.globals["written_by"] = written_by()
     return made
+
+
+def unbroken(page: str) -> str:
+    """Keep numbers and their units on one line, but for what stands in `pre`, which is pasted."""
+    parts = re.split(r"(<pre.*?</pre>)", page, flags=re.DOTALL)
+    return "".join(part if part.startswith("<pre") else _QUANTITY.sub("\N{NO-BREAK SPACE}", part) for part in parts)
 
 
 def write_page(folder: Path, title: str, words: str, pictures: Iterable[Path]) -> None:
