@@ -16,7 +16,7 @@ from _command import OFF, columns_of, files, refused, run, without_jax
 from fits.cli._main import cli
 from fits.io._jax_setup import _cache_folder
 from fits.loop._plain import INITIAL_STATES
-from microid import FAMILIES
+from microid.densities import FAMILIES
 
 ROOT = Path(__file__).parents[1]
 

@@ -14,6 +14,7 @@ from test_compensate import read
 
 import microid
 from fits import DataError, Reference, compensate, save_model
+from microid.hysteresis import PrandtlIshlinskii
 
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 SAMPLES, HALF = 400, 200
@@ -121,7 +122,7 @@ def test_what_a_stage_cannot_follow_is_refused_or_said(rng):
     with pytest.raises(DataError, match="dynamically"):
         compensate(stage["hysteresis"], wanted, way="dynamic")
     with pytest.raises(DataError, match=r"plays.*hysteresis"):
-        compensate(microid.Stage.of(plays=microid.PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)), wanted)
+        compensate(microid.Stage.of(plays=PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)), wanted)
     turned = stage.swap("sensor", microid.Sensor(-1.0, 0.0))
     with pytest.raises(DataError, match=r"'sensor'.*positive"):
         compensate(turned, wanted)

@@ -15,7 +15,7 @@ from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, partly_fitted, runs_read, stage_parameters
 from fits.report._words import NONE, headline, length, number, plain, spread, verdict_sentence
-from microid import EFFECTS
+from microid.effects import EFFECTS
 
 SIZES_um = (0.0471, 0.0123, 0.04709, 0.0470999, 0.9, np.nan)
 

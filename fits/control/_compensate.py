@@ -30,7 +30,9 @@ from fits.loop._surface import Surface
 from fits.stage._encode import encode
 from fits.stage._model_file import AnyModel, model_given
 from fits.stage._plain_stage import plain_model
-from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Reversible, Stage, Start, innermost
+from microid import AbstractLinear, Preisach, Reversible, Stage, Start, innermost
+from microid.densities import GridDensity
+from microid.effects import AbstractEffect
 
 Way = Literal["static", "dynamic"]
 
@@ -149,7 +151,7 @@ def plain_loop_of(model: Preisach) -> PlainLoop:
 
 
 def plain_of(stage: Stage) -> Stage:
-    """The same stage without effects of `microid.EFFECTS`; itself where it has none."""
+    """The same stage without effects of `microid.effects.EFFECTS`; itself where it has none."""
     if not any(isinstance(part, AbstractEffect) for part in stage.parts):
         return stage
     parts = {

@@ -27,7 +27,8 @@ from fits.loop._surface import Surface
 from fits.loop._uncertainty import Uncertainty
 from fits.stats._metrics import WHITE
 from fits.stats._noise import LOSSES
-from microid import FAMILIES, Preisach
+from microid import Preisach
+from microid.densities import FAMILIES
 
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
@@ -59,7 +60,7 @@ def fit(
     records
         Runs of one rig, or one: records, or what `read_table` takes. Each has its own sensor offset.
     family, levels
-        Name in `microid.FAMILIES`, and number of switching voltages, chosen from the data by default.
+        Name in `microid.densities.FAMILIES`, and number of switching voltages, chosen from the data by default.
     holdout
         Fraction at the end of every run that is only predicted, or records that are.
     initial
