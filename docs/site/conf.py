@@ -13,8 +13,6 @@ include_patterns = ["*.md", "docs/**", "benchmarks/*.md", "notebooks/*.ipynb"]
 root_doc = "docs/site/index"
 html_theme = "furo"
 html_show_copyright = False
-# Two hyphens begin an option.
-smartquotes = False
 myst_heading_anchors = 3
 nb_execution_mode = "off"
 napoleon_use_ivar = True
