@@ -247,7 +247,7 @@ def test_rows_that_failed_are_drawn_as_such_and_names_whole():
 
 def test_cells_without_a_row_are_said_to_be_white():
     swept = {"mechanics.gain": np.array([1.0, 2.0, 2.0]), "program.bias_V": np.array([0.0, 0.0, 5.0])}
-    for keep, words in ((slice(3), "white: no row"), (slice(2), "")):
+    for keep, words in ((slice(3), "white: no row"), (slice(2), ""), (slice(1, 3), "")):
         some = {name: values[keep] for name, values in swept.items()}
         rows = _Rows(some, {}, "width_pct", np.array([1.0, 2.0, 3.0])[keep])
         assert _heat(rows, tuple(some)).axes[0].get_title("left") == words

@@ -132,7 +132,7 @@ def _heat(rows: _Rows, pair: tuple[str, str]) -> Figure:
         legend(picture, (axes,))
     axes.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
     axes.set(xlim=corners[0][[0, -1]], ylim=corners[1][[0, -1]])
-    empty = "white: no row" if (count == 0).any() and done.all() else ""
+    empty = "white: no row" if (np.histogram2d(x, y, bins=edges)[0] == 0).any() else ""
     picture.colorbar(drawn, label=f"mean {verbatim(rows.by)}")
     label(axes, verbatim(pair[0]), verbatim(pair[1]), empty)
     for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
