@@ -70,7 +70,7 @@ def test_refusals_name_sample_range_cause_and_remedy(rng):
     wanted_um[[70, 90]] = highest_um + 0.5, lowest_um - 0.5
     with pytest.raises(DataError) as refusal:
         compensate(model, reference(wanted_um))
-    for words in ("wanted.csv", "sample 71", "0.7 s", f"{lowest_um:.6g} to {highest_um:.6g} um", "fitted", "--clip"):
+    for words in ("wanted.csv", "sample 71", "0.7 s", f"{lowest_um:.6g} to {highest_um:.6g} um", "fitted", "clipped"):
         assert words in str(refusal.value)
     assert f"2 of {SAMPLES} samples" in str(refusal.value)
     assert np.flatnonzero(compensate(model, reference(wanted_um), clip=True).clipped).tolist() == [70, 90]
@@ -154,7 +154,7 @@ def test_the_command_writes_a_voltage_and_a_plot(rng, model_file, tmp_path):
     whole_picture(tmp_path / "plots" / "compensation.png")
 
     csv.write_text(f"time_s,displacement_um\n0,{lowest_um}\n1,{highest_um + 1}\n")
-    refused(run("compensate", path, csv, "--out", tmp_path / "w.csv"), "r.csv", "sample 2", "--clip")
+    refused(run("compensate", path, csv, "--out", tmp_path / "w.csv"), "r.csv", "sample 2", "clipped")
     lower_V, upper_V = limits_V(model)
     high_V = 0.3 * lower_V + 0.7 * upper_V
     clipped = run("compensate", path, csv, "--out", out, "--clip", f"--limits={lower_V},{high_V}", "--json")

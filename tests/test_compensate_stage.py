@@ -106,7 +106,7 @@ def test_what_a_stage_cannot_follow_is_refused_or_said(rng):
     assert "begins in motion" in remark
 
     too_far_um = low_um + (wanted.displacement_um - low_um) * 1.6
-    for words in ("um of the piezo", "can be reached", f"{lower_V:g} and {upper_V:g} V", "slow it down", "--clip"):
+    for words in ("um of the piezo", "can be reached", f"{lower_V:g} and {upper_V:g} V", "slow it down", "clipped"):
         assert words in refusal(too_far_um)
     # Fast, and near the end of the range of a command: the hysteresis could, the driver cannot.
     limits = (lower_V, float(compensate(stage, wanted, way="dynamic").voltage_V.max()) * 0.7)
@@ -186,5 +186,5 @@ def test_what_is_out_of_reach_beside_an_effect_is_not_said_of_the_reference(rng)
     low, high = ends_um(law)
     time_s = np.linspace(0, 2, 400)
     there = Reference(time_s, low + (high - low) * 0.8 * np.clip(np.minimum(time_s, 2 - time_s), 0, 0.5), "r.csv")
-    with pytest.raises(DataError, match=r"r\.csv, less what the effects of the model add: .* asks for .* --clip"):
+    with pytest.raises(DataError, match=r"r\.csv, less what the effects of the model add: .* asks for .* clipped"):
         compensate(stage, there)

@@ -174,7 +174,7 @@ def test_runs_of_other_speeds_that_are_far_from_noise_ask_for_the_stage():
 
     (said,) = _of_speed([moved(1.0), moved(40.0), moved(3.0)])
     assert "by a factor of 40," in said
-    assert "--model stage" in said
+    assert "whole stage" in said
     # A run at rest has no speed, and one or two alike tell nothing of it.
     still = moved(1.0)
     still.record.voltage_V = np.zeros(400)

@@ -144,8 +144,8 @@ def _of_speed(runs: Sequence[Run]) -> list[str]:
         return []
     times = max(per_s) / min(per_s)
     return [
-        f"the runs differ in speed by a factor of {times:.2g}, and a hysteresis alone knows no speed: fit the "
-        "whole stage with --model stage, or ask what else there is with 'microid diagnose'"
+        f"the runs differ in speed by a factor of {times:.2g}, and a hysteresis alone knows no speed: fit a "
+        "whole stage to them, with driver and mechanics, or have it diagnosed"
     ]
 
 
